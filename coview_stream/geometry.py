@@ -1,0 +1,91 @@
+"""Rigid transforms in 3-D, as 4x4 float64 matrices.
+
+``T_target_source`` maps coordinates of the *source* frame into the *target* frame:
+``p_target = T_target_source @ p_source``. Metres and radians throughout.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Pose = npt.NDArray[np.float64]
+"""A 4x4 float64 rigid transform."""
+
+Points = npt.NDArray[np.float32]
+"""(N, 3) float32 coordinates near the origin of their frame, metres."""
+
+
+def pose_from(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Pose:
+    """Pose (4, 4) from a rotation matrix (3, 3) and a translation (3,) in metres."""
+    T = np.eye(4)
+    T[:3, :3] = np.asarray(rotation, dtype=np.float64)
+    T[:3, 3] = np.asarray(translation, dtype=np.float64)
+    return T
+
+
+def inverse(T: Pose) -> Pose:
+    """Inverse of a rigid transform, without a general matrix inversion."""
+    R_t = T[:3, :3].T
+    return pose_from(R_t, -R_t @ T[:3, 3])
+
+
+def transform(T: Pose, points: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Apply ``T`` to (N, 3) points, in the points' own precision."""
+    R = T[:3, :3].astype(points.dtype)
+    t = T[:3, 3].astype(points.dtype)
+    return points @ R.T + t
+
+
+def rot_z(yaw: float) -> npt.NDArray[np.float64]:
+    """Rotation matrix (3, 3) about z by ``yaw`` radians."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def yaw_of(T: Pose) -> float:
+    """Heading of a pose about z, radians in (-pi, pi]."""
+    return float(np.arctan2(T[1, 0], T[0, 0]))
+
+
+def wrap_angle(angle: float) -> float:
+    """The same angle in [-pi, pi), radians."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def rotation_angle(T: Pose) -> float:
+    """Angle of the rotation part, radians in [0, pi]."""
+    # the sine keeps its precision near zero, where the cosine of eq. 15 has none left
+    R = T[:3, :3]
+    sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
+
+
+def exp_se3(xi: npt.NDArray[np.float64]) -> Pose:
+    """Left-multiplied pose increment from (rx, ry, rz, x, y, z): rotate, then shift."""
+    return pose_from(Rotation.from_rotvec(xi[:3]).as_matrix(), xi[3:])
+
+
+def orthonormal(T: Pose) -> Pose:
+    """``T`` with its rotation projected back onto SO(3) (drift from repeated products)."""
+    return pose_from(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+
+
+def is_pose(T: npt.NDArray[np.floating]) -> bool:
+    """Whether ``T`` is a finite 4x4 rigid transform (rotation orthonormal to 1e-3)."""
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        return False
+    R = T[:3, :3]
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0)
+
+
+def pose_to_tum(T: Pose) -> npt.NDArray[np.float64]:
+    """(7,) x y z qx qy qz qw of a pose."""
+    return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat()])
+
+
+def pose_from_tum(row: npt.ArrayLike) -> Pose:
+    """Pose from (7,) x y z qx qy qz qw; the quaternion need not be normalised."""
+    values = np.asarray(row, dtype=np.float64)
+    return pose_from(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
