@@ -1,0 +1,34 @@
+"""Numerical kernels of coview_stream: arrays in, arrays out; no files, no network, no localization.
+
+Every function checks its arguments, then runs in Taichi on one owner thread, or in NumPy
+(:mod:`coview_kernels.reference`) where Taichi is missing or ``COVIEW_KERNELS=numpy`` is set; both agree. All
+can be called from any thread. Importing this package does not import Taichi; the first call does.
+"""
+
+from __future__ import annotations
+
+from coview_kernels.covisibility import coview, visible
+from coview_kernels.polar import polar_bin, station_bins
+from coview_kernels.runtime import backend, shutdown, submit, warm_up
+from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
+from coview_kernels.trimmed_icp import normal_equations, trim
+from coview_kernels.types import PolarGrid
+from coview_kernels.voxel import transform_unique
+
+__all__ = [
+    "PolarGrid",
+    "all_shift_distance",
+    "backend",
+    "column_spectra",
+    "coview",
+    "normal_equations",
+    "polar_bin",
+    "shutdown",
+    "station_bins",
+    "submit",
+    "transform_unique",
+    "trim",
+    "unit_columns",
+    "visible",
+    "warm_up",
+]

@@ -1,0 +1,97 @@
+"""Eqs 1-4: which bins are visible from the ground, from above, and the co-view descriptor."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import check, reference
+from coview_kernels.types import F32, I32, Mask, Mode, Vertical
+
+_MODES = ("paper", "eye", "off")
+_VERTICALS = ("max", "mean", "off")
+
+
+def visible(max_height: npt.ArrayLike, count: npt.ArrayLike, mode: Mode, eye: float = 1.5) -> Mask:
+    """Eq. 2: bins that no nearer bin of the same sector hides. A bin is occupied where its count is positive.
+
+    From the centre outwards, rings i = 1..R, the first occupied bin of a sector is visible and becomes the
+    horizon; an occupied bin above the horizon is visible and becomes the next horizon.
+
+    * ``paper``: above means h > i * h_vis / i_vis, strictly. Heights must be measured from the viewpoint.
+    * ``eye``: line of sight from ``eye`` metres: slope (h - eye) / (i - 1/2) > that of the horizon.
+    * ``off``: every occupied bin is visible.
+
+    Args:
+        max_height: (..., R, S) float32 greatest height above the centre, metres; ignored in empty bins.
+        count: (..., R, S) int32 points.
+        mode: ``paper``, ``eye`` or ``off``.
+        eye: height of the eye above the centre, metres; mode ``eye`` only. Rounded to float32.
+
+    Returns:
+        (..., R, S) bool.
+
+    Raises:
+        ValueError: shapes disagree, there are fewer than two axes, the mode is unknown or ``eye`` is not
+            finite.
+    """
+    height, points = _grids(max_height, count)
+    _check_mode(mode, eye)
+    return reference.visible(height, points, mode, eye)
+
+
+def coview(
+    max_height: npt.ArrayLike,
+    sum_height: npt.ArrayLike,
+    count: npt.ArrayLike,
+    vertical: Vertical = "max",
+    mode: Mode = "paper",
+    eye: float = 1.5,
+) -> F32:
+    """Eqs 1-4: the co-view context, one height per bin that both a ground robot and an airborne scanner see.
+
+    Our reading of the paper: a bin is *horizontally* visible by :func:`visible`. It is *vertically* visible
+    (seen from above) if it is occupied and its density d_ij, the count, is at least the mean count over all R
+    x S bins, empty ones included (eqs 3-4): dense bins hold vertical structure, which both views share. A
+    horizontally visible bin has its greatest height as value; a bin that is only vertically visible has its
+    greatest height (``vertical="max"``), its mean height (``"mean"``, the letter of eq. 4) or nothing
+    (``"off"``); others have 0.
+
+    Args:
+        max_height: (..., R, S) float32, metres above the viewpoint (or the ground below it).
+        sum_height: (..., R, S) float32, metres.
+        count: (..., R, S) int32, of voxels rather than of raw points, lest the scan pattern decides.
+        vertical: value of bins that are visible from above only: ``max``, ``mean`` or ``off``.
+        mode: horizontal visibility, see :func:`visible`.
+        eye: see :func:`visible`.
+
+    Returns:
+        (..., R, S) float32, metres.
+
+    Raises:
+        ValueError: shapes disagree, an option is unknown or ``eye`` is not finite.
+    """
+    height, points = _grids(max_height, count)
+    total = np.ascontiguousarray(sum_height, dtype=np.float32)
+    check.same_shape("sum_height", total, "max_height", height.shape)
+    check.one_of("vertical", vertical, _VERTICALS)
+    _check_mode(mode, eye)
+    return reference.coview(height, total, points, vertical, mode, eye)
+
+
+def _grids(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
+    height: npt.NDArray[Any] = np.ascontiguousarray(max_height, dtype=np.float32)
+    points: npt.NDArray[Any] = np.ascontiguousarray(count, dtype=np.int32)
+    if np.ndim(max_height) < 2:
+        raise ValueError(f"max_height has shape {np.shape(max_height)}, expected (..., rings, sectors)")
+    check.same_shape("count", points, "max_height", height.shape)
+    return height, points
+
+
+def _check_mode(mode: str, eye: float) -> None:
+    check.one_of("mode", mode, _MODES)
+    if not math.isfinite(eye):
+        raise ValueError(f"eye must be finite, got {eye}")

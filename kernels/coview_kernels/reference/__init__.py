@@ -1,0 +1,14 @@
+"""Every kernel in plain NumPy, same names and signatures: the oracle of the tests, and the implementation
+where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
+
+Functions here trust their arguments; the public twins in :mod:`coview_kernels` check them first.
+"""
+
+from __future__ import annotations
+
+from coview_kernels.reference.covisibility import coview, visible
+from coview_kernels.reference.polar import polar_bin, station_bins
+from coview_kernels.reference.trimmed_icp import normal_equations
+from coview_kernels.reference.voxel import transform_unique
+
+__all__ = ["coview", "normal_equations", "polar_bin", "station_bins", "transform_unique", "visible"]
