@@ -1,0 +1,155 @@
+"""A point cloud near its own float64 origin, and how it is put together without losing precision."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import CloudError
+from coview_stream.geometry import Points
+
+LOCAL_LIMIT = 10_000.0
+"""Coordinates below this (metres) keep a zero origin: float32 still resolves 1 mm there."""
+
+ORIGIN_STEP = 100.0
+"""An origin is a multiple of this (metres), so that neighbouring tiles have readable, exact offsets."""
+
+ABSURD = 1e8
+"""No coordinate on Earth, geocentric ones included, reaches this (metres): such a row is damaged."""
+
+COARSE_FLOAT32 = 1e6
+"""From here on (metres) float32 is coarser than 6 cm; a file that stores it has lost precision already."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points and the float64 origin they are relative to.
+
+    Attributes:
+        points: (N, 3) float32 metres, ``raw - origin``, subtracted in float64.
+        origin: (3,) float64 metres. Zeros if the cloud lies within ``LOCAL_LIMIT`` of its frame's zero,
+            otherwise the rounded (``ORIGIN_STEP``) median of the points.
+        crs: coordinate reference system as the file states it (WKT or ``EPSG:code``), if it does.
+        classification: (N,) uint8 LAS classes, if the format has them.
+        dropped: rows left out: not finite, absurd, withheld or labelled as noise.
+    """
+
+    points: Points
+    origin: npt.NDArray[np.float64]
+    crs: str | None = None
+    classification: npt.NDArray[np.uint8] | None = None
+    dropped: int = 0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def map_points(self) -> npt.NDArray[np.float64]:
+        """(N, 3) float64 coordinates in the file's own frame, metres."""
+        return self.points.astype(np.float64) + self.origin
+
+
+@dataclass
+class CloudBuilder:
+    """Collects chunks of raw coordinates; the first usable chunk decides the origin."""
+
+    crs: str | None = None
+    origin: npt.NDArray[np.float64] | None = None
+    dropped: int = 0
+    _points: list[Points] = field(default_factory=list)
+    _classes: list[npt.NDArray[np.uint8]] = field(default_factory=list)
+
+    def add(
+        self,
+        raw: npt.NDArray[np.floating],
+        classification: npt.NDArray[np.uint8] | None = None,
+        dropped: int = 0,
+    ) -> None:
+        """Append (N, 3) raw coordinates in metres; ``dropped`` counts rows the reader left out before."""
+        with np.errstate(invalid="ignore"):
+            # false for NaN as well
+            usable = (np.abs(raw) < ABSURD).all(axis=1)
+        self.dropped += dropped + int(len(raw) - usable.sum())
+        if not usable.all():
+            raw = raw[usable]
+            classification = None if classification is None else classification[usable]
+        if not len(raw):
+            return
+        if self.origin is None:
+            self.origin = choose_origin(raw)
+            if raw.dtype == np.float32 and np.abs(self.origin).max() > COARSE_FLOAT32:
+                warnings.warn(
+                    f"float32 coordinates near {self.origin.tolist()} are rounded to 6 cm or worse in the "
+                    "file itself; export them as float64 or LAS",
+                    stacklevel=2,
+                )
+        if self.origin.any():
+            raw = raw.astype(np.float64) - self.origin
+        self._points.append(np.ascontiguousarray(raw, dtype=np.float32))
+        if classification is not None:
+            self._classes.append(classification)
+
+    def finish(self, name: str) -> Cloud:
+        """Return the cloud of all chunks; ``name`` is the file for the error message.
+
+        Raises:
+            CloudError: not one usable point was added.
+        """
+        if self.origin is None:
+            if self.dropped:
+                raise CloudError(
+                    f"{name}: none of the {self.dropped} points is usable (NaN, infinite, withheld or "
+                    "noise); export the cloud again"
+                )
+            raise CloudError(f"{name}: holds zero points; export the cloud again")
+        points = self._points[0] if len(self._points) == 1 else np.concatenate(self._points)
+        classes = np.concatenate(self._classes) if self._classes else None
+        return Cloud(points, self.origin, self.crs, classes, self.dropped)
+
+
+def choose_origin(raw: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """(3,) float64 origin for (N, 3) coordinates in metres; zeros if they are all local.
+
+    A sparse median rather than the bounding box: one stray point must not move the origin away.
+    """
+    if np.abs(raw).max() < LOCAL_LIMIT:
+        return np.zeros(3)
+    sample = raw[:: max(1, len(raw) // 10_000)].astype(np.float64)
+    # + 0.0 turns -0.0 into 0.0
+    return np.asarray(np.round(np.median(sample, axis=0) / ORIGIN_STEP) * ORIGIN_STEP + 0.0)
+
+
+def merge(clouds: Sequence[Cloud]) -> Cloud:
+    """One cloud from several of the same frame, re-based in float64 to the origin of the first.
+
+    Classes survive only if every cloud has them; dropped rows add up.
+
+    Raises:
+        CloudError: no cloud was given, or the clouds name different reference systems.
+    """
+    if not clouds:
+        raise CloudError("no cloud to merge: give at least one file")
+    systems = {cloud.crs for cloud in clouds if cloud.crs is not None}
+    if len(systems) > 1:
+        names = " and ".join(sorted(text.split("\n")[0][:60] for text in systems))
+        raise CloudError(f"clouds are in different reference systems ({names}); reproject them to one")
+    if len(clouds) == 1:
+        return clouds[0]
+    origin = clouds[0].origin
+    shifted = [_rebased(cloud, origin) for cloud in clouds]
+    classes = [cloud.classification for cloud in clouds if cloud.classification is not None]
+    return Cloud(
+        np.concatenate(shifted),
+        origin,
+        next(iter(systems), None),
+        np.concatenate(classes) if len(classes) == len(clouds) else None,
+        sum(cloud.dropped for cloud in clouds),
+    )
+
+
+def _rebased(cloud: Cloud, origin: npt.NDArray[np.float64]) -> Points:
+    shift = cloud.origin - origin
+    return (cloud.points + shift).astype(np.float32) if shift.any() else cloud.points

@@ -1,0 +1,129 @@
+"""LAS and LAZ (COPC included), in chunks."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coview_stream.clouds.cloud import Cloud, CloudBuilder
+from coview_stream.errors import CloudError
+
+CHUNK = 1_000_000
+"""Points per chunk: about 100 MB of float64 and record buffers at a time."""
+
+NOISE_CLASSES = (7, 18)
+"""ASPRS classes low and high noise."""
+
+_FOOT_UNITS = {9002, 9003, 9005}
+_PROJECTED_CRS_KEY, _LINEAR_UNIT_KEY = 3072, 3076
+
+
+def read_las(path: Path) -> Cloud:
+    """Read a LAS or LAZ file; withheld points and the noise classes 7 and 18 are dropped and counted.
+
+    Raises:
+        CloudError: the file is damaged, truncated, empty or not in metres.
+    """
+    import laspy
+
+    try:
+        with laspy.open(path) as reader:
+            return _read(reader, path)
+    except (CloudError, MemoryError):
+        raise
+    except Exception as error:
+        raise CloudError(_damaged(path, error)) from error
+    except BaseException as error:
+        # the LAZ decoder's Rust panics are no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        raise CloudError(_damaged(path, error)) from error
+
+
+def _read(reader: Any, path: Path) -> Cloud:
+    header = reader.header
+    expected = int(header.point_count)
+    size = path.stat().st_size
+    if not header.are_points_compressed:
+        stored = max(0, size - header.offset_to_point_data) // header.point_format.size
+        if stored < expected:
+            raise CloudError(_truncated(path, expected, stored))
+    crs = _crs(header)
+    _check_metres(header, crs, path)
+    builder = CloudBuilder(crs)
+    read = 0
+    for chunk in reader.chunk_iterator(CHUNK):
+        read += len(chunk)
+        classes = np.asarray(chunk.classification, dtype=np.uint8)
+        keep = ~np.isin(classes, NOISE_CLASSES) & ~np.asarray(chunk.withheld, dtype=bool)
+        columns = [
+            np.asarray(axis)[keep] * scale + offset
+            for axis, scale, offset in zip(
+                (chunk.X, chunk.Y, chunk.Z), header.scales, header.offsets, strict=True
+            )
+        ]
+        builder.add(np.stack(columns, axis=1), classes[keep], dropped=int(len(keep) - keep.sum()))
+    if read < expected:
+        raise CloudError(_truncated(path, expected, read))
+    return builder.finish(os.fspath(path))
+
+
+def _damaged(path: Path, error: BaseException) -> str:
+    reason = " ".join(str(error).split())[:160] or type(error).__name__
+    return f"{path}: damaged or truncated LAS/LAZ ({reason}); copy or export the file again"
+
+
+def _truncated(path: Path, expected: int, found: int) -> str:
+    return (
+        f"{path}: truncated, the header promises {expected} points and the file holds {found}; "
+        "copy or export the file again"
+    )
+
+
+def _crs(header: Any) -> str | None:
+    """WKT of the header where there is any (by pyproj if it is installed), else ``EPSG:code``, else None."""
+    if importlib.util.find_spec("pyproj") is not None:
+        try:
+            crs = header.parse_crs()
+        except Exception:
+            # a wrong reference system record is no reason to refuse the points
+            crs = None
+        if crs is not None:
+            return str(crs.to_wkt())
+    for vlr in _vlrs(header, "WktCoordinateSystemVlr"):
+        text = str(vlr.string).strip("\0 \n")
+        if text:
+            return text
+    code = _geo_key(header, _PROJECTED_CRS_KEY)
+    return f"EPSG:{code}" if code is not None and 1024 <= code < 32767 else None
+
+
+def _vlrs(header: Any, kind: str) -> list[Any]:
+    records = [*header.vlrs, *(getattr(header, "evlrs", None) or [])]
+    return [record for record in records if type(record).__name__ == kind]
+
+
+def _geo_key(header: Any, key: int) -> int | None:
+    for vlr in _vlrs(header, "GeoKeyDirectoryVlr"):
+        for entry in vlr.geo_keys:
+            if entry.id == key and entry.tiff_tag_location == 0:
+                return int(entry.value_offset)
+    return None
+
+
+def _check_metres(header: Any, crs: str | None, path: Path) -> None:
+    """Refuse feet and degrees where the file states them: a silent scale error looks like a lost robot."""
+    remedy = "reproject it to a metric system, for example with `pdal translate -f filters.reprojection`"
+    text = crs or ""
+    if re.search(r'UNIT\["[^"]*(foot|feet)', text, re.IGNORECASE) or (
+        _geo_key(header, _LINEAR_UNIT_KEY) in _FOOT_UNITS
+    ):
+        raise CloudError(f"{path}: coordinates are in feet according to its reference system; {remedy}")
+    geographic = re.search(r"GEOG(CS|CRS)\[", text) and not re.search(r"(PROJ(CS|CRS)|ENGCRS)\[", text)
+    if geographic and np.abs([header.mins[:2], header.maxs[:2]]).max() <= 360.0:
+        raise CloudError(f"{path}: coordinates are in degrees according to its reference system; {remedy}")

@@ -1,0 +1,134 @@
+"""Runs: a robot's frames with their odometry, read one frame at a time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.layout import Layout, find_layout, read_odometry
+from coview_stream.clouds.readers import read_cloud
+from coview_stream.clouds.trajectory import Poses, Stamps
+from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry import Points, Pose
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One scan of a run.
+
+    Attributes:
+        index: position in the run, from 0.
+        stamp: seconds.
+        points: (N, 3) float32 in the body frame (x forward, z up), metres, relative to ``origin``.
+        T_odom_body: (4, 4), odometry <- body.
+        origin: (3,) float64 metres. Zeros, except for a single terrestrial scan in map-like coordinates.
+        path: the file it came from.
+        dropped: rows of the file that were not usable.
+    """
+
+    index: int
+    stamp: float
+    points: Points
+    T_odom_body: Pose
+    origin: npt.NDArray[np.float64]
+    path: Path
+    dropped: int = 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A validated run. Iterating reads lazily: one frame is in memory at a time.
+
+    Attributes:
+        path: the directory or the single cloud file.
+        frames_paths: (N) files in order.
+        stamps: (N,) seconds, strictly increasing.
+        poses: (N, 4, 4), odometry <- body, metres.
+    """
+
+    path: Path
+    frames_paths: tuple[Path, ...]
+    stamps: Stamps
+    poses: Poses
+
+    def __len__(self) -> int:
+        return len(self.frames_paths)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield every frame in order; raises like ``read`` (use ``read`` to skip a damaged frame)."""
+        return (self.read(index) for index in range(len(self)))
+
+    def read(self, index: int) -> Frame:
+        """Read frame ``index``.
+
+        Raises:
+            IndexError: there is no such frame.
+            CloudError: the file is unreadable, has no usable point, or is not in the body frame.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.path}: no frame {index} among {len(self)}")
+        path = self.frames_paths[index]
+        cloud = read_cloud(path)
+        if len(self) > 1 and cloud.origin.any():
+            raise CloudError(
+                f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "
+                "write frames relative to the sensor"
+            )
+        return Frame(
+            index,
+            float(self.stamps[index]),
+            cloud.points,
+            self.poses[index],
+            cloud.origin,
+            path,
+            cloud.dropped,
+        )
+
+    def with_odometry(self, poses: Poses) -> Run:
+        """Return the same frames with other poses (N, 4, 4), odometry <- body, metres.
+
+        Raises:
+            RunError: the number of poses is not that of the frames, or one is not finite.
+        """
+        if poses.shape != (len(self), 4, 4) or not np.isfinite(poses).all():
+            raise RunError(f"{self.path}: odometry of shape {poses.shape} does not fit {len(self)} frames")
+        return replace(self, poses=poses)
+
+
+def open_run(path: str | os.PathLike[str], odometry: str | os.PathLike[str] = "auto") -> Run:
+    """Open a run and validate all but the clouds themselves.
+
+    Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
+    ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); one cloud file, or
+    one frame without odometry, is a run of one frame with stamp 0 and the identity.
+
+    Args:
+        path: directory or cloud file.
+        odometry: ``"auto"`` takes what the layout brings; otherwise a TUM file, or KITTI poses (12 columns)
+            where the run has a ``times.txt``.
+
+    Raises:
+        RunError: no frames, no odometry or odometry that does not fit; the message names file and line.
+    """
+    path = Path(path)
+    layout = find_layout(path)
+    count = len(layout.frames)
+    explicit = None if odometry == "auto" else Path(odometry)
+    if explicit is None and layout.odometry is None:
+        if count == 1:
+            return _single(layout)
+        raise RunError(
+            f"{path}: {count} frames but no odometry; add {path / 'odometry.tum'} "
+            "(t x y z qx qy qz qw per frame) or name a file"
+        )
+    stamps, poses = read_odometry(layout, explicit)
+    return Run(path, layout.frames, stamps, poses)
+
+
+def _single(layout: Layout) -> Run:
+    return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None])

@@ -1,0 +1,161 @@
+"""Trajectories as text: TUM (``t x y z qx qy qz qw``) and KITTI (3x4 rows with separate times)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from coview_stream.clouds.writers import atomic
+from coview_stream.errors import InputError, RunError
+from coview_stream.geometry import Pose, pose_to_tum
+
+Stamps = npt.NDArray[np.float64]
+Poses = npt.NDArray[np.float64]
+
+_TUM_COLUMNS = 8
+_ABSURD = 1e8  # metres; see cloud.ABSURD
+_SHORTEST_QUATERNION = 1e-6
+_ROTATION_TOLERANCE = 1e-2
+
+
+def read_tum(path: str | os.PathLike[str]) -> tuple[Stamps, Poses]:
+    """Stamps (N,) in seconds and poses (N, 4, 4) in metres of a TUM file.
+
+    Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. A file
+    without poses gives N = 0 (a trajectory of a run that was never localised).
+
+    Raises:
+        RunError: missing or unreadable file, text or a wrong number of columns, NaN, a zero quaternion, or
+            stamps that do not increase; the message names the line.
+    """
+    path = Path(path)
+    rows, lines = _read_rows(path, _TUM_COLUMNS, "t x y z qx qy qz qw")
+    stamps, quaternions = rows[:, 0], rows[:, 4:]
+    check_stamps(stamps, lines, path)
+    short = np.linalg.norm(quaternions, axis=1) < _SHORTEST_QUATERNION
+    if short.any():
+        raise RunError(f"{path}:{lines[int(np.argmax(short))]}: quaternion is zero; write qx qy qz qw")
+    return stamps, _poses(rows[:, 1:4], Rotation.from_quat(quaternions).as_matrix() if len(rows) else None)
+
+
+def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
+    """Poses (N, 4, 4) of a KITTI file: 12 numbers a line, the first three rows of each matrix.
+
+    Raises:
+        RunError: as ``read_tum``; also where the 3x3 part is no rotation.
+    """
+    path = Path(path)
+    rows, lines = _read_rows(path, 12, "the 3x4 pose, row by row")
+    if not len(rows):
+        return np.zeros((0, 4, 4))
+    matrices = rows.reshape(-1, 3, 4)
+    R = matrices[:, :, :3]
+    wrong = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
+    wrong |= np.linalg.det(R) <= 0
+    if wrong.any():
+        raise RunError(
+            f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is no rotation; check the columns"
+        )
+    return _poses(matrices[:, :, 3], Rotation.from_matrix(R).as_matrix())
+
+
+def read_times(path: str | os.PathLike[str]) -> Stamps:
+    """Stamps (N,) in seconds, one a line, increasing.
+
+    Raises:
+        RunError: as ``read_tum``.
+    """
+    path = Path(path)
+    rows, lines = _read_rows(path, 1, "one stamp in seconds")
+    check_stamps(rows[:, 0], lines, path)
+    return rows[:, 0]
+
+
+def write_tum(
+    path: str | os.PathLike[str], stamps: Sequence[float] | Stamps, poses: Sequence[Pose] | Poses
+) -> None:
+    """Write stamps (N,) in seconds and poses (N, 4, 4) in metres; the file is complete or not there.
+
+    N = 0 writes an empty file.
+
+    Raises:
+        InputError: the lengths differ, or the file cannot be written.
+    """
+    path = Path(path)
+    if len(stamps) != len(poses):
+        raise InputError(f"{path}: {len(stamps)} stamps for {len(poses)} poses; give as many of both")
+    lines = []
+    for stamp, T in zip(stamps, poses, strict=True):
+        x, y, z, qx, qy, qz, qw = pose_to_tum(np.asarray(T, dtype=np.float64))
+        lines.append(f"{stamp:.6f} {x:.6f} {y:.6f} {z:.6f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}\n")
+    try:
+        with atomic(path) as stream:
+            stream.write("".join(lines).encode("ascii"))
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
+
+
+def check_stamps(stamps: Stamps, lines: Sequence[int], path: Path) -> None:
+    """Raise RunError at the first stamp that does not come after the one before."""
+    late = np.diff(stamps) <= 0
+    if late.any():
+        at = int(np.argmax(late)) + 1
+        what = "repeats" if stamps[at] == stamps[at - 1] else "comes before"
+        raise RunError(
+            f"{path}:{lines[at]}: stamp {stamps[at]:.6f} {what} the one of the line before; "
+            "sort the lines and remove repetitions"
+        )
+
+
+def columns_of(path: Path) -> int:
+    """Count the columns in the first line with content; 0 if there is none."""
+    return next((len(words) for _, words in _words(path)), 0)
+
+
+def _words(path: Path) -> list[tuple[int, list[str]]]:
+    """(line number, words) of each line that is neither blank nor a comment."""
+    try:
+        text = path.read_bytes().decode("ascii")
+    except FileNotFoundError as error:
+        raise RunError(f"{path}: no such file; check the path") from error
+    except IsADirectoryError as error:
+        raise RunError(f"{path}: is a directory; name the trajectory file") from error
+    except UnicodeDecodeError as error:
+        raise RunError(f"{path}: is no text; give a trajectory as numbers in lines") from error
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: cannot be read ({error}); check path and permissions") from error
+    numbered = ((number, line.split()) for number, line in enumerate(text.splitlines(), start=1))
+    return [(number, words) for number, words in numbered if words and not words[0].startswith("#")]
+
+
+def _read_rows(path: Path, columns: int, meaning: str) -> tuple[npt.NDArray[np.float64], list[int]]:
+    rows, lines = [], []
+    for number, words in _words(path):
+        if len(words) != columns:
+            raise RunError(
+                f"{path}:{number}: {len(words)} columns instead of {columns}; each line is {meaning}"
+            )
+        try:
+            row = [float(word) for word in words]
+        except ValueError as error:
+            raise RunError(f"{path}:{number}: not a number ({error}); each line is {meaning}") from error
+        # false for NaN as well; stamps may be any finite number
+        if not all(abs(value) < np.inf for value in row) or max(map(abs, row[1:]), default=0.0) > _ABSURD:
+            raise RunError(f"{path}:{number}: NaN, infinite or absurd number; repair or drop the line")
+        rows.append(row)
+        lines.append(number)
+    return np.array(rows, dtype=np.float64).reshape(-1, columns), lines
+
+
+def _poses(translations: npt.NDArray[np.float64], rotations: npt.NDArray[np.float64] | None) -> Poses:
+    poses = np.tile(np.eye(4), (len(translations), 1, 1))
+    if rotations is not None:
+        poses[:, :3, :3] = rotations
+        poses[:, :3, 3] = translations
+    return poses
