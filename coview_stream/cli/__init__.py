@@ -1,0 +1,110 @@
+"""The ``coview-stream`` command: one thin module per subcommand, one line per error.
+
+A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Whatever is heavy it
+imports inside ``run``, for ``coview-stream --help`` must answer at once.
+
+Exit codes: 0 done; 1 could not localise (files are written all the same); 2 bad usage or input;
+130 interrupted; 141 the reader of a pipe went away.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from coview_stream.errors import ConfigError, CoViewError
+
+PROGRAM = "coview-stream"
+
+COMMANDS = ("demo", "build", "info", "locate", "eval", "simulate", "serve", "replay", "watch", "doctor")
+"""Names in the order of ``--help``; a command whose module does not exist is left out."""
+
+_MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin wherever it is imported
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports bad usage like any other bad input instead of printing the usage and exiting."""
+
+    def error(self, message: str) -> NoReturn:
+        # argparse's own "try --help" names the subcommand, which is where the reader has to look
+        raise ConfigError(f"{message}; see `{self.prog} --help`")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; ``argv`` defaults to the process's arguments.
+
+    Raises nothing on purpose: errors of the caller's making become one line on stderr and exit code 2.
+    """
+    try:
+        code = _dispatch(sys.argv[1:] if argv is None else list(argv))
+        sys.stdout.flush()  # a closed pipe must show up here, not while the interpreter shuts down
+        return code
+    except CoViewError as error:
+        return _fail(str(error))
+    except MemoryError:
+        return _fail("out of memory; use a smaller map or a coarser voxel size")
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        _discard_stdout()
+        return 141
+    except OSError as error:
+        return _fail(_describe(error))
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Register every command that exists and return the parser."""
+    parser = _Parser(
+        prog=PROGRAM,
+        description="Tells a robot where it is on a base map, by lidar: no GPU, no GNSS, no initial guess.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, title="commands")
+    for name in COMMANDS:
+        module_name = f"{__name__}.{_MODULES.get(name, name)}"
+        if importlib.util.find_spec(module_name) is None:
+            continue
+        module = importlib.import_module(module_name)
+        sub = commands.add_parser(name, help=module.HELP, description=module.HELP)
+        module.add_arguments(sub)
+        sub.set_defaults(run=module.run)
+    return parser
+
+
+def _dispatch(argv: list[str]) -> int:
+    try:
+        args = build_parser().parse_args(argv)
+    except SystemExit as done:  # --help and --version
+        return int(done.code or 0)
+    return int(args.run(args))
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version(PROGRAM)
+    except importlib.metadata.PackageNotFoundError:  # run from a source tree that was never installed
+        return "(not installed)"
+
+
+def _fail(message: str) -> int:
+    print(f"{PROGRAM}: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _describe(error: OSError) -> str:
+    reason = error.strerror or str(error) or type(error).__name__
+    return f"{error.filename}: {reason}" if error.filename else reason
+
+
+def _discard_stdout() -> None:
+    """Point stdout at nothing, or the interpreter complains about the closed pipe on its way out."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

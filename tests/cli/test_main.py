@@ -1,0 +1,99 @@
+"""The command line's frame: errors are one line, exit codes keep their promise, nothing heavy loads early."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+import coview_stream.cli as cli
+from coview_stream.errors import CloudError
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Replaces the registered commands by one, ``act``, that does what the test says."""
+
+    def install(act):
+        module = SimpleNamespace(HELP="acts", add_arguments=lambda parser: None, run=lambda args: act())
+        monkeypatch.setattr(cli, "COMMANDS", ("act",))
+        monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: object())
+        monkeypatch.setattr(cli.importlib, "import_module", lambda name: module)
+
+    return install
+
+
+def _raise(error):
+    raise error
+
+
+def test_version_and_help_exit_with_zero(capsys):
+    assert cli.main(["--version"]) == 0
+    assert cli.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert "coview-stream" in out
+    assert "COMMAND" in out
+
+
+@pytest.mark.parametrize("argv", [[], ["no-such-command"], ["--no-such-option"]])
+def test_bad_usage_is_one_line_and_exit_two(argv, capsys):
+    assert cli.main(argv) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("coview-stream: error: ")
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (CloudError("site.laz: truncated\nexport it again"), 2, "site.laz: truncated export it again"),
+        (MemoryError(), 2, "out of memory"),
+        (PermissionError(13, "Permission denied", "site.coview"), 2, "site.coview: Permission denied"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_errors_become_one_line(command, capsys, error, code, text):
+    command(lambda: _raise(error))
+    assert cli.main(["act"]) == code
+    err = capsys.readouterr().err
+    assert text in err
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+
+
+def test_the_commands_own_exit_code_is_returned(command):
+    command(lambda: 1)
+    assert cli.main(["act"]) == 1
+
+
+def test_a_bug_is_not_hidden(command):
+    command(lambda: _raise(ZeroDivisionError()))
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["act"])
+
+
+def test_a_closed_pipe_is_quiet():
+    reader, writer = os.pipe()
+    os.close(reader)
+    # a command that prints, for argparse swallows the error while it prints its own help
+    script = "import sys; from coview_stream import cli; cli._dispatch = print; sys.exit(cli.main(['row']))"
+    with os.fdopen(writer) as stdout:
+        done = subprocess.run(
+            [sys.executable, "-c", script], stdout=stdout, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 141
+    assert done.stderr == ""
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys; from coview_stream.cli import main; main(['--help']);"
+        "heavy = {'open3d', 'taichi', 'quadrants', 'matplotlib', 'zenoh', 'tqdm'};"
+        "print('loaded:', *sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded:"
