@@ -1,7 +1,7 @@
 """The ``coview-stream`` command: one thin module per subcommand, one line per error.
 
-A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Whatever is heavy it
-imports inside ``run``, for ``coview-stream --help`` must answer at once.
+A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Whatever is heavy
+it imports inside ``run``, for ``coview-stream --help`` must answer at once.
 
 Exit codes: 0 done; 1 could not localise (files are written all the same); 2 bad usage or input;
 130 interrupted; 141 the reader of a pipe went away.

@@ -1,0 +1,183 @@
+"""Errors of a trajectory against truth (eqs 15-17), and what an operator would ask.
+
+Both trajectories are poses ``T_map_body``. A frame without a pose is *not localised*; it is never an error.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from coview_stream.errors import InputError
+from coview_stream.geometry import Pose
+
+MAX_ROTATION = float(np.radians(5.0))
+"""A pose is right below this rotation error (eq. 15), radians ..."""
+
+MAX_TRANSLATION = 3.0
+"""... and below this translation error (eq. 16), metres (the success criterion of eq. 17)."""
+
+MAX_STAMP_GAP = 0.051
+"""Poses that differ by this from every true stamp (seconds) are not compared: half a 10 Hz frame, rounded."""
+
+RIGHT_SHARE = 0.95
+"""A run succeeds if its first pose is right and more than this share of all poses."""
+
+Floats = npt.NDArray[np.float64]
+Trajectory = tuple[Floats, Floats]
+"""Stamps (N,) in seconds, increasing, and poses (N, 4, 4) in metres, as ``read_tum`` returns them."""
+
+
+@dataclass(frozen=True)
+class FrameErrors:
+    """Errors of every estimated pose that has a true one.
+
+    Attributes:
+        index: (K,) index of the true pose.
+        distance: (K,) metres driven along the truth up to there.
+        e_r: (K,) rotation errors, radians (eq. 15).
+        e_t: (K,) translation errors, metres (eq. 16).
+    """
+
+    index: npt.NDArray[np.intp]
+    distance: Floats
+    e_r: Floats
+    e_t: Floats
+
+    @property
+    def right(self) -> npt.NDArray[np.bool_]:
+        """(K,) whether each pose counts as a success (eq. 17)."""
+        return (self.e_r < MAX_ROTATION) & (self.e_t < MAX_TRANSLATION)
+
+
+@dataclass(frozen=True)
+class ErrorStats:
+    """Mean, root mean square, median and maximum of an error."""
+
+    mean: float
+    rmse: float
+    median: float
+    max: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The verdict on one run.
+
+    Attributes:
+        frames: true poses.
+        posed: estimated poses that have a true one within ``MAX_STAMP_GAP``.
+        unmatched: estimated poses that have none.
+        share_localised: share of the frames with a right pose, 0 to 1.
+        false_frames: poses that are wrong; the number that has to be zero.
+        first_fix_m: metres driven before the first pose; None if there is none.
+        success: the first pose is right, and more than 95 % of all.
+        translation: errors of the right poses, metres; None if there are none.
+        rotation: errors of the right poses, degrees; None if there are none.
+        worst_t_m: largest translation error of all poses, the false ones included, metres.
+        worst_r_deg: largest rotation error of all poses, degrees.
+        origin_t_m: translation error at the origin of the odometry, as the paper reports it: the yaw error
+            times the lever arm from there to the robot is part of it. None if it was not asked for.
+    """
+
+    frames: int
+    posed: int
+    unmatched: int
+    share_localised: float
+    false_frames: int
+    first_fix_m: float | None
+    success: bool
+    translation: ErrorStats | None
+    rotation: ErrorStats | None
+    worst_t_m: float | None
+    worst_r_deg: float | None
+    origin_t_m: float | None = None
+
+    def to_json(self) -> str:
+        """One JSON object with the attributes as keys; errors rounded to 0.1 mm and 0.0001 degree."""
+        return json.dumps(_rounded(asdict(self)), indent=1)
+
+
+def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
+    """Errors of each estimated pose against the true pose with the nearest stamp.
+
+    Raises:
+        InputError: the truth holds no pose.
+    """
+    stamps, poses = estimate
+    true_stamps, true_poses = truth
+    if not len(true_stamps):
+        raise InputError("truth: holds no pose; give the trajectory that was really driven")
+    after = np.clip(np.searchsorted(true_stamps, stamps), 0, len(true_stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(true_stamps[before] - stamps) < np.abs(true_stamps[after] - stamps)
+    index = np.where(closer, before, after)
+    matched = np.abs(true_stamps[index] - stamps) < MAX_STAMP_GAP
+    index, T_est = index[matched], poses[matched]
+    T_true = true_poses[index]
+    e_t = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    e_r = _angles(T_est[:, :3, :3] @ T_true[:, :3, :3].transpose(0, 2, 1))
+    return FrameErrors(index, driven(true_poses)[index], e_r, e_t)
+
+
+def driven(poses: Floats) -> Floats:
+    """(N,) metres driven up to each of the (N, 4, 4) poses."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])[: len(poses)]
+
+
+def evaluate(
+    estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Pose] | None = None
+) -> Evaluation:
+    """Judge an estimated trajectory; an empty one is "not localised", never an error.
+
+    Args:
+        estimate: stamps and poses ``T_map_body``, only where the robot was localised.
+        truth: stamps and poses ``T_map_body`` of every frame.
+        T_map_odom: estimated and true pose of the odometry frame, for ``origin_t_m``.
+
+    Raises:
+        InputError: the truth holds no pose.
+    """
+    errors = frame_errors(estimate, truth)
+    right, posed, frames = errors.right, len(errors.index), len(truth[0])
+    return Evaluation(
+        frames=frames,
+        posed=posed,
+        unmatched=len(estimate[0]) - posed,
+        share_localised=len(np.unique(errors.index[right])) / frames,
+        false_frames=int((~right).sum()),
+        first_fix_m=float(errors.distance[0]) if posed else None,
+        success=bool(posed and right[0] and right.mean() > RIGHT_SHARE),
+        translation=_stats(errors.e_t[right]),
+        rotation=_stats(np.degrees(errors.e_r[right])),
+        worst_t_m=float(errors.e_t.max()) if posed else None,
+        worst_r_deg=float(np.degrees(errors.e_r.max())) if posed else None,
+        origin_t_m=None if T_map_odom is None else _origin_error(*T_map_odom),
+    )
+
+
+def _angles(R: Floats) -> Floats:
+    """(K,) rotation angles of (K, 3, 3) matrices: eq. 15, in a form that keeps its precision near zero."""
+    return np.asarray(Rotation.from_matrix(R).magnitude()) if len(R) else np.zeros(0)
+
+
+def _origin_error(T_est: Pose, T_true: Pose) -> float:
+    return float(np.linalg.norm(T_est[:3, 3] - T_true[:3, 3]))
+
+
+def _stats(values: Floats) -> ErrorStats | None:
+    if not len(values):
+        return None
+    rmse = float(np.sqrt(np.mean(values**2)))
+    return ErrorStats(float(values.mean()), rmse, float(np.median(values)), float(values.max()))
+
+
+def _rounded(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return round(value, 4) if isinstance(value, float) else value
