@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels.types import F32, F64, I32
+from coview_kernels.arrays import F32, F64, I32
 
 
 def _array(name: str, value: npt.ArrayLike, dtype: Any, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import check, reference
-from coview_kernels.types import F32, I32, Mask, Mode, Vertical
+from coview_kernels.arrays import F32, I32, Mask, Mode, Vertical
 
 _MODES = ("paper", "eye", "off")
 _VERTICALS = ("max", "mean", "off")

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import check, reference
-from coview_kernels.types import PolarGrid
+from coview_kernels.arrays import PolarGrid
 
 
 def polar_bin(

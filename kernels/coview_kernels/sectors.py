@@ -18,7 +18,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from coview_kernels.types import F32, F64, I64
+from coview_kernels.arrays import F32, F64, I64
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import check
-from coview_kernels.types import C64, F32
+from coview_kernels.arrays import C64, F32
 
 _PORTION = 1024  # candidates transformed at a time: 1.2 MB per 20 x 60 spectrum array stays near the cache
 
@@ -34,8 +34,7 @@ def unit_columns(desc: npt.ArrayLike) -> F32:
 
 
 def column_spectra(desc: npt.ArrayLike) -> C64:
-    """Spectra over the sectors of the unit columns of (M, R, S) descriptors: what a map stores of its
-    stations.
+    """Spectra over the sectors of the unit columns of (M, R, S) descriptors: what a map stores.
 
     Returns:
         (F, M, R) complex64 with F = S // 2 + 1; frequency first, so that each frequency is one contiguous

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import check, reference
-from coview_kernels.types import F32, F64
+from coview_kernels.arrays import F32, F64
 
 
 def normal_equations(

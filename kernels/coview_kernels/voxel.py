@@ -7,7 +7,7 @@ import math
 import numpy.typing as npt
 
 from coview_kernels import check, reference
-from coview_kernels.types import F32
+from coview_kernels.arrays import F32
 
 
 def transform_unique(

@@ -1,6 +1,6 @@
-"""Every kernel in plain NumPy, same names and signatures: the oracle of the tests, and the implementation
-where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
+"""Every kernel in plain NumPy, same names and signatures.
 
+The oracle of the tests, and the implementation where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
 Functions here trust their arguments; the public twins in :mod:`coview_kernels` check them first.
 """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_kernels.types import F32, I32, Mask, Mode, Vertical
+from coview_kernels.arrays import F32, I32, Mask, Mode, Vertical
 
 
 def visible(max_height: F32, count: I32, mode: Mode, eye: float = 1.5) -> Mask:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_kernels.types import F32, F64
+from coview_kernels.arrays import F32, F64
 
 
 def normal_equations(

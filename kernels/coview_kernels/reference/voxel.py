@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from coview_kernels.types import F32, F64, I64
+from coview_kernels.arrays import F32, F64, I64
 
 
 def transform_unique(

@@ -25,5 +25,5 @@ class PolarGrid(NamedTuple):
     """(..., R, S) greatest height above the centre, metres."""
     sum_height: F32
     """(..., R, S) sum of the heights above the centre, metres."""
-    count: I32
+    count: I32  # type: ignore[assignment]  # hides tuple.count, which nobody misses
     """(..., R, S) number of points; the only witness of occupancy, since a height of 0 is a valid height."""
