@@ -1,0 +1,123 @@
+"""Filters on local (N, 3) float32 points: outliers, voxel grid, normals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.errors import ConfigError
+from coview_stream.geometry import Points
+
+_MAX_CELLS = 2**62
+"""Voxel keys must fit a signed 64-bit integer."""
+
+
+def remove_outliers(
+    points: Points, neighbours: int = 20, std_ratio: float = 2.0
+) -> tuple[Points, npt.NDArray[np.bool_]]:
+    """Drop points that lie unusually far from their neighbours (Open3D's statistical filter).
+
+    Costs about 1.6 s per million points on two cores, so run it after ``voxel_grid`` on large maps.
+
+    Args:
+        points: (N, 3) float32 metres, finite.
+        neighbours: how many nearest points the mean distance is taken over.
+        std_ratio: mean distances above mean + ``std_ratio`` * standard deviation of the cloud are outliers.
+
+    Returns:
+        The kept points (K, 3) and the mask (N,) that kept them. Clouds with no more than ``neighbours``
+        points are kept whole.
+
+    Raises:
+        ConfigError: ``neighbours`` < 1 or ``std_ratio`` <= 0.
+    """
+    if neighbours < 1 or not std_ratio > 0:
+        raise ConfigError(f"neighbours={neighbours}, std_ratio={std_ratio}: both must be positive")
+    mask = np.ones(len(points), dtype=bool)
+    if len(points) <= neighbours:
+        return points, mask
+    _, kept = _legacy(points).remove_statistical_outlier(neighbours, std_ratio)
+    mask[:] = False
+    mask[np.asarray(kept, dtype=np.intp)] = True
+    return points[mask], mask
+
+
+def voxel_grid(points: Points, voxel: float) -> Points:
+    """Centroids of the occupied voxels, in the order of their keys (x slowest, z fastest).
+
+    In NumPy because it is several times quicker than Open3D's filter on clouds of 10 M points, and its order
+    does not depend on threads.
+
+    Args:
+        points: (N, 3) float32 metres, finite.
+        voxel: edge length in metres; voxel borders are multiples of it.
+
+    Raises:
+        ConfigError: ``voxel`` is not positive, or so small for this extent that keys would overflow.
+    """
+    if not voxel > 0:
+        raise ConfigError(f"voxel={voxel}: must be positive")
+    if not len(points):
+        return points.reshape(0, 3)
+    order, starts = _voxel_groups(points, voxel)
+    counts = np.diff(np.append(starts, len(points)))
+    centroids = np.empty((len(starts), 3), dtype=np.float32)
+    for axis in range(3):  # one axis at a time bounds the float64 copies
+        column = points[:, axis][order].astype(np.float64)
+        centroids[:, axis] = np.add.reduceat(column, starts) / counts
+    return centroids
+
+
+def _voxel_groups(points: Points, voxel: float) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Order of the points by voxel key, and where in that order each voxel begins."""
+    low = np.floor(points.min(axis=0).astype(np.float64) / voxel)
+    extent = np.floor(points.max(axis=0).astype(np.float64) / voxel) - low + 1
+    if float(np.prod(extent)) > _MAX_CELLS:
+        raise ConfigError(f"voxel={voxel}: too small for a cloud of {(extent * voxel).round().tolist()} m")
+    keys = np.zeros(len(points), dtype=np.int64)
+    for axis in range(3):
+        cell = np.floor(points[:, axis].astype(np.float64) / voxel) - low[axis]
+        keys *= int(extent[axis])
+        keys += cell.astype(np.int64)
+    order = np.argsort(keys)
+    keys = keys[order]
+    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    return order, starts
+
+
+def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> Points:
+    """Unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0).
+
+    Costs about 1.7 s per million points on two cores. Fewer than three neighbours give (0, 0, 1).
+
+    Args:
+        points: (N, 3) float32 metres, finite.
+        k: at most this many neighbours.
+        radius: only neighbours within this distance in metres (hybrid search); None for the k nearest.
+
+    Raises:
+        ConfigError: ``k`` < 3 or ``radius`` <= 0.
+    """
+    if k < 3 or (radius is not None and not radius > 0):
+        raise ConfigError(f"k={k}, radius={radius}: k must be at least 3 and the radius positive")
+    if not len(points):
+        return points.reshape(0, 3)
+    geometry = open3d().geometry
+    search = (
+        geometry.KDTreeSearchParamKNN(k)
+        if radius is None
+        else geometry.KDTreeSearchParamHybrid(radius=radius, max_nn=k)
+    )
+    cloud = _legacy(points)
+    cloud.estimate_normals(search)
+    normals = np.asarray(cloud.normals).astype(np.float32)
+    normals[normals[:, 2] < 0] *= -1
+    return normals
+
+
+def _legacy(points: Points) -> Any:
+    o3d = open3d()
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
