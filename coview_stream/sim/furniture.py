@@ -1,0 +1,73 @@
+"""What stands along streets: parked cars, lamp posts, signs, fences."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from coview_stream.sim.layout import Layout, directions
+from coview_stream.sim.mesh import Floats, Mesh, box, cylinder, frustum, join, placed
+from coview_stream.sim.site import Site
+
+SPOT_COLUMNS = ("x", "y", "yaw", "kind")
+
+
+def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: float) -> Floats:
+    """(N, 4) places beside the streets, ``offset`` metres from the centre line, in random order.
+
+    Places on a crossing are left out. ``kind`` is a random number in [0, 1).
+    """
+    every = np.concatenate(layout.streets)
+    tree = cKDTree(every)
+    rows = []
+    for line in layout.streets:
+        heading = directions(line)
+        for side in (-1.0, 1.0):
+            at = np.arange(rng.uniform(0, spacing), len(line) - 1, spacing) + rng.uniform(-0.1, 0.1) * spacing
+            k = np.clip(at.astype(int), 0, len(line) - 1)
+            normal = np.column_stack([-np.sin(heading[k]), np.cos(heading[k])])
+            xy = line[k] + side * offset * normal
+            yaw = heading[k] + (np.pi if side > 0 else 0.0) + rng.normal(0, 0.03, len(k))
+            rows.append(np.column_stack([xy, yaw, rng.random(len(k))]))
+    found = np.concatenate(rows)
+    clear = tree.query(found[:, :2])[0] > 0.8 * offset
+    route_clear = cKDTree(layout.route).query(found[:, :2])[0] > 0.9 * offset
+    return np.asarray(rng.permutation(found[clear & route_clear]))
+
+
+def cars(rows: Floats, site: Site) -> Mesh:
+    """Parked cars, vans and, for the largest ``kind``, lorries."""
+    return join(_stand(_vehicle(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
+
+
+def poles(rows: Floats, site: Site) -> Mesh:
+    """Lamp posts with an arm over the road, traffic signs and masts."""
+    return join(_stand(_pole(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
+
+
+def _stand(mesh: Mesh, site: Site, x: float, y: float, yaw: float) -> Mesh:
+    return placed(mesh, x, y, site.height(x, y), yaw)
+
+
+def _vehicle(kind: float) -> Mesh:
+    scale = 0.9 + 0.25 * ((kind * 7.0) % 1.0)
+    if kind < 0.75:
+        body = placed(box(4.3 * scale, 1.75, 0.65), 0, 0, 0.25)
+        cabin = placed(frustum(2.5 * scale, 1.65, 0.6, 1.6 * scale, 1.4), -0.2, 0, 0.9)
+        return join([body, cabin])
+    if kind < 0.95:
+        return join(
+            [placed(box(4.9, 1.9, 1.9), -0.3, 0, 0.25), placed(frustum(0.9, 1.8, 0.9, 0.5, 1.7), 2.5, 0, 0.3)]
+        )
+    return join([placed(box(6.2, 2.4, 2.7), -0.9, 0, 0.9), placed(box(2.0, 2.3, 2.5), 3.3, 0, 0.4)])
+
+
+def _pole(kind: float) -> Mesh:
+    tall = 4.5 + 4.0 * ((kind * 11.0) % 1.0)
+    if kind < 0.6:
+        # +y points at the road on the side where spots() puts things
+        arm = placed(box(0.12, 1.6, 0.12), 0, 0.8, tall - 0.2)
+        return join([cylinder(0.1, tall, 6, top=0.06), arm])
+    if kind < 0.85:
+        return join([cylinder(0.05, 2.6, 6), placed(box(0.08, 0.7, 0.7), 0, 0, 2.0)])
+    return join([cylinder(0.18, tall + 2.0, 8, top=0.1), placed(box(1.2, 0.15, 0.15), 0, 0, tall + 1.2)])

@@ -1,0 +1,152 @@
+"""The kinds of scene, as numbers: what stands in a town, on a campus, in a village, a forest, a works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.sim import buildings
+from coview_stream.sim.layout import Layout, grid_layout, loop_layout
+from coview_stream.sim.vegetation import Species
+
+Range = tuple[float, float]
+
+
+class Plot(NamedTuple):
+    """One type of building and the ranges of its size; lengths in metres."""
+
+    draw: buildings.Draw
+    weight: float
+    frontage: Range
+    depth: Range
+
+
+class Kind(NamedTuple):
+    """What a scene is made of; lengths in metres, densities per square metre.
+
+    Attributes:
+        streets: (rng, size, half) -> layout.
+        relief, roughness, ditch: see ``Site``.
+        plots: buildings along the streets, ``setback`` from the footway and ``gap`` from each other; a share
+            of ``vacant`` plots stays empty.
+        infill: buildings away from streets.
+        trees, species, undergrowth, rocks, logs: vegetation and what lies in it.
+        cars: share of the parking places that are taken.
+        pole_spacing: mean distance between poles on one side of a street; 0 for none.
+        hedges: share of the plots with a hedge or fence in front.
+    """
+
+    streets: Callable[[np.random.Generator, float, float], Layout]
+    relief: float
+    roughness: float
+    ditch: float
+    plots: tuple[Plot, ...]
+    setback: Range
+    gap: Range
+    vacant: float
+    infill: float
+    trees: float
+    species: Species
+    undergrowth: float = 0.0
+    rocks: float = 0.0
+    logs: float = 0.0
+    cars: float = 0.0
+    pole_spacing: float = 0.0
+    hedges: float = 0.0
+
+
+_HOUSE = Plot(buildings.house, 1.0, (8.0, 15.0), (8.0, 13.0))
+_INSTITUTE = Plot(buildings.institute, 1.0, (24.0, 48.0), (18.0, 36.0))
+
+KINDS: dict[str, Kind] = {
+    "town": Kind(
+        streets=lambda rng, size, half: grid_layout(rng, size, half, (42.0, 72.0), 4.2, bend=4.0),
+        relief=0.9,
+        roughness=0.03,
+        ditch=0.0,
+        plots=(_HOUSE, Plot(buildings.institute, 0.12, (18.0, 30.0), (14.0, 20.0))),
+        setback=(0.5, 5.0),
+        gap=(0.8, 7.0),
+        vacant=0.12,
+        infill=0.0004,
+        trees=0.0035,
+        species=Species((4.0, 12.0)),
+        undergrowth=0.004,
+        cars=0.45,
+        pole_spacing=26.0,
+        hedges=0.5,
+    ),
+    "campus": Kind(
+        streets=lambda rng, size, half: loop_layout(rng, size, half, 3.2, branches=5, waviness=0.22),
+        relief=1.6,
+        roughness=0.05,
+        ditch=0.0,
+        plots=(_INSTITUTE, Plot(buildings.hall, 0.15, (20.0, 30.0), (15.0, 22.0))),
+        setback=(3.0, 14.0),
+        gap=(8.0, 30.0),
+        vacant=0.3,
+        infill=0.0004,
+        trees=0.0045,
+        species=Species((5.0, 15.0), conifers=0.2),
+        undergrowth=0.002,
+        cars=0.2,
+        pole_spacing=30.0,
+        hedges=0.25,
+    ),
+    "village": Kind(
+        streets=lambda rng, size, half: loop_layout(rng, size, half, 3.0, branches=4, waviness=0.3),
+        relief=2.4,
+        roughness=0.06,
+        ditch=0.25,
+        plots=(_HOUSE, Plot(buildings.barn, 0.35, (14.0, 26.0), (9.0, 14.0))),
+        setback=(1.5, 9.0),
+        gap=(4.0, 18.0),
+        vacant=0.25,
+        infill=0.0002,
+        trees=0.006,
+        species=Species((3.5, 13.0), conifers=0.2),
+        undergrowth=0.006,
+        cars=0.15,
+        pole_spacing=38.0,
+        hedges=0.6,
+    ),
+    "industrial": Kind(
+        streets=lambda rng, size, half: grid_layout(rng, size, half, (70.0, 105.0), 5.2, bend=0.0),
+        relief=0.4,
+        roughness=0.02,
+        ditch=0.0,
+        plots=(
+            Plot(buildings.hall, 1.0, (25.0, 50.0), (18.0, 35.0)),
+            Plot(buildings.tanks, 0.35, (18.0, 32.0), (10.0, 16.0)),
+            Plot(buildings.containers, 0.45, (14.0, 30.0), (8.0, 16.0)),
+        ),
+        setback=(3.0, 9.0),
+        gap=(4.0, 16.0),
+        vacant=0.2,
+        infill=0.0002,
+        trees=0.001,
+        species=Species((4.0, 10.0)),
+        undergrowth=0.001,
+        cars=0.3,
+        pole_spacing=32.0,
+        hedges=0.6,
+    ),
+    "forest": Kind(
+        streets=lambda rng, size, half: loop_layout(rng, size, half, 2.1, branches=3, waviness=0.3),
+        relief=4.5,
+        roughness=0.12,
+        ditch=0.45,
+        plots=(Plot(buildings.cabin, 1.0, (4.0, 8.0), (4.0, 6.0)),),
+        setback=(2.0, 10.0),
+        gap=(30.0, 120.0),
+        vacant=0.6,
+        infill=0.0,
+        trees=0.036,
+        species=Species((7.0, 26.0), spread=(0.12, 0.2), conifers=0.5),
+        undergrowth=0.02,
+        rocks=0.0012,
+        logs=0.0012,
+    ),
+}

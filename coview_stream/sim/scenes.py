@@ -1,0 +1,224 @@
+"""Seeded scenes: the same place when the map was made, and now.
+
+Frame: the scene's own, z up, metres, origin in the middle. What may change between the two epochs are trees,
+cars and poles; ground, buildings and hedges stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.errors import ConfigError
+from coview_stream.sim import furniture, vegetation
+from coview_stream.sim.kinds import KINDS, Kind, Plot
+from coview_stream.sim.layout import directions, resample
+from coview_stream.sim.mesh import Floats, Mesh, join, placed
+from coview_stream.sim.site import Site
+
+_MARGIN = 50.0  # metres of world beyond the map, for a robot near its edge still sees something
+_FOOTWAY = 1.8
+_PARKING = 6.4
+
+# one random stream per purpose: a change of one leaves the others as they are
+_GROUND, _BUILT, _GREEN, _STREET, _SPARE = range(5)
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where a building stands: centre, frontage w, depth d, heading, ground and ridge height."""
+
+    x: float
+    y: float
+    w: float
+    d: float
+    yaw: float
+    ground: float
+    top: float
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """The scene at one time: what stops every ray, and the foliage that lets some pass."""
+
+    solid: Mesh
+    foliage: Mesh
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A place.
+
+    Attributes:
+        kind: one of ``KINDS``.
+        size: side of the square that the map covers, metres.
+        mapped: the scene as the aircraft saw it.
+        now: the scene as the robot sees it.
+        site: ground and roads.
+        route: (N, 2) closed loop to drive on.
+        footprints: the buildings.
+    """
+
+    kind: str
+    size: float
+    mapped: Epoch
+    now: Epoch
+    site: Site
+    route: Floats
+    footprints: tuple[Footprint, ...]
+
+
+@dataclass(frozen=True)
+class _Movable:
+    """Things of one sort, as rows, and spares for those that change."""
+
+    rows: Floats
+    spares: Floats
+
+    def now(self, rng: np.random.Generator, changed: float) -> Floats:
+        """Take a share of the rows away and put as many elsewhere."""
+        count = round(changed * len(self.rows))
+        keep = np.sort(rng.permutation(len(self.rows))[count:])
+        return np.concatenate([self.rows[keep], self.spares[:count]])
+
+
+def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0) -> Scene:
+    """Draw a scene of ``size`` metres; the share ``changed`` of trees, cars and poles is another one now.
+
+    Scenes that differ in ``changed`` only have the same map.
+
+    Raises:
+        ConfigError: unknown kind.
+    """
+    if kind not in KINDS:
+        raise ConfigError(f"scene: {kind!r} is unknown; use one of {', '.join(KINDS)}")
+    spec, half = KINDS[kind], size / 2 + _MARGIN
+    rng = [np.random.default_rng([seed, sum(kind.encode()), stream]) for stream in range(5)]
+    layout = spec.streets(rng[_GROUND], size, half)
+    site = Site(rng[_GROUND], layout, half, relief=spec.relief, roughness=spec.roughness, ditch=spec.ditch)
+    footprints, built = _buildings(rng[_BUILT], site, spec)
+    fixed, bushes = _greenery(rng[_GREEN], site, spec)
+    cars, poles = _street_furniture(rng[_STREET], site, spec)
+    trees = _trees(rng[_GREEN], rng[_SPARE], site, spec, changed)
+
+    def epoch(pick: Callable[[_Movable], Floats]) -> Epoch:
+        rows = pick(trees)
+        ground = site.z(rows[:, 0], rows[:, 1])
+        street = [furniture.cars(pick(cars), site), furniture.poles(pick(poles), site)]
+        solid = join([site.mesh(), *built, *fixed, *street, vegetation.trunks(rows, ground)])
+        return Epoch(solid, join([*bushes, vegetation.crowns(rows, ground)]))
+
+    mapped = epoch(lambda movable: movable.rows)
+    now = epoch(lambda movable: movable.now(rng[_SPARE], changed)) if changed else mapped
+    return Scene(kind, size, mapped, now, site, layout.route, tuple(footprints))
+
+
+def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Footprint], list[Mesh]]:
+    footprints: list[Footprint] = []
+    meshes: list[Mesh] = []
+
+    def build(plot: Plot, x: float, y: float, yaw: float, w: float, d: float, margin: float) -> bool:
+        if not site.claim(x, y, w, d, yaw, margin):
+            return False
+        local = plot.draw(rng, w, d)
+        ground = site.height(x, y)
+        meshes.append(placed(local, x, y, ground, yaw))
+        top = ground + float(local.vertices[:, 2].max(initial=0.0))
+        footprints.append(Footprint(x, y, w, d, yaw, ground, top))
+        return True
+
+    for line in site.layout.streets:
+        for side in (-1.0, 1.0):
+            _line_street(rng, site, spec, line, side, build, meshes)
+    for _ in range(int(spec.infill * (2 * site.half) ** 2)):
+        plot, w, d = _draw_plot(rng, spec)
+        x, y = rng.uniform(-site.half, site.half, 2)
+        build(plot, x, y, rng.uniform(0, 2 * np.pi), w, d, 2.5)
+    return footprints, meshes
+
+
+def _line_street(
+    rng: np.random.Generator,
+    site: Site,
+    spec: Kind,
+    line: Floats,
+    side: float,
+    build: Callable[[Plot, float, float, float, float, float, float], bool],
+    meshes: list[Mesh],
+) -> None:
+    """Fill one side of a street with plots: a building and perhaps a hedge or fence in front."""
+    heading = directions(line)
+    kerb = site.layout.half_width + _FOOTWAY
+    at = rng.uniform(0.0, 10.0)
+    while True:
+        plot, w, d = _draw_plot(rng, spec)
+        k = int(at + w / 2)
+        if k >= len(line):
+            return
+        setback = rng.uniform(*spec.setback)
+        normal = side * np.array([-np.sin(heading[k]), np.cos(heading[k])])
+        x, y = line[k] + normal * (kerb + setback + d / 2)
+        yaw = heading[k] + (0.0 if side > 0 else np.pi)
+        vacant, hedged = rng.random() < spec.vacant, rng.random() < spec.hedges
+        if not vacant and build(plot, x, y, yaw, w, d, 0.3) and hedged and setback > 1.5:
+            along = np.array([np.cos(heading[k]), np.sin(heading[k])])
+            front = line[k] + normal * (kerb + 0.5)
+            meshes.append(_enclosure(rng, site, front - along * w / 2, front + along * w / 2))
+        at += w + rng.uniform(*spec.gap)
+
+
+def _enclosure(rng: np.random.Generator, site: Site, start: Floats, end: Floats) -> Mesh:
+    """Draw a hedge, wall or fence with a gate, left out where it would cross a road."""
+    line = resample(np.array([start, end]), 2.0)
+    if site.road_distance(*line.T).min() < site.layout.half_width + 0.8 or np.abs(line).max() >= site.half:
+        return join([])
+    gate = int(rng.integers(0, len(line) - 1))
+    thickness, height = [(0.7, 1.5), (0.25, 1.1), (0.06, 1.8)][int(rng.integers(3))]
+    height *= rng.uniform(0.8, 1.2)
+    return join(
+        vegetation.strip(site, part, thickness, height) for part in (line[: gate + 1], line[gate + 1 :])
+    )
+
+
+def _draw_plot(rng: np.random.Generator, spec: Kind) -> tuple[Plot, float, float]:
+    weights = np.array([plot.weight for plot in spec.plots])
+    plot = spec.plots[int(rng.choice(len(weights), p=weights / weights.sum()))]
+    return plot, rng.uniform(*plot.frontage), rng.uniform(*plot.depth)
+
+
+def _greenery(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Mesh], list[Mesh]]:
+    """Solid and leafy things that stay: rocks and logs, bushes."""
+    area, extent = (2 * site.half) ** 2, site.half - 2.0
+    solid = [
+        vegetation.rocks(rng, site, int(spec.rocks * area), extent),
+        vegetation.logs(rng, site, int(spec.logs * area), extent),
+    ]
+    return solid, [vegetation.undergrowth(rng, site, int(spec.undergrowth * area), extent)]
+
+
+def _trees(
+    rng: np.random.Generator, spare_rng: np.random.Generator, site: Site, spec: Kind, changed: float
+) -> _Movable:
+    def plant(rng: np.random.Generator, count: int) -> Floats:
+        rows = []
+        for x, y in rng.uniform(-site.half + 2, site.half - 2, (count, 2)):
+            tree = vegetation.draw_tree(rng, x, y, spec.species)
+            if site.claim(x, y, 0.5, 0.5, 0.0, 0.6):
+                rows.append(tree)
+        return np.array(rows).reshape(-1, len(vegetation.TREE_COLUMNS))
+
+    count = int(spec.trees * (2 * site.half) ** 2)
+    return _Movable(plant(rng, count), plant(spare_rng, int(count * changed)))
+
+
+def _street_furniture(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[_Movable, _Movable]:
+    parked = furniture.spots(rng, site.layout, _PARKING, site.layout.half_width - 1.1)
+    taken = int(spec.cars * len(parked))
+    spacing = spec.pole_spacing or 40.0
+    posts = furniture.spots(rng, site.layout, spacing / 2, site.layout.half_width + 0.6)
+    used = len(posts) // 2 if spec.pole_spacing else 0
+    return _Movable(parked[:taken], parked[taken:] if taken else parked[:0]), _Movable(
+        posts[:used], posts[used:]
+    )

@@ -1,0 +1,175 @@
+"""Simulate a world on disk: a base map, a run of a robot, and the truth.
+
+OUT/base.laz              airborne scan, map frame
+OUT/run/frames/000000.pcd ...  deskewed frames, body frame
+OUT/run/odometry.tum      odom <- body, drifting
+OUT/truth.tum             map <- body
+OUT/world.json            the configuration and what came of it
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.clouds.writers import write_cloud
+from coview_stream.errors import InputError
+from coview_stream.geometry import Points, Pose
+from coview_stream.sim.airborne import airborne_scan
+from coview_stream.sim.caster import Caster
+from coview_stream.sim.config import SimulationConfig
+from coview_stream.sim.drive import drive
+from coview_stream.sim.mesh import Floats
+from coview_stream.sim.odometry import drifting_odometry
+from coview_stream.sim.scenes import Scene, build_scene
+from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS
+
+_FIRST_STAMP = 1000.0
+_AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY = range(100, 104)  # random streams, apart from those of the scene
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What ``simulate`` wrote.
+
+    Attributes:
+        directory: where.
+        base_points: points of the base map.
+        frames: frames of the run.
+        distance: metres driven.
+    """
+
+    directory: Path
+    base_points: int
+    frames: int
+    distance: float
+
+
+def simulate(
+    out: str | os.PathLike[str],
+    config: SimulationConfig | None = None,
+    *,
+    progress: bool = False,
+    overwrite: bool = False,
+) -> Simulated:
+    """Write a simulated world to the directory ``out``; it is complete or not there.
+
+    ``progress`` draws a bar on stderr. ``overwrite`` replaces a world that was simulated there before, and
+    nothing else.
+
+    Raises:
+        InputError: ``out`` exists and is not empty, or cannot be written.
+        DependencyError: Open3D cannot be loaded.
+    """
+    config = config or SimulationConfig()
+    out = Path(out)
+    with _staging(out, overwrite) as staging, _Bar(progress) as bar:
+        scene = build_scene(config.scene, config.seed, config.size, config.changed)
+        base = base_map(scene, config, bar)
+        write_cloud(staging / "base.laz", base, origin=config.origin)
+        stamps, truth, odometry = trajectories(scene, config)
+        (staging / "run" / "frames").mkdir(parents=True)
+        bar.begin("drive", len(truth))
+        for k, points in enumerate(frames(scene, config, truth)):
+            write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
+            bar.advance(1)
+        write_tum(staging / "run" / "odometry.tum", stamps, odometry)
+        in_map = truth.copy()
+        in_map[:, :3, 3] += config.origin
+        write_tum(staging / "truth.tum", stamps, in_map)
+        distance = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+        facts = {"base_points": len(base), "frames": len(truth), "distance": round(distance, 2)}
+        (staging / "world.json").write_text(json.dumps(config.to_dict() | facts, indent=1) + "\n")
+    return Simulated(out, len(base), len(truth), distance)
+
+
+def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) -> Floats:
+    """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added)."""
+    bar = bar or _Bar(False)
+    bar.begin("airborne scan", 100)
+    strips, before = [], 0
+    for done, points in airborne_scan(
+        Caster(scene.mapped), config.size, config.density, _stream(config, _AIRBORNE)
+    ):
+        strips.append(points)
+        bar.advance(int(100 * done) - before)
+        before = int(100 * done)
+    return np.concatenate(strips)
+
+
+def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats, Floats]:
+    """Stamps (N,), true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4)."""
+    truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE))
+    odometry = drifting_odometry(truth, config.odometry, _stream(config, _ODOMETRY))
+    return _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth)), truth, odometry
+
+
+def frames(scene: Scene, config: SimulationConfig, truth: Floats) -> Iterator[Points]:
+    """Scan the scene as it is now from each true pose; (N, 3) float32 metres, body frame."""
+    caster, sensor, rng = Caster(scene.now), SENSORS[config.sensor](), _stream(config, _SENSOR)
+    T: Pose
+    for k, T in enumerate(truth):
+        yield sensor.scan(caster, T, k, rng)
+
+
+def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:
+    return np.random.default_rng([config.seed, purpose])
+
+
+@contextmanager
+def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
+    """Give a directory beside ``out`` that becomes ``out`` if all goes well, and vanishes if not."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; name a new directory")
+    ours = (out / "world.json").is_file()
+    if out.exists() and any(out.iterdir()) and not (overwrite and ours):
+        remedy = "pass --overwrite to replace it" if ours else "name a new or empty directory"
+        raise InputError(f"{out}: is not empty; {remedy}")
+    staging = out.with_name(f".{out.resolve().name}.{os.getpid()}.tmp")
+    try:
+        staging.mkdir(parents=True)
+        yield staging
+        if out.exists():
+            shutil.rmtree(out)
+        staging.rename(out)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{out}: cannot be written ({reason}); check the path and the disk") from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+class _Bar:
+    """A progress bar per phase on stderr, or nothing."""
+
+    def __init__(self, shown: bool) -> None:
+        self._shown = shown
+        self._bar: Any = None
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def begin(self, phase: str, total: int) -> None:
+        self.__exit__()
+        if self._shown:
+            from tqdm import tqdm
+
+            layout = "{desc}: {percentage:3.0f}%|{bar}| {remaining} left"
+            self._bar = tqdm(total=total, desc=phase, leave=False, bar_format=layout)
+
+    def advance(self, steps: int) -> None:
+        if self._bar is not None:
+            self._bar.update(steps)
