@@ -89,7 +89,7 @@ def _voxel_groups(points: Points, voxel: float) -> tuple[npt.NDArray[np.intp], n
 
 
 def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> Points:
-    """Unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0).
+    """Estimate unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0).
 
     Costs about 1.7 s per million points on two cores. Fewer than three neighbours give (0, 0, 1).
 
