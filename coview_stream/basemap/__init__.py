@@ -1,0 +1,1 @@
+"""Base maps: ground, stations, virtual reference scans, the file."""

@@ -1,0 +1,132 @@
+"""The base map: stations with descriptors to search in, and a tiled cloud with normals to register to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.basemap import store, tiles
+from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, map_preset
+from coview_stream.errors import ConfigError, MapError
+from coview_stream.geometry import Points
+
+_REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
+
+
+class BaseMap:
+    """A base map, built from clouds or loaded from a ``.coview`` file.
+
+    All coordinates inside are float32 metres relative to :attr:`origin`, (3,) float64 in the frame of the source.
+
+    Attributes:
+        config: how it was built.
+        origin: (3,) float64, the source-frame position of the map's zero.
+        crs: coordinate reference system text of the source, if it had one.
+        sources: names and sha256 of the source files.
+        sha256: hash of parameters and content; empty until saved or loaded.
+    """
+
+    def __init__(self, arrays: store.Arrays, parameters: dict[str, Any], sha256: str = "") -> None:
+        missing = [name for name in _REQUIRED if name not in arrays]
+        if missing:
+            raise MapError(f"the map lacks {', '.join(missing)}; build it again")
+        try:
+            fields = dict(parameters["config"])
+            descriptor = dict(fields.pop("descriptor"))
+            descriptor["channels"] = tuple(descriptor["channels"])
+            self.config = MapConfig(descriptor=DescriptorConfig(**descriptor), **fields)
+            self.crs: str | None = parameters["crs"]
+            self.sources: dict[str, str] = dict(parameters["sources"])
+        except (KeyError, TypeError, ConfigError) as error:
+            raise MapError(f"the map's parameters cannot be read ({error}); build it again") from error
+        absent = [n for n in self.config.descriptor.channels if f"descriptor.{n}" not in arrays]
+        if absent:
+            raise MapError(f"the map lacks descriptors {', '.join(absent)}; build it again")
+        self._arrays = arrays
+        self.parameters = parameters
+        self.origin = np.array(arrays["origin"], dtype=np.float64)
+        self.sha256 = sha256
+
+    @classmethod
+    def build(
+        cls,
+        sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        preset: Preset = "slam",
+        config: MapConfig | None = None,
+        progress: bool = False,
+        **options: Any,
+    ) -> BaseMap:
+        """Build from one or several cloud files (tiles).
+
+        Args:
+            sources: las/laz, ply, pcd, npy or bin files in one frame, metres.
+            preset: ``slam`` (radius 50 m) or ``tls`` (100 m).
+            config: takes the place of preset and options.
+            progress: show a bar on stderr.
+            options: fields of :class:`MapConfig` or :class:`DescriptorConfig`.
+
+        Raises:
+            CloudError: a source cannot be read. ConfigError: an option is unknown or out of range.
+            MapError: there is no ground to stand on.
+        """
+        from coview_stream.basemap.build import build_arrays
+
+        paths = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
+        settings = config or map_preset(preset, **options)
+        arrays, parameters = build_arrays([Path(p) for p in paths], settings, progress)
+        parameters["config"] = asdict(settings)
+        return cls(arrays, parameters)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> BaseMap:
+        """Memory-map a ``.coview`` file; raises :class:`MapError` if it is missing, damaged or of another version."""
+        return cls(*store.load(Path(path)))
+
+    def save(self, path: str | os.PathLike[str]) -> str:
+        """Write the map atomically and return its sha256; raises :class:`MapError` if that fails."""
+        self.sha256 = store.save(Path(path), self._arrays, self.parameters)
+        return self.sha256
+
+    def __len__(self) -> int:
+        """Return the number of stations."""
+        return len(self.stations)
+
+    @property
+    def descriptor_config(self) -> DescriptorConfig:
+        """How the descriptors were made; queries must be made the same way."""
+        return self.config.descriptor
+
+    @cached_property
+    def stations(self) -> npt.NDArray[np.float32]:
+        """(M, 3) ground positions, relative to :attr:`origin`."""
+        return np.array(self._arrays["stations"])
+
+    @property
+    def points(self) -> npt.NDArray[np.float32]:
+        """(N, 3) voxel cloud sorted by tile, relative to :attr:`origin`; memory-mapped when loaded."""
+        return self._arrays["points"]
+
+    def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
+        """Descriptors (M, R, S) of one channel."""
+        return self._arrays[f"descriptor.{name}"]
+
+    def crop(self, centre: npt.NDArray[np.float64], radius: float) -> tuple[Points, Points]:
+        """Points and unit normals (K, 3) within ``radius`` metres of ``centre``, both relative to :attr:`origin`."""
+        return tiles.crop(
+            self.points, self._arrays["normals"], self._arrays["tile_index"], self.config.tile, centre, radius
+        )
+
+    def surveyed(self, xy: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+        """Whether the map has points around each of (K, 2) positions, relative to :attr:`origin`."""
+        grid, corner = self._arrays["surveyed"], self._arrays["surveyed_corner"]
+        index = np.floor((xy - corner) / self.config.block).astype(np.int64)
+        inside = ((index >= 0) & (index < np.array(grid.shape)[::-1])).all(axis=1)
+        index[~inside] = 0
+        return np.asarray(inside & (grid[index[:, 1], index[:, 0]] > 0))

@@ -1,0 +1,137 @@
+"""From clouds to the arrays of a base map (paper, section 3.1, and the VRS part of 3.2)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from coview_stream.basemap.ground import ground_mask
+from coview_stream.basemap.raster import aligned_corner, rasterise
+from coview_stream.basemap.stations import Progress, describe_stations, station_positions
+from coview_stream.basemap.store import Arrays
+from coview_stream.basemap.tiles import sort_by_tile
+from coview_stream.clouds.cloud import merge
+from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
+from coview_stream.clouds.readers import read_cloud
+from coview_stream.config import MapConfig
+from coview_stream.errors import MapError
+from coview_stream.geometry import Points
+
+_RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
+_MIN_POINTS = 1000
+_SURVEY_MARGIN = 1  # cells
+
+
+def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
+    """Read ``paths`` and return a map's arrays and the parameters that say where it came from.
+
+    Raises:
+        CloudError: a source cannot be read.
+        MapError: no sources, too few points, or no ground to put stations on.
+    """
+    if not paths:
+        raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
+    with _bar(progress, "reading") as step:
+        clouds = [_read(path, k, len(paths), step) for k, path in enumerate(paths)]
+    whole = merge(clouds)
+    source_points = len(whole)
+    origin, crs, raw = whole.origin, whole.crs, whole.points
+    del clouds, whole
+    # stations and float32 like a zero near the site, whatever the source's own origin is
+    shift = np.round(np.median(raw[:: max(1, len(raw) // 100_000)], axis=0).astype(np.float64) / 10.0) * 10.0
+    raw -= shift.astype(np.float32)
+
+    with _bar(progress, "cleaning and normals") as step:
+        points = voxel_grid(raw, config.voxel)
+        del raw
+        step(1, 3)
+        if config.outlier_neighbours:
+            points = remove_outliers(points, config.outlier_neighbours, config.outlier_std_ratio)
+        if len(points) < _MIN_POINTS:
+            raise MapError(f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more")
+        step(2, 3)
+        normals = estimate_normals(points, radius=config.normal_radius, neighbours=config.normal_neighbours)
+        step(3, 3)
+    with _bar(progress, "ground") as step:
+        stations = _stations(points, config)
+        step(1, 1)
+    with _bar(progress, "describing stations") as step:
+        corner = aligned_corner(points, config.block, _RASTER_CELL)
+        margin = int(np.ceil(config.block / _RASTER_CELL))
+        raster = rasterise(points, corner, _RASTER_CELL, config.descriptor.voxel, margin)
+        described = describe_stations(raster, stations, config.descriptor, step)
+
+    sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
+    surveyed, surveyed_corner = surveyed_cells(points, config.block)
+    arrays: Arrays = {
+        "origin": origin + shift,
+        "stations": stations,
+        "points": sorted_points,
+        "normals": packed,
+        "tile_index": index,
+        "surveyed": surveyed,
+        "surveyed_corner": surveyed_corner,
+        **{f"descriptor.{name}": values for name, values in described.items()},
+    }
+    parameters = {
+        "crs": crs,
+        "sources": {path.name: _sha256(path) for path in paths},
+        "source_points": source_points,
+    }
+    return arrays, parameters
+
+
+def _read(path: Path, done: int, total: int, step: Progress) -> Any:
+    cloud = read_cloud(path)
+    step(done + 1, total)
+    return cloud
+
+
+def _stations(points: Points, config: MapConfig) -> Points:
+    ground = points[ground_mask(points)]
+    if not len(ground):
+        raise MapError("no ground found in the base map; it needs points on the ground to put stations on")
+    return station_positions(ground, config.block)
+
+
+def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float64]]:
+    """Block-sized cells (H, W) that hold points or neighbour on cells that do, and the lower left corner (2,).
+
+    The neighbours bridge the shadows of buildings: a scan that shows nothing there has still been there.
+    """
+    cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
+    low = cells.min(axis=0) - _SURVEY_MARGIN
+    columns, rows = (cells - low).T
+    grid = np.zeros((int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool)
+    grid[rows, columns] = True
+    square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
+    return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while chunk := file.read(1 << 22):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+@contextmanager
+def _bar(show: bool, title: str) -> Iterator[Progress]:
+    """Progress on stderr with an ETA; silent unless asked for."""
+    from tqdm import tqdm
+
+    with tqdm(total=1, desc=title, unit="", disable=not show, leave=False) as bar:
+
+        def step(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield step

@@ -1,0 +1,123 @@
+"""The ``.coview`` file: safetensors, memory-mapped, versioned, checksummed, written atomically.
+
+safetensors is a length, a JSON header and raw little-endian arrays: nothing in it is executed on loading. The header's
+metadata hold the format version, all parameters, and the sha256 of parameters and arrays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import MapError
+
+FORMAT = "coview-map"
+VERSION = 1
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+_CHUNK = 1 << 22
+_TYPES = {
+    "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U8": "|u1",
+}  # fmt: skip
+
+
+def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
+    """Write a map and return its sha256; a file that was there before stays whole until the new one is complete.
+
+    Raises:
+        MapError: the directory does not exist or cannot be written.
+    """
+    from safetensors.numpy import save as serialise
+
+    text = json.dumps(parameters, sort_keys=True)
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    digest = _digest(text, contiguous)
+    metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
+    temporary: str | None = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        with os.fdopen(handle, "wb") as file:
+            file.write(serialise(contiguous, metadata))
+            file.flush()
+            os.fsync(file.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except OSError as error:
+        raise MapError(f"{path}: cannot write the map ({error.strerror}); choose a writable place") from error
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+    return digest
+
+
+def load(path: Path) -> tuple[Arrays, dict[str, Any], str]:
+    """Memory-map a map: its arrays (read-only), parameters and sha256.
+
+    The whole file is read once, to compare it with its checksum; after that only the pages used are in memory.
+
+    Raises:
+        MapError: missing, not a base map, of another version, truncated, or damaged.
+    """
+    header, start = _header(path)
+    metadata = header.pop("__metadata__", {})
+    if metadata.get("format") != FORMAT:
+        raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
+    if metadata.get("version") != str(VERSION):
+        raise MapError(
+            f"{path}: map format {metadata.get('version')}, this program reads {VERSION}; build the map again"
+        )
+    try:
+        arrays = {name: _mapped(path, start, entry) for name, entry in sorted(header.items())}
+        digest = _digest(metadata["parameters"], arrays)
+        parameters = json.loads(metadata["parameters"])
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
+    if digest != metadata.get("sha256"):
+        raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
+    return arrays, parameters, digest
+
+
+def _header(path: Path) -> tuple[dict[str, Any], int]:
+    try:
+        with path.open("rb") as file:
+            size = int.from_bytes(file.read(8), "little")
+            if not 2 <= size <= min(path.stat().st_size, 1 << 24):
+                raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
+            header = json.loads(file.read(size))
+    except OSError as error:
+        raise MapError(f"{path}: cannot read the map ({error.strerror})") from error
+    except ValueError as error:
+        raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
+    if not isinstance(header, dict) or not isinstance(header.get("__metadata__", {}), dict):
+        raise MapError(f"{path}: not a coview map, or its header is damaged; build it again")
+    return header, 8 + size
+
+
+def _mapped(path: Path, start: int, entry: dict[str, Any]) -> npt.NDArray[Any]:
+    dtype = np.dtype(_TYPES[entry["dtype"]])
+    shape = tuple(int(n) for n in entry["shape"])
+    begin, end = entry["data_offsets"]
+    if end - begin != dtype.itemsize * int(np.prod(shape)) or start + end > path.stat().st_size:
+        raise ValueError("an array reaches beyond the file")
+    if end == begin:
+        return np.empty(shape, dtype=dtype)
+    return np.memmap(path, dtype=dtype, mode="r", offset=start + begin, shape=shape)
+
+
+def _digest(parameters: str, arrays: Arrays) -> str:
+    total = hashlib.sha256(parameters.encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        total.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        data = array.reshape(-1).view(np.uint8)
+        for begin in range(0, len(data), _CHUNK):
+            total.update(data[begin : begin + _CHUNK])
+    return total.hexdigest()

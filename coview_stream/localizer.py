@@ -1,0 +1,127 @@
+"""The engine: frames and odometry in, fixes out. No clock, no network, no threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.errors import CloudError, RunError
+from coview_stream.fix import Fix, KeyframeEvidence, State
+from coview_stream.geometry import Points, Pose, is_pose, orthonormal, pose_from
+from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
+from coview_stream.pose.registration import LocalMaps
+from coview_stream.search import GlobalSearch
+from coview_stream.tracking import Tracker, relative_to, unanchored
+
+_LEAST_POINTS = 10
+
+
+class Localizer:
+    """Tells where the robot is on a base map, or that it does not know (paper, Algorithm 1).
+
+    Attributes:
+        base_map: the map; may be shared by many localizers.
+        config: how decisions are made.
+        state: the newest fix's state.
+    """
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
+        self.base_map = base_map
+        self.config = config or LocalizerConfig()
+        self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the map."""
+        self.state = State.SEARCHING
+        self._buffer = KeyframeBuffer(self.config.keyframe)
+        self._search = GlobalSearch(self.base_map, self.config, self._local_maps)
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps)
+        self._anchor: npt.NDArray[np.float64] | None = None
+        self._evidence: KeyframeEvidence | None = None
+        self._doubts = 0
+
+    def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
+        """Take in one frame and say where the robot is.
+
+        Args:
+            cloud: (N, 3) float32 body-frame points (x forward, z up), deskewed, metres; rows with NaN are dropped.
+            T_odom_body: (4, 4) odometry pose of the frame, gravity aligned, metres.
+            stamp: seconds.
+
+        Returns:
+            The fix; its pose is None unless the state is TRACKING.
+
+        Raises:
+            CloudError: the cloud has another shape or fewer than 10 finite points. RunError: the pose or stamp is not
+                finite or not rigid. Neither changes the localizer: count the frame, skip it and go on.
+        """
+        cloud, T_odom_body = self._checked(cloud, T_odom_body, stamp)
+        keyframe = self._buffer.add(cloud, T_odom_body, stamp)
+        self._tracker.observe(cloud, T_odom_body)
+        if self.state is State.TRACKING:
+            if self._tracker.due:
+                self._track(cloud, T_odom_body, stamp)
+        elif keyframe is not None:
+            self._find(keyframe, cloud)
+        return self._fix(T_odom_body, stamp)
+
+    def _find(self, keyframe: Keyframe, cloud: Points) -> None:
+        """Search the whole map; start tracking when one place stands alone."""
+        verdict = self._search.update(self._buffer, keyframe, cloud)
+        self._evidence = verdict.evidence
+        if verdict.accepted is not None:
+            self._tracker.start(verdict.accepted.registration)
+            self._search.clear()
+            self.state, self._doubts = State.TRACKING, 0
+        elif self.state is not State.LOST:
+            self.state = verdict.evidence.state
+
+    def _track(self, cloud: Points, T_odom_body: Pose, stamp: float) -> None:
+        """Correct the drift since the last registration, and verify again that the place is right."""
+        evidence = self._tracker.update(cloud, T_odom_body)
+        rule = self.config.acceptance
+        score = evidence.score if evidence else 0.0
+        doubtful = evidence is None or score < rule.keep_score or evidence.inside < rule.inside
+        self._doubts = self._doubts + 1 if doubtful else 0
+        if self._doubts >= rule.patience:
+            self.state = State.LOST
+            self._buffer.clear()
+        reason = f"evidence gone, {self._doubts} times in a row" if doubtful else "verified"
+        self._evidence = KeyframeEvidence(stamp, self.state, reason, score, 0.0, evidence)
+
+    def _fix(self, T_odom_body: Pose, stamp: float) -> Fix:
+        evidence = self._evidence
+        if self.state is not State.TRACKING or self._anchor is None:
+            return Fix(stamp, self.state, evidence=evidence)
+        T_map_local = orthonormal(self._tracker.T_map_odom)
+        T_map_body = T_map_local @ T_odom_body
+        confidence = max(0.0, evidence.score - evidence.rival) if evidence else 0.0
+        return Fix(
+            stamp,
+            self.state,
+            pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
+            unanchored(T_map_local, self._anchor, self.base_map.origin),
+            self._tracker.reported_covariance(),
+            confidence,
+            evidence,
+        )
+
+    def _checked(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:
+        """Finite float32 points, and the pose relative to the first one so that float32 stays exact."""
+        cloud = np.asarray(cloud)
+        if cloud.ndim != 2 or cloud.shape[1] != 3:
+            raise CloudError(f"cloud has shape {cloud.shape}; expected (N, 3)")
+        finite = np.ascontiguousarray(cloud[np.isfinite(cloud).all(axis=1)], dtype=np.float32)
+        if len(finite) < _LEAST_POINTS:
+            raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_LEAST_POINTS} or more")
+        T = np.asarray(T_odom_body, dtype=np.float64)
+        if not np.isfinite(stamp):
+            raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
+        if not is_pose(T):
+            raise RunError("T_odom_body is not a finite rigid 4x4 transform; check the odometry")
+        if self._anchor is None:
+            self._anchor = T[:3, 3].copy()
+        return finite, relative_to(T, self._anchor)

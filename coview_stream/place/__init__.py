@@ -1,0 +1,1 @@
+"""Where am I, roughly: descriptors, keyframes, retrieval, consensus."""

@@ -1,0 +1,165 @@
+"""Consensus: every keyframe votes for one ``T_map_odom``.
+
+Each (keyframe, station, shift) is a hypothesis of the same unknown transform. Odometry says where the other
+keyframes stood relative to the newest one, so a hypothesis of the newest keyframe predicts a station and a shift
+for each of the others: their distances are looked up there and added. All M x S hypotheses are summed, none is cut
+by a top-k before it could be confirmed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config import Channel, ConsensusConfig
+from coview_stream.geometry import Pose, pose_from, rot_z
+from coview_stream.place.retrieval import Volume
+
+_SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
+_LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A coarse ``T_map_odom`` (4 x 4), with its station, shift and summed score (lower is better)."""
+
+    T_map_odom: Pose
+    station: int
+    shift: int
+    score: float
+
+
+@dataclass(frozen=True)
+class _Ballot:
+    centre: npt.NDArray[np.float64]  # (3,) odometry frame, z on the ground
+    votes: npt.NDArray[np.float16]  # (M, S) standardised distances
+    smallest: float  # smallest raw distance, for the paper's single-minimum rule
+
+
+class StationGrid:
+    """Finds the station at a position: stations stand at the centres of a square grid, one per level."""
+
+    def __init__(self, stations: npt.NDArray[np.float32], block: float) -> None:
+        self.stations = stations
+        self.block = block
+        cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
+        self._low = cells.min(axis=0)
+        self._shape = cells.max(axis=0) - self._low + 1
+        flat = self._flat(cells - self._low)
+        order = np.lexsort((stations[:, 2], flat))
+        unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
+        self._grid = np.full((int(count.max()), int(self._shape.prod())), -1, dtype=np.int32)
+        for level in range(len(self._grid)):
+            has = count > level
+            self._grid[level, unique[has]] = order[first[has] + level]
+
+    def _flat(self, cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return np.asarray(cells[..., 0] * self._shape[1] + cells[..., 1])
+
+    def moved(self, shift_cells: npt.NDArray[np.int64], rise: float) -> npt.NDArray[np.int32]:
+        """Index (M,) of the station that lies ``shift_cells`` (2,) from each station, -1 where there is none.
+
+        ``rise`` (metres) is the height gained on the way; it picks the storey.
+        """
+        cells = self._cells + shift_cells
+        inside = ((cells >= 0) & (cells < self._shape)).all(axis=1)
+        flat = np.where(inside, self._flat(cells), 0)
+        if len(self._grid) == 1:
+            return np.where(inside, self._grid[0][flat], -1).astype(np.int32)
+        levels = self._grid[:, flat]
+        gap = np.abs(self.stations[levels, 2] - (self.stations[:, 2] + rise))
+        gap[(levels < 0) | ~inside] = np.inf
+        best = gap.argmin(axis=0)
+        columns = np.arange(len(self.stations))
+        return np.where(gap[best, columns] < _LEVEL_GAP, levels[best, columns], -1).astype(np.int32)
+
+    @property
+    def _cells(self) -> npt.NDArray[np.int64]:
+        return np.floor(self.stations[:, :2].astype(np.float64) / self.block).astype(np.int64) - self._low
+
+
+class Consensus:
+    """The newest keyframes' votes and the hypotheses they agree on."""
+
+    def __init__(self, stations: npt.NDArray[np.float32], block: float, config: ConsensusConfig) -> None:
+        self.config = config
+        self.stations = stations
+        self.grid = StationGrid(stations, block)
+        self._ballots: deque[_Ballot] = deque(maxlen=config.window)
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        return len(self._ballots)
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        self._ballots.clear()
+
+    def vote(self, centre: npt.NDArray[np.float64], distances: dict[Channel, Volume]) -> None:
+        """Add one keyframe's distances (M, S) per channel; ``centre`` (3,) is its descriptor's zero, odometry frame.
+
+        Channels are standardised (median and MAD over all hypotheses) before they are averaged: how far a
+        hypothesis stands out is comparable between channels and places, the distance itself is not.
+        """
+        votes = sum(standardised(volume) for volume in distances.values()) / np.float32(len(distances))
+        smallest = min(float(volume.min()) for volume in distances.values())
+        self._ballots.append(_Ballot(centre, np.asarray(votes, dtype=np.float16), smallest))
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the best spatially distinct hypotheses, best first; none before the first vote."""
+        if not self._ballots:
+            return []
+        if self.config.mode == "single":
+            ballot = min(self._ballots, key=lambda b: b.smallest)
+            return self._peaks(ballot.votes.astype(np.float32), ballot.centre)[:1]
+        return self._peaks(self.scores(), self._ballots[-1].centre)
+
+    def scores(self) -> Volume:
+        """Summed votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
+        newest = self._ballots[-1]
+        total = newest.votes.astype(np.float32)
+        sectors = total.shape[1]
+        for ballot in list(self._ballots)[:-1]:
+            step = ballot.centre - newest.centre
+            for n in range(sectors):
+                xy = rot_z(yaw_of_shift(n, sectors))[:2, :2] @ step[:2]
+                moved = self.grid.moved(np.rint(xy / self.grid.block).astype(np.int64), float(step[2]))
+                # no station there (map edge, inside a building): no opinion
+                total[:, n] += np.where(moved >= 0, ballot.votes[moved, n], np.float16(0))
+        return np.asarray(total / np.sqrt(len(self._ballots)), dtype=np.float32)
+
+    def _peaks(self, scores: Volume, centre: npt.NDArray[np.float64]) -> list[Hypothesis]:
+        sectors = scores.shape[1]
+        flat = scores.ravel()
+        some = min(_SHORTLIST, flat.size - 1)
+        shortlist = np.argpartition(flat, some)[: some + 1]
+        shortlist = shortlist[np.argsort(flat[shortlist], kind="stable")]
+        station, shift = np.divmod(shortlist, sectors)
+        xyz = self.stations[station].astype(np.float64)
+        yaw = yaw_of_shift(shift, sectors)
+        free = np.ones(len(shortlist), dtype=bool)
+        found: list[Hypothesis] = []
+        while free.any() and len(found) < self.config.peaks:
+            k = int(free.argmax())
+            T = pose_from(rot_z(float(yaw[k])), xyz[k]) @ pose_from(np.eye(3), -centre)  # eq. 12, mended
+            found.append(Hypothesis(T, int(station[k]), int(shift[k]), float(flat[shortlist[k]])))
+            turn = np.abs((yaw - yaw[k] + np.pi) % (2 * np.pi) - np.pi)
+            near = np.linalg.norm(xyz - xyz[k], axis=1) < self.config.distinct_distance
+            free &= ~(near & (turn < self.config.distinct_yaw))
+        return found
+
+
+def yaw_of_shift(shift: int | npt.NDArray[np.integer], sectors: int) -> float | npt.NDArray[np.float64]:
+    """Eq. 9: heading of the odometry frame's x axis in the map for shift n, radians."""
+    return -2.0 * np.pi * shift / sectors
+
+
+def standardised(volume: Volume) -> Volume:
+    """How many robust standard deviations each distance lies from the median of all, negative is better."""
+    sample = volume.ravel()[:: max(1, volume.size // 100_000)]
+    median = np.median(sample)
+    spread = 1.4826 * np.median(np.abs(sample - median)) + 1e-6
+    return np.asarray((volume - median) / spread, dtype=np.float32)

@@ -1,0 +1,81 @@
+"""Retrieval: the distance of a virtual local scan to every station at every shift (eqs 5-9)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import coview_kernels as kernels
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
+from coview_stream.place.descriptor import Descriptor, ring_key
+
+Volume = npt.NDArray[np.float32]
+"""(M, S) float32: one number for each station and shift."""
+
+Spectra = npt.NDArray[np.complex64]
+
+_CACHE_BYTES = 400_000_000  # spectra of all stations are kept if they fit, else made anew block by block
+_BLOCK = 8192
+
+
+class Stations(Protocol):
+    """What retrieval needs to know of a base map."""
+
+    descriptor_config: DescriptorConfig
+
+    def __len__(self) -> int:
+        """Return the number of stations M."""
+        ...
+
+    def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
+        """Return (M, R, S) of one channel."""
+        ...
+
+
+class Retrieval:
+    """Scores one query against all stations of a map, exactly (``exhaustive``), or by the paper's ``ring_key``."""
+
+    def __init__(self, stations: Stations, config: RetrievalConfig) -> None:
+        self.stations = stations
+        self.config = config
+        self._spectra: dict[Channel, Spectra] = {}
+        self._keys: dict[Channel, npt.NDArray[np.float32]] = {}
+
+    def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, Volume]:
+        """Eqs 7-9 for each channel: (M, S) distances in [0, 2]; shift n means yaw -2 pi n / S.
+
+        In ``ring_key`` mode stations that are not among the candidates have distance 1 at every shift.
+        """
+        return {name: self._channel(name, descriptor) for name, descriptor in query.items()}
+
+    def _channel(self, name: Channel, query: Descriptor) -> Volume:
+        if self.config.mode == "ring_key":
+            return self._by_ring_key(name, query)
+        sectors = query.shape[-1]
+        parts = [kernels.all_shift_distance(query, spectra, sectors) for spectra in self._blocks(name)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _blocks(self, name: Channel) -> Iterator[Spectra]:
+        config = self.stations.descriptor_config
+        descriptors = self.stations.descriptors(name)
+        size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
+        if size > _CACHE_BYTES:
+            for start in range(0, len(descriptors), _BLOCK):
+                yield kernels.column_spectra(descriptors[start : start + _BLOCK].astype(np.float32))
+            return
+        if name not in self._spectra:
+            self._spectra[name] = kernels.column_spectra(descriptors.astype(np.float32))
+        yield self._spectra[name]
+
+    def _by_ring_key(self, name: Channel, query: Descriptor) -> Volume:
+        if name not in self._keys:
+            self._keys[name] = ring_key(self.stations.descriptors(name).astype(np.float32))
+        gap = np.linalg.norm(self._keys[name] - ring_key(query), axis=1)
+        nearest = np.argsort(gap, kind="stable")[: self.config.candidates]
+        volume = np.ones((len(self.stations), query.shape[-1]), dtype=np.float32)
+        spectra = kernels.column_spectra(self.stations.descriptors(name)[nearest].astype(np.float32))
+        volume[nearest] = kernels.all_shift_distance(query, spectra, query.shape[-1])
+        return volume

@@ -1,0 +1,1 @@
+"""Where am I, exactly, and how sure: registration and verification."""

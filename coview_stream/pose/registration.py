@@ -1,0 +1,187 @@
+"""Registration of a local scan to the base map: trimmed ICP (eq. 13), point-to-plane, coarse to fine."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import coview_kernels as kernels
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry import Points, Pose, exp_se3, pose_from, transform
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.basemap import BaseMap
+
+Matrix6 = npt.NDArray[np.float64]
+
+_CACHED_CROPS = 12
+_CROP_STEP = 16.0  # metres between the centres of cached crops
+_STOP_SHIFT = 5e-4  # metres; below the map's own noise
+_STOP_TURN = 2e-5  # radians
+_LEAST_PAIRS = 50
+
+
+@dataclass(frozen=True)
+class LocalMap:
+    """A crop of the base map with its search tree: points and unit normals (K, 3), map frame, metres."""
+
+    points: Points
+    normals: Points
+    tree: cKDTree
+
+
+class LocalMaps:
+    """Crops of a base map by place, the recently used ones kept."""
+
+    def __init__(self, base_map: BaseMap, radius: float) -> None:
+        self._map = base_map
+        self._radius = radius
+        self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
+
+    def around(self, position: npt.NDArray[np.float64]) -> LocalMap | None:
+        """The map within at least ``radius`` metres of ``position`` (3,); None where the map is (nearly) empty."""
+        key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
+        if key not in self._crops:
+            centre = np.array([key[0], key[1]]) * _CROP_STEP
+            points, normals = self._map.crop(centre, self._radius + 0.75 * _CROP_STEP)
+            enough = len(points) >= _LEAST_PAIRS
+            # an unbalanced tree is built three times as fast and searched as fast
+            tree = cKDTree(points, balanced_tree=False, compact_nodes=False) if enough else None
+            self._crops[key] = LocalMap(points, normals, tree) if enough else None
+            if len(self._crops) > _CACHED_CROPS:
+                self._crops.popitem(last=False)
+        self._crops.move_to_end(key)
+        return self._crops[key]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A Gaussian belief about the pose: mean (4, 4) and information (6, 6) over (rx, ry, rz, x, y, z).
+
+    The tangent is a rotation about the body's position, then a shift, both along the map's axes.
+    """
+
+    T_map_source: Pose
+    information: Matrix6
+
+
+@dataclass(frozen=True)
+class Registration:
+    """What a registration found, with its evidence.
+
+    Attributes:
+        T_map_source: (4, 4) float64.
+        information: (6, 6) over (rx, ry, rz, x, y, z) about ``centre``, the prior included, before inflation.
+        rmse: root mean square of the kept point-to-plane residuals, metres.
+        pairs: how many pairs were kept at the last iteration.
+        iterations: over all scales.
+        converged: the last step was below 0.5 mm and 0.001 degrees.
+    """
+
+    T_map_source: Pose
+    information: Matrix6
+    rmse: float
+    pairs: int
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Source:
+    """Points (N, 3) float32 of a local scan, which of them stand above the ground, and how high (metres)."""
+
+    points: Points
+    above: npt.NDArray[np.bool_]
+    height: npt.NDArray[np.float32]
+
+
+def register(
+    source: Source,
+    T_map_source: Pose,
+    target: LocalMap,
+    config: RegistrationConfig,
+    scales: tuple[float, ...],
+    prior: Prior | None = None,
+    centre: npt.NDArray[np.float64] | None = None,
+) -> Registration | None:
+    """Trimmed ICP from an initial pose.
+
+    Args:
+        source: the local scan.
+        T_map_source: (4, 4) initial guess.
+        target: the map around it.
+        config: overlap, residual scale, iterations.
+        scales: largest correspondence distance of each scale, metres.
+        prior: belief to fuse; its mean is about ``centre`` too.
+        centre: (3,) source-frame point that rotations are about (the body's position); default the mean.
+
+    Returns:
+        The result, or None where fewer than 50 points find a partner.
+    """
+    T = T_map_source
+    pivot = source.points.mean(axis=0, dtype=np.float64) if centre is None else centre
+    total, converged, result = 0, False, None
+    for scale in scales:
+        for _ in range(config.iterations):
+            step = _step(source, T, target, config, scale, prior, pivot)
+            if step is None:
+                return None
+            increment, information, rmse, pairs = step
+            about = transform(T, pivot[None])[0]
+            T = pose_from(np.eye(3), about) @ exp_se3(increment) @ pose_from(np.eye(3), -about) @ T
+            total += 1
+            converged = bool(
+                np.linalg.norm(increment[3:]) < _STOP_SHIFT and np.linalg.norm(increment[:3]) < _STOP_TURN
+            )
+            result = Registration(T, information, rmse, pairs, total, converged)
+            if converged:
+                break
+    return result
+
+
+def _step(
+    source: Source,
+    T: Pose,
+    target: LocalMap,
+    config: RegistrationConfig,
+    scale: float,
+    prior: Prior | None,
+    pivot: npt.NDArray[np.float64],
+) -> tuple[npt.NDArray[np.float64], Matrix6, float, int] | None:
+    """One Gauss-Newton step: increment (6,), information (6, 6), rmse and number of pairs."""
+    moved = transform(T, source.points)
+    distance, partner = target.tree.query(moved, distance_upper_bound=scale)
+    # above the ground and on it apart, with equal weight: the ground fits anywhere and would crowd out the rest
+    share = np.zeros(len(moved), dtype=np.float32)
+    for group in (source.above, ~source.above):
+        index = np.flatnonzero(group & np.isfinite(distance))
+        if len(index):
+            kept = kernels.trim(distance[index], config.keep)
+            share[index] = kept * (0.5 * len(moved) / kept.sum())
+    chosen = np.flatnonzero(share)
+    if len(chosen) < _LEAST_PAIRS:
+        return None
+    q, n = target.points[partner[chosen]], target.normals[partner[chosen]]
+    residual = np.einsum("ij,ij->i", moved[chosen] - q, n)
+    # Cauchy weights: what remains of foliage and changes after trimming must not pull
+    weight = share[chosen] / (1.0 + (residual / config.residual_scale) ** 2)
+    about = transform(T, pivot[None])[0]
+    H, b, _ = kernels.normal_equations(source.points[chosen], q, n, weight, T, about)
+    variance = float((weight * residual**2).sum() / weight.sum()) + 1e-6
+    information, gradient = H / variance, b / variance
+    if prior is not None:
+        # the deviation from the prior's mean, in the same tangent
+        R = T[:3, :3] @ prior.T_map_source[:3, :3].T
+        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        shift = about - transform(prior.T_map_source, pivot[None])[0]
+        scaled = prior.information * config.inflation**2  # H counts correlated points; weigh the prior alike
+        information = information + scaled
+        gradient = gradient + scaled @ np.concatenate([turn, shift])
+    increment = -np.linalg.solve(information + 1e-6 * np.eye(6), gradient)
+    rmse = float(np.sqrt((weight * residual**2).sum() / weight.sum()))
+    return increment, information, rmse, len(chosen)

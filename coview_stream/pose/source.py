@@ -1,0 +1,54 @@
+"""What of the robot's recent points goes into registration and verification."""
+
+from __future__ import annotations
+
+import coview_kernels as kernels
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry import Points
+from coview_stream.pose.registration import Source
+
+_CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
+_CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, not part of it
+_SEED = 20240
+
+
+def local_source(points: Points, position: npt.NDArray[np.float64], config: RegistrationConfig) -> Source:
+    """Thin a local scan to at most ``source_points`` points within ``source_range`` metres of ``position``.
+
+    Args:
+        points: (N, 3) float32 in a gravity-aligned frame, metres.
+        position: (3,) where the sensor is, same frame.
+        config: range, voxel and number of points.
+
+    Returns:
+        The thinned points and, for each, its height above the lowest ground nearby. The choice is random but
+        seeded: equal input gives equal output.
+    """
+    near = points[np.linalg.norm(points - position.astype(np.float32), axis=1) < config.source_range]
+    thin, _ = kernels.transform_unique(near, np.eye(4), config.source_voxel)
+    height = height_above_lowest(thin)
+    if len(thin) > config.source_points:
+        chosen = np.random.default_rng(_SEED).choice(len(thin), config.source_points, replace=False)
+        chosen.sort()
+        thin, height = thin[chosen], height[chosen]
+    return Source(thin, height > _CLEAR, height)
+
+
+def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
+    """Height (N,) of each point above the lowest of its 2 m cell and the eight around it, metres.
+
+    The neighbours matter where a sparse sensor sees only a facade in a cell and no ground.
+    """
+    if not len(points):
+        return np.empty(0, dtype=np.float32)
+    cells = np.floor(points[:, :2] / _CELL).astype(np.int64)
+    cells -= cells.min(axis=0)
+    lowest = np.full(cells.max(axis=0) + 1, np.inf, dtype=np.float32)
+    np.minimum.at(lowest, (cells[:, 0], cells[:, 1]), points[:, 2])
+    around = ndimage.minimum_filter(lowest, size=3, mode="constant", cval=np.inf)
+    height: npt.NDArray[np.float32] = points[:, 2] - around[cells[:, 0], cells[:, 1]]
+    return height

@@ -1,0 +1,189 @@
+"""Global search: from the ring buffer's newest keyframe to verified hypotheses, and when to believe one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.fix import KeyframeEvidence, State
+from coview_stream.geometry import Points, Pose, inverse, rotation_angle, transform
+from coview_stream.place.consensus import Consensus, Hypothesis
+from coview_stream.place.descriptor import describe, ground_below
+from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
+from coview_stream.place.retrieval import Retrieval
+from coview_stream.pose.registration import LocalMaps, Prior, Registration, Source, register
+from coview_stream.pose.source import local_source
+from coview_stream.pose.verification import Evidence, verify
+
+_SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
+_SAME_ANGLE = np.radians(5.0)
+_SUBMAP_KEYFRAMES = 4  # of the newest in the local scan that is registered: more are smeared by drift
+_COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through
+_HOPELESS = 0.5  # after them, what has less than this share of the best score is not refined further
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A registered and verified hypothesis of ``T_map_odom``."""
+
+    hypothesis: Hypothesis
+    registration: Registration
+    evidence: Evidence
+
+    @property
+    def T_map_odom(self) -> Pose:
+        """(4, 4) map <- odometry."""
+        return self.registration.T_map_source
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What one keyframe's search came to: the accepted candidate if any, and why."""
+
+    accepted: Candidate | None
+    evidence: KeyframeEvidence
+
+
+class GlobalSearch:
+    """Votes, registers the best hypotheses, verifies them, and accepts one only when it stands alone."""
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
+        self.base_map = base_map
+        self.config = config
+        self.local_maps = local_maps
+        self.retrieval = Retrieval(base_map, config.retrieval)
+        self.consensus = Consensus(base_map.stations, base_map.config.block, config.consensus)
+        self._favourite: Candidate | None = None
+        self._confirmed = 0
+
+    def clear(self) -> None:
+        """Forget all votes and confirmations."""
+        self.consensus.clear()
+        self._favourite, self._confirmed = None, 0
+
+    def update(self, buffer: KeyframeBuffer, keyframe: Keyframe, cloud: Points) -> Verdict:
+        """Take in one keyframe; ``cloud`` (N, 3) is its newest frame in the body frame."""
+        self._vote(buffer, keyframe)
+        hypotheses = self.consensus.hypotheses()
+        source = local_source(
+            buffer.recent(_SUBMAP_KEYFRAMES), keyframe.position, self.config.registration
+        )
+        candidates = self._refine(hypotheses, source, keyframe, cloud)
+        return self._judge(candidates, keyframe)
+
+    def _vote(self, buffer: KeyframeBuffer, keyframe: Keyframe) -> None:
+        descriptor = self.base_map.descriptor_config
+        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
+        if len(scan) < self.config.keyframe.min_points:
+            return
+        centre = keyframe.position.copy()
+        if descriptor.ground_zero:
+            centre[2] = ground_below(scan, keyframe.position)
+        self.consensus.vote(centre, self.retrieval.distances(describe(scan, centre, descriptor)))
+
+    def _refine(
+        self, hypotheses: list[Hypothesis], source: Source, keyframe: Keyframe, cloud: Points
+    ) -> list[Candidate]:
+        """Verified candidates, best first. All go through the coarse scales, the promising ones through all."""
+        scales = self.config.registration.search
+        coarse = [
+            candidate
+            for hypothesis in hypotheses
+            if (candidate := self._candidate(hypothesis, None, source, keyframe, cloud, scales[:_COARSE_SCALES]))
+        ]
+        best = max((c.evidence.score for c in coarse), default=0.0)
+        fine = [
+            (c.evidence.score >= _HOPELESS * best and scales[_COARSE_SCALES:]
+             and self._candidate(c.hypothesis, c.T_map_odom, source, keyframe, cloud, scales[_COARSE_SCALES:]))
+            or c
+            for c in coarse
+        ]  # fmt: skip
+        return sorted(fine, key=lambda c: -c.evidence.score)
+
+    def _candidate(
+        self,
+        hypothesis: Hypothesis,
+        T_map_odom: Pose | None,
+        source: Source,
+        keyframe: Keyframe,
+        cloud: Points,
+        scales: tuple[float, ...],
+    ) -> Candidate | None:
+        start = hypothesis.T_map_odom if T_map_odom is None else T_map_odom
+        target = self.local_maps.around(transform(start, keyframe.position[None])[0])
+        if target is None:
+            return None
+        upright = Prior(hypothesis.T_map_odom, gravity_information(self.config.registration.gravity_sigma))
+        found = register(
+            source, start, target, self.config.registration, scales, upright, keyframe.position
+        )
+        if found is None or tilt_of(found.T_map_source) > self.config.acceptance.most_tilt:
+            return None
+        T = found.T_map_source
+        surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
+        evidence = verify(source, T, cloud, T @ keyframe.T_odom_body, target, surveyed)
+        return Candidate(hypothesis, found, evidence)
+
+    def _judge(self, candidates: list[Candidate], keyframe: Keyframe) -> Verdict:
+        rule = self.config.acceptance
+        least, most_rival, needed = rule.score, rule.rival, rule.confirmations
+        if self.config.stationary:
+            least, most_rival, needed = rule.single_score, rule.single_rival, 1
+        if not candidates:
+            self._favourite, self._confirmed = None, 0
+            reason = "too few points to search with" if not len(self.consensus) else "no hypothesis fits the map"
+            return Verdict(None, KeyframeEvidence(keyframe.stamp, State.SEARCHING, reason))
+        best = candidates[0]
+        rival = max(
+            (c.evidence.score for c in candidates[1:] if not _same(c.T_map_odom, best.T_map_odom, keyframe)),
+            default=0.0,
+        )
+        score = best.evidence.score
+        state, accepted = State.AMBIGUOUS, None
+        if score < least or best.evidence.inside < rule.inside:
+            state, reason = State.SEARCHING, f"no place fits: best score {score:.2f}, {least:.2f} needed"
+            self._favourite, self._confirmed = None, 0
+        elif rival > most_rival * score:
+            reason = f"two places fit: scores {score:.2f} and {rival:.2f}"
+            self._favourite, self._confirmed = None, 0
+        else:
+            self._confirmed = self._confirmed + 1 if self._agrees(best, keyframe) else 1
+            self._favourite = best
+            reason = f"confirmed by {self._confirmed} of {needed} keyframes"
+            if self._confirmed >= needed:
+                state, accepted = State.TRACKING, best
+        return Verdict(
+            accepted,
+            KeyframeEvidence(
+                keyframe.stamp, state, reason, score, rival, best.evidence, best.hypothesis.station,
+                best.hypothesis.shift,
+            ),
+        )  # fmt: skip
+
+    def _agrees(self, best: Candidate, keyframe: Keyframe) -> bool:
+        rule = self.config.acceptance
+        return self._favourite is not None and _same(
+            best.T_map_odom, self._favourite.T_map_odom, keyframe, rule.agree_distance, rule.agree_angle
+        )
+
+
+def gravity_information(sigma: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Information (6, 6) over (rx, ry, rz, x, y, z) of "both frames are level to ``sigma`` radians"."""
+    return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])
+
+
+def tilt_of(T: Pose) -> float:
+    """Angle between the vertical axes of two frames, radians."""
+    return float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+
+
+def _same(
+    T_a: Pose, T_b: Pose, keyframe: Keyframe, distance: float = _SAME_DISTANCE, angle: float = float(_SAME_ANGLE)
+) -> bool:
+    """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
+    a, b = T_a @ keyframe.T_odom_body, T_b @ keyframe.T_odom_body
+    apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    return apart < distance and rotation_angle(inverse(a) @ b) < angle

@@ -1,0 +1,130 @@
+"""Tracking: keep ``T_map_odom`` right by registering recent points, a Kalman filter with ICP as its measurement."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import coview_kernels as kernels
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry import Points, Pose, inverse, pose_from, transform
+from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
+from coview_stream.pose.source import local_source
+from coview_stream.pose.verification import Evidence, verify
+
+_MOST_FRAMES = 40
+
+
+@dataclass(frozen=True)
+class _Recent:
+    travelled: float
+    points: Points  # (N, 3) odometry frame
+
+
+class Tracker:
+    """Belief over ``T_map_odom``: a mean and a covariance (6, 6) over (rx, ry, rz, x, y, z) about the body.
+
+    Odometry adds random-walk noise with every metre driven; a registration of the last metres' points, with the
+    predicted pose as its prior, takes it away.
+    """
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
+        self.base_map = base_map
+        self.config = config
+        self.local_maps = local_maps
+        self.T_map_odom: Pose = np.eye(4)
+        self.covariance: npt.NDArray[np.float64] = np.eye(6)
+        self._recent: deque[_Recent] = deque(maxlen=_MOST_FRAMES)
+        self._travelled = 0.0
+        self._registered_at = 0.0
+        self._last: Pose | None = None
+
+    def observe(self, cloud: Points, T_odom_body: Pose) -> None:
+        """Remember a frame's points (body frame) and how far odometry has driven."""
+        if self._last is not None:
+            self._travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self._last[:3, 3]))
+        self._last = T_odom_body
+        points, _ = kernels.transform_unique(
+            cloud, T_odom_body, self.config.keyframe.voxel, self.config.keyframe.range_min
+        )
+        self._recent.append(_Recent(self._travelled, points))
+
+    def start(self, registration: Registration) -> None:
+        """Begin with an accepted fix."""
+        self.T_map_odom = registration.T_map_source
+        self.covariance = self._posterior(registration)
+        self._registered_at = self._travelled
+
+    @property
+    def due(self) -> bool:
+        """Whether the robot has driven far enough for another registration."""
+        return self._travelled - self._registered_at >= self.config.tracking.distance
+
+    def update(self, cloud: Points, T_odom_body: Pose) -> Evidence | None:
+        """Register the recent points from the predicted pose; None where the map offers nothing to register to."""
+        position = T_odom_body[:3, 3]
+        target = self.local_maps.around(transform(self.T_map_odom, position[None])[0])
+        covariance = self.predicted_covariance()
+        self._registered_at, self.covariance = self._travelled, covariance
+        if target is None:
+            return None
+        source = local_source(self._window(), position, self.config.registration)
+        if len(source.points) < 100:
+            return None
+        found = register(
+            source, self.T_map_odom, target, self.config.registration, self.config.registration.track,
+            Prior(self.T_map_odom, np.linalg.inv(covariance)), position,
+        )  # fmt: skip
+        T = self.T_map_odom if found is None else found.T_map_source
+        surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
+        evidence = verify(source, T, cloud, T @ T_odom_body, target, surveyed)
+        rule = self.config.acceptance
+        if found is not None and evidence.inside >= rule.inside and evidence.score >= rule.keep_score:
+            self.T_map_odom = found.T_map_source
+            self.covariance = self._posterior(found)
+        return evidence
+
+    def predicted_covariance(self) -> npt.NDArray[np.float64]:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the last registration."""
+        drift = self.config.tracking
+        driven = self._travelled - self._registered_at
+        rates = np.array([drift.tilt_drift, drift.tilt_drift, drift.yaw_drift, *[drift.position_drift] * 3])
+        return self.covariance + np.diag(rates**2 * driven)
+
+    def reported_covariance(self) -> npt.NDArray[np.float64]:
+        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), floors included, map axes."""
+        order = [3, 4, 5, 0, 1, 2]
+        settings = self.config.registration
+        floor = np.array([settings.sigma_floor] * 3 + [settings.sigma_floor_angle] * 3) ** 2
+        return np.asarray(self.predicted_covariance()[np.ix_(order, order)] + np.diag(floor))
+
+    def _posterior(self, registration: Registration) -> npt.NDArray[np.float64]:
+        information = registration.information + 1e-6 * np.eye(6)
+        return np.asarray(np.linalg.inv(information) * self.config.registration.inflation**2)
+
+    def _window(self) -> Points:
+        """Points of the last metres, more if they are too few."""
+        settings = self.config.tracking
+        parts: list[Points] = []
+        count = 0
+        for frame in reversed(self._recent):
+            if count >= settings.min_points and self._travelled - frame.travelled > settings.window:
+                break
+            parts.append(frame.points)
+            count += len(frame.points)
+        return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
+
+
+def relative_to(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:
+    """The same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
+    return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
+
+
+def unanchored(T_map_local: Pose, anchor: npt.NDArray[np.float64], origin: npt.NDArray[np.float64]) -> Pose:
+    """``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
+    shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
+    return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)
