@@ -57,12 +57,11 @@ def grid_layout(
 ) -> Layout:
     """Blocks between crossing streets; the loop goes round some blocks. ``bend`` metres curve the streets."""
     yaw = rng.uniform(0, np.pi / 2)
-    lines = [_street_lines(rng, half, spacing) for _ in range(2)]
-    x0, x1 = _loop_lines(lines[0], size)
-    y0, y1 = _loop_lines(lines[1], size)
+    xs, x0, x1 = _loop_lines(_street_lines(rng, half, spacing), size)
+    ys, y0, y1 = _loop_lines(_street_lines(rng, half, spacing), size)
     across = np.linspace(-1.5 * half, 1.5 * half, 200)
-    straight = [np.column_stack([np.full(200, x), across]) for x in lines[0]]
-    straight += [np.column_stack([across, np.full(200, y)]) for y in lines[1]]
+    straight = [np.column_stack([np.full(200, x), across]) for x in xs]
+    straight += [np.column_stack([across, np.full(200, y)]) for y in ys]
     phase = rng.uniform(0, 2 * np.pi, 2)
     length = rng.uniform(110, 170)
 
@@ -117,11 +116,18 @@ def _street_lines(rng: np.random.Generator, half: float, spacing: tuple[float, f
     return np.asarray(lines - lines[len(lines) // 2] + rng.uniform(-0.5, 0.5) * spacing[0])
 
 
-def _loop_lines(lines: Floats, size: float) -> tuple[float, float]:
-    """Two distinct street lines near a quarter of the map's size on either side of its middle."""
-    low = int(np.argmin(np.abs(lines + 0.24 * size)))
-    high = max(int(np.argmin(np.abs(lines - 0.24 * size))), low + 1)
-    return float(lines[low]), float(lines[high])
+def _loop_lines(lines: Floats, size: float) -> tuple[Floats, float, float]:
+    """Pick the two street lines that bound the loop; return all lines and those two.
+
+    They are the ones next to a quarter of the map's size on either side of its middle, moved where that would
+    lead out of the map; streets that then run too close beside them are left out.
+    """
+    near, far = 0.14 * size, 0.28 * size
+    low = np.clip(lines[np.argmin(np.abs(lines + 0.24 * size))], -far, -near)
+    high = np.clip(lines[np.argmin(np.abs(lines - 0.24 * size))], near, far)
+    apart = 0.5 * float(np.diff(lines).min())
+    clear = (np.abs(lines - low) > apart) & (np.abs(lines - high) > apart)
+    return np.concatenate([lines[clear], [low, high]]), float(low), float(high)
 
 
 def _rounded_rectangle(x0: float, x1: float, y0: float, y1: float, radius: float) -> Floats:

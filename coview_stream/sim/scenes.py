@@ -214,10 +214,10 @@ def _trees(
 
 
 def _street_furniture(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[_Movable, _Movable]:
-    parked = furniture.spots(rng, site.layout, _PARKING, site.layout.half_width - 1.1)
+    parked = furniture.spots(rng, site.layout, _PARKING, site.layout.half_width - 0.6)
     taken = int(spec.cars * len(parked))
     spacing = spec.pole_spacing or 40.0
-    posts = furniture.spots(rng, site.layout, spacing / 2, site.layout.half_width + 0.6)
+    posts = furniture.spots(rng, site.layout, spacing / 2, site.layout.half_width + 1.1)
     used = len(posts) // 2 if spec.pole_spacing else 0
     return _Movable(parked[:taken], parked[taken:] if taken else parked[:0]), _Movable(
         posts[:used], posts[used:]

@@ -76,13 +76,13 @@ def _spinning(elevations: npt.ArrayLike, offsets: Floats, columns: int) -> Calla
 def _vlp16() -> Sensor:
     # laser i of the data sheet: even ones below the horizon, odd ones above, 2 degrees apart
     elevation = np.radians([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
-    firing = -2 * np.pi * np.arange(16) * 2.304e-6 / FRAME_PERIOD
+    firing: Floats = -2 * np.pi * np.arange(16, dtype=np.float64) * 2.304e-6 / FRAME_PERIOD
     return Sensor("vlp16", _spinning(elevation, firing, 1800), 0.5, 100.0)
 
 
 def _os64() -> Sensor:
     elevation = np.radians(np.linspace(22.5, -22.5, 64))
-    staggered = np.radians(np.tile([3.16, 1.05, -1.05, -3.16], 16))
+    staggered: Floats = np.radians(np.tile([3.16, 1.05, -1.05, -3.16], 16))
     return Sensor("os64", _spinning(elevation, staggered, 512), 0.5, 120.0)
 
 

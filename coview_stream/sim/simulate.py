@@ -110,7 +110,8 @@ def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats
     """Stamps (N,), true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4)."""
     truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE))
     odometry = drifting_odometry(truth, config.odometry, _stream(config, _ODOMETRY))
-    return _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth)), truth, odometry
+    stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
+    return stamps, truth, odometry
 
 
 def frames(scene: Scene, config: SimulationConfig, truth: Floats) -> Iterator[Points]:

@@ -26,6 +26,10 @@ def command(monkeypatch):
     return install
 
 
+# pytest's own import roots, for processes that it starts do not inherit them
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
 def _raise(error):
     raise error
 
@@ -83,7 +87,12 @@ def test_a_closed_pipe_is_quiet():
     script = "import sys; from coview_stream import cli; cli._dispatch = print; sys.exit(cli.main(['row']))"
     with os.fdopen(writer) as stdout:
         done = subprocess.run(
-            [sys.executable, "-c", script], stdout=stdout, stderr=subprocess.PIPE, text=True, check=False
+            [sys.executable, "-c", script],
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+            env=ENVIRONMENT,
+            text=True,
+            check=False,
         )
     assert done.returncode == 141
     assert done.stderr == ""
@@ -95,5 +104,6 @@ def test_help_loads_nothing_heavy():
         "heavy = {'open3d', 'taichi', 'quadrants', 'matplotlib', 'zenoh', 'tqdm'};"
         "print('loaded:', *sorted(heavy & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=ENVIRONMENT, text=True)
+    assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "loaded:"

@@ -1,0 +1,118 @@
+"""Pictures: each is a PNG that shows something, also where there is little to show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.errors import InputError
+from coview_stream.report import plots, style
+
+NO_POINTS = np.zeros((0, 3))
+
+
+@pytest.fixture(scope="module")
+def base():
+    """A flat square with one block on it, three points a square metre."""
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-20, 20, (5000, 2)), np.zeros(5000)])
+    points[(np.abs(points[:, :2] - 5) < 4).all(axis=1), 2] = 6.0
+    return points
+
+
+def pixels(path):
+    """The picture as (height, width, RGBA) in 0..1; fails if it is no PNG."""
+    from matplotlib import image
+
+    assert path.read_bytes().startswith(b"\x89PNG")
+    return image.imread(path)
+
+
+def has_colour(picture, name):
+    """Whether a state's colour is anywhere in the picture."""
+    from matplotlib.colors import to_rgb
+
+    return bool((np.abs(picture[:, :, :3] - to_rgb(name)).max(axis=2) < 0.02).any())
+
+
+def test_map_shows_the_base_in_grey_and_the_stations(base, tmp_path):
+    plots.plot_map(base, base[::100], tmp_path / "map.png")
+    picture = pixels(tmp_path / "map.png")
+    assert has_colour(picture, style.STATE_COLOURS["TRACKING"])
+    grey = np.ptp(picture[:, :, :3], axis=2) < 0.01
+    dark = grey & (np.abs(picture[:, :, 0] - 0.38) < 0.02)
+    pale = grey & (np.abs(picture[:, :, 0] - 0.93) < 0.02)
+    assert dark.sum() > 2_000  # the block
+    assert pale.sum() > 10 * dark.sum()  # the ground
+
+
+def test_trajectory_is_coloured_by_state(base, tmp_path):
+    line = np.column_stack([np.linspace(-15, 15, 40), np.zeros(40), np.zeros(40)])
+    states = ["SEARCHING"] * 10 + ["TRACKING"] * 30
+    line[:10] = np.nan
+    plots.plot_trajectory(base, line, states, tmp_path / "t.png", truth=np.nan_to_num(line))
+    picture = pixels(tmp_path / "t.png")
+    assert has_colour(picture, style.STATE_COLOURS["TRACKING"])
+    assert not has_colour(picture, style.STATE_COLOURS["LOST"])
+
+
+def test_a_trajectory_without_poses_says_so(base, tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(plots, "say", lambda axes, text: said.append(text))
+    plots.plot_trajectory(base, np.full((3, 3), np.nan), ["SEARCHING"] * 3, tmp_path / "none.png")
+    plots.plot_trajectory(NO_POINTS, NO_POINTS, [], tmp_path / "empty.png")
+    assert [text.split(":")[0] for text in said] == ["not localised", "not localised"]
+    pixels(tmp_path / "none.png")
+    pixels(tmp_path / "empty.png")
+
+
+def test_states_and_positions_must_fit(base, tmp_path):
+    with pytest.raises(InputError, match="2 states for 3 positions"):
+        plots.plot_trajectory(base, np.zeros((3, 3)), ["LOST"] * 2, tmp_path / "t.png")
+    assert not (tmp_path / "t.png").exists()
+
+
+def test_false_poses_stand_out(tmp_path):
+    distance, e_r = np.arange(50.0), np.full(50, 0.01)
+    e_t = np.full(50, 0.05)
+    plots.plot_errors(distance, e_t, e_r, tmp_path / "right.png")
+    assert not has_colour(pixels(tmp_path / "right.png"), style.STATE_COLOURS["LOST"])
+    e_t[20:25] = 40.0
+    plots.plot_errors(distance, e_t, e_r, tmp_path / "false.png")
+    assert has_colour(pixels(tmp_path / "false.png"), style.STATE_COLOURS["LOST"])
+
+
+def test_errors_of_nothing_say_so(tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr(plots, "say", lambda axes, text: said.append(text))
+    plots.plot_errors(np.zeros(0), np.zeros(0), np.zeros(0), tmp_path / "none.png")
+    assert said == ["no pose to compare"] * 2
+    pixels(tmp_path / "none.png")
+
+
+def test_equal_descriptors_look_equal_after_the_shift(tmp_path):
+    query = np.random.default_rng(3).random((6, 12))
+    query[:, 4] = np.nan
+    plots.plot_descriptor_pair(query, np.roll(query, -3, axis=1), 3, tmp_path / "turned.png")
+    plots.plot_descriptor_pair(query, query, 0, tmp_path / "same.png")
+    turned, same = pixels(tmp_path / "turned.png"), pixels(tmp_path / "same.png")
+    below_titles = turned.shape[0] // 6
+    np.testing.assert_array_equal(turned[below_titles:], same[below_titles:])
+    plots.plot_descriptor_pair(query, query, 3, tmp_path / "wrong.png")
+    assert (pixels(tmp_path / "wrong.png")[below_titles:] != same[below_titles:]).any()
+
+
+def test_descriptors_of_different_shape_are_refused(tmp_path):
+    with pytest.raises(InputError, match="differ"):
+        plots.plot_descriptor_pair(np.zeros((6, 12)), np.zeros((6, 10)), 0, tmp_path / "d.png")
+
+
+def test_far_coordinates_are_shifted_for_the_reader(base):
+    assert not style.base_shift(base).any()
+    shift = style.base_shift(base + np.array([412_345.0, 5_318_765.0, 240.0]))
+    assert shift.tolist() == [412_300.0, 5_318_800.0, 0.0]
+
+
+def test_a_picture_that_cannot_be_written_names_its_file(tmp_path):
+    with pytest.raises(InputError, match=r"missing/map\.png"):
+        plots.plot_map(NO_POINTS, NO_POINTS, tmp_path / "missing" / "map.png")

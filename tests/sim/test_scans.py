@@ -1,0 +1,122 @@
+"""Scans: points lie on surfaces, the aircraft sees roofs, the robot sees facades."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.sim.caster import Caster
+from coview_stream.sim.mesh import EMPTY, Mesh, box, join, placed
+from coview_stream.sim.scenes import Epoch
+from coview_stream.sim.sensors import SENSORS
+
+RNG = np.random.default_rng(0)
+
+
+def distance_to_surfaces(scene, points):
+    """(N,) metres to the nearest triangle of the scene as it is now."""
+    from coview_stream.clouds.open3d_loader import open3d
+
+    o3d = open3d()
+    surfaces = o3d.t.geometry.RaycastingScene(nthreads=1)
+    for mesh in (scene.now.solid, scene.now.foliage):
+        vertices = o3d.core.Tensor(mesh.vertices.astype(np.float32))
+        surfaces.add_triangles(vertices, o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
+    queries = o3d.core.Tensor(points.astype(np.float32))
+    return surfaces.compute_distance(queries, nthreads=1).numpy()
+
+
+def around_buildings(scene, points):
+    """Points within a metre of a footprint, and their height above the building's ground, as one array."""
+    heights = []
+    for f in scene.footprints:
+        c, s = np.cos(f.yaw), np.sin(f.yaw)
+        local = (points[:, :2] - (f.x, f.y)) @ np.array([[c, -s], [s, c]])
+        near = (np.abs(local) < (f.w / 2 + 0.3, f.d / 2 + 0.3)).all(axis=1)
+        heights.append(points[near, 2] - f.ground)
+    return np.concatenate(heights)
+
+
+def test_points_lie_on_surfaces(scene, base, run):
+    for points, noise in ((base, 0.025), (run[1], 0.02)):
+        sample = points[RNG.choice(len(points), 1500, replace=False)]
+        off = distance_to_surfaces(scene, sample)
+        assert np.median(off) < 1.5 * noise
+        assert (off < 5 * noise).mean() > 0.9  # the rest lies in foliage
+
+
+def test_the_base_map_covers_its_square_at_the_asked_density(base):
+    assert np.abs(base[:, :2]).max() < 60.0
+    assert len(base) / 120.0**2 == pytest.approx(6.0, rel=0.15)
+    filled, _, _ = np.histogram2d(base[:, 0], base[:, 1], bins=24, range=[[-60, 60], [-60, 60]])
+    assert (filled > 0).mean() > 0.99
+
+
+def test_the_aircraft_sees_roofs_and_the_robot_facades(scene, base, run):
+    airborne, ground = around_buildings(scene, base), around_buildings(scene, run[1])
+    assert len(airborne) > 500
+    assert len(ground) > 500
+    walls = lambda heights: np.mean((heights > 0.7) & (heights < 2.2))  # noqa: E731
+    assert walls(ground) > 3 * walls(airborne)
+    assert np.median(airborne) > 2.0
+
+
+def test_the_robot_stands_on_the_road(scene, run):
+    truth, _ = run
+    position = truth[:, :3, 3]
+    assert scene.site.road_distance(*position.T[:2]).max() < 1.0
+    assert position[:, 2] - scene.site.z(*position.T[:2]) == pytest.approx(1.5)
+    heading, step = truth[:-1, :3, 0], np.diff(position, axis=0)
+    assert np.einsum("ij,ij->i", heading, step / np.linalg.norm(step, axis=1)[:, None]).min() > 0.98
+
+
+@pytest.mark.parametrize("name", sorted(SENSORS))
+def test_beams_are_unit_vectors_and_repeat_only_where_they_should(name):
+    sensor = SENSORS[name]()
+    first, second = sensor.beams(0), sensor.beams(1)
+    assert np.linalg.norm(first, axis=1) == pytest.approx(1.0)
+    assert np.array_equal(first, second) is (name != "mid360")
+    elevation = np.degrees(np.arcsin(first[:, 2]))
+    low, high = {"vlp16": (-15, 15), "os64": (-22.5, 22.5), "mid360": (-7, 52)}[name]
+    assert elevation.min() == pytest.approx(low, abs=0.1)
+    assert elevation.max() == pytest.approx(high, abs=0.1)
+    rows = {"vlp16": 16, "os64": 64}.get(name)
+    assert rows is None or len(np.unique(elevation.round(6))) == rows
+
+
+def cast_down(epoch, porosity, count=4000):
+    rays = np.tile(np.array([[0, 0, -1]], np.float32), (count, 1))
+    origins = np.column_stack([RNG.uniform(-3, 3, (count, 2)), np.full(count, 20.0)]).astype(np.float32)
+    return Caster(epoch).cast(origins, rays, np.random.default_rng(1), porosity)
+
+
+def test_foliage_lets_its_share_of_rays_pass():
+    ground, leaves = box(20, 20, 1), placed(box(10, 10, 1), 0, 0, 8.0)
+    upper = cast_down(Epoch(ground, leaves), 0.5).distance < 13
+    assert upper.mean() == pytest.approx(0.75, abs=0.03)  # two surfaces, each stops half of what comes
+    assert (cast_down(Epoch(ground, leaves), 0.0).distance < 13).all()
+    solid = cast_down(Epoch(join([ground, leaves]), EMPTY), 0.5)
+    np.testing.assert_allclose(solid.distance, 11.0, atol=1e-4)
+    np.testing.assert_allclose(solid.incidence, 1.0, atol=1e-4)
+
+
+def test_rays_into_the_sky_meet_nothing():
+    hits = Caster(Epoch(box(2, 2, 1), EMPTY)).cast(
+        np.array([[0, 0, 5]], np.float32), np.array([[0, 0, 1]], np.float32), RNG, 0.0
+    )
+    assert np.isinf(hits.distance).all()
+
+
+def test_a_far_and_grazed_wall_returns_less():
+    corners = np.array([[10.0, -500, -50], [10, 500, -50], [10, 500, 50], [10, -500, 50]])
+    wall = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    sensor = SENSORS["vlp16"]()
+    points = sensor.scan(Caster(Epoch(wall, EMPTY)), np.eye(4), 0, np.random.default_rng(0))
+    assert np.abs(points[:, 0] - 10.0).max() < 0.15
+    returned = np.linalg.norm(points, axis=1)
+    ahead = sensor.beams(0)[:, 0]
+    expected = 10.0 / ahead[ahead > 0.05]
+    assert returned.max() <= sensor.max_range + 0.2
+    assert (returned < 30).sum() == pytest.approx(0.99 * (expected < 30).sum(), rel=0.02)
+    far, grazed = (returned > 70).sum(), ((expected > 70) & (expected < 100)).sum()
+    assert 0.2 * grazed < far < 0.8 * grazed

@@ -1,0 +1,75 @@
+"""Scenes: free roads, things on the ground, and changes that leave the map alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.errors import ConfigError
+from coview_stream.sim.kinds import KINDS
+from coview_stream.sim.layout import arc_lengths
+from coview_stream.sim.scenes import build_scene
+
+
+@pytest.fixture(scope="module", params=sorted(KINDS))
+def any_scene(request):
+    return build_scene(request.param, 3, 140.0)
+
+
+def test_the_route_is_a_smooth_loop_inside_the_map(any_scene):
+    route = any_scene.route
+    assert np.abs(route).max() < any_scene.size / 2
+    assert np.hypot(*(route[0] - route[-1])) < 0.5
+    assert arc_lengths(route)[-1] > 100.0
+    assert np.hypot(*np.diff(route, axis=0).T).max() < 0.6
+
+
+def test_buildings_stand_beside_the_roads_and_not_in_each_other(any_scene):
+    places = np.array([[f.x, f.y] for f in any_scene.footprints])
+    assert len(places) >= 2
+    road = any_scene.site.road_distance(*places.T)
+    halves = np.array([min(f.w, f.d) / 2 for f in any_scene.footprints])
+    assert (road > any_scene.site.layout.half_width + halves - 0.75).all()
+    gaps = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)) + 1e3 * np.eye(len(places))
+    assert (gaps.min(axis=1) > halves).all()
+
+
+def test_nothing_solid_blocks_the_robot(any_scene):
+    vertices = any_scene.mapped.solid.vertices
+    x, y, z = vertices.T
+    lift = z - any_scene.site.z(x, y)
+    in_the_way = vertices[(lift > 0.3) & (lift < 1.8)]
+    steps = any_scene.route[::8]
+    nearest = min(np.hypot(*(in_the_way[:, :2] - step).T).min() for step in steps)
+    assert nearest > 0.9
+
+
+def test_triangles_are_valid(any_scene):
+    for mesh in (*any_scene.mapped.__dict__.values(), *any_scene.now.__dict__.values()):
+        assert np.isfinite(mesh.vertices).all()
+        assert mesh.triangles.min() >= 0
+        assert mesh.triangles.max() < len(mesh.vertices)
+
+
+def test_a_change_leaves_the_map_and_moves_the_share():
+    before, after = build_scene("village", 3, 140.0), build_scene("village", 3, 140.0, changed=0.3)
+    for name in ("solid", "foliage"):
+        np.testing.assert_array_equal(
+            getattr(before.mapped, name).vertices, getattr(after.mapped, name).vertices
+        )
+    old = {tuple(v) for v in np.round(after.mapped.foliage.vertices, 6)}
+    new = {tuple(v) for v in np.round(after.now.foliage.vertices, 6)}
+    kept = len(old & new) / len(old)
+    assert 0.55 < kept < 0.95  # bushes stay, 30 % of the trees do not
+    assert len(new - old) > 0.1 * len(old)
+    assert before.now is before.mapped
+
+
+def test_seeds_and_kinds_give_other_scenes():
+    a, b = build_scene("town", 1, 100.0), build_scene("town", 2, 100.0)
+    assert [f.x for f in a.footprints] != [f.x for f in b.footprints]
+
+
+def test_an_unknown_kind_names_the_known_ones():
+    with pytest.raises(ConfigError, match=r"'moon'.*town"):
+        build_scene("moon", 1)

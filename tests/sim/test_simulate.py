@@ -1,0 +1,141 @@
+"""Worlds on disk: the layout of the contract, equal seeds equal bytes, all or nothing."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coview_stream.cli import main
+from coview_stream.clouds import open_run, read_cloud, read_tum
+from coview_stream.errors import ConfigError, InputError
+from coview_stream.sim import SimulationConfig, simulate
+from coview_stream.sim import simulate as package_level
+from coview_stream.sim.simulate import Simulated
+
+TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
+ORIGIN = (412_000.0, 5_318_000.0, 240.0)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    out = tmp_path_factory.mktemp("worlds") / "a"
+    simulate(out, TINY)
+    return out
+
+
+def test_the_layout_of_the_contract(world):
+    facts = json.loads((world / "world.json").read_text())
+    stamps, truth = read_tum(world / "truth.tum")
+    odometry_stamps, _ = read_tum(world / "run" / "odometry.tum")
+    assert len(stamps) == facts["frames"] == len(list((world / "run" / "frames").iterdir()))
+    np.testing.assert_array_equal(stamps, odometry_stamps)
+    np.testing.assert_allclose(np.diff(stamps), 0.1)
+    assert len(read_cloud(world / "base.laz")) == facts["base_points"] > 5_000
+    first = next(iter(open_run(world / "run")))
+    assert len(first.cloud if hasattr(first, "cloud") else first.points) > 5_000
+    assert truth[0, 2, 2] > 0.98
+
+
+def test_equal_seeds_give_equal_bytes(world, tmp_path):
+    simulate(tmp_path / "b", TINY)
+    names = sorted(path.relative_to(world) for path in world.rglob("*") if path.is_file())
+    assert names == sorted(p.relative_to(tmp_path / "b") for p in (tmp_path / "b").rglob("*") if p.is_file())
+    for name in names:
+        ours, theirs = world / name, tmp_path / "b" / name
+        if name.suffix == ".laz":  # its header holds the date of the day
+            np.testing.assert_array_equal(read_cloud(ours).map_points(), read_cloud(theirs).map_points())
+        else:
+            assert ours.read_bytes() == theirs.read_bytes(), name
+
+
+def test_another_seed_gives_another_world(world, tmp_path):
+    from dataclasses import replace
+
+    simulate(tmp_path / "c", replace(TINY, seed=6))
+    assert (tmp_path / "c" / "truth.tum").read_bytes() != (world / "truth.tum").read_bytes()
+
+
+def test_an_origin_moves_map_and_truth_and_nothing_else(world, tmp_path, capsys):
+    argv = ["simulate", str(tmp_path / "u"), "--scene", "village", "--seed", "5", "--size", "80"]
+    assert main([*argv, "--length", "0.5", "--density", "2", "--utm"]) == 0
+    assert "map points, 4 frames" in capsys.readouterr().out
+    moved, here = read_cloud(tmp_path / "u" / "base.laz"), read_cloud(world / "base.laz")
+    np.testing.assert_allclose(moved.map_points() - ORIGIN, here.map_points(), atol=2e-3)
+    T_moved, T_here = read_tum(tmp_path / "u" / "truth.tum")[1], read_tum(world / "truth.tum")[1]
+    np.testing.assert_allclose(T_moved[:, :3, 3] - ORIGIN, T_here[:, :3, 3], atol=1e-5)
+    for name in ("run/odometry.tum", "run/frames/000000.pcd"):
+        assert (tmp_path / "u" / name).read_bytes() == (world / name).read_bytes()
+
+
+def test_nothing_of_the_users_is_overwritten(tmp_path):
+    (tmp_path / "thesis.txt").write_text("all of it")
+    with pytest.raises(InputError, match="not empty"):
+        simulate(tmp_path, TINY, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
+    import sys
+
+    module = sys.modules["coview_stream.sim.simulate"]
+
+    def broken(*_):
+        raise InputError("broken")
+
+    monkeypatch.setattr(module, "trajectories", broken)
+    monkeypatch.setattr(module, "base_map", lambda *_: np.zeros((5, 3)))
+    with pytest.raises(InputError, match="broken"):
+        simulate(tmp_path / "w", TINY)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_an_earlier_world_is_replaced(world, tmp_path, monkeypatch):
+    import shutil
+
+    copy = tmp_path / "w"
+    shutil.copytree(world, copy)
+    with pytest.raises(InputError, match="--overwrite"):
+        simulate(copy, TINY)
+    (copy / "run" / "frames" / "999999.pcd").write_bytes(b"left over")
+    assert isinstance(package_level(copy, TINY, overwrite=True), Simulated)
+    assert not (copy / "run" / "frames" / "999999.pcd").exists()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("scene", "moon"),
+        ("sensor", "radar"),
+        ("seed", -1),
+        ("size", 10.0),
+        ("length", -1.0),
+        ("density", 0.0),
+        ("changed", 1.5),
+        ("speed", 0.0),
+        ("height", float("nan")),
+        ("origin", (1.0, 2.0)),
+    ],
+)
+def test_the_configuration_is_checked(field, value):
+    with pytest.raises(ConfigError, match=field):
+        SimulationConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--scene", "moon"],
+        ["--size", "5"],
+        ["--utm", "--origin", "1", "2", "3"],
+        ["--drift", "-1"],
+        ["--seed", "x"],
+    ],
+)
+def test_bad_options_are_one_line_and_write_nothing(options, tmp_path, capsys):
+    assert main(["simulate", str(tmp_path / "w"), *options]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("coview-stream: error: ")
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
