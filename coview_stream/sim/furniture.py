@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from coview_stream.sim.layout import Layout, directions
 from coview_stream.sim.mesh import Floats, Mesh, box, cylinder, frustum, join, placed
 from coview_stream.sim.site import Site
 
+_LORRIES = 0.95  # from this kind on
+_LANE = 2.2  # metres from the middle of the robot's lane to the middle of a vehicle
 SPOT_COLUMNS = ("x", "y", "yaw", "kind")
 
 
@@ -31,8 +34,18 @@ def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: floa
             rows.append(np.column_stack([xy, yaw, rng.random(len(k))]))
     found = np.concatenate(rows)
     clear = tree.query(found[:, :2])[0] > 0.8 * offset
-    route_clear = cKDTree(layout.route).query(found[:, :2])[0] > 0.9 * offset
-    return np.asarray(rng.permutation(found[clear & route_clear]))
+    return np.asarray(rng.permutation(found[clear & _leaves_lane(found, layout.route)]))
+
+
+def _leaves_lane(rows: Floats, route: Floats) -> npt.NDArray[np.bool_]:
+    """(N,) whether a vehicle parked there leaves the robot's lane free, its two ends included."""
+    tree = cKDTree(route)
+    reach = np.where(rows[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
+    along = reach * np.column_stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])])
+    ends = np.stack(
+        [rows[:, :2] - along, rows[:, :2] - along / 2, rows[:, :2] + along / 2, rows[:, :2] + along]
+    )
+    return np.asarray((tree.query(ends)[0] > _LANE).all(axis=0))
 
 
 def cars(rows: Floats, site: Site) -> Mesh:
@@ -55,7 +68,7 @@ def _vehicle(kind: float) -> Mesh:
         body = placed(box(4.3 * scale, 1.75, 0.65), 0, 0, 0.25)
         cabin = placed(frustum(2.5 * scale, 1.65, 0.6, 1.6 * scale, 1.4), -0.2, 0, 0.9)
         return join([body, cabin])
-    if kind < 0.95:
+    if kind < _LORRIES:
         return join(
             [placed(box(4.9, 1.9, 1.9), -0.3, 0, 0.25), placed(frustum(0.9, 1.8, 0.9, 0.5, 1.7), 2.5, 0, 0.3)]
         )
