@@ -7,12 +7,12 @@ can be called from any thread. Importing this package does not import Taichi; th
 
 from __future__ import annotations
 
+from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview, visible
 from coview_kernels.polar import polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit, warm_up
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
 from coview_kernels.trimmed_icp import normal_equations, trim
-from coview_kernels.arrays import PolarGrid
 from coview_kernels.voxel import transform_unique
 
 __all__ = [

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference
+from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, I32, Mask, Mode, Vertical
 
 _MODES = ("paper", "eye", "off")
@@ -40,7 +40,17 @@ def visible(max_height: npt.ArrayLike, count: npt.ArrayLike, mode: Mode, eye: fl
     """
     height, points = _grids(max_height, count)
     _check_mode(mode, eye)
-    return reference.visible(height, points, mode, eye)
+    if mode == "off":
+        return reference.visible(height, points, mode, eye)
+    return runtime.dispatch(_visible, reference.visible, height, points, mode, eye)
+
+
+def _visible(max_height: F32, count: I32, mode: Mode, eye: float) -> Mask:
+    seen = np.empty(max_height.shape, dtype=np.bool_)
+    runtime.kernels("covisibility").visible(
+        _flat(max_height), _flat(count), *_slope(mode, eye), _flat(seen.view(np.uint8))
+    )
+    return seen
 
 
 def coview(
@@ -79,7 +89,26 @@ def coview(
     check.same_shape("sum_height", total, "max_height", height.shape)
     check.one_of("vertical", vertical, _VERTICALS)
     _check_mode(mode, eye)
-    return reference.coview(height, total, points, vertical, mode, eye)
+    return runtime.dispatch(_coview, reference.coview, height, total, points, vertical, mode, eye)
+
+
+def _coview(max_height: F32, sum_height: F32, count: I32, vertical: Vertical, mode: Mode, eye: float) -> F32:
+    value = np.empty_like(max_height)
+    runtime.kernels("covisibility").coview(
+        *(_flat(max_height), _flat(sum_height), _flat(count)),
+        *(("off", "max", "mean").index(vertical), int(mode != "off"), *_slope(mode, eye), _flat(value)),
+    )
+    return value
+
+
+def _flat(grids: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """View of the grids as (M, R, S)."""
+    return grids.reshape(math.prod(grids.shape[:-2]), *grids.shape[-2:])
+
+
+def _slope(mode: Mode, eye: float) -> tuple[int, float]:
+    """Factor of the ring number and height of the eye; see the comment in the reference."""
+    return (2, float(np.float32(eye))) if mode == "eye" else (1, 0.0)
 
 
 def _grids(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:

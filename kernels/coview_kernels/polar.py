@@ -7,8 +7,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference
-from coview_kernels.arrays import PolarGrid
+from coview_kernels import check, reference, runtime
+from coview_kernels.arrays import F32, F64, I32, PolarGrid
+from coview_kernels.reference.polar import cell_table
+from coview_kernels.sectors import ring_edges2, sector_edges, sector_guesses
+
+_MAX_SECTORS = 3000  # beyond, a guess from the table may be off by more than one sector
 
 
 def polar_bin(
@@ -38,7 +42,34 @@ def polar_bin(
     cloud = check.float32("points", points, None, 3)
     origin = check.finite64("centre", centre, 3)
     check.grid_size(rings, sectors, r_max)
-    return reference.polar_bin(cloud, origin, rings, sectors, r_max)
+    native = _polar_bin if sectors <= _MAX_SECTORS else reference.polar_bin
+    return runtime.dispatch(native, reference.polar_bin, cloud, origin, rings, sectors, float(r_max))
+
+
+def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
+    chunks = runtime.workers()
+    size = (chunks, rings * sectors)
+    highest, total = np.empty(size, np.float32), np.zeros(size)
+    count, dropped = np.zeros(size, np.int32), np.zeros(chunks, np.int32)
+    runtime.kernels("polar").polar_bin(
+        points,
+        *centre.tolist(),
+        ring_edges2(rings, r_max),
+        sector_edges(sectors),
+        sector_guesses(sectors),
+        rings / r_max,
+        highest,
+        total,
+        count,
+        dropped,
+    )
+    number = count.sum(axis=0, dtype=np.int32)
+    top = np.where(number > 0, highest.max(axis=0), np.float32(0))
+    shape = (rings, sectors)
+    grid = PolarGrid(
+        top.reshape(shape), total.sum(axis=0).astype(np.float32).reshape(shape), number.reshape(shape)
+    )
+    return grid, int(dropped.sum())
 
 
 def station_bins(
@@ -89,4 +120,41 @@ def station_bins(
         raise ValueError(f"cell must be finite and positive, got {cell}")
     if np.any((row < 0) | (row >= top.shape[0]) | (col < 0) | (col >= top.shape[1])):
         raise ValueError(f"rows and cols must lie inside the raster of {top.shape[0]} x {top.shape[1]} cells")
-    return reference.station_bins(top, count, total, cell, row, col, base, rings, sectors, r_max)
+    return runtime.dispatch(
+        _station_bins,
+        reference.station_bins,
+        *(top, count, total, float(cell), row, col, base, rings, sectors, float(r_max)),
+    )
+
+
+def _station_bins(
+    raster_max: F32,
+    raster_count: I32,
+    raster_sum: F32,
+    cell: float,
+    rows: I32,
+    cols: I32,
+    ground: F32,
+    rings: int,
+    sectors: int,
+    r_max: float,
+) -> PolarGrid:
+    d_row, d_col, bins = cell_table(cell, rings, sectors, r_max)
+    starts = np.searchsorted(bins, np.arange(rings * sectors + 1)).astype(np.int32)
+    reach = math.ceil(r_max / cell)
+    # a border as wide as the radius makes every neighbour a plain offset, without bounds checks
+    empty = raster_count <= 0
+    lowest = np.finfo(np.float32).min
+    top = np.pad(np.where(empty, lowest, raster_max), reach, constant_values=lowest)
+    points = np.pad(np.where(empty, 0, raster_count).astype(np.int32), reach)
+    heights = np.pad(np.where(empty, 0, raster_sum).astype(np.float32), reach)
+    width = top.shape[1]
+    base = (rows.astype(np.int64) + reach) * width + cols + reach
+    size = (len(rows), rings * sectors)
+    grid = PolarGrid(np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.int32))
+    runtime.kernels("polar").station_bins(
+        *(top.ravel(), points.ravel(), heights.ravel(), base.astype(np.int32), ground),
+        *(starts, (d_row * width + d_col).astype(np.int32), *grid),
+    )
+    shape = (len(rows), rings, sectors)
+    return PolarGrid(grid[0].reshape(shape), grid[1].reshape(shape), grid[2].reshape(shape))

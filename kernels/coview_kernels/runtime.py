@@ -1,27 +1,284 @@
-"""Where kernels run. For now in NumPy, on the calling thread."""
+"""The one place that imports Taichi (or quadrants, its maintained fork with the same interface).
+
+Taichi is started at the first kernel, not at import, and belongs to one thread: a program must be initialised
+and first launched on the same thread, and concurrent launches fail now and then. So one daemon thread owns it
+and takes its work from a queue; callers, on any thread, wait for their result.
+
+* ``COVIEW_KERNELS`` = ``taichi``, ``quadrants`` or ``numpy`` forces a backend; unset, the first usable one
+  serves.
+* A host program that has initialised Taichi itself keeps it: a second ``init`` would destroy its fields, and
+  its program accepts no other thread. We then take quadrants, if that is installed, or NumPy. The same if the
+  host initialises Taichi after us; it must not do so while one of our kernels runs.
+* A forked child inherits Taichi's state without its threads and would hang, so it computes in NumPy.
+* :func:`shutdown` ends the thread and frees Taichi; the next kernel starts both again. It runs at exit by
+  itself.
+"""
 
 from __future__ import annotations
 
+import atexit
+import importlib
+import importlib.util
+import os
+import queue
+import sys
+import threading
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from types import ModuleType
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+_BACKENDS = ("taichi", "quadrants", "numpy")
+_MAX_WORKERS = 16  # the kernels are bound by memory; more threads only add private bins to merge
 
-def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """Run ``fn(*args, **kwargs)`` where kernels may be launched and return its result; from any thread."""
-    return fn(*args, **kwargs)
+
+class _DisplacedError(Exception):
+    """The host has replaced our Taichi program."""
+
+
+class _Job:
+    """A call on its way through the queue."""
+
+    __slots__ = ("call", "done", "error", "result")
+
+    def __init__(self, call: Callable[[], Any]) -> None:
+        self.call = call
+        self.done = threading.Lock()  # a bare lock wakes the caller faster than an Event
+        self.done.acquire()
+        self.result: Any = None
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        try:
+            self.result = self.call()
+        except BaseException as error:
+            self.error = error
+        self.done.release()
+
+    def wait(self) -> Any:
+        self.done.acquire()
+        if self.error is not None:
+            raise self.error
+        return self.result
+
+
+class _Owner:
+    """The thread that initialises Taichi and launches every kernel."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.library: Any = None
+        self._program: Any = None
+        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._loop, name="coview-kernels", daemon=True)
+        self._thread.start()
+
+    def _loop(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job.run()
+
+    def start(self) -> None:
+        """Import and initialise the library on the owner thread."""
+        self.call(self._start)
+
+    def _start(self) -> None:
+        self.library = _import(self.name)
+        _forget_kernels(self.library)
+        _init(self.library)
+        self._program = _program(self.library)
+
+    def displaced(self) -> bool:
+        return _program(self.library) is not self._program
+
+    def is_current(self) -> bool:
+        return threading.current_thread() is self._thread
+
+    def call(self, fn: Callable[[], R]) -> R:
+        if self.is_current():
+            return fn()
+        job = _Job(fn)
+        self._jobs.put(job)
+        result: R = job.wait()
+        return result
+
+    def stop(self) -> None:
+        if not self.displaced():
+            self.call(self.library.reset)
+        self._jobs.put(None)
+        self._thread.join(timeout=5.0)
+
+
+_lock = threading.RLock()
+_owner: _Owner | None = None
+_backend: str | None = None
+
+
+def _import(name: str) -> ModuleType:
+    # the import prints a banner otherwise; a user's own setting stays
+    os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
+    return importlib.import_module(name)
+
+
+def _program(library: Any) -> Any:
+    """Return the initialised program of the library, or None."""
+    state = vars(library.lang.impl.get_runtime())
+    return state["_prog"] if "_prog" in state else state["prog"]  # quadrants, taichi
+
+
+def _init(library: Any) -> None:
+    # init prints a line, whatever its log level. A name in its module hides the builtin there, and only
+    # there: redirecting sys.stdout would swallow what other threads print meanwhile.
+    misc = library.lang.misc
+    misc.print = lambda *args, **kwargs: None
+    try:
+        library.init(
+            arch=library.cpu,
+            cpu_max_num_threads=workers(),
+            fast_math=False,  # the twins agree to the bit on edges; measured to cost nothing here
+            log_level="error",
+        )
+    finally:
+        del misc.print
+
+
+def workers() -> int:
+    """Threads that a kernel spreads over."""
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(_MAX_WORKERS, own)
+
+
+def library() -> Any:
+    """Return the initialised Taichi module, for the modules of kernels to build on."""
+    if _owner is None:
+        raise RuntimeError("kernel modules are imported by runtime.kernels, on the owner thread")
+    return _owner.library
+
+
+def kernels(name: str) -> Any:
+    """Return the module ``_ti_<name>``, imported at first use; call on the owner thread."""
+    return importlib.import_module(f"coview_kernels._ti_{name}")
+
+
+def _forget_kernels(library: Any) -> None:
+    """Drop kernel modules that are bound to another library than ``library``."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith("coview_kernels._ti_") and vars(module).get("ti") is not library:
+            del sys.modules[name]
+
+
+def _usable(name: str) -> bool:
+    """Whether the library can be imported and has no program of the host's."""
+    if importlib.util.find_spec(name) is None:
+        return False
+    try:
+        return _program(_import(name)) is None
+    except (ImportError, OSError):  # a wheel for another system: the NumPy twins serve
+        return False
+
+
+def _choose() -> str:
+    forced = os.environ.get("COVIEW_KERNELS", "")
+    if not forced:
+        return next((name for name in _BACKENDS[:-1] if _usable(name)), "numpy")
+    if forced not in _BACKENDS:
+        raise ValueError(f"COVIEW_KERNELS is {forced!r}; set it to {', '.join(_BACKENDS)}, or unset it")
+    if forced != "numpy" and not _usable(forced):
+        raise ImportError(f"COVIEW_KERNELS={forced}, but it is missing or in use by the host; unset it")
+    return forced
 
 
 def backend() -> str:
-    """Which implementation runs: ``taichi``, ``quadrants`` or ``numpy``."""
-    return "numpy"
+    """Which implementation runs: ``taichi``, ``quadrants`` or ``numpy``. Starts it, if need be.
+
+    Raises:
+        ValueError: ``COVIEW_KERNELS`` names no backend.
+        ImportError: ``COVIEW_KERNELS`` names a backend that is missing, or that the host program uses.
+    """
+    global _owner, _backend
+    if _backend is not None:
+        return _backend
+    with _lock:
+        if _backend is None:
+            name = _choose()
+            if name != "numpy":
+                owner = _Owner(name)
+                owner.start()
+                _owner = owner
+                # registered after the import of Taichi, so that it runs before Taichi's own exit handler
+                atexit.unregister(shutdown)
+                atexit.register(shutdown)
+            _backend = name
+    return _backend
+
+
+def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """Run ``fn(*args, **kwargs)`` on the thread that may launch kernels; return or raise what it does.
+
+    Callable from any thread, the owner included. With the NumPy backend there is no such thread and ``fn``
+    runs on the caller's.
+    """
+    backend()
+    owner = _owner
+    if owner is None:
+        return fn(*args, **kwargs)
+    return owner.call(lambda: fn(*args, **kwargs))
+
+
+def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """``native`` on the owner thread where Taichi runs, else its twin ``plain`` on the caller's thread."""
+    global _owner, _backend
+    if backend() == "numpy":
+        return plain(*args, **kwargs)
+
+    def launch(*args: P.args, **kwargs: P.kwargs) -> R:
+        if _owner is None or _owner.displaced():
+            raise _DisplacedError
+        return native(*args, **kwargs)
+
+    try:
+        return submit(launch, *args, **kwargs)
+    except _DisplacedError:
+        with _lock:
+            _owner, _backend = None, "numpy"
+        return plain(*args, **kwargs)
 
 
 def warm_up() -> None:
     """Start the backend and compile every kernel now rather than at first use."""
+    if backend() == "numpy":
+        return
+    import coview_kernels as api
+
+    cloud = np.ones((2, 3), dtype=np.float32)
+    eye, origin = np.eye(4), np.zeros(3)
+    api.transform_unique(cloud, eye, 1.0)
+    grid, _ = api.polar_bin(cloud, origin, 2, 4, 8.0)
+    one = np.zeros(1, dtype=np.int32)
+    api.station_bins(np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, one, one, one, 2, 4, 2.0)
+    api.visible(grid.max_height, grid.count, "paper")
+    api.coview(*grid)
+    for normals in (None, cloud):
+        api.normal_equations(cloud, cloud, normals, np.ones(2), eye, origin)
 
 
 def shutdown() -> None:
-    """Stop the owner thread; the next call starts it again."""
+    """Finish the queued kernels, free Taichi and end its thread. Idempotent; the next kernel starts anew."""
+    global _owner, _backend
+    with _lock:
+        owner, _owner, _backend = _owner, None, None
+    if owner is not None:
+        owner.stop()
+
+
+def _after_fork() -> None:
+    global _lock, _owner, _backend
+    _lock = threading.RLock()  # whoever held it does not exist here
+    _owner, _backend = None, "numpy"
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

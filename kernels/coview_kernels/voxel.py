@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference
-from coview_kernels.arrays import F32
+from coview_kernels import check, reference, runtime
+from coview_kernels.arrays import F32, F64
+
+_HUGE = 1e300  # stands for no limit: a compiler may assume that there is no infinity
 
 
 def transform_unique(
@@ -40,4 +43,30 @@ def transform_unique(
         raise ValueError(f"r_min and r_max must not be negative, got {r_min} and {r_max}")
     if not math.isfinite(voxel):
         raise ValueError(f"voxel must be finite, got {voxel}")
-    return reference.transform_unique(cloud, pose, voxel, r_min, r_max)
+    return runtime.dispatch(
+        _transform_unique, reference.transform_unique, cloud, pose, float(voxel), float(r_min), float(r_max)
+    )
+
+
+def _transform_unique(points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int]:
+    moved = np.empty_like(points)
+    key = np.empty(len(points), dtype=np.int64)
+    bits = max(4, (2 * len(points)).bit_length())  # a power of two, between a quarter and half full
+    table = np.zeros(1 << bits if voxel > 0 else 1, dtype=np.int64)
+    totals = np.zeros(3, dtype=np.int32)
+    runtime.kernels("voxel").transform_unique(
+        points,
+        T,
+        1.0 / voxel if voxel > 0 else 0.0,
+        min(r_min * r_min, _HUGE),
+        min(r_max * r_max, _HUGE),
+        moved,
+        key,
+        table,
+        64 - bits,
+        totals,
+    )
+    kept, dropped, out_of_reach = (int(n) for n in totals)
+    if out_of_reach:  # more than a million voxels from the origin
+        return reference.transform_unique(points, T, voxel, r_min, r_max)
+    return moved[:kept].copy(), dropped

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from coview_kernels.sectors import polar_index
 from coview_kernels.arrays import F32, F64, I32, I64, PolarGrid
+from coview_kernels.sectors import polar_index
 
 
 def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
