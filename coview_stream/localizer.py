@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import LocalizerConfig
+from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.fix import Fix, KeyframeEvidence, State
 from coview_stream.geometry import Points, Pose, is_pose, orthonormal, pose_from
+from coview_stream.place.descriptor import Descriptor
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch
@@ -42,6 +43,11 @@ class Localizer:
         self._anchor: npt.NDArray[np.float64] | None = None
         self._evidence: KeyframeEvidence | None = None
         self._doubts = 0
+
+    @property
+    def last_query(self) -> dict[Channel, Descriptor]:
+        """Descriptors (R, S) of the newest keyframe that searched, by channel; empty before the first."""
+        return self._search.last_query
 
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
         """Take in one frame and say where the robot is.

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import LocalizerConfig
+from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.fix import KeyframeEvidence, State
 from coview_stream.geometry import Points, Pose, inverse, rotation_angle, transform
 from coview_stream.place.consensus import Consensus, Hypothesis
-from coview_stream.place.descriptor import describe, ground_below
+from coview_stream.place.descriptor import Descriptor, describe, ground_below
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.place.retrieval import Retrieval
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, Source, register
@@ -56,6 +56,7 @@ class GlobalSearch:
         self.local_maps = local_maps
         self.retrieval = Retrieval(base_map, config.retrieval)
         self.consensus = Consensus(base_map.stations, base_map.config.block, config.consensus)
+        self.last_query: dict[Channel, Descriptor] = {}
         self._favourite: Candidate | None = None
         self._confirmed = 0
 
@@ -82,7 +83,8 @@ class GlobalSearch:
         centre = keyframe.position.copy()
         if descriptor.ground_zero:
             centre[2] = ground_below(scan, keyframe.position)
-        self.consensus.vote(centre, self.retrieval.distances(describe(scan, centre, descriptor)))
+        self.last_query = describe(scan, centre, descriptor)
+        self.consensus.vote(centre, self.retrieval.distances(self.last_query))
 
     def _refine(
         self, hypotheses: list[Hypothesis], source: Source, keyframe: Keyframe, cloud: Points

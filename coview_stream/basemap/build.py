@@ -53,11 +53,11 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
         del raw
         step(1, 3)
         if config.outlier_neighbours:
-            points = remove_outliers(points, config.outlier_neighbours, config.outlier_std_ratio)
+            points, _ = remove_outliers(points, config.outlier_neighbours, config.outlier_std_ratio)
         if len(points) < _MIN_POINTS:
             raise MapError(f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more")
         step(2, 3)
-        normals = estimate_normals(points, radius=config.normal_radius, neighbours=config.normal_neighbours)
+        normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
     with _bar(progress, "ground") as step:
         stations = _stations(points, config)

@@ -1,0 +1,73 @@
+"""``coview-stream info``: what is inside a base map file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.basemap import BaseMap
+
+HELP = "show what is inside a base map file"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the map and its stations")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the map's contents, parameters and hash."""
+    import json
+
+    import numpy as np
+
+    from coview_stream.basemap.basemap import BaseMap
+
+    base_map = BaseMap.load(args.map)
+    facts = describe(base_map)
+    if args.json:
+        print(json.dumps(facts, indent=1))
+    else:
+        print("\n".join(f"{name:<14} {_text(value)}" for name, value in facts.items()))
+    if args.plot:
+        from coview_stream.report.plots import plot_map
+
+        points = base_map.points.astype(np.float64) + base_map.origin
+        plot_map(points, base_map.stations + base_map.origin, args.plot, args.map.name)
+    return 0
+
+
+def describe(base_map: BaseMap) -> dict[str, object]:
+    """Return the facts worth showing; metres in the source's frame."""
+    from dataclasses import asdict
+
+    low = base_map.points.min(axis=0) + base_map.origin
+    high = base_map.points.max(axis=0) + base_map.origin
+    return {
+        "stations": len(base_map),
+        "points": len(base_map.points),
+        "source points": base_map.parameters.get("source_points"),
+        "from": [round(float(v), 2) for v in low],
+        "to": [round(float(v), 2) for v in high],
+        "origin": base_map.origin.tolist(),
+        "crs": base_map.crs,
+        "sources": base_map.sources,
+        "sha256": base_map.sha256,
+        "parameters": asdict(base_map.config),
+    }
+
+
+def _text(value: object) -> str:
+    if isinstance(value, dict):
+        rows = []
+        for key, inner in value.items():
+            parts = inner.items() if isinstance(inner, dict) else [("", inner)]
+            rows += [f"{key}{'.' if name else ''}{name} = {item}" for name, item in parts]
+        return ("\n" + " " * 15).join(rows)
+    if isinstance(value, list):
+        return "  ".join(str(v) for v in value)
+    return "unknown" if value is None else " ".join(str(value).split())[:100]

@@ -1,0 +1,52 @@
+"""``coview-stream locate``: localize a recorded run, offline."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "localize a recorded run on a base map, offline"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, or one cloud file")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="directory to write")
+    parser.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry to use (auto)")
+    parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
+    parser.add_argument("--no-pictures", action="store_true", help="write no png files")
+    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Localize and write; exit code 1 if no frame could be localised."""
+    from tqdm import tqdm
+
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.clouds.runs import open_run
+    from coview_stream.config import LocalizerConfig, RetrievalConfig
+    from coview_stream.errors import ConfigError, InputError
+    from coview_stream.fix import Fix
+    from coview_stream.offline import locate, summary, write
+
+    if args.odometry == "kiss-icp":
+        raise ConfigError("--odometry kiss-icp is not supported yet; give the robot's odometry as a TUM file")
+    if args.output.exists() and not args.output.is_dir():
+        raise InputError(f"{args.output}: is a file; give a directory for the results")
+    base_map = BaseMap.load(args.map)
+    recorded = open_run(args.run_path, args.odometry)
+    config = LocalizerConfig(retrieval=RetrievalConfig(mode=args.retrieval))
+    quiet = not (args.progress or sys.stderr.isatty())
+    with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
+
+        def step(done: int, total: int, fix: Fix | None) -> None:
+            bar.update(done - bar.n)
+            if fix is not None:
+                bar.set_postfix_str(fix.state.value)
+
+        located = locate(base_map, recorded, config, step)
+    write(located, base_map, args.output, pictures=not args.no_pictures)
+    print(summary(located))
+    return 0 if located.posed else 1

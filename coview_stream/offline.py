@@ -1,0 +1,185 @@
+"""Localize a recorded run offline and write down what came out: trajectory, evidence, timings, pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.runs import Frame, Run
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.fix import Fix, KeyframeEvidence, State
+from coview_stream.geometry import pose_from
+from coview_stream.localizer import Localizer
+from coview_stream.place.descriptor import Descriptor
+
+Progress = Callable[[int, int, Fix | None], None]
+"""Called with (frames done, frames, newest fix)."""
+
+
+@dataclass
+class Located:
+    """What localizing a run gave.
+
+    Attributes:
+        fixes: one per frame that could be used, in order.
+        keyframes: evidence of every keyframe.
+        skipped: file and reason of every frame that could not be used.
+        seconds: time each step took.
+        query: descriptors of the keyframe that won the first fix, if there was one.
+        winner: its evidence: station and shift.
+    """
+
+    frames: int
+    fixes: list[Fix] = field(default_factory=list)
+    keyframes: list[KeyframeEvidence] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    query: dict[Channel, Descriptor] = field(default_factory=dict)
+    winner: KeyframeEvidence | None = None
+
+    @property
+    def posed(self) -> list[Fix]:
+        """Fixes that have a pose."""
+        return [fix for fix in self.fixes if fix.T_map_body is not None]
+
+    @property
+    def state(self) -> State:
+        """The last frame's state; SEARCHING if there was none."""
+        return self.fixes[-1].state if self.fixes else State.SEARCHING
+
+    @property
+    def first(self) -> Fix | None:
+        """The first fix that has a pose."""
+        return next(iter(self.posed), None)
+
+    def to_json(self, base_map: BaseMap) -> dict[str, Any]:
+        """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres."""
+        last = self.posed[-1] if self.posed else None
+        latency = np.quantile(self.seconds, [0.5, 0.95, 0.99]) if self.seconds else np.zeros(3)
+        return {
+            "state": self.state.value,
+            "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
+            "first_fix_stamp": None if self.first is None else self.first.stamp,
+            "frames": self.frames,
+            "posed": len(self.posed),
+            "skipped": self.skipped,
+            "map_sha256": base_map.sha256,
+            "timings_s": dict(zip(("p50", "p95", "p99"), latency.round(6).tolist(), strict=True)),
+            "keyframes": [keyframe.to_json() for keyframe in self.keyframes],
+        }
+
+
+def locate(
+    base_map: BaseMap, run: Run, config: LocalizerConfig | None = None, progress: Progress | None = None
+) -> Located:
+    """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
+
+    A run of one frame is localized by the stationary path. A frame that cannot be read is skipped and noted.
+
+    Raises:
+        CloudError, RunError: not one frame could be used; the message is the first frame's.
+    """
+    config = config or LocalizerConfig()
+    if len(run) == 1:
+        config = replace(config, stationary=True)
+    localizer = Localizer(base_map, config)
+    located = Located(len(run))
+    for index in range(len(run)):
+        try:
+            frame = run.read(index)
+            begin = time.perf_counter()
+            fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
+        except (CloudError, RunError) as error:
+            located.skipped.append(str(error))
+            continue
+        located.seconds.append(time.perf_counter() - begin)
+        _note(located, localizer, _in_file_frame(fix, frame))
+        if progress:
+            progress(index + 1, len(run), fix)
+    if not located.fixes:
+        raise InputError(f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}")
+    return located
+
+
+def write(located: Located, base_map: BaseMap, out: str | os.PathLike[str], pictures: bool = True) -> None:
+    """Write ``trajectory.tum`` (posed frames only), ``result.json`` and, unless unwanted, pictures into ``out``.
+
+    Raises:
+        InputError: the directory cannot be written.
+    """
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        posed = located.posed
+        poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
+        write_tum(folder / "trajectory.tum", np.array([fix.stamp for fix in posed]), poses)
+        text = json.dumps(located.to_json(base_map), indent=1) + "\n"
+        temporary = folder / ".result.json.part"
+        temporary.write_text(text)
+        temporary.replace(folder / "result.json")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot write the results ({error.strerror}); choose another place") from error
+    if pictures:
+        draw(located, base_map, folder)
+
+
+def draw(located: Located, base_map: BaseMap, folder: Path, truth: Any = None) -> None:
+    """Draw ``trajectory.png`` and, after a fix, ``descriptors.png``."""
+    from coview_stream.report.plots import plot_descriptor_pair, plot_trajectory
+
+    nowhere = np.full(3, np.nan)
+    positions = np.array([nowhere if f.T_map_body is None else f.T_map_body[:3, 3] for f in located.fixes])
+    base = base_map.points.astype(np.float64) + base_map.origin
+    plot_trajectory(base, positions, [f.state.value for f in located.fixes], folder / "trajectory.png", truth)
+    winner = located.winner
+    if winner is not None and winner.station is not None and winner.shift is not None and located.query:
+        name = next(iter(located.query))
+        station = base_map.descriptors(name)[winner.station].astype(np.float32)
+        titles = (f"keyframe ({name})", f"winning station {winner.station}")
+        plot_descriptor_pair(located.query[name], station, winner.shift, folder / "descriptors.png", titles)
+
+
+def _note(located: Located, localizer: Localizer, fix: Fix) -> None:
+    if fix.evidence is not None and (not located.keyframes or located.keyframes[-1] is not fix.evidence):
+        located.keyframes.append(fix.evidence)
+    if fix.T_map_body is not None and located.winner is None:
+        located.winner = fix.evidence
+        located.query = localizer.last_query
+    located.fixes.append(fix)
+
+
+def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
+    """The pose of the file's own coordinates: a single scan may be stored far from its zero."""
+    if fix.T_map_body is None or not frame.origin.any():
+        return fix
+    away = pose_from(np.eye(3), -frame.origin)
+    T_map_odom = None if fix.T_map_odom is None else fix.T_map_odom @ away
+    return replace(fix, T_map_body=fix.T_map_body @ away, T_map_odom=T_map_odom)
+
+
+def summary(located: Located) -> str:
+    """A few lines for a person."""
+    posed = located.posed
+    lines = [f"{'state':<18} {located.state.value}", f"{'localised':<18} {len(posed)} of {located.frames} frames"]
+    if posed:
+        x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
+        lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
+        lines.append(f"{'confidence':<18} {posed[-1].confidence:.2f}")
+    elif located.keyframes:
+        lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
+    if located.skipped:
+        lines.append(f"{'skipped':<18} {len(located.skipped)} frames; first: {located.skipped[0]}")
+    if located.seconds:
+        p50, p99 = np.quantile(located.seconds, [0.5, 0.99]) * 1e3
+        lines.append(f"{'step time':<18} p50 {p50:.1f} ms, p99 {p99:.0f} ms")
+    return "\n".join(lines)
