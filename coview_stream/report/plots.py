@@ -23,6 +23,7 @@ from coview_stream.report.style import (
     figure,
     legend_above,
     legend_below,
+    map_figure_size,
     say,
 )
 
@@ -35,7 +36,7 @@ def plot_map(base: Floats, stations: Floats, path: Path, title: str = "Base map"
     Raises:
         InputError: the picture cannot be written.
     """
-    with figure(path, figsize=(8, 8.6)) as (drawing, axes):
+    with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
         shift = draw_base_map(axes, base)
         if len(stations):
             at = np.asarray(stations, dtype=np.float64) - shift
@@ -74,7 +75,7 @@ def plot_trajectory(
         raise InputError(f"{path}: {len(states)} states for {len(positions)} positions; give as many of both")
     positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     drawn: npt.NDArray[np.bool_] = np.asarray(np.isfinite(positions).all(axis=1))
-    with figure(path, figsize=(8, 8.6)) as (drawing, axes):
+    with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
         shift = draw_base_map(axes, base)
         if truth is not None and len(truth):
             line = np.asarray(truth, dtype=np.float64) - shift

@@ -119,6 +119,16 @@ def _shaded(points: npt.NDArray[np.float64]) -> tuple[Any, tuple[float, float, f
     return np.ma.masked_where(~known, grey), (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
 
 
+def map_figure_size(points: Floats) -> tuple[float, float]:
+    """Width and height of a map's figure, inches: a road corridor needs less height than a square."""
+    if not len(points):
+        return 8.0, 8.6
+    east, north = np.maximum(np.ptp(np.asarray(points[:, :2], dtype=np.float64), axis=0), 1.0)
+    ratio = float(np.clip(north / east, 0.35, 1.6))
+    wide = 8.0 if ratio > 0.7 else 11.0
+    return wide, min(wide * ratio, 10.5) + 0.9
+
+
 def base_shift(points: Floats) -> npt.NDArray[np.float64]:
     """(3,) round offset to subtract before drawing; zeros where coordinates are short enough to read."""
     if not len(points):

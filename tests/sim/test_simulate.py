@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +13,7 @@ import pytest
 from coview_stream.cli import main
 from coview_stream.clouds import open_run, read_cloud, read_tum
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.sim import SimulationConfig, simulate
-from coview_stream.sim import simulate as package_level
-from coview_stream.sim.simulate import Simulated
+from coview_stream.sim import Simulated, SimulationConfig, simulate
 
 TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
 ORIGIN = (412_000.0, 5_318_000.0, 240.0)
@@ -34,7 +35,7 @@ def test_the_layout_of_the_contract(world):
     np.testing.assert_allclose(np.diff(stamps), 0.1)
     assert len(read_cloud(world / "base.laz")) == facts["base_points"] > 5_000
     first = next(iter(open_run(world / "run")))
-    assert len(first.cloud if hasattr(first, "cloud") else first.points) > 5_000
+    assert len(first.points) > 5_000
     assert truth[0, 2, 2] > 0.98
 
 
@@ -51,8 +52,6 @@ def test_equal_seeds_give_equal_bytes(world, tmp_path):
 
 
 def test_another_seed_gives_another_world(world, tmp_path):
-    from dataclasses import replace
-
     simulate(tmp_path / "c", replace(TINY, seed=6))
     assert (tmp_path / "c" / "truth.tum").read_bytes() != (world / "truth.tum").read_bytes()
 
@@ -77,9 +76,7 @@ def test_nothing_of_the_users_is_overwritten(tmp_path):
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
-    import sys
-
-    module = sys.modules["coview_stream.sim.simulate"]
+    module = sys.modules[simulate.__module__]  # the package's attribute of that name is the function
 
     def broken(*_):
         raise InputError("broken")
@@ -91,15 +88,13 @@ def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_only_an_earlier_world_is_replaced(world, tmp_path, monkeypatch):
-    import shutil
-
+def test_only_an_earlier_world_is_replaced(world, tmp_path):
     copy = tmp_path / "w"
     shutil.copytree(world, copy)
     with pytest.raises(InputError, match="--overwrite"):
         simulate(copy, TINY)
     (copy / "run" / "frames" / "999999.pcd").write_bytes(b"left over")
-    assert isinstance(package_level(copy, TINY, overwrite=True), Simulated)
+    assert isinstance(simulate(copy, TINY, overwrite=True), Simulated)
     assert not (copy / "run" / "frames" / "999999.pcd").exists()
 
 
