@@ -1,0 +1,196 @@
+"""Ground points of a base map, by cloth simulation (paper, section 3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from coview_stream.basemap.cloth import cloth_available, cloth_ground
+from coview_stream.basemap.ground_raster import GroundRaster, Heights, cells, filled, lowest_per_cell
+from coview_stream.basemap.morphology import morphological_ground
+from coview_stream.errors import ConfigError
+from coview_stream.geometry import Points
+
+_FEWEST = 50
+"""Below this many occupied cells a cloth has nothing to hang on."""
+
+_CLASSIFY_PORTION = 1_000_000
+
+
+@dataclass(frozen=True)
+class GroundConfig:
+    """How ground is told from the rest. Defaults are scored in ``bench/ground.py``.
+
+    Attributes:
+        method: ``auto`` takes the cloth where its wheel is installed, else the morphological filter.
+        cell: the filter sees the lowest point of each cell of this size, metres.
+        cloth_resolution: distance of cloth nodes, metres.
+        rigidness: 1 for mountains, 2 for relief, 3 for plains.
+        slope_smooth: let the cloth follow steep steps (banks, terraces).
+        iterations: most steps of the simulation; it stops when the cloth rests.
+        cloth_threshold: a lowest point within this distance of the cloth is ground, metres.
+        class_threshold: a point within this height of the ground raster is ground, metres.
+        slope_allowance: added to ``class_threshold`` for each unit of local slope, metres.
+        refinements: rounds in which lowest points near the raster join the ground that made it.
+        max_cells: above this many occupied cells ``cell`` grows; bounds time and memory.
+    """
+
+    method: str = "auto"
+    cell: float = 0.5
+    cloth_resolution: float = 1.0
+    rigidness: int = 2
+    slope_smooth: bool = True
+    iterations: int = 200
+    cloth_threshold: float = 0.5
+    class_threshold: float = 0.3
+    slope_allowance: float = 0.3
+    refinements: int = 2
+    max_cells: int = 20_000_000
+
+    def __post_init__(self) -> None:
+        if self.method not in ("auto", "cloth", "morphological"):
+            raise ConfigError(f"method={self.method!r}: must be auto, cloth or morphological")
+        ranges = {
+            "cell": (0.05, 10.0),
+            "cloth_resolution": (0.1, 20.0),
+            "rigidness": (1, 3),
+            "iterations": (1, 10_000),
+            "cloth_threshold": (0.01, 5.0),
+            "class_threshold": (0.01, 5.0),
+            "slope_allowance": (0.0, 5.0),
+            "refinements": (0, 20),
+            "max_cells": (10_000, 1_000_000_000),
+        }
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(f"{name}={getattr(self, name)}: must lie in {low} to {high}")
+
+
+def ground_mask(points: Points, config: GroundConfig | None = None) -> npt.NDArray[np.bool_]:
+    """Which of the points lie on the ground.
+
+    The lowest point of each cell goes through the filter; then all points are classified by their height
+    above the raster of the lowest points that were ground.
+
+    Args:
+        points: (N, 3) float32 metres, finite, z up.
+        config: defaults suit airborne and mobile scans.
+
+    Returns:
+        (N,) booleans.
+
+    Raises:
+        ConfigError: the extent is absurd for a map.
+        DependencyError: ``method`` is ``cloth`` and the cloth-simulation-filter wheel is not installed.
+    """
+    config = config or GroundConfig()
+    if not len(points):
+        return np.zeros(0, dtype=bool)
+    surface = ground_surface(points, config)
+    mask = np.zeros(len(points), dtype=bool)
+    slope = _slope(surface)
+    for start in range(0, len(points), _CLASSIFY_PORTION):
+        part = points[start : start + _CLASSIFY_PORTION]
+        column = ((part[:, 0] - surface.x0) / surface.cell).astype(np.intp)
+        row = ((part[:, 1] - surface.y0) / surface.cell).astype(np.intp)
+        allowed = config.class_threshold + config.slope_allowance * slope[row, column]
+        mask[start : start + len(part)] = np.abs(part[:, 2] - surface.height_at(part[:, :2])) <= allowed
+    return mask
+
+
+def ground_surface(points: Points, config: GroundConfig | None = None) -> GroundRaster:
+    """Lowest ground of all cells of the cloud's extent, interpolated under buildings and trees, without NaN.
+
+    Arguments and errors as ``ground_mask``; ``points`` must not be empty.
+    """
+    config = config or GroundConfig()
+    corner, shape, flat, cell = _cells_within(points, config)
+    lowest = points[lowest_per_cell(points, flat)]
+    occupied = np.unique(flat)
+    z = np.full(shape, np.nan, dtype=np.float32)
+    z.flat[occupied] = lowest[:, 2]
+    usable = ~_stray_low(z).flat[occupied]
+    lowest, occupied = lowest[usable], occupied[usable]
+    ground = _filtered(lowest, z, occupied, cell, config)
+    return GroundRaster(_refined(z, occupied, ground, config, cell), float(corner[0]), float(corner[1]), cell)
+
+
+def _cells_within(
+    points: Points, config: GroundConfig
+) -> tuple[npt.NDArray[np.float64], tuple[int, int], npt.NDArray[np.int64], float]:
+    cell = config.cell
+    while True:
+        corner, shape, flat = cells(points, cell)
+        if shape[0] * shape[1] <= config.max_cells:
+            return corner, shape, flat, cell
+        cell *= 2
+
+
+def _stray_low(z: Heights) -> npt.NDArray[np.bool_]:
+    """Cells more than 1 m below all but three of their 9 x 9 neighbours: echoes from below the ground."""
+    high = np.where(np.isnan(z), np.float32(np.inf), z)
+    fourth = ndimage.rank_filter(high, rank=3, size=9, mode="nearest")
+    return np.asarray(np.isfinite(fourth) & (high < fourth - 1.0))
+
+
+def _filtered(
+    lowest: Points, z: Heights, occupied: npt.NDArray[np.int64], cell: float, config: GroundConfig
+) -> npt.NDArray[np.bool_]:
+    """Which of the lowest points are ground; all of them if they are too few to tell."""
+    if len(lowest) < _FEWEST:
+        return np.ones(len(lowest), dtype=bool)
+    extent = float(min(np.ptp(lowest[:, :2], axis=0)))
+    hangs = extent > 5 * config.cloth_resolution
+    if config.method == "cloth" or (config.method == "auto" and cloth_available() and hangs):
+        ground = cloth_ground(
+            lowest,
+            resolution=config.cloth_resolution,
+            rigidness=config.rigidness,
+            slope_smooth=config.slope_smooth,
+            iterations=config.iterations,
+            threshold=config.cloth_threshold,
+        )
+    else:
+        kept = np.full(z.shape, np.nan, dtype=np.float32)
+        kept.flat[occupied] = lowest[:, 2]
+        ground = morphological_ground(kept, cell).flat[occupied]
+    return ground if bool(ground.any()) else np.ones(len(lowest), dtype=bool)
+
+
+def _refined(
+    z: Heights,
+    occupied: npt.NDArray[np.int64],
+    ground: npt.NDArray[np.bool_],
+    config: GroundConfig,
+    cell: float,
+) -> Heights:
+    """Raster of the ground cells; lowest points on its interpolation join, which mends steep slopes."""
+    heights = z.flat[occupied]
+    for _ in range(config.refinements + 1):
+        kept = np.full(z.shape, np.nan, dtype=np.float32)
+        kept.flat[occupied[ground]] = heights[ground]
+        surface = filled(kept)
+        # a little smoothing: single low returns must not carry the surface, and slopes need a scale
+        smooth = ndimage.gaussian_filter(surface, 1.0 / cell, mode="nearest")
+        away = np.abs(heights - smooth.flat[occupied])
+        slope = _gradient(smooth, cell).flat[occupied]
+        near = away <= config.class_threshold + config.slope_allowance * slope
+        ground = near | (ground & (away <= 2.0 + slope))
+        if not ground.any():
+            break
+    return surface
+
+
+def _gradient(z: Heights, cell: float) -> Heights:
+    if min(z.shape) < 2:
+        return np.zeros_like(z)
+    dy, dx = np.gradient(z, cell)
+    slope: Heights = np.minimum(np.hypot(dx, dy), 2.0).astype(np.float32)
+    return slope
+
+
+def _slope(surface: GroundRaster) -> Heights:
+    return _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
