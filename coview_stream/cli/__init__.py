@@ -12,13 +12,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from coview_stream import __version__
 from coview_stream.errors import ConfigError, CoViewError
 
 PROGRAM = "coview-stream"
@@ -66,7 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
         prog=PROGRAM,
         description="Tells a robot where it is on a base map, by lidar: no GPU, no GNSS, no initial guess.",
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, title="commands")
     for name in COMMANDS:
         module_name = f"{__name__}.{_MODULES.get(name, name)}"
@@ -85,13 +85,6 @@ def _dispatch(argv: list[str]) -> int:
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
     return int(args.run(args))
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version(PROGRAM)
-    except importlib.metadata.PackageNotFoundError:  # run from a source tree that was never installed
-        return "(not installed)"
 
 
 def _fail(message: str) -> int:
