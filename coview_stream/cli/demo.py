@@ -1,0 +1,155 @@
+"""``coview-stream demo``: the whole way from a laser scan to poses, without input and without network."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.clouds.runs import Run
+    from coview_stream.offline import Located
+    from coview_stream.report.evaluation import Evaluation, Trajectory
+    from coview_stream.sim import SimulationConfig
+
+HELP = "simulate a site and a robot, build the map, localize, compare with the truth; needs no input"
+
+_PICTURES = ("map.png", "trajectory.png", "errors.png", "descriptors.png")
+_WRITTEN = (*_PICTURES, "trajectory.tum", "result.json", "report.json")
+_STEPS = 4
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; names and ranges are checked by SimulationConfig."""
+    parser.add_argument("--out", type=Path, default=Path("coview-demo"), metavar="DIR", help="(coview-demo)")
+    parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
+    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64 or mid360 (vlp16)")
+    parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
+    parser.add_argument("--size", type=float, default=180.0, help="side of the map, metres (180)")
+    parser.add_argument("--length", type=float, default=40.0, help="distance driven, metres (40)")
+    parser.epilog = (
+        "Offline: frames go straight from file to localizer. Streaming them over zenoh comes with `serve`, "
+        "which is not there yet. Exit code 0 if the robot was localised rightly, 1 if not."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the four steps, write what came out, print the errors."""
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.clouds.runs import open_run
+    from coview_stream.clouds.trajectory import read_tum
+    from coview_stream.sim import SimulationConfig, simulate
+
+    config = SimulationConfig(
+        scene=args.scene, sensor=args.sensor, seed=args.seed, size=args.size, length=args.length
+    )
+    out = _own_folder(args.out)
+    world, shown = out / "world", sys.stderr.isatty()
+    seconds: dict[str, float] = {}
+    with _step(seconds, "simulate", f"simulating a {args.scene}, {args.size:g} m wide, and a {args.sensor}"):
+        simulate(world, config, progress=shown, overwrite=True)
+    with _step(seconds, "build", "building the base map"):
+        base_map = BaseMap.build(world / "base.laz", progress=shown)
+        base_map.save(out / "site.coview")
+    with _step(seconds, "locate", f"driving {args.length:g} m without knowing where"):
+        located = _locate(base_map, open_run(world / "run"), shown)
+    with _step(seconds, "report", "comparing with the truth, drawing"):
+        verdict = _report(located, base_map, read_tum(world / "truth.tum"), out)
+    _write_report(verdict, config, seconds, out)
+    print(_text(verdict, located, out))
+    return 0 if verdict.success else 1
+
+
+def _own_folder(out: Path) -> Path:
+    """Return the directory, created or cleared of an earlier demo's results; refuses anybody else's files."""
+    from coview_stream.errors import InputError
+
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; name a directory with --out")
+    if out.exists() and any(out.iterdir()) and not (out / "world" / "world.json").is_file():
+        raise InputError(f"{out}: is not empty and holds no earlier demo; name a new directory with --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in _WRITTEN:  # an old picture beside a new result would lie
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); name another with --out") from error
+    return out
+
+
+@contextmanager
+def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
+    """Say on stderr what is going on and, afterwards, how long it took."""
+    import time
+
+    number = len(seconds) + 1
+    print(f"[{number}/{_STEPS}] {text} ...", file=sys.stderr, flush=True)
+    begin = time.perf_counter()
+    yield
+    seconds[name] = round(time.perf_counter() - begin, 2)
+    print(f"[{number}/{_STEPS}] done in {seconds[name]:.1f} s", file=sys.stderr, flush=True)
+
+
+def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> Located:
+    from tqdm import tqdm
+
+    from coview_stream.fix import Fix
+    from coview_stream.offline import locate
+
+    with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown, leave=False) as bar:
+
+        def step(done: int, total: int, fix: Fix | None) -> None:
+            bar.update(done - bar.n)
+            if fix is not None:
+                bar.set_postfix_str(fix.state.value)
+
+        return locate(base_map, recorded, progress=step)
+
+
+def _report(located: Located, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
+    """Write trajectory, evidence and pictures; return the evaluation."""
+    import numpy as np
+
+    from coview_stream.clouds.trajectory import read_tum
+    from coview_stream.offline import draw, write
+    from coview_stream.report.evaluation import evaluate, frame_errors
+    from coview_stream.report.plots import plot_errors, plot_map
+
+    write(located, base_map, out, pictures=False)
+    draw(located, base_map, out, truth[1][:, :3, 3])
+    points = base_map.points.astype(np.float64) + base_map.origin
+    plot_map(points, base_map.stations + base_map.origin, out / "map.png")
+    estimate = read_tum(out / "trajectory.tum")  # what is judged is what was written
+    errors = frame_errors(estimate, truth)
+    plot_errors(errors.distance, errors.e_t, errors.e_r, out / "errors.png")
+    return evaluate(estimate, truth)
+
+
+def _write_report(
+    verdict: Evaluation, config: SimulationConfig, seconds: dict[str, float], out: Path
+) -> None:
+    import json
+
+    from coview_stream.clouds.writers import atomic
+
+    facts = json.loads(verdict.to_json()) | {"world": config.to_dict(), "seconds": seconds}
+    with atomic(out / "report.json") as stream:
+        stream.write((json.dumps(facts, indent=1) + "\n").encode())
+
+
+def _text(verdict: Evaluation, located: Located, out: Path) -> str:
+    from coview_stream.cli.evaluate import table
+
+    lines = [table(verdict)]
+    if not located.posed and located.keyframes:
+        lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
+    written = [name for name in _WRITTEN if (out / name).is_file()]
+    lines.append(f"{'written':<18} {out}: {', '.join(written)}")
+    lines.append(f"{'step by step':<18} coview-stream build {out / 'world' / 'base.laz'} -o site.coview")
+    lines.append(f"{'':<18} coview-stream locate site.coview {out / 'world' / 'run'} -o out")
+    lines.append(f"{'':<18} coview-stream eval out/trajectory.tum {out / 'world' / 'truth.tum'}")
+    return "\n".join(lines)
