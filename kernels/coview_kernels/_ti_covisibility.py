@@ -13,31 +13,6 @@ def rises(h, a, best_h, best_a) -> ti.i32:
 
 
 @ti.kernel
-def visible(
-    highest: ti.types.ndarray(ti.f32, 3),
-    count: ti.types.ndarray(ti.i32, 3),
-    scale: ti.i32,
-    eye: ti.f64,
-    seen: ti.types.ndarray(ti.u8, 3),
-):
-    """Slopes are (h - eye) / (scale * i - (scale - 1)): scale 1 is mode paper, 2 is mode eye."""
-    for m in range(highest.shape[0]):
-        for j in range(highest.shape[2]):
-            best_h = ti.cast(0.0, ti.f64)
-            best_a = 0
-            for i in range(highest.shape[1]):
-                now = 0
-                if count[m, i, j] > 0:
-                    h = ti.cast(highest[m, i, j], ti.f64) - eye
-                    a = scale * i + 1
-                    now = rises(h, a, best_h, best_a)
-                    if now != 0:
-                        best_h = h
-                        best_a = a
-                seen[m, i, j] = ti.cast(now, ti.u8)
-
-
-@ti.kernel
 def coview(
     highest: ti.types.ndarray(ti.f32, 3),
     total: ti.types.ndarray(ti.f32, 3),
@@ -48,7 +23,10 @@ def coview(
     eye: ti.f64,
     value: ti.types.ndarray(ti.f32, 3),
 ):
-    """vertical: 0 off, 1 greatest height, 2 mean height. hide 0: every occupied bin is visible."""
+    """Write the context. vertical: 0 off, 1 greatest, 2 mean height; hide 0: every occupied bin is visible.
+
+    Slopes are (h - eye) / (scale * i + 1) with i from 0: scale 1 is mode paper, 2 is mode eye, doubled.
+    """
     rings = highest.shape[1]
     sectors = highest.shape[2]
     for m in range(highest.shape[0]):

@@ -1,4 +1,7 @@
-"""Eqs 1-4: which bins are visible from the ground, from above, and the co-view descriptor."""
+"""Eqs 1-4: which bins are visible from the ground, from above, and the co-view descriptor.
+
+``visible`` runs in NumPy, ring by ring, on every backend: a Taichi kernel was 0.8 to 1.3 times as fast.
+"""
 
 from __future__ import annotations
 
@@ -40,17 +43,7 @@ def visible(max_height: npt.ArrayLike, count: npt.ArrayLike, mode: Mode, eye: fl
     """
     height, points = _grids(max_height, count)
     _check_mode(mode, eye)
-    if mode == "off":
-        return reference.visible(height, points, mode, eye)
-    return runtime.dispatch(_visible, reference.visible, height, points, mode, eye)
-
-
-def _visible(max_height: F32, count: I32, mode: Mode, eye: float) -> Mask:
-    seen = np.empty(max_height.shape, dtype=np.bool_)
-    runtime.kernels("covisibility").visible(
-        _flat(max_height), _flat(count), *_slope(mode, eye), _flat(seen.view(np.uint8))
-    )
-    return seen
+    return reference.visible(height, points, mode, eye)
 
 
 def coview(

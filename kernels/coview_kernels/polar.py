@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -47,29 +48,25 @@ def polar_bin(
 
 
 def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
-    chunks = runtime.workers()
-    size = (chunks, rings * sectors)
-    highest, total = np.empty(size, np.float32), np.zeros(size)
-    count, dropped = np.zeros(size, np.int32), np.zeros(chunks, np.int32)
+    bins = np.zeros((runtime.workers(), rings * sectors + 1, 3))
     runtime.kernels("polar").polar_bin(
-        points,
-        *centre.tolist(),
-        ring_edges2(rings, r_max),
-        sector_edges(sectors),
-        sector_guesses(sectors),
-        rings / r_max,
-        highest,
-        total,
-        count,
-        dropped,
+        *(points, *centre.tolist(), rings, sectors, rings / r_max),
+        *(_packed_edges(rings, sectors, r_max), sector_guesses(sectors), bins),
     )
-    number = count.sum(axis=0, dtype=np.int32)
-    top = np.where(number > 0, highest.max(axis=0), np.float32(0))
+    highest, (_, total, number) = bins[:, :-1, 0].max(axis=0), bins[:, :-1].sum(axis=0).T
     shape = (rings, sectors)
-    grid = PolarGrid(
-        top.reshape(shape), total.sum(axis=0).astype(np.float32).reshape(shape), number.reshape(shape)
-    )
-    return grid, int(dropped.sum())
+    with np.errstate(over="ignore"):  # a sum of absurd heights may be infinite
+        grid = PolarGrid(
+            np.where(number > 0, highest, 0.0).astype(np.float32).reshape(shape),
+            total.astype(np.float32).reshape(shape),
+            number.astype(np.int32).reshape(shape),
+        )
+    return grid, int(bins[:, -1, 0].sum())
+
+
+@lru_cache(maxsize=64)
+def _packed_edges(rings: int, sectors: int, r_max: float) -> F64:
+    return np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
 
 
 def station_bins(

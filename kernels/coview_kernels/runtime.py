@@ -259,7 +259,6 @@ def warm_up() -> None:
     grid, _ = api.polar_bin(cloud, origin, 2, 4, 8.0)
     one = np.zeros(1, dtype=np.int32)
     api.station_bins(np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, one, one, one, 2, 4, 2.0)
-    api.visible(grid.max_height, grid.count, "paper")
     api.coview(*grid)
     for normals in (None, cloud):
         api.normal_equations(cloud, cloud, normals, np.ones(2), eye, origin)

@@ -9,7 +9,8 @@ across an edge:
   are float32 directions, 6e-8 rad from 2 pi k / S at worst and exact on the axes.
 
 So a point on a ring edge belongs to the outer ring, a point on a sector edge to the sector counter-clockwise
-of it, and the centre itself to ring 0, sector 0.
+of it, and the centre itself to ring 0, sector 0. Offsets below 1e-37 m may count as zero: Taichi's
+threads flush subnormal numbers.
 """
 
 from __future__ import annotations
@@ -62,16 +63,20 @@ def sector_guesses(sectors: int, steps: int = 1024) -> I32:
 
 def polar_index(dx: F32, dy: F32, rings: int, sectors: int, r_max: float) -> I64:
     """Flat bin ``ring * S + sector`` of (N,) offsets in metres, -1 at and beyond ``r_max``."""
-    x, y = dx.astype(np.float64), dy.astype(np.float64)
-    ring = np.searchsorted(ring_edges2(rings, r_max), x * x + y * y, side="right") - 1
+    x, y = dx.astype(np.float64) + 0.0, dy.astype(np.float64) + 0.0  # -0 + 0 is 0: arctan2 tells them apart
+    r2 = x * x + y * y
+    edge2 = ring_edges2(rings, r_max)
+    inside = r2 < edge2[-1]
+    ring = np.minimum(np.sqrt(np.where(inside, r2, 0.0)) * (rings / r_max), rings - 1).astype(np.int64)
+    # the guesses are right to 1e-15 or so: only the edge next to them can be on the wrong side
+    ring += (r2 >= edge2[ring + 1]).astype(np.int64) - (r2 < edge2[ring])
 
     theta = np.arctan2(y, x)
     theta[theta < 0] += 2.0 * np.pi
-    guess = np.clip((theta * (sectors / (2.0 * np.pi))).astype(np.int64), 0, sectors - 1)
-    edges = sector_edges(sectors)
-    # the angle is right to 1e-15 or so: only an edge next to the guess can be on the wrong side
-    lower, upper = edges[guess], edges[guess + 1]
-    before = (lower[:, 0] * y < lower[:, 1] * x) & (lower[:, 0] * x + lower[:, 1] * y > 0)
-    after = (upper[:, 0] * y >= upper[:, 1] * x) & (upper[:, 0] * x + upper[:, 1] * y > 0)
-    sector = (guess - before + (after & ~before)) % sectors
-    return np.where(ring < rings, ring * sectors + sector, -1).astype(np.int64)
+    sector = np.minimum(theta * (sectors / (2.0 * np.pi)), sectors - 1).astype(np.int64)
+    ray_x, ray_y = np.ascontiguousarray(sector_edges(sectors).T)
+    lx, ly, ux, uy = ray_x[sector], ray_y[sector], ray_x[sector + 1], ray_y[sector + 1]
+    before = (lx * y < ly * x) & (lx * x + ly * y > 0)
+    after = (ux * y >= uy * x) & (ux * x + uy * y > 0)
+    sector = (sector - before + (after & ~before)) % sectors
+    return np.where(inside, ring * sectors + sector, -1).astype(np.int64)

@@ -21,7 +21,8 @@ def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) 
 
     size = rings * sectors
     count = np.bincount(bins, minlength=size).astype(np.int32)
-    total = np.bincount(bins, weights=height, minlength=size).astype(np.float32)
+    with np.errstate(over="ignore"):  # a sum of absurd heights may be infinite
+        total = np.bincount(bins, weights=height, minlength=size).astype(np.float32)
     highest = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(highest, bins, height)
     highest[count == 0] = 0.0

@@ -23,9 +23,10 @@ def normal_equations(
     if normals is not None:
         n = normals[usable].astype(np.float64)
         r = np.einsum("ij,ij->i", n, error)
-        J = np.concatenate([np.cross(arm, n), n], axis=1)
+        (ax, ay, az), (nx, ny, nz) = arm.T, n.T
+        J = np.stack([ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx, nx, ny, nz], axis=1)
         wJ = w[:, None] * J
-        return J.T @ wJ, wJ.T @ r, float(w @ (r * r))
+        return _symmetric(J.T @ wJ), wJ.T @ r, float(w @ (r * r))
 
     J3 = np.zeros((len(w), 3, 6))  # d(rx x arm)/drx and so on, one row per coordinate
     J3[:, 0, 1], J3[:, 0, 2] = arm[:, 2], -arm[:, 1]
@@ -34,4 +35,9 @@ def normal_equations(
     J3[:, :, 3:] = np.eye(3)
     J = J3.reshape(-1, 6)
     wJ = np.repeat(w, 3)[:, None] * J
-    return J.T @ wJ, wJ.T @ error.ravel(), float(w @ (error * error).sum(axis=1))
+    return _symmetric(J.T @ wJ), wJ.T @ error.ravel(), float(w @ (error * error).sum(axis=1))
+
+
+def _symmetric(H: F64) -> F64:
+    """Return the mean of H and its transpose: BLAS rounds the two halves differently."""
+    return 0.5 * (H + H.T)

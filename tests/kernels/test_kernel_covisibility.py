@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coview_kernels import coview, reference, visible
+
+MODES = st.sampled_from(["paper", "eye", "off"])
+VERTICALS = st.sampled_from(["max", "mean", "off"])
+
+
+@st.composite
+def grids(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    lead = draw(st.sampled_from([(), (1,), (4,), (0,), (2, 3)]))
+    shape = (*lead, draw(st.integers(1, 12)), draw(st.integers(1, 9)))
+    count = rng.integers(0, draw(st.integers(1, 6)), shape).astype(np.int32)
+    # halves make ties, multiples of the ring number make slopes that are exactly equal
+    height = (np.round(rng.normal(0, 3, shape) * 2) / 2).astype(np.float32)
+    if draw(st.booleans()):
+        height = np.broadcast_to(0.3 * np.arange(1, shape[-2] + 1)[:, None], shape).astype(np.float32)
+    return height, (height * count).astype(np.float32), count
+
+
+@given(grids(), MODES, VERTICALS, st.sampled_from([0.0, 1.5, 1.7]))
+def test_agrees_with_numpy(grid, mode, vertical, eye):
+    height, total, count = grid
+    seen = visible(height, count, mode, eye)
+    assert seen.dtype == np.bool_
+    np.testing.assert_array_equal(seen, reference.visible(height, count, mode, eye))
+    context = coview(height, total, count, vertical, mode, eye)
+    assert context.dtype == np.float32
+    expected = reference.coview(height, total, count, vertical, mode, eye)
+    np.testing.assert_allclose(context, expected, rtol=1e-6, atol=0)
+
+
+@given(grids(), st.sampled_from(["paper", "eye"]))
+def test_agrees_with_equation_2_in_exact_arithmetic(grid, mode):
+    height, _, count = (a.reshape(-1, *a.shape[-2:]) for a in grid)
+    seen = visible(height, count, mode, 1.5)
+    for m, j in np.ndindex(len(height), height.shape[2]):
+        horizon = None
+        for i in range(1, height.shape[1] + 1):
+            now = False
+            if count[m, i - 1, j] > 0:
+                h = Fraction(float(height[m, i - 1, j]))
+                slope = h / i if mode == "paper" else (h - Fraction(3, 2)) / (i - Fraction(1, 2))
+                now = horizon is None or slope > horizon
+                horizon = slope if now else horizon
+            assert seen[m, i - 1, j] == now
+
+
+def test_a_wall_hides_what_is_lower_behind_it_and_not_what_towers():
+    height = np.array([0.0, 5.0, 0.0, 9.0, 30.0], dtype=np.float32)[:, None]
+    count = np.ones((5, 1), dtype=np.int32)
+    assert visible(height, count, "paper")[:, 0].tolist() == [True, True, False, False, True]
+    assert visible(height, count, "off").all()
+
+
+def test_density_lets_the_airborne_view_see_behind_the_wall():
+    height = np.array([[5.0], [4.0], [3.0]], dtype=np.float32)
+    count = np.array([[1], [7], [1]], dtype=np.int32)
+    total = np.array([[5.0], [14.0], [3.0]], dtype=np.float32)
+    assert coview(height, total, count, "max")[:, 0].tolist() == [5, 4, 0]
+    assert coview(height, total, count, "mean")[:, 0].tolist() == [5, 2, 0]
+    assert coview(height, total, count, "off")[:, 0].tolist() == [5, 0, 0]
+
+
+def test_the_mean_density_counts_empty_bins():
+    height = np.array([[5.0, 0.0], [4.0, 0.0]], dtype=np.float32)
+    count = np.array([[3, 0], [1, 0]], dtype=np.int32)
+    # mean over four bins is 1: the second bin just reaches it; over the two occupied ones it would be 2
+    assert coview(height, height, count)[1, 0] == 4.0
+
+
+@given(grids(), MODES, VERTICALS)
+def test_empty_bins_neither_count_nor_hide(grid, mode, vertical):
+    height, total, count = (a.copy() for a in grid)
+    expected = coview(height, total, count, vertical, mode)
+    height[count == 0] = np.nan
+    total[count == 0] = np.inf
+    np.testing.assert_array_equal(coview(height, total, count, vertical, mode), expected)
+
+
+def test_bad_arguments_are_named():
+    grid = np.zeros((2, 3))
+    with pytest.raises(ValueError, match="count"):
+        visible(grid, np.zeros((3, 2)), "paper")
+    with pytest.raises(ValueError, match="mode"):
+        visible(grid, grid, "Paper")
+    with pytest.raises(ValueError, match="max_height"):
+        visible(np.zeros(3), np.zeros(3), "paper")
+    with pytest.raises(ValueError, match="eye"):
+        coview(grid, grid, grid, eye=np.nan)
+    with pytest.raises(ValueError, match="vertical"):
+        coview(grid, grid, grid, "highest")
+    with pytest.raises(ValueError, match="sum_height"):
+        coview(grid, np.zeros(3), grid)

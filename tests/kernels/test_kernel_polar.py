@@ -1,0 +1,183 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_cases import clouds
+
+from coview_kernels import polar_bin, reference, station_bins
+from coview_kernels.sectors import polar_index
+
+SIZES = st.sampled_from([(1, 1), (1, 2), (3, 4), (20, 60), (20, 61), (7, 360)])
+
+
+def assert_same(grid, expected):
+    np.testing.assert_array_equal(grid.count, expected.count)
+    np.testing.assert_array_equal(grid.max_height, expected.max_height)
+    np.testing.assert_allclose(grid.sum_height, expected.sum_height, rtol=1e-6, atol=1e-6)
+    for ours, theirs in zip(grid, expected, strict=True):
+        assert ours.dtype == theirs.dtype
+        assert ours.shape == theirs.shape
+
+
+@given(
+    clouds(),
+    SIZES,
+    st.sampled_from([5.0, 50.0]),
+    st.sampled_from([(0, 0, 0), (2.5, -7.5, 1.0), (0.1, 0.2, 0.3)]),
+)
+def test_agrees_with_numpy(points, size, r_max, centre):
+    grid, dropped = polar_bin(points, centre, *size, r_max)
+    expected, expected_dropped = reference.polar_bin(points, np.array(centre, dtype=float), *size, r_max)
+    assert_same(grid, expected)
+    assert dropped == expected_dropped == np.count_nonzero(~np.isfinite(points).all(axis=1))
+
+
+@given(clouds(max_points=120), st.sampled_from([(3, 4), (20, 60)]))
+def test_agrees_with_the_definition_away_from_edges(points, size):
+    rings, sectors = size
+    count = np.zeros(size, dtype=int)
+    highest = np.zeros(size)
+    total = np.zeros(size)
+    clear = []
+    for x, y, z in points[np.isfinite(points).all(axis=1)].astype(float):
+        ring = math.hypot(x, y) / (50.0 / rings)
+        sector = math.atan2(y, x) % (2 * math.pi) / (2 * math.pi / sectors)
+        if abs(z) > 1e30 or ring >= rings or min(abs(ring - round(ring)), abs(sector - round(sector))) < 1e-5:
+            continue
+        clear.append((x, y, z))
+        bin_ = (int(ring), int(sector) % sectors)
+        highest[bin_] = z if count[bin_] == 0 else max(z, highest[bin_])
+        count[bin_] += 1
+        total[bin_] += z
+    grid, _ = polar_bin(np.array(clear, dtype=np.float32).reshape(-1, 3), (0, 0, 0), *size, 50.0)
+    np.testing.assert_array_equal(grid.count, count)
+    np.testing.assert_allclose(grid.max_height, highest, rtol=1e-6)
+    np.testing.assert_allclose(grid.sum_height, total, rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("implementation", [polar_bin, reference.polar_bin])
+def test_edges_belong_outward_and_counter_clockwise(implementation):
+    def where(x, y):
+        grid, _ = implementation(np.array([[x, y, 1.0]], dtype=np.float32), np.zeros(3), 5, 4, 10.0)
+        found = np.argwhere(grid.count)
+        return tuple(int(v) for v in found[0]) if len(found) else None
+
+    assert where(0.0, 0.0) == (0, 0)
+    assert where(-0.0, -0.0) == (0, 0)
+    assert where(2.0, 0.0) == (1, 0)
+    assert where(2.0, -0.0) == (1, 0)
+    assert where(0.0, 4.0) == (2, 1)
+    assert where(-6.0, 0.0) == (3, 2)
+    assert where(-6.0, -0.0) == (3, 2)
+    assert where(0.0, -8.0) == (4, 3)
+    assert where(np.nextafter(np.float32(10), np.float32(0)), 0.0) == (4, 0)
+    assert where(10.0, 0.0) is None
+    assert where(1.0, -1e-30) == (0, 3)
+
+
+@pytest.mark.parametrize("sectors", [3, 8, 60, 64, 361])
+def test_points_on_every_sector_edge_agree(sectors):
+    angle = np.arange(sectors) * 2 * np.pi / sectors
+    radius = np.linspace(0.1, 49.9, 40)
+    on = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+    points = np.concatenate([np.c_[(on * np.float32(r)), np.zeros(sectors)] for r in radius]).astype(
+        np.float32
+    )
+    grid, _ = polar_bin(points, (0, 0, 0), 20, sectors, 50.0)
+    assert_same(grid, reference.polar_bin(points, np.zeros(3), 20, sectors, 50.0)[0])
+    assert grid.count.sum() == len(points)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_index_turns_with_the_cloud(seed):
+    offset = np.random.default_rng(seed).uniform(-40, 40, (100, 2)).astype(np.float32)
+    here = polar_index(offset[:, 0], offset[:, 1], 20, 60, 60.0)
+    turned = polar_index(-offset[:, 1], offset[:, 0], 20, 60, 60.0)
+    np.testing.assert_array_equal(turned, here // 60 * 60 + (here % 60 + 15) % 60)
+
+
+def test_empty_and_all_in_one_bin():
+    grid, dropped = polar_bin(np.empty((0, 3)), (0, 0, 0), 20, 60, 50.0)
+    assert dropped == 0
+    assert not any(a.any() for a in grid)
+    one = np.tile(np.array([[3.0, 1.0, -2.0]], dtype=np.float32), (1000, 1))
+    grid, _ = polar_bin(one, (0, 0, 0), 20, 60, 50.0)
+    assert grid.count.max() == grid.count.sum() == 1000
+    assert grid.max_height.min() == -2.0
+    assert grid.sum_height.min() == -2000.0
+
+
+def test_two_million_points():
+    points = np.random.default_rng(2).normal(0, 20, (2_000_000, 3)).astype(np.float32)
+    points[::500, 1] = np.inf
+    grid, dropped = polar_bin(points, (1.0, 2.0, -1.5), 20, 60, 50.0)
+    expected, expected_dropped = reference.polar_bin(points, np.array([1.0, 2.0, -1.5]), 20, 60, 50.0)
+    assert_same(grid, expected)
+    assert dropped == expected_dropped == 4000
+
+
+@st.composite
+def rasters(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    shape = draw(st.tuples(st.integers(1, 30), st.integers(1, 30)))
+    count = rng.integers(0, 4, shape).astype(np.int32) * (
+        rng.random(shape) < draw(st.sampled_from([0.1, 0.9]))
+    )
+    top = rng.normal(100, 5, shape).astype(np.float32)
+    stations = draw(st.integers(0, 5))
+    at = rng.integers(0, shape[0], stations), rng.integers(0, shape[1], stations)
+    return top, count.astype(np.int32), (count * top).astype(np.float32), *at, rng.normal(95, 2, stations)
+
+
+@given(rasters(), st.sampled_from([(1, 1), (4, 6), (20, 60)]), st.sampled_from([0.5, 1.0, 2.3]))
+def test_stations_agree_with_numpy(raster, size, cell):
+    top, count, total, rows, cols, ground = raster
+    rows, cols, ground = rows.astype(np.int32), cols.astype(np.int32), ground.astype(np.float32)
+    arguments = (top, count, total, cell, rows, cols, ground, *size, 8.0)
+    grid, expected = station_bins(*arguments), reference.station_bins(*arguments)
+    np.testing.assert_array_equal(grid.count, expected.count)
+    np.testing.assert_array_equal(grid.max_height, expected.max_height)
+    np.testing.assert_allclose(grid.sum_height, expected.sum_height, rtol=1e-5, atol=1e-4)
+
+
+@given(rasters())
+def test_a_station_sees_the_raster_as_points_at_cell_centres(raster):
+    top, count, total, rows, cols, ground = raster
+    grid = station_bins(top, count, total, 0.5, rows, cols, ground, 5, 8, 6.0)
+    assert grid.count.shape == (len(rows), 5, 8)
+    row, col = np.nonzero(count)
+    for m in range(len(rows)):
+        centres = np.stack([(col - cols[m]) * 0.5, (row - rows[m]) * 0.5, top[row, col]], axis=1)
+        points = np.repeat(centres, count[row, col], axis=0).astype(np.float32)
+        expected, _ = polar_bin(points, (0, 0, np.float32(ground[m])), 5, 8, 6.0)
+        np.testing.assert_array_equal(grid.count[m], expected.count)
+        np.testing.assert_array_equal(grid.max_height[m], expected.max_height)
+        np.testing.assert_allclose(grid.sum_height[m], expected.sum_height, rtol=1e-4, atol=1e-3)
+
+
+def test_what_an_empty_cell_holds_does_not_matter():
+    count = np.array([[1, 0, 0]], dtype=np.int32)
+    junk = np.array([[2.0, np.nan, 1e30]], dtype=np.float32)
+    grid = station_bins(junk, count, junk, 1.0, [0], [1], [1.0], 3, 4, 6.0)
+    assert grid.count.sum() == 1
+    assert grid.max_height.max() == grid.sum_height.max() == 1.0
+
+
+def test_bad_arguments_are_named():
+    cloud, raster = np.zeros((1, 3)), np.zeros((4, 5))
+    with pytest.raises(ValueError, match="centre"):
+        polar_bin(cloud, (0, np.nan, 0), 20, 60, 50.0)
+    with pytest.raises(ValueError, match="r_max"):
+        polar_bin(cloud, (0, 0, 0), 20, 60, 0.0)
+    with pytest.raises(ValueError, match="rings"):
+        polar_bin(cloud, (0, 0, 0), 0, 60, 50.0)
+    with pytest.raises(ValueError, match="raster_count"):
+        station_bins(raster, raster[:2], raster, 1.0, [0], [0], [0], 2, 4, 5.0)
+    with pytest.raises(ValueError, match="inside the raster"):
+        station_bins(raster, raster, raster, 1.0, [4], [0], [0], 2, 4, 5.0)
+    with pytest.raises(ValueError, match="cell"):
+        station_bins(raster, raster, raster, 0.0, [0], [0], [0], 2, 4, 5.0)

@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from kernel_cases import ROOT, run_python
+
+import coview_kernels
+from coview_kernels import backend, polar_bin, reference, runtime, shutdown, submit, warm_up
+
+LIBRARIES = [name for name in ("taichi", "quadrants") if importlib.util.find_spec(name)]
+needs_library = pytest.mark.skipif(not LIBRARIES, reason="neither taichi nor quadrants is installed")
+USE = (
+    "import numpy as np, coview_kernels as ck\n"
+    "def use():\n"
+    "    points = np.ones((5, 3), dtype=np.float32)\n"
+    "    assert ck.polar_bin(points, (0, 0, 0), 4, 8, 10.0)[0].count.sum() == 5\n"
+    "    assert len(ck.transform_unique(points, np.eye(4), 1.0)[0]) == 1\n"
+)
+
+
+def succeeds(code: str, **environment: str) -> str:
+    done = run_python(USE + code, **environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_public_names():
+    assert coview_kernels.__all__ == sorted(coview_kernels.__all__)
+    assert set(coview_kernels.__all__) == {
+        *("PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "normal_equations"),
+        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "trim", "unit_columns"),
+        *("visible", "warm_up"),
+    }
+    assert all(callable(getattr(coview_kernels, name)) for name in coview_kernels.__all__)
+    for name in reference.__all__:
+        assert getattr(reference, name) is not getattr(coview_kernels, name)
+
+
+def test_only_runtime_imports_taichi():
+    for path in (ROOT / "kernels").rglob("*.py"):
+        if path.name != "runtime.py":
+            text = path.read_text()
+            assert not any(
+                f"import {name}" in text or f"from {name}" in text for name in ("taichi", "quadrants")
+            )
+
+
+def test_import_is_cheap_and_every_backend_is_silent():
+    code = "import sys\nassert not {'taichi', 'quadrants', 'scipy'} & set(sys.modules)\n"
+    code += "use()\nprint(ck.backend())"
+    for name in [*LIBRARIES, "numpy"]:
+        assert succeeds(code, COVIEW_KERNELS=name) == name + "\n"
+    assert succeeds(code) == (LIBRARIES[0] if LIBRARIES else "numpy") + "\n"
+
+
+def test_an_unknown_backend_is_named():
+    done = run_python("import coview_kernels as ck; ck.backend()", COVIEW_KERNELS="cuda")
+    assert done.returncode == 1
+    assert "COVIEW_KERNELS is 'cuda'" in done.stderr
+
+
+def test_without_a_library_numpy_serves():
+    blocked = (
+        "import sys\nsys.modules['taichi'] = sys.modules['quadrants'] = None\nuse()\nprint(ck.backend())"
+    )
+    assert succeeds(blocked) == "numpy\n"
+    done = run_python(
+        "import sys; sys.modules['taichi'] = None\nimport coview_kernels as ck; ck.backend()",
+        COVIEW_KERNELS="taichi",
+    )
+    assert "COVIEW_KERNELS=taichi, but it is missing" in done.stderr
+
+
+def test_submit_returns_raises_and_nests():
+    assert submit(divmod, 7, 2) == (3, 1)
+    assert (
+        submit(lambda: submit(lambda: polar_bin(np.ones((2, 3)), (0, 0, 0), 1, 1, 9.0)))[0].count[0, 0] == 2
+    )
+    with pytest.raises(ZeroDivisionError):
+        submit(divmod, 1, 0)
+    assert submit(int) == 0
+
+
+def test_one_thread_owns_the_kernels():
+    threads = {submit(threading.get_ident) for _ in range(3)}
+    assert len(threads) == 1
+    assert (threading.get_ident() in threads) == (backend() == "numpy")
+
+
+def test_many_threads_submit_at_once():
+    clouds = [np.random.default_rng(s).normal(0, 20, (2000, 3)).astype(np.float32) for s in range(32)]
+    expected = [reference.polar_bin(c, np.zeros(3), 20, 60, 50.0)[0].count for c in clouds]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda c: polar_bin(c, (0, 0, 0), 20, 60, 50.0)[0].count, clouds))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_first_use_from_many_threads_starts_one_backend():
+    code = (
+        "from concurrent.futures import ThreadPoolExecutor\nimport threading\n"
+        "with ThreadPoolExecutor(6) as pool:\n"
+        "    [f.result() for f in [pool.submit(use) for _ in range(24)]]\n"
+        "assert sum(t.name == 'coview-kernels' for t in threading.enumerate()) == (ck.backend() != 'numpy')\n"
+    )
+    assert succeeds(code) == ""
+
+
+def test_shutdown_is_idempotent_and_the_next_kernel_starts_again():
+    warm_up()
+    before = backend()
+    shutdown()
+    shutdown()
+    assert not any(t.name == "coview-kernels" for t in threading.enumerate())
+    assert polar_bin(np.ones((3, 3)), (0, 0, 0), 1, 1, 9.0)[0].count[0, 0] == 3
+    assert backend() == before
+
+
+@needs_library
+@pytest.mark.parametrize("name", LIBRARIES)
+@pytest.mark.parametrize("launched", [True, False])
+def test_a_host_that_runs_taichi_keeps_it(name, launched):
+    host = (
+        f"import {name} as ti\nimport threading\nti.init(arch=ti.cpu)\n"
+        "field = ti.field(ti.f32, shape=4)\n" + ("field.fill(3.0)\n" if launched else "") + "use()\n"
+        "thread = threading.Thread(target=use)\nthread.start()\nthread.join()\n"
+        "field[1] = 7.0\nassert field[1] == 7.0\nck.shutdown()\nuse()\nassert field[1] == 7.0\n"
+        f"assert ck.backend() != {name!r}\nprint('fine')"
+    )
+    done = run_python(USE + host)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("fine\n")
+
+
+@needs_library
+@pytest.mark.parametrize("name", LIBRARIES)
+def test_a_host_that_starts_taichi_after_us_takes_it_over(name):
+    host = (
+        f"import {name} as ti\nuse()\nassert ck.backend() == {name!r}\nti.init(arch=ti.cpu)\n"
+        "field = ti.field(ti.f32, shape=4)\nfield[1] = 7.0\nuse()\nassert ck.backend() == 'numpy'\n"
+        "ck.shutdown()\nassert field[1] == 7.0\nprint('fine')"
+    )
+    done = run_python(USE + host, COVIEW_KERNELS=name)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("fine\n")
+
+
+def test_a_forked_child_computes_in_numpy():
+    code = (
+        "import os, warnings\nwarnings.simplefilter('ignore')\nuse()\nchild = os.fork()\n"
+        "if child == 0:\n    use()\n    os._exit(0 if ck.backend() == 'numpy' else 3)\n"
+        "assert os.waitpid(child, 0)[1] == 0\nuse()\n"
+    )
+    assert succeeds(code) == ""
+
+
+def test_the_interpreter_exits_while_another_thread_still_works():
+    code = (
+        "import threading\nuse()\n"
+        "def forever():\n    while True:\n        use()\n"
+        "threading.Thread(target=forever, daemon=True).start()\nuse()\n"
+    )
+    done = run_python(USE + code)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_kernel_modules_insist_on_the_owner():
+    code = "import coview_kernels._ti_voxel"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"PYTHONPATH": str(ROOT / "kernels")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "runtime.kernels" in done.stderr
+
+
+def test_workers_are_at_least_one():
+    assert 1 <= runtime.workers() <= 16
