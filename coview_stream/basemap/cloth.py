@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import importlib
 import importlib.util
 import os
@@ -53,27 +54,28 @@ def cloth_ground(
     size = np.ptp(points[:, :2], axis=0).astype(np.float64) / counts + 1e-3
     tile = np.minimum(((points[:, :2] - low) / size).astype(int), counts - 1)
     for i in range(counts[0]):
+        strip = np.flatnonzero(_between(points[:, 0], low[0] + size[0] * i, size[0]))
         for j in range(counts[1]):
-            own = (tile[:, 0] == i) & (tile[:, 1] == j)
+            index = strip[_between(points[strip, 1], low[1] + size[1] * j, size[1])]
+            own = (tile[index] == (i, j)).all(axis=1)
             if not own.any():
                 continue
-            corner = low + size * (i, j)
-            near = ((points[:, :2] > corner - _MARGIN) & (points[:, :2] < corner + size + _MARGIN)).all(
-                axis=1
-            )
-            index = np.flatnonzero(near)
-            if len(index) < _FEWEST:
-                ground[own] = True
-                continue
-            inside = _one_cloth(points[index], resolution, rigidness, slope_smooth, iterations, threshold)
-            ground[index[inside & own[index]]] = True
+            inside = own
+            if len(index) >= _FEWEST:
+                inside = _one_cloth(points[index], resolution, rigidness, slope_smooth, iterations, threshold)
+            ground[index[inside & own]] = True
     return ground
+
+
+def _between(values: npt.NDArray[np.float32], start: float, length: float) -> npt.NDArray[np.bool_]:
+    return np.asarray((values > start - _MARGIN) & (values < start + length + _MARGIN))
 
 
 def _one_cloth(
     points: Points, resolution: float, rigidness: int, slope_smooth: bool, iterations: int, threshold: float
 ) -> npt.NDArray[np.bool_]:
     csf = importlib.import_module("CSF")
+    _one_thread()
     cloth = csf.CSF()
     cloth.params.bSloopSmooth = slope_smooth
     cloth.params.cloth_resolution = resolution
@@ -87,6 +89,17 @@ def _one_cloth(
     mask = np.zeros(len(points), dtype=bool)
     mask[np.array(kept, dtype=np.intp)] = True
     return mask
+
+
+@functools.cache
+def _one_thread() -> None:
+    """Run the cloth in one thread: its many short parallel loops spin: three times slower on busy cores."""
+    library = importlib.import_module("_CSF").__file__
+    try:
+        # its private OpenMP is among its dependencies, where a symbol lookup by handle finds it
+        ctypes.CDLL(library).omp_set_num_threads(1)
+    except (OSError, AttributeError):
+        return  # built without OpenMP
 
 
 @contextmanager
