@@ -1,0 +1,35 @@
+"""Localize one scan, without odometry: a terrestrial scanner on its tripod, or a robot that stands still.
+
+    coview-stream simulate world --scene campus --sensor os64 --length 0
+    python examples/single_scan.py world/base.laz world/run/frames/000000.pcd
+
+One scan has no second opinion from other keyframes, so the evidence has to be stronger than on a drive.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from coview_stream import BaseMap, Fix
+from coview_stream.clouds import open_run
+from coview_stream.offline import locate
+
+
+def main(base: Path, scan: Path) -> Fix:
+    """Print the scan's pose in the map, or why there is none; return the fix."""
+    base_map = BaseMap.build(base, preset="tls")  # descriptors reach 100 m, as terrestrial scanners do
+    # one cloud file is a run of one frame, which takes the stationary path; z has to point up, no more
+    fix = locate(base_map, open_run(scan)).fixes[-1]
+    if fix.T_map_body is None:
+        print(f"{fix.state.value}: {fix.evidence.reason if fix.evidence else 'nothing to go by'}")
+    else:
+        print(f"{fix.state.value}, confidence {fix.confidence:.2f}; from the scan's frame into the map's:")
+        print(fix.T_map_body.round(3))
+    return fix
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,82 @@
+"""``coview-stream demo`` end to end in a small world."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from coview_stream.cli import main
+from coview_stream.clouds import read_tum
+
+SMALL = ["--scene", "campus", "--sensor", "os64", "--size", "100", "--length", "10"]
+PICTURES = ("map.png", "trajectory.png", "errors.png", "descriptors.png")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """(exit code, directory) of one demo."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    return main(["demo", "--out", str(out), *SMALL]), out
+
+
+def test_it_localises_and_says_so(demo):
+    code, out = demo
+    report = json.loads((out / "report.json").read_text())
+    assert code == 0
+    assert report["success"] is True
+    assert report["false_frames"] == 0
+    assert report["translation"]["mean"] < 0.3
+    assert report["world"]["scene"] == "campus"
+    assert set(report["seconds"]) == {"simulate", "build", "locate", "report"}
+
+
+def test_it_writes_what_it_promises(demo):
+    _, out = demo
+    for name in PICTURES:
+        assert (out / name).read_bytes().startswith(b"\x89PNG"), name
+    stamps, _ = read_tum(out / "trajectory.tum")
+    assert len(stamps) == json.loads((out / "report.json").read_text())["posed"]
+    assert json.loads((out / "result.json").read_text())["state"] == "TRACKING"
+
+
+def test_its_files_serve_the_other_commands(demo, capsys):
+    _, out = demo
+    assert main(["info", str(out / "site.coview")]) == 0
+    assert "stations" in capsys.readouterr().out
+    assert main(["eval", str(out / "trajectory.tum"), str(out / "world" / "truth.tum"), "--json"]) == 0
+    verdict = json.loads(capsys.readouterr().out)
+    report = json.loads((out / "report.json").read_text())
+    assert {key: report[key] for key in verdict} == verdict
+
+
+def test_without_a_fix_it_exits_with_one_and_leaves_no_old_result(demo, tmp_path, capsys):
+    out = tmp_path / "again"
+    shutil.copytree(demo[1], out)
+    # two metres are one keyframe, and one is not enough to be believed
+    assert main(["demo", "--out", str(out), *SMALL, "--length", "1"]) == 1
+    captured = capsys.readouterr()
+    assert "never" in captured.out
+    assert "reason" in captured.out
+    assert captured.err.count("[4/4]") == 2
+    assert "\r" not in captured.err  # no bars where nobody watches
+    assert (out / "trajectory.tum").read_text() == ""
+    assert not (out / "descriptors.png").exists()
+    assert json.loads((out / "report.json").read_text())["success"] is False
+
+
+@pytest.mark.parametrize("option", ["--scene moon", "--sensor sonar", "--size 3", "--length nan", "--seed x"])
+def test_bad_options_are_one_line_and_leave_nothing(option, tmp_path, capsys):
+    assert main(["demo", "--out", str(tmp_path / "out"), *option.split()]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_it_does_not_touch_other_peoples_files(tmp_path, capsys):
+    mine = tmp_path / "report.json"
+    mine.write_text("mine")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+    assert main(["demo", "--out", str(mine)]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+    assert mine.read_text() == "mine"
