@@ -20,7 +20,6 @@ import atexit
 import importlib
 import importlib.util
 import os
-import queue
 import sys
 import threading
 from collections.abc import Callable
@@ -28,6 +27,8 @@ from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+
+from coview_kernels.owner import OwnerThread, StoppedError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -40,53 +41,23 @@ class _DisplacedError(Exception):
     """The host has replaced our Taichi program."""
 
 
-class _Job:
-    """A call on its way through the queue."""
-
-    __slots__ = ("call", "done", "error", "result")
-
-    def __init__(self, call: Callable[[], Any]) -> None:
-        self.call = call
-        self.done = threading.Lock()  # a bare lock wakes the caller faster than an Event
-        self.done.acquire()
-        self.result: Any = None
-        self.error: BaseException | None = None
-
-    def run(self) -> None:
-        try:
-            self.result = self.call()
-        except BaseException as error:
-            self.error = error
-        self.done.release()
-
-    def wait(self) -> Any:
-        self.done.acquire()
-        if self.error is not None:
-            raise self.error
-        return self.result
-
-
-class _Owner:
-    """The thread that initialises Taichi and launches every kernel."""
+class _Backend:
+    """An initialised library, its program, and the thread that launches every kernel."""
 
     def __init__(self, name: str) -> None:
-        self.name = name
         self.library: Any = None
         self._program: Any = None
-        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._loop, name="coview-kernels", daemon=True)
-        self._thread.start()
-
-    def _loop(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            job.run()
-
-    def start(self) -> None:
-        """Import and initialise the library on the owner thread."""
-        self.call(self._start)
+        self._name = name
+        self._thread = OwnerThread("coview-kernels")
+        self.call = self._thread.call
+        try:
+            self.call(self._start)
+        except BaseException:
+            self._thread.stop()
+            raise
 
     def _start(self) -> None:
-        self.library = _import(self.name)
+        self.library = _import(self._name)
         _forget_kernels(self.library)
         _init(self.library)
         self._program = _program(self.library)
@@ -94,26 +65,13 @@ class _Owner:
     def displaced(self) -> bool:
         return _program(self.library) is not self._program
 
-    def is_current(self) -> bool:
-        return threading.current_thread() is self._thread
-
-    def call(self, fn: Callable[[], R]) -> R:
-        if self.is_current():
-            return fn()
-        job = _Job(fn)
-        self._jobs.put(job)
-        result: R = job.wait()
-        return result
-
     def stop(self) -> None:
-        if not self.displaced():
-            self.call(self.library.reset)
-        self._jobs.put(None)
-        self._thread.join(timeout=5.0)
+        self.call(lambda: None if self.displaced() else self.library.reset())
+        self._thread.stop()
 
 
 _lock = threading.RLock()
-_owner: _Owner | None = None
+_owner: _Backend | None = None
 _backend: str | None = None
 
 
@@ -205,12 +163,10 @@ def backend() -> str:
         if _backend is None:
             name = _choose()
             if name != "numpy":
-                owner = _Owner(name)
-                owner.start()
-                _owner = owner
+                _owner = _Backend(name)
                 # registered after the import of Taichi, so that it runs before Taichi's own exit handler
-                atexit.unregister(shutdown)
-                atexit.register(shutdown)
+                atexit.unregister(_at_exit)
+                atexit.register(_at_exit)
             _backend = name
     return _backend
 
@@ -221,11 +177,15 @@ def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
     Callable from any thread, the owner included. With the NumPy backend there is no such thread and ``fn``
     runs on the caller's.
     """
-    backend()
-    owner = _owner
-    if owner is None:
-        return fn(*args, **kwargs)
-    return owner.call(lambda: fn(*args, **kwargs))
+    while True:
+        backend()
+        owner = _owner
+        if owner is None:
+            return fn(*args, **kwargs)
+        try:
+            return owner.call(lambda: fn(*args, **kwargs))
+        except StoppedError:  # a shutdown came between; start again
+            continue
 
 
 def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
@@ -243,7 +203,9 @@ def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwa
         return submit(launch, *args, **kwargs)
     except _DisplacedError:
         with _lock:
-            _owner, _backend = None, "numpy"
+            owner, _owner, _backend = _owner, None, "numpy"
+        if owner is not None:
+            owner.stop()
         return plain(*args, **kwargs)
 
 
@@ -271,6 +233,12 @@ def shutdown() -> None:
         owner, _owner, _backend = _owner, None, None
     if owner is not None:
         owner.stop()
+
+
+def _at_exit() -> None:
+    global _backend
+    shutdown()
+    _backend = "numpy"  # a daemon thread that still computes must not start Taichi in a dying interpreter
 
 
 def _after_fork() -> None:

@@ -122,6 +122,15 @@ def test_shutdown_is_idempotent_and_the_next_kernel_starts_again():
     assert backend() == before
 
 
+def test_shutdown_while_other_threads_compute_loses_no_call():
+    cloud = np.ones((100, 3), dtype=np.float32)
+    with ThreadPoolExecutor(4) as pool:
+        calls = [pool.submit(polar_bin, cloud, (0, 0, 0), 4, 8, 9.0) for _ in range(200)]
+        for _ in range(3):
+            shutdown()
+        assert all(call.result(timeout=60)[0].count.sum() == 100 for call in calls)
+
+
 @needs_library
 @pytest.mark.parametrize("name", LIBRARIES)
 @pytest.mark.parametrize("launched", [True, False])

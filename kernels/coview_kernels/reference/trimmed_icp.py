@@ -40,4 +40,5 @@ def normal_equations(
 
 def _symmetric(H: F64) -> F64:
     """Return the mean of H and its transpose: BLAS rounds the two halves differently."""
-    return 0.5 * (H + H.T)
+    mean: F64 = 0.5 * (H + H.T)
+    return mean
