@@ -56,7 +56,7 @@ def test_custom_descriptor(world, capsys):
 
 def test_single_scan(tmp_path, capsys):
     world = tmp_path / "world"
-    simulate(world, SimulationConfig(scene="campus", sensor="os64", seed=2, length=0.0))
+    simulate(world, SimulationConfig(scene="campus", sensor="os64", seed=2, size=140.0, length=0.0))
     fix = example("single_scan.py")(world / "base.laz", world / "run" / "frames" / "000000.pcd")
     assert fix.T_map_body is not None, capsys.readouterr().out
     truth = read_tum(world / "truth.tum")[1][0]
