@@ -184,8 +184,9 @@ def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
             return fn(*args, **kwargs)
         try:
             return owner.call(lambda: fn(*args, **kwargs))
-        except StoppedError:  # a shutdown came between; start again
-            continue
+        except StoppedError:  # a shutdown came between
+            with _lock:  # wait for its end, then start again
+                continue
 
 
 def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
@@ -203,9 +204,9 @@ def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwa
         return submit(launch, *args, **kwargs)
     except _DisplacedError:
         with _lock:
-            owner, _owner, _backend = _owner, None, "numpy"
-        if owner is not None:
-            owner.stop()
+            if _owner is not None and _owner.displaced():
+                _owner.stop()
+                _owner, _backend = None, "numpy"
         return plain(*args, **kwargs)
 
 
@@ -229,10 +230,10 @@ def warm_up() -> None:
 def shutdown() -> None:
     """Finish the queued kernels, free Taichi and end its thread. Idempotent; the next kernel starts anew."""
     global _owner, _backend
-    with _lock:
-        owner, _owner, _backend = _owner, None, None
-    if owner is not None:
-        owner.stop()
+    with _lock:  # held to the end: a new program would destroy the old one under a running kernel
+        if _owner is not None:
+            _owner.stop()
+        _owner, _backend = None, None
 
 
 def _at_exit() -> None:
