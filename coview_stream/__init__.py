@@ -3,16 +3,44 @@
 >>> from coview_stream import BaseMap, Localizer
 >>> localizer = Localizer(BaseMap.load("site.coview"))      # doctest: +SKIP
 >>> fix = localizer.step(cloud, T_odom_body, stamp)          # doctest: +SKIP
+
+Names are loaded when they are first used: importing the package costs next to nothing.
 """
 
 from __future__ import annotations
 
-from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import LocalizerConfig, MapConfig
-from coview_stream.errors import CoViewError
-from coview_stream.fix import Fix, State
-from coview_stream.localizer import Localizer
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.config import LocalizerConfig, MapConfig
+    from coview_stream.errors import CoViewError
+    from coview_stream.fix import Fix, State
+    from coview_stream.localizer import Localizer
 
 __all__ = ["BaseMap", "CoViewError", "Fix", "Localizer", "LocalizerConfig", "MapConfig", "State", "__version__"]
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "BaseMap": "basemap.basemap",
+    "CoViewError": "errors",
+    "Fix": "fix",
+    "Localizer": "localizer",
+    "LocalizerConfig": "config",
+    "MapConfig": "config",
+    "State": "fix",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

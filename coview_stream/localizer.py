@@ -82,6 +82,7 @@ class Localizer:
             self._tracker.start(verdict.accepted.registration)
             self._search.clear()
             self.state, self._doubts = State.TRACKING, 0
+            self._tracker.update(cloud, keyframe.T_odom_body)
         elif self.state is not State.LOST:
             self.state = verdict.evidence.state
 

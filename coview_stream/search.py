@@ -22,6 +22,7 @@ _SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close 
 _SAME_ANGLE = np.radians(5.0)
 _SUBMAP_KEYFRAMES = 4  # of the newest in the local scan that is registered: more are smeared by drift
 _COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through
+_COARSE_EVERY = 3  # of the source's points, for the coarse scales only every third
 _HOPELESS = 0.5  # after them, what has less than this share of the best score is not refined further
 
 
@@ -91,10 +92,11 @@ class GlobalSearch:
     ) -> list[Candidate]:
         """Verified candidates, best first. All go through the coarse scales, the promising ones through all."""
         scales = self.config.registration.search
+        rough = source.every(_COARSE_EVERY)
         coarse = [
             candidate
             for hypothesis in hypotheses
-            if (candidate := self._candidate(hypothesis, None, source, keyframe, cloud, scales[:_COARSE_SCALES]))
+            if (candidate := self._candidate(hypothesis, None, rough, keyframe, cloud, scales[:_COARSE_SCALES]))
         ]
         best = max((c.evidence.score for c in coarse), default=0.0)
         fine = [

@@ -17,6 +17,7 @@ from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
 
 _MOST_FRAMES = 40
+_START_COVARIANCE = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ class Tracker:
         self._recent.append(_Recent(self._travelled, points))
 
     def start(self, registration: Registration) -> None:
-        """Begin with an accepted fix."""
+        """Begin with an accepted fix, which may not have converged yet: its own covariance is not believed."""
         self.T_map_odom = registration.T_map_source
-        self.covariance = self._posterior(registration)
+        self.covariance = self._posterior(registration) + _START_COVARIANCE
         self._registered_at = self._travelled
 
     @property

@@ -42,6 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Raises nothing on purpose: errors of the caller's making become one line on stderr and exit code 2.
     """
+    # Our matrices are small: BLAS threads cost more than they bring, most of all beside other programs.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = _dispatch(sys.argv[1:] if argv is None else list(argv))
         sys.stdout.flush()  # a closed pipe must show up here, not while the interpreter shuts down

@@ -19,6 +19,7 @@ from coview_stream.geometry import Pose, pose_from, rot_z
 from coview_stream.place.retrieval import Volume
 
 _SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
+_MARGIN = 100  # cells around the stations; farther apart than this keyframes do not vote together
 _LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys
 
 
@@ -35,50 +36,47 @@ class Hypothesis:
 @dataclass(frozen=True)
 class _Ballot:
     centre: npt.NDArray[np.float64]  # (3,) odometry frame, z on the ground
-    votes: npt.NDArray[np.float16]  # (M, S) standardised distances
+    votes: npt.NDArray[np.float32]  # (S, M + 1) standardised distances; the last station is nowhere: no opinion
     smallest: float  # smallest raw distance, for the paper's single-minimum rule
 
 
 class StationGrid:
-    """Finds the station at a position: stations stand at the centres of a square grid, one per level."""
+    """Finds the station at a position: stations stand at the centres of a square grid, one per level.
+
+    The grid has a margin, so that a step from any station to a place off the map is one addition and finds nothing.
+    """
 
     def __init__(self, stations: npt.NDArray[np.float32], block: float) -> None:
         self.stations = stations
         self.block = block
         cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
-        self._low = cells.min(axis=0)
-        self._shape = cells.max(axis=0) - self._low + 1
-        flat = self._flat(cells - self._low)
-        order = np.lexsort((stations[:, 2], flat))
-        unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-        self._grid = np.full((int(count.max()), int(self._shape.prod())), -1, dtype=np.int32)
+        cells += _MARGIN - cells.min(axis=0)
+        self._width = int(cells[:, 1].max()) + 1 + _MARGIN
+        self._flat = cells[:, 0] * self._width + cells[:, 1]
+        order = np.lexsort((stations[:, 2], self._flat))
+        unique, first, count = np.unique(self._flat[order], return_index=True, return_counts=True)
+        size = (int(cells[:, 0].max()) + 1 + _MARGIN) * self._width
+        self._grid = np.full((int(count.max()), size), -1, dtype=np.int32)
         for level in range(len(self._grid)):
             has = count > level
             self._grid[level, unique[has]] = order[first[has] + level]
-
-    def _flat(self, cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        return np.asarray(cells[..., 0] * self._shape[1] + cells[..., 1])
 
     def moved(self, shift_cells: npt.NDArray[np.int64], rise: float) -> npt.NDArray[np.int32]:
         """Index (M,) of the station that lies ``shift_cells`` (2,) from each station, -1 where there is none.
 
         ``rise`` (metres) is the height gained on the way; it picks the storey.
         """
-        cells = self._cells + shift_cells
-        inside = ((cells >= 0) & (cells < self._shape)).all(axis=1)
-        flat = np.where(inside, self._flat(cells), 0)
+        if np.abs(shift_cells).max() >= _MARGIN:
+            return np.full(len(self.stations), -1, dtype=np.int32)
+        there = self._flat + (shift_cells[0] * self._width + shift_cells[1])
         if len(self._grid) == 1:
-            return np.where(inside, self._grid[0][flat], -1).astype(np.int32)
-        levels = self._grid[:, flat]
+            return np.asarray(self._grid[0][there])
+        levels = self._grid[:, there]
         gap = np.abs(self.stations[levels, 2] - (self.stations[:, 2] + rise))
-        gap[(levels < 0) | ~inside] = np.inf
+        gap[levels < 0] = np.inf
         best = gap.argmin(axis=0)
         columns = np.arange(len(self.stations))
         return np.where(gap[best, columns] < _LEVEL_GAP, levels[best, columns], -1).astype(np.int32)
-
-    @property
-    def _cells(self) -> npt.NDArray[np.int64]:
-        return np.floor(self.stations[:, :2].astype(np.float64) / self.block).astype(np.int64) - self._low
 
 
 class Consensus:
@@ -106,7 +104,9 @@ class Consensus:
         """
         votes = sum(standardised(volume) for volume in distances.values()) / np.float32(len(distances))
         smallest = min(float(volume.min()) for volume in distances.values())
-        self._ballots.append(_Ballot(centre, np.asarray(votes, dtype=np.float16), smallest))
+        by_shift = np.zeros((np.shape(votes)[1], len(self.stations) + 1), dtype=np.float32)
+        by_shift[:, :-1] = np.transpose(votes)
+        self._ballots.append(_Ballot(centre, by_shift, smallest))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
@@ -114,26 +114,25 @@ class Consensus:
             return []
         if self.config.mode == "single":
             ballot = min(self._ballots, key=lambda b: b.smallest)
-            return self._peaks(ballot.votes.astype(np.float32), ballot.centre)[:1]
+            return self._peaks(ballot.votes[:, :-1].T, ballot.centre)[:1]
         return self._peaks(self.scores(), self._ballots[-1].centre)
 
     def scores(self) -> Volume:
         """Summed votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
         newest = self._ballots[-1]
-        total = newest.votes.astype(np.float32)
-        sectors = total.shape[1]
+        total = newest.votes[:, :-1].copy()
+        sectors = len(total)
         for ballot in list(self._ballots)[:-1]:
             step = ballot.centre - newest.centre
             for n in range(sectors):
                 xy = rot_z(yaw_of_shift(n, sectors))[:2, :2] @ step[:2]
                 moved = self.grid.moved(np.rint(xy / self.grid.block).astype(np.int64), float(step[2]))
-                # no station there (map edge, inside a building): no opinion
-                total[:, n] += np.where(moved >= 0, ballot.votes[moved, n], np.float16(0))
-        return np.asarray(total / np.sqrt(len(self._ballots)), dtype=np.float32)
+                total[n] += ballot.votes[n][moved]  # -1, no station there (map edge, building), finds the zero
+        return np.asarray(total.T / np.float32(np.sqrt(len(self._ballots))))
 
     def _peaks(self, scores: Volume, centre: npt.NDArray[np.float64]) -> list[Hypothesis]:
         sectors = scores.shape[1]
-        flat = scores.ravel()
+        flat = np.ascontiguousarray(scores).ravel()
         some = min(_SHORTLIST, flat.size - 1)
         shortlist = np.argpartition(flat, some)[: some + 1]
         shortlist = shortlist[np.argsort(flat[shortlist], kind="stable")]

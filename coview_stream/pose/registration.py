@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import coview_kernels as kernels
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry import Points, Pose, exp_se3, pose_from, transform
+from coview_stream.pose.edges import EdgeRaster, edge_raster
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -21,9 +23,10 @@ Matrix6 = npt.NDArray[np.float64]
 
 _CACHED_CROPS = 12
 _CROP_STEP = 16.0  # metres between the centres of cached crops
-_STOP_SHIFT = 5e-4  # metres; below the map's own noise
-_STOP_TURN = 2e-5  # radians
+_STOP_SHIFT = 1e-3  # metres; below the map's own noise
+_STOP_TURN = 5e-5  # radians
 _LEAST_PAIRS = 50
+_WIDTH_SHARE = 0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,11 @@ class LocalMap:
     points: Points
     normals: Points
     tree: cKDTree
+
+    @cached_property
+    def edges(self) -> EdgeRaster:
+        """Where the map must have walls that it does not show."""
+        return edge_raster(self.points)
 
 
 class LocalMaps:
@@ -80,7 +88,7 @@ class Registration:
         rmse: root mean square of the kept point-to-plane residuals, metres.
         pairs: how many pairs were kept at the last iteration.
         iterations: over all scales.
-        converged: the last step was below 0.5 mm and 0.001 degrees.
+        converged: the last step was below 1 mm and 0.003 degrees.
     """
 
     T_map_source: Pose
@@ -98,6 +106,11 @@ class Source:
     points: Points
     above: npt.NDArray[np.bool_]
     height: npt.NDArray[np.float32]
+
+    def every(self, nth: int) -> Source:
+        """Return a thinner scan: every ``nth`` point of each kind."""
+        order = np.argsort(~self.above, kind="stable")[::nth]
+        return Source(self.points[order], self.above[order], self.height[order])
 
 
 def register(
@@ -169,7 +182,8 @@ def _step(
     q, n = target.points[partner[chosen]], target.normals[partner[chosen]]
     residual = np.einsum("ij,ij->i", moved[chosen] - q, n)
     # Cauchy weights: what remains of foliage and changes after trimming must not pull
-    weight = share[chosen] / (1.0 + (residual / config.residual_scale) ** 2)
+    width = max(config.residual_scale, _WIDTH_SHARE * scale)
+    weight = share[chosen] / (1.0 + (residual / width) ** 2)
     about = transform(T, pivot[None])[0]
     H, b, _ = kernels.normal_equations(source.points[chosen], q, n, weight, T, about)
     variance = float((weight * residual**2).sum() / weight.sum()) + 1e-6
