@@ -1,0 +1,65 @@
+"""One small world for all tests of the engine: built once, never changed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.writers import write_cloud
+from coview_stream.localizer import Localizer
+
+RADIUS = 30.0
+
+
+@pytest.fixture(scope="session")
+def scene():
+    return small_world.boxes(seed=3)
+
+
+@pytest.fixture(scope="session")
+def map_points(scene):
+    """(N, 3) float64 base map points around zero."""
+    return small_world.sample_map(scene)
+
+
+@pytest.fixture(scope="session")
+def map_cloud_file(map_points, tmp_path_factory):
+    path = tmp_path_factory.mktemp("world") / "site.ply"
+    write_cloud(path, map_points.astype(np.float32))
+    return path
+
+
+@pytest.fixture(scope="session")
+def world_map(map_cloud_file):
+    """The base map of the small world, source frame at zero."""
+    return BaseMap.build(map_cloud_file, radius=RADIUS)
+
+
+@pytest.fixture(scope="session")
+def world_file(world_map, tmp_path_factory):
+    """The same, saved; read only."""
+    path = tmp_path_factory.mktemp("maps") / "site.coview"
+    # a map of its own, for saving sets the hash
+    BaseMap(world_map._arrays, world_map.parameters).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def world_drive(scene):
+    return small_world.record(scene)
+
+
+@pytest.fixture(scope="session")
+def elsewhere():
+    """A run through another world."""
+    return small_world.record(small_world.boxes(seed=77), frames=4)
+
+
+@pytest.fixture(scope="session")
+def world_fixes(world_map, world_drive):
+    """What a localizer says of the drive, frame by frame."""
+    localizer = Localizer(world_map)
+    pairs = zip(world_drive.clouds, world_drive.T_odom_body, strict=True)
+    return [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]

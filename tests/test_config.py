@@ -1,0 +1,120 @@
+"""Configurations refuse what makes no sense, by name, and the presets are the paper's."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError, asdict, fields
+
+import pytest
+
+from coview_stream import config
+from coview_stream.config import (
+    AcceptanceConfig,
+    ConsensusConfig,
+    DescriptorConfig,
+    KeyframeConfig,
+    LocalizerConfig,
+    MapConfig,
+    RegistrationConfig,
+    RetrievalConfig,
+    TrackingConfig,
+    map_preset,
+)
+from coview_stream.errors import ConfigError
+
+BAD = [
+    (DescriptorConfig, "radius", 0.0),
+    (DescriptorConfig, "radius", float("nan")),
+    (DescriptorConfig, "radius", float("inf")),
+    (DescriptorConfig, "rings", 3),
+    (DescriptorConfig, "sectors", 60.0),
+    (DescriptorConfig, "channels", ()),
+    (DescriptorConfig, "channels", ("coview", "coview")),
+    (DescriptorConfig, "channels", ("colour",)),
+    (DescriptorConfig, "visibility", "x-ray"),
+    (DescriptorConfig, "voxel", -0.1),
+    (DescriptorConfig, "eye", 0.0),
+    (MapConfig, "block", 0.0),
+    (MapConfig, "block", 50.0),
+    (MapConfig, "voxel", 2.5),
+    (MapConfig, "tile", -1.0),
+    (MapConfig, "outlier_neighbours", -1),
+    (MapConfig, "normal_neighbours", 2),
+    (KeyframeConfig, "distance", 0.0),
+    (KeyframeConfig, "capacity", 0),
+    (KeyframeConfig, "range_min", -0.5),
+    (RetrievalConfig, "mode", "guess"),
+    (RetrievalConfig, "candidates", 0),
+    (ConsensusConfig, "mode", "majority"),
+    (ConsensusConfig, "window", 0),
+    (ConsensusConfig, "peaks", 0),
+    (ConsensusConfig, "distinct_yaw", 0.0),
+    (RegistrationConfig, "keep", 0.0),
+    (RegistrationConfig, "keep", 1.1),
+    (RegistrationConfig, "search", ()),
+    (RegistrationConfig, "search", (0.5, 1.0)),
+    (RegistrationConfig, "track", (0.5, 0.0)),
+    (RegistrationConfig, "iterations", 0),
+    (RegistrationConfig, "gravity_sigma", 0.0),
+    (AcceptanceConfig, "score", 0.0),
+    (AcceptanceConfig, "rival", 1.01),
+    (AcceptanceConfig, "confirmations", 0),
+    (AcceptanceConfig, "agree_angle", float("nan")),
+    (TrackingConfig, "distance", 0.0),
+    (TrackingConfig, "yaw_drift", -0.1),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), BAD)
+def test_a_value_out_of_range_is_refused_by_name(kind, name, value):
+    with pytest.raises(ConfigError, match=rf"{kind.__name__}\.{name} is .*must be"):
+        kind(**{name: value})
+
+
+def test_defaults_are_the_papers():
+    usual = MapConfig()
+    assert (usual.block, usual.descriptor.radius) == (2.0, 50.0)
+    assert (usual.descriptor.rings, usual.descriptor.sectors) == (20, 60)
+    assert LocalizerConfig().keyframe.distance == 2.0
+    assert LocalizerConfig().retrieval.mode == "exhaustive"
+    assert LocalizerConfig().stationary is False
+
+
+def test_configurations_are_frozen_and_equal_by_value():
+    assert LocalizerConfig() == LocalizerConfig()
+    with pytest.raises(FrozenInstanceError):
+        MapConfig().block = 3.0
+    for item in fields(LocalizerConfig):
+        inner = getattr(LocalizerConfig(), item.name)
+        if item.name != "stationary":
+            assert type(inner)(**asdict(inner)) == inner
+
+
+def test_presets():
+    assert map_preset("slam") == MapConfig()
+    assert map_preset("tls").descriptor.radius == 100.0
+    assert map_preset("tls", radius=80.0).descriptor.radius == 80.0
+
+
+def test_preset_options_reach_the_right_configuration():
+    changed = map_preset("slam", block=1.0, sectors=30, channels=("density",), voxel=0.5)
+    assert changed.block == 1.0
+    assert changed.descriptor.sectors == 30
+    assert changed.descriptor.channels == ("density",)
+    # voxel is the stored cloud's; the descriptor's own stays
+    assert changed.voxel == 0.5
+    assert map_preset("slam", voxel=0.2).descriptor.voxel == DescriptorConfig().voxel
+
+
+def test_unknown_presets_and_options_are_named():
+    with pytest.raises(ConfigError, match=r"'indoor'.*slam, tls"):
+        map_preset("indoor")
+    with pytest.raises(ConfigError, match=r"'blok'.*block"):
+        map_preset("slam", blok=1.0)
+    with pytest.raises(ConfigError, match="'descriptor'"):
+        map_preset("slam", descriptor=DescriptorConfig())
+    with pytest.raises(ConfigError, match=r"MapConfig\.block"):
+        map_preset("slam", block=-2.0)
+
+
+def test_config_errors_are_value_errors():
+    assert issubclass(config.ConfigError, ValueError)

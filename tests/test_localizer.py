@@ -1,0 +1,188 @@
+"""The engine on a small world: right where it speaks, silent where it cannot know, unharmed by bad frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from small_world import pose_error
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.errors import CloudError, RunError
+from coview_stream.fix import State
+from coview_stream.geometry import pose_from, rot_z
+from coview_stream.localizer import Localizer
+
+UTM = np.array([512_345.6, 5_403_210.9, 287.4])
+
+
+def follow(localizer, drive, frames=None):
+    some = slice(0, frames)
+    return [
+        localizer.step(cloud, T, 0.5 * k)
+        for k, (cloud, T) in enumerate(zip(drive.clouds[some], drive.T_odom_body[some], strict=True))
+    ]
+
+
+def moved_map(base_map: BaseMap, origin) -> BaseMap:
+    return BaseMap({**base_map._arrays, "origin": np.asarray(origin) + base_map.origin}, base_map.parameters)
+
+
+def test_the_first_fix_and_every_pose_after_it_are_right(world_fixes, world_drive):
+    posed = [k for k, fix in enumerate(world_fixes) if fix.T_map_body is not None]
+    assert posed
+    assert posed[0] <= 5  # 12 m
+    assert posed == list(range(posed[0], len(world_fixes)))
+    for k in posed:
+        metres, degrees = pose_error(world_fixes[k].T_map_body, world_drive.T_map_body[k])
+        assert metres < 0.08, k
+        assert degrees < 0.3, k
+
+
+def test_no_pose_unless_tracking(world_fixes):
+    for fix in world_fixes:
+        known = fix.state is State.TRACKING
+        assert (fix.T_map_body is not None) == known
+        assert (fix.T_map_odom is not None) == known
+        assert (fix.covariance is not None) == known
+        assert known or fix.state in (State.SEARCHING, State.AMBIGUOUS)
+        assert fix.evidence is not None
+
+
+def test_the_first_keyframe_alone_is_not_believed(world_fixes):
+    assert world_fixes[0].T_map_body is None
+    assert world_fixes[0].confidence == 0.0
+
+
+def test_the_correction_explains_the_pose(world_fixes, world_drive):
+    for fix, T_odom_body in zip(world_fixes, world_drive.T_odom_body, strict=True):
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_odom @ T_odom_body, fix.T_map_body, atol=1e-6)
+            R = fix.T_map_body[:3, :3]
+            np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+def test_covariance_is_symmetric_positive_and_ordered(world_fixes):
+    covariance = world_fixes[-1].covariance
+    assert covariance.shape == (6, 6)
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    sigma = np.sqrt(np.diag(covariance))
+    # metres come first: centimetres to decimetres; then radians: tenths of a degree
+    assert (sigma[:3] > 0.015).all()
+    assert (sigma[:3] < 0.5).all()
+    assert (sigma[3:] < np.radians(2.0)).all()
+    assert (sigma[3:] >= np.radians(0.05) * 0.999).all()
+
+
+def test_covariance_axes_are_those_of_the_contract(world_map):
+    """(x, y, z, roll, pitch, yaw) from the tracker's (rx, ry, rz, x, y, z)."""
+    tracker = Localizer(world_map)._tracker
+    tracker.covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    tracker.covariance[2, 3] = tracker.covariance[3, 2] = 0.7  # yaw with x
+    reported = tracker.reported_covariance()
+    np.testing.assert_allclose(np.diag(reported), [4, 5, 6, 1, 2, 3], atol=1e-2)
+    assert reported[5, 0] == reported[0, 5] == 0.7
+
+
+def test_confidence_is_a_share(world_fixes):
+    assert all(0.0 <= fix.confidence <= 1.0 for fix in world_fixes)
+    assert world_fixes[-1].confidence > 0.3
+
+
+def test_utm_map_and_utm_odometry_lose_no_millimetre(world_map, world_drive, world_fixes):
+    odometry = small_world.pose_from(small_world.ODOM_FAR[:3, :3], [443_000.4, 5_900_000.8, -60.0])
+    far = world_drive.seen_from(odometry)
+    fixes = follow(Localizer(moved_map(world_map, UTM)), far, 8)
+    posed = 0
+    for here, there, T_odom_body in zip(world_fixes, fixes, far.T_odom_body, strict=False):
+        assert there.state is here.state
+        if here.T_map_body is not None:
+            posed += 1
+            np.testing.assert_allclose(there.T_map_body[:3, 3] - UTM, here.T_map_body[:3, 3], atol=1e-3)
+            np.testing.assert_allclose(there.T_map_body[:3, :3], here.T_map_body[:3, :3], atol=1e-4)
+            np.testing.assert_allclose(there.T_map_odom @ T_odom_body, there.T_map_body, atol=1e-3)
+    assert posed >= 2
+
+
+def test_lost_when_the_world_no_longer_fits(world_map, world_drive):
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, 7)[-1].state is State.TRACKING
+    states = []
+    rng = np.random.default_rng(1)
+    for k in range(7, 10):
+        garbage = rng.uniform([-20, -20, -1.5], [20, 20, 6], (6000, 3)).astype(np.float32)
+        fix = localizer.step(garbage, world_drive.T_odom_body[k], 0.5 * k)
+        states.append(fix.state)
+        assert (fix.T_map_body is None) == (fix.state is not State.TRACKING)
+    assert states[-1] is State.LOST
+    assert "evidence gone" in fix.evidence.reason or fix.evidence.state is not State.TRACKING
+
+
+def test_never_a_pose_outside_the_map(world_map, elsewhere):
+    for fix in follow(Localizer(world_map), elsewhere):
+        assert fix.state in (State.SEARCHING, State.AMBIGUOUS)
+        assert fix.T_map_body is None
+
+
+def test_bad_frames_raise_and_change_nothing(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    cloud, T = world_drive.clouds[0], world_drive.T_odom_body[0]
+    scaled = T.copy()
+    scaled[:3, :3] *= 1.1
+    mirrored = T @ np.diag([1.0, -1.0, 1.0, 1.0])
+    nan_pose = T.copy()
+    nan_pose[0, 3] = np.nan
+    bad = [
+        (cloud[:, :2], T, 0.0, CloudError),
+        (cloud[:9], T, 0.0, CloudError),
+        (np.full((50, 3), np.nan, np.float32), T, 0.0, CloudError),
+        (np.empty((0, 3), np.float32), T, 0.0, CloudError),
+        (cloud, scaled, 0.0, RunError),
+        (cloud, mirrored, 0.0, RunError),
+        (cloud, nan_pose, 0.0, RunError),
+        (cloud, T[:3], 0.0, RunError),
+        (cloud, T, float("nan"), RunError),
+    ]
+    fixes = []
+    for k in range(5):
+        for points, pose, stamp, error in bad:
+            with pytest.raises(error):
+                localizer.step(points, pose, stamp)
+        fixes.append(localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k))
+    for fix, undisturbed in zip(fixes, world_fixes, strict=False):
+        assert fix.state is undisturbed.state
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, undisturbed.T_map_body, atol=1e-9)
+
+
+def test_rows_with_nan_are_dropped(world_map, world_drive):
+    cloud = np.full((len(world_drive.clouds[0]) + 500, 3), np.nan, np.float32)
+    cloud[250:-250] = world_drive.clouds[0]
+    one, other = Localizer(world_map), Localizer(world_map)
+    with_nan = one.step(cloud, world_drive.T_odom_body[0], 0.0)
+    without = other.step(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    assert with_nan.evidence.score == pytest.approx(without.evidence.score)
+
+
+def test_the_callers_arrays_stay_as_they_are(world_map, world_drive):
+    cloud, T = world_drive.clouds[0].copy(), world_drive.T_odom_body[0].copy()
+    Localizer(world_map).step(cloud, T, 0.0)
+    np.testing.assert_array_equal(cloud, world_drive.clouds[0])
+    np.testing.assert_array_equal(T, world_drive.T_odom_body[0])
+
+
+def test_reset_forgets_all_but_the_map(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    follow(localizer, world_drive, 2)
+    assert localizer.last_query
+    localizer.reset()
+    assert localizer.state is State.SEARCHING
+    assert not localizer.last_query
+    # another odometry frame after the reset must not matter: the old one is forgotten
+    T_other = pose_from(rot_z(-0.4), [1e5, -2e5, 3.0])
+    again = follow(localizer, world_drive.seen_from(T_other), 6)
+    assert [fix.state for fix in again] == [fix.state for fix in world_fixes[:6]]
+    metres, degrees = pose_error(again[-1].T_map_body, world_drive.T_map_body[5])
+    assert metres < 0.08
+    assert degrees < 0.3

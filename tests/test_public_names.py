@@ -1,0 +1,57 @@
+"""``import coview_stream`` is cheap, and every public name is there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+import coview_stream
+from coview_stream import errors
+
+HEAVY = ("taichi", "quadrants", "open3d", "matplotlib", "zenoh", "laspy", "CSF")
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def run_python(script: str) -> list[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, env=ENVIRONMENT, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["import coview_stream", "from coview_stream import *", "from coview_stream import BaseMap, Localizer"],
+)
+def test_import_loads_nothing_heavy(statement):
+    script = f"{statement}\nimport sys; print('loaded:', *sorted({set(HEAVY)!r} & set(sys.modules)))"
+    assert run_python(script) == ["loaded:"]
+
+
+def test_all_is_sorted_and_resolvable():
+    names = coview_stream.__all__
+    assert sorted(names, key=lambda n: (n.startswith("_"), n)) == list(names)
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert getattr(coview_stream, name) is not None
+    assert set(names) <= set(dir(coview_stream))
+    assert {"BaseMap", "Localizer", "LocalizerConfig"} <= set(names)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = coview_stream.no_such_name
+
+
+def test_one_error_tree():
+    kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, Exception)]
+    assert len(kinds) >= 7
+    for kind in kinds:
+        assert issubclass(kind, errors.CoViewError)
+        assert kind.__doc__
+    assert issubclass(errors.MapError, errors.InputError)
+    assert issubclass(errors.DependencyError, ImportError)
