@@ -22,7 +22,9 @@ def read_npy(path: Path) -> Cloud:
     """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, OSError, TypeError, SyntaxError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # NumPy parses the header as Python, so anything may come out of a damaged one
         reason = " ".join(str(error).split())[:120]
         raise CloudError(f"{path}: damaged or truncated NPY ({reason}); save the array again") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":

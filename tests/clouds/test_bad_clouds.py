@@ -1,0 +1,146 @@
+"""Whatever is wrong with a cloud is one CloudError that names the file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from coview_stream.clouds import read_cloud, write_cloud
+from coview_stream.errors import CloudError
+
+POINTS = np.random.default_rng(2).normal(0, 20, (60, 3)).astype(np.float32)
+SUFFIXES = [".pcd", ".ply", ".npy", ".las", ".laz", ".bin"]
+HEADER = "VERSION 0.7\nFIELDS {f}\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nPOINTS {n}\nDATA ascii\n"
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_missing_empty_directory_and_junk(tmp_path: Path, suffix: str) -> None:
+    for name, content in (
+        ("text", b"just some words\n" * 40),
+        ("html", b"<!DOCTYPE html><html>" + b" " * 43),
+    ):
+        (tmp_path / f"{name}{suffix}").write_bytes(content)
+    (tmp_path / f"empty{suffix}").touch()
+    (tmp_path / f"folder{suffix}").mkdir()
+    reasons = {
+        "missing": "no such file",
+        "empty": "empty",
+        "folder": "directory",
+        "text": "text",
+        "html": "HTML",
+    }
+    for name, reason in reasons.items():
+        with pytest.raises(CloudError, match=reason) as caught:
+            read_cloud(tmp_path / f"{name}{suffix}")
+        assert f"{name}{suffix}" in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_zero_points(tmp_path: Path, suffix: str) -> None:
+    write_cloud(tmp_path / f"a{suffix}", np.zeros((0, 3), np.float32))
+    with pytest.raises(CloudError, match=r"zero points|is empty"):
+        read_cloud(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy", ".bin"])
+def test_all_nan(tmp_path: Path, suffix: str) -> None:
+    write_cloud(tmp_path / f"a{suffix}", np.full((9, 3), np.nan, np.float32))
+    with pytest.raises(CloudError, match="none of the 9 points"):
+        read_cloud(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize(
+    ("real", "named"), [(".ply", ".pcd"), (".pcd", ".laz"), (".laz", ".ply"), (".npy", ".bin")]
+)
+def test_content_of_another_format(tmp_path: Path, real: str, named: str) -> None:
+    write_cloud(tmp_path / f"a{real}", POINTS[:52])
+    os.rename(tmp_path / f"a{real}", tmp_path / f"a{named}")  # noqa: PTH104
+    what = "LAS" if real == ".laz" else real[1:].upper()
+    with pytest.raises(CloudError, match=f"content is {what}"):
+        read_cloud(tmp_path / f"a{named}")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.e57", b"ASTM-E57\0\0", "not supported yet"),
+        ("a.xyz", b"1 2 3\n", "unknown cloud suffix"),
+        ("a.pcd", HEADER.format(f="x y q", n=1).encode() + b"1 2 3\n", "no field z"),
+        ("a.pcd", HEADER.format(f="x y z", n=2).encode() + b"1 2 3\n", "truncated"),
+        ("a.pcd", HEADER.format(f="x y z", n=2).encode() + b"1 2 3\n1 a 3\n", "unreadable ascii"),
+        ("a.pcd", HEADER.format(f="x y z", n=10**15).encode() + b"1 2 3\n", "truncated"),
+        ("a.pcd", HEADER.format(f="x y z", n=2).replace("SIZE 4", "SIZE 3").encode(), "TYPE and SIZE"),
+        ("a.pcd", HEADER.format(f="x y z", n=2).replace("ascii", "zip").encode(), "unknown encoding"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "without a vertex"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+            "have no y, z",
+        ),
+        ("a.ply", b"ply\nformat odd 1.0\nend_header\n", "damaged PLY header"),
+        ("a.bin", b"\x01\xff" * 15, "no multiple"),
+    ],
+)
+def test_damaged_content(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(CloudError, match=reason):
+        read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "array", [np.zeros(9), np.zeros((4, 2)), np.array([["a"] * 3]), np.array([[None] * 3])]
+)
+def test_npy_of_another_shape_or_type(tmp_path: Path, array: np.ndarray) -> None:
+    np.save(tmp_path / "a.npy", array, allow_pickle=True)
+    with pytest.raises(CloudError, match=r"a\.npy"):
+        read_cloud(tmp_path / "a.npy")
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("originals")
+    for suffix in SUFFIXES:
+        write_cloud(folder / f"a{suffix}", POINTS)
+    return {suffix: (folder / f"a{suffix}").read_bytes() for suffix in SUFFIXES}
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(suffix=st.sampled_from(SUFFIXES), share=st.floats(0, 1, exclude_max=True))
+def test_truncated_anywhere(tmp_path: Path, originals: dict[str, bytes], suffix: str, share: float) -> None:
+    whole = originals[suffix]
+    cut = int(share * len(whole))
+    path = tmp_path / f"cut{suffix}"
+    path.write_bytes(whole[:cut])
+    if suffix == ".bin" and cut % 16 == 0 and cut:
+        # rows without a header: a shorter file is a shorter cloud
+        np.testing.assert_array_equal(read_cloud(path).points, POINTS[: cut // 16])
+        return
+    with pytest.raises(CloudError, match="cut"):
+        read_cloud(path)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    suffix=st.sampled_from([".pcd", ".ply", ".npy", ".las"]),
+    where=st.floats(0, 1, exclude_max=True),
+    bit=st.integers(0, 7),
+)
+def test_flipped_bits_give_a_cloud_or_a_cloud_error(
+    tmp_path: Path, originals: dict[str, bytes], suffix: str, where: float, bit: int
+) -> None:
+    content = bytearray(originals[suffix])
+    # the header decides; flips in coordinates are mere coordinates
+    content[int(where * min(400, len(content)))] ^= 1 << bit
+    path = tmp_path / f"flip{suffix}"
+    path.write_bytes(content)
+    try:
+        cloud = read_cloud(path)
+    except CloudError:
+        return
+    assert np.isfinite(cloud.points).all()

@@ -1,0 +1,192 @@
+"""Every format round trip, and the variants that other programs write."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from coview_stream.clouds import merge, read_cloud, write_cloud
+from coview_stream.clouds.pcd import lzf_decompress
+from coview_stream.errors import CloudError
+
+POINTS = np.random.default_rng(1).normal(0, 20, (300, 3)).astype(np.float32)
+UTM = np.array([351_154.5, 4_025_876.25, 14.0])
+SUFFIXES = [".pcd", ".ply", ".npy", ".las", ".laz", ".bin"]
+TOLERANCE = {".las": 6e-4, ".laz": 6e-4}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_local_round_trip(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    write_cloud(path, POINTS)
+    cloud = read_cloud(path)
+    assert cloud.points.dtype == np.float32
+    assert not cloud.origin.any()
+    assert cloud.dropped == 0
+    np.testing.assert_allclose(cloud.points, POINTS, rtol=0, atol=TOLERANCE.get(suffix, 0.0))
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES[:-1])
+def test_utm_coordinates_keep_millimetres(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    write_cloud(path, POINTS, origin=UTM)
+    cloud = read_cloud(path)
+    assert np.abs(cloud.points).max() < 500
+    assert (cloud.origin % 100 == 0).all()
+    np.testing.assert_allclose(cloud.map_points(), POINTS + UTM, rtol=0, atol=1e-3)
+
+
+def test_bin_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
+    with pytest.raises(CloudError, match="10 km"):
+        write_cloud(tmp_path / "a.bin", POINTS, origin=UTM)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy", ".bin"])
+def test_unusable_rows_are_dropped_and_counted(tmp_path: Path, suffix: str) -> None:
+    points = POINTS.copy()
+    points[3, 1], points[5, 0], points[7, 2] = np.nan, np.inf, 1e30
+    write_cloud(tmp_path / f"a{suffix}", points)
+    cloud = read_cloud(tmp_path / f"a{suffix}")
+    assert cloud.dropped == 3
+    np.testing.assert_array_equal(cloud.points, np.delete(POINTS, [3, 5, 7], axis=0))
+
+
+def _pcd(fields: str, size: str, kind: str, count: str, n: int, data: str) -> bytes:
+    return (
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nCOUNT {count}\n"
+        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n"
+    ).encode()
+
+
+def _mixed_rows() -> npt.NDArray[np.void]:
+    row = np.dtype([("i", "u1"), ("z", "<f8"), ("n", "<f4", (3,)), ("x", "<f4"), ("y", "<i2")])
+    rows = np.zeros(50, row)
+    rows["x"], rows["y"], rows["z"] = POINTS[:50, 0], np.arange(50), POINTS[:50, 2]
+    rows["n"] = 7.0
+    return rows
+
+
+def _expected(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
+    return np.column_stack([rows["x"], rows["y"], rows["z"]])
+
+
+def test_pcd_binary_any_order_and_types(tmp_path: Path) -> None:
+    rows = _mixed_rows()
+    path = tmp_path / "a.pcd"
+    path.write_bytes(_pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "binary") + rows.tobytes())
+    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
+
+
+def test_pcd_ascii_any_order(tmp_path: Path) -> None:
+    rows = _mixed_rows()
+    body = "".join(f"{r['i']} {r['z']} 1 nan 3 {r['x']} {r['y']}\n" for r in rows)
+    path = tmp_path / "a.pcd"
+    path.write_bytes(_pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "ascii") + body.encode())
+    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-5)
+
+
+def _lzf_literals(data: bytes) -> bytes:
+    return b"".join(bytes([len(data[i : i + 32]) - 1]) + data[i : i + 32] for i in range(0, len(data), 32))
+
+
+def test_pcd_binary_compressed_stores_fields_one_after_another(tmp_path: Path) -> None:
+    rows = _mixed_rows()
+    data = b"".join(np.ascontiguousarray(rows[name]).tobytes() for name in rows.dtype.names or ())
+    packed = _lzf_literals(data)
+    path = tmp_path / "a.pcd"
+    header = _pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "binary_compressed")
+    path.write_bytes(header + struct.pack("<II", len(packed), len(data)) + packed)
+    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
+
+
+def test_lzf_back_references_repeat_and_overlap() -> None:
+    # "ab", then 5 from distance 2 (it reads what it writes), then a long one of 7 + 3 + 2 from distance 7
+    packed = bytes([1]) + b"ab" + bytes([3 << 5, 1]) + bytes([7 << 5, 3, 6])
+    assert lzf_decompress(packed, 19) == b"ab" + b"ababa" + (b"abababa" * 2)[:12]
+    with pytest.raises(ValueError, match="before the start"):
+        lzf_decompress(bytes([1 << 5, 9]), 3)
+    with pytest.raises(ValueError, match="instead of"):
+        lzf_decompress(packed, 18)
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_ply_vertices_after_elements_with_lists(tmp_path: Path, order: str) -> None:
+    sign = "<" if order == "little" else ">"
+    header = (
+        f"ply\nformat binary_{order}_endian 1.0\ncomment made by hand\nelement camera 2\nproperty double f\n"
+        "element face 2\nproperty list uchar int vertex_indices\nproperty uchar flag\n"
+        "element vertex 40\nproperty uchar red\nproperty double x\nproperty float y\nproperty short z\n"
+        "end_header\n"
+    )
+    faces = struct.pack(f"{sign}B3iB", 3, 1, 2, 3, 9) + struct.pack(f"{sign}B1iB", 1, 5, 9)
+    rows = np.zeros(40, np.dtype([("r", "u1"), ("x", f"{sign}f8"), ("y", f"{sign}f4"), ("z", f"{sign}i2")]))
+    rows["x"], rows["y"], rows["z"] = POINTS[:40, 0], POINTS[:40, 1], np.arange(40)
+    path = tmp_path / "a.ply"
+    path.write_bytes(header.encode() + struct.pack(f"{sign}2d", 1, 2) + faces + rows.tobytes())
+    np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
+
+
+def test_ply_ascii(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nelement vertex 2\n"
+        "property float z\nproperty float x\nproperty float y\nend_header\n3 1 2 3\n3 1 2\n6 4 5\n"
+    )
+    np.testing.assert_array_equal(read_cloud(path).points, [[1, 2, 3], [4, 5, 6]])
+
+
+def test_las_drops_withheld_and_noise_and_keeps_classes(tmp_path: Path) -> None:
+    import laspy
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.01), UTM
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (POINTS[:5] + UTM).T
+    las.classification = np.array([2, 7, 6, 18, 1], np.uint8)
+    las.withheld = np.array([0, 0, 0, 0, 1], np.uint8)
+    las.write(tmp_path / "a.laz")
+    cloud = read_cloud(tmp_path / "a.laz")
+    assert cloud.dropped == 3
+    assert cloud.classification is not None
+    assert cloud.classification.tolist() == [2, 6]
+    np.testing.assert_allclose(cloud.map_points(), (POINTS[:5] + UTM)[[0, 2]], atol=6e-3)
+
+
+@pytest.mark.parametrize(
+    ("wkt", "unit"),
+    [
+        ('PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["US survey foot",0.3048]]', "feet"),
+        ('GEOGCS["WGS 84",UNIT["degree",0.017]]', "degrees"),
+        ('PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["metre",1]]', None),
+    ],
+)
+def test_las_must_be_in_metres(tmp_path: Path, wkt: str, unit: str | None) -> None:
+    import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.header.vlrs.append(WktCoordinateSystemVlr(wkt))
+    las.x, las.y, las.z = POINTS.astype(np.float64).T
+    las.write(tmp_path / "a.las")
+    if unit:
+        with pytest.raises(CloudError, match=unit):
+            read_cloud(tmp_path / "a.las")
+    else:
+        assert read_cloud(tmp_path / "a.las").crs == wkt
+
+
+def test_merge_rebases_in_float64(tmp_path: Path) -> None:
+    for name, shift in (("a", 0.0), ("b", 12_345.678)):
+        write_cloud(tmp_path / f"{name}.npy", POINTS, origin=UTM + shift)
+    clouds = [read_cloud(tmp_path / f"{name}.npy") for name in "ab"]
+    merged = merge(clouds)
+    expected = np.concatenate([POINTS + UTM, POINTS + UTM + 12_345.678])
+    np.testing.assert_allclose(merged.map_points(), expected, rtol=0, atol=2e-3)
+    with pytest.raises(CloudError, match="at least one"):
+        merge([])
