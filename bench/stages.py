@@ -1,0 +1,182 @@
+"""The search alone, before any registration: which place each variant of the method would name.
+
+A run's keyframes are made once, and stations are described once per (channel, visibility), so that a dozen
+variants cost little more than one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream import BaseMap
+from coview_stream.basemap import store
+from coview_stream.basemap.raster import HeightRaster, aligned_corner, rasterise
+from coview_stream.basemap.stations import describe_stations
+from coview_stream.clouds import open_run, read_tum
+from coview_stream.config import (
+    Channel,
+    ConsensusConfig,
+    DescriptorConfig,
+    KeyframeConfig,
+    RetrievalConfig,
+    Visibility,
+)
+from coview_stream.geometry import Points, Pose, inverse, transform, wrap_angle, yaw_of
+from coview_stream.place.consensus import Consensus
+from coview_stream.place.descriptor import describe, ground_below
+from coview_stream.place.keyframes import KeyframeBuffer
+from coview_stream.place.retrieval import Retrieval, Volume
+
+WINDOW = 5
+"""Keyframes that vote together in the coarse measure."""
+
+NEAR, ALIGNED = 3.0, float(np.radians(9.0))
+"""A place is right within this, metres and radians: one and a half blocks, one and a half shifts."""
+
+_RASTER_CELL = 0.5  # metres, as in a map's own build; the tests hold the two together
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The method with one or more of its choices made otherwise."""
+
+    name: str
+    descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
+    retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
+    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A keyframe as the search sees it.
+
+    Attributes:
+        scan: (N, 3) virtual local scan, odometry frame, metres.
+        position: (3,) of the sensor; ``ground``: the height below it.
+        T_map_odom: (4, 4) the truth, map frame relative to the map's origin.
+    """
+
+    scan: Points
+    position: npt.NDArray[np.float64]
+    ground: float
+    T_map_odom: Pose
+
+
+@dataclass
+class Places:
+    """Right places: of keyframes alone, and of windows of :data:`WINDOW` keyframes."""
+
+    keyframes: int = 0
+    top1: int = 0
+    windows: int = 0
+    coarse: int = 0
+
+
+class Bank:
+    """One map's geometry, and its stations described in as many ways as are asked for, each once."""
+
+    def __init__(self, path: Path) -> None:
+        arrays, self._parameters, _ = store.load(path)
+        self._geometry = {name: a for name, a in arrays.items() if not name.startswith("descriptor.")}
+        self.built = BaseMap(arrays, self._parameters)
+        self._raster: HeightRaster | None = None
+        self._known: dict[tuple[Channel, Visibility], npt.NDArray[np.float16]] = {}
+
+    def map(self, descriptor: DescriptorConfig) -> BaseMap:
+        """Return the base map as if it had been built with ``descriptor``."""
+        described = {f"descriptor.{name}": self._described(name, descriptor) for name in descriptor.channels}
+        config = self._parameters["config"] | {"descriptor": asdict(descriptor)}
+        return BaseMap(self._geometry | described, self._parameters | {"config": config})
+
+    def _described(self, name: Channel, descriptor: DescriptorConfig) -> npt.NDArray[np.float16]:
+        key = (name, descriptor.visibility if name.startswith("coview") else "off")
+        if key not in self._known:
+            one = replace(descriptor, channels=(name,))
+            self._known[key] = describe_stations(self._heights(one), self.built.stations, one)[name]
+        return self._known[key]
+
+    def _heights(self, descriptor: DescriptorConfig) -> HeightRaster:
+        if self._raster is None:
+            points, block = np.array(self.built.points), self.built.config.block
+            corner = aligned_corner(points, block, _RASTER_CELL)
+            margin = int(np.ceil(block / _RASTER_CELL))
+            self._raster = rasterise(points, corner, _RASTER_CELL, descriptor.voxel, margin)
+        return self._raster
+
+
+def keyframes_of(
+    world: Path, origin: npt.NDArray[np.float64], descriptor: DescriptorConfig
+) -> Iterator[Seen]:
+    """Keyframes of a world's run in order; ``origin`` (3,) is the map's."""
+    run, (_, truth) = open_run(world / "run"), read_tum(world / "truth.tum")
+    settings = KeyframeConfig()
+    buffer = KeyframeBuffer(settings)
+    for frame in run:
+        T_odom_body, T_map_body = frame.T_odom_body.copy(), truth[frame.index].copy()
+        T_odom_body[:3, 3] -= run.poses[0][:3, 3]  # near its own origin, as the localizer has it
+        T_map_body[:3, 3] -= origin
+        keyframe = buffer.add(frame.points, T_odom_body, frame.stamp)
+        if keyframe is None:
+            continue
+        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
+        if len(scan) >= settings.min_points:
+            ground = ground_below(scan, keyframe.position)
+            yield Seen(scan, keyframe.position.copy(), ground, T_map_body @ inverse(T_odom_body))
+
+
+class _Search:
+    """One variant's votes: of the newest keyframe alone, and of the last few together."""
+
+    def __init__(self, variant: Variant, base_map: BaseMap) -> None:
+        self.variant = variant
+        block, stations = base_map.config.block, base_map.stations
+        alone = replace(variant.consensus, window=1, mode="consensus")
+        self._alone = Consensus(stations, block, alone)
+        self._window = Consensus(stations, block, replace(variant.consensus, window=WINDOW))
+        self.places = Places()
+
+    def vote(self, seen: Seen, centre: npt.NDArray[np.float64], volumes: dict[Channel, Volume]) -> None:
+        self._alone.vote(centre, volumes)
+        self._window.vote(centre, volumes)
+        self.places.keyframes += 1
+        self.places.top1 += right(self._alone.hypotheses()[0].T_map_odom, seen)
+        if len(self._window) == WINDOW:
+            self.places.windows += 1
+            self.places.coarse += right(self._window.hypotheses()[0].T_map_odom, seen)
+
+
+def places(world: Path, variants: list[Variant], bank: Bank) -> dict[str, Places]:
+    """How often each variant names the right place along a world's run."""
+    searches = [_Search(variant, bank.built) for variant in variants]
+    scorers: dict[tuple[object, ...], Retrieval] = {}
+    for seen in keyframes_of(world, bank.built.origin, variants[0].descriptor):
+        known: dict[tuple[object, ...], Volume] = {}
+        for search in searches:
+            descriptor, volumes = search.variant.descriptor, {}
+            centre = seen.position.copy()
+            if descriptor.ground_zero:
+                centre[2] = seen.ground
+            for name in descriptor.channels:
+                one = replace(descriptor, channels=(name,))
+                # the zero is the keyframe's affair: it does not change the stations
+                key = (replace(one, ground_zero=True), search.variant.retrieval)
+                if key not in scorers:
+                    scorers[key] = Retrieval(bank.map(one), search.variant.retrieval)
+                asked = (*key, one.ground_zero)
+                if asked not in known:
+                    known[asked] = scorers[key].distances(describe(seen.scan, centre, one))[name]
+                volumes[name] = known[asked]
+            search.vote(seen, centre, volumes)
+    return {search.variant.name: search.places for search in searches}
+
+
+def right(T_map_odom: Pose, seen: Seen) -> bool:
+    """Whether a hypothesis puts the keyframe at its true place and heading; heights are not compared."""
+    found, true = (transform(T, seen.position[None])[0] for T in (T_map_odom, seen.T_map_odom))
+    turn = wrap_angle(yaw_of(T_map_odom) - yaw_of(seen.T_map_odom))
+    return bool(np.hypot(*(found - true)[:2]) < NEAR and abs(turn) < ALIGNED)
