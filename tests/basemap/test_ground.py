@@ -1,0 +1,198 @@
+"""Ground, its raster and its levels on scenes whose truth is known."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from coview_stream.basemap.cloth import cloth_available
+from coview_stream.basemap.ground import GroundConfig, ground_mask
+from coview_stream.basemap.ground_raster import GroundRaster, filled, ground_raster
+from coview_stream.basemap.levels import LevelConfig, ground_levels
+from coview_stream.errors import ConfigError
+
+METHODS = [
+    pytest.param("cloth", marks=pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")),
+    "morphological",
+]
+DATA = Path(os.environ.get("COVIEW_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+
+
+def _slab(x: tuple[float, float], y: tuple[float, float], z: float, seed: int) -> npt.NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    count = int((x[1] - x[0]) * (y[1] - y[0]) * 16)
+    return np.column_stack([rng.uniform(*x, count), rng.uniform(*y, count), rng.normal(z, 0.02, count)])
+
+
+def _hills(xy: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return 3.0 * np.sin(xy[:, 0] / 20.0) + 0.05 * xy[:, 1]
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Rolling ground without returns below two houses; trees over ground; a few echoes from below."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(-50, 50, (60_000, 2))
+    ground = np.column_stack([xy, _hills(xy) + rng.normal(0, 0.02, len(xy))])
+    parts = [ground]
+    for x, y in ((-20, 10), (15, -25)):
+        inside = (np.abs(ground[:, 0] - x) < 8) & (np.abs(ground[:, 1] - y) < 6)
+        ground[inside, 2] = _hills(np.array([[x, y]])) + 7.0
+    tree = np.column_stack([rng.uniform(20, 45, 15_000), rng.uniform(5, 40, 15_000)])
+    parts.append(np.column_stack([tree, _hills(tree) + rng.uniform(2.5, 9, len(tree))]))
+    deep = rng.uniform(-45, 45, (8, 2))
+    parts.append(np.column_stack([deep, _hills(deep) - rng.uniform(4, 9, 8)]))
+    points = np.concatenate(parts)
+    truth = np.abs(points[:, 2] - _hills(points[:, :2])) < 0.2
+    return points.astype(np.float32), truth
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_ground_of_hills_houses_and_trees(
+    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], method: str
+) -> None:
+    points, truth = scene
+    mask = ground_mask(points, GroundConfig(method=method))
+    assert mask.shape == (len(points),)
+    assert (truth & ~mask).sum() / truth.sum() < 0.02
+    assert (~truth & mask).sum() / (~truth).sum() < 0.005
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_filter_is_silent_and_leaves_no_files(
+    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]],
+    method: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sys.stdout.write("before\n")
+    ground_mask(scene[0], GroundConfig(method=method))
+    sys.stdout.write("after\n")
+    assert capfd.readouterr().out == "before\nafter\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_cloth_tiles_have_no_seams() -> None:
+    xy = np.random.default_rng(6).uniform(0, 300, (120_000, 2))
+    points = np.column_stack([xy, 0.1 * xy[:, 0]]).astype(np.float32)
+    assert ground_mask(points).mean() > 0.999
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 49])
+def test_few_points_are_their_own_ground(count: int) -> None:
+    points = np.random.default_rng(7).uniform(0, 1, (count, 3)).astype(np.float32) * np.float32(
+        [20, 20, 0.05]
+    )
+    assert ground_mask(points).shape == (count,)
+    assert ground_mask(points).all()
+
+
+def test_absurd_extent_is_refused() -> None:
+    points = np.array([[0, 0, 0], [9e7, 9e7, 0]], np.float32)
+    with pytest.raises(ConfigError, match="stray points"):
+        ground_mask(points)
+
+
+@pytest.mark.parametrize(
+    "field", [{"cell": 0.0}, {"rigidness": 4}, {"method": "magic"}, {"class_threshold": float("nan")}]
+)
+def test_config_is_validated(field: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(field))):
+        GroundConfig(**field)  # type: ignore[arg-type]
+
+
+def test_raster_follows_a_slope_and_fills_near_holes_only() -> None:
+    xy = np.random.default_rng(8).uniform(0, 60, (40_000, 2))
+    hole = (np.abs(xy - 30) < 15).all(axis=1)
+    points = np.column_stack([xy, 0.2 * xy[:, 0]])[~hole].astype(np.float32)
+    raster = ground_raster(points, np.ones(len(points), bool), cell=1.0, fill=5.0)
+    at = np.array([[10.3, 20.7], [16.5, 30.0], [30.0, 30.0], [-1.0, 5.0], [61.0, 5.0]])
+    heights = raster.height_at(at)
+    np.testing.assert_allclose(heights[:2], 0.2 * at[:2, 0], atol=0.15)
+    assert heights[1] == pytest.approx(3.3, abs=0.5)
+    assert np.isnan(heights[2:]).all()
+    assert np.isfinite(ground_raster(points, np.ones(len(points), bool), fill=50.0).z).all()
+    with pytest.raises(ConfigError):
+        ground_raster(points, np.zeros(len(points), bool))
+
+
+def test_height_is_bilinear_and_ignores_unknown_neighbours() -> None:
+    raster = GroundRaster(np.array([[0, 1], [np.nan, 3]], np.float32), x0=10.0, y0=20.0, cell=2.0)
+    at = np.array([[11.0, 21.0], [12.0, 21.0], [13.0, 22.0], [11.0, 23.0], [11.9, 21.9]])
+    expected = [0.0, 0.5, 2.0, np.nan, (0.45 * 0.55 * 1 + 0.45 * 0.45 * 3) / (1 - 0.45 * 0.55)]
+    np.testing.assert_allclose(raster.height_at(at), expected, rtol=1e-5)
+
+
+def test_push_pull_keeps_known_cells_and_stays_between_them() -> None:
+    z = np.full((37, 53), np.nan, np.float32)
+    z[3, 4], z[30, 50] = 1.0, 5.0
+    out = filled(z)
+    assert out[3, 4] == 1.0
+    assert out[30, 50] == 5.0
+    assert ((out >= 1.0) & (out <= 5.0)).all()
+
+
+@pytest.fixture(scope="module")
+def storeys() -> npt.NDArray[np.float32]:
+    """A two-storey house on a field, with a canopy, a bridge in the open and a table on the upper floor."""
+    rng = np.random.default_rng(9)
+    canopy = np.column_stack(
+        [rng.uniform(14, 26, 20_000), rng.uniform(-20, 20, 20_000), rng.uniform(2.5, 9, 20_000)]
+    )
+    parts = [
+        _slab((-30, 30), (-30, 30), 0.0, 1),
+        *(_slab((-10, 10), (-8, 8), z, i) for i, z in enumerate((3.0, 3.3, 6.3))),
+        _slab((-10.3, 10.3), (-8.3, 8.3), 6.8, 4),
+        _slab((0, 1.4), (0, 0.8), 4.1, 5),
+        _slab((-28, -20), (-30, 30), 5.0, 6),
+        canopy,
+    ]
+    return np.concatenate(parts).astype(np.float32)
+
+
+def test_levels_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
+    levels = ground_levels(storeys, cell=2.0)
+    ground, upper = levels[levels[:, 2] < 1], levels[levels[:, 2] >= 1]
+    # the whole field, below the house, the bridge and the canopy too, once per square
+    assert len(ground) == len(np.unique(ground[:, :2], axis=0)) == 30 * 30
+    np.testing.assert_allclose(ground[:, 2], 0.0, atol=0.1)
+    # one upper floor; neither roof nor bridge deck nor canopy nor table
+    assert len(upper) == len(np.unique(upper[:, :2], axis=0)) == 10 * 8
+    np.testing.assert_allclose(upper[:, 2], 3.3, atol=0.15)
+    assert (np.abs(upper[:, :2]) < [10, 8]).all()
+    np.testing.assert_array_equal(np.mod(levels[:, :2], 2.0), 1.0)
+
+
+def test_levels_need_extent_and_headroom(storeys: npt.NDArray[np.float32]) -> None:
+    wide = LevelConfig(area=400.0)
+    assert (ground_levels(storeys, config=wide)[:, 2] < 1).all()
+    high = LevelConfig(headroom=3.5)
+    assert (ground_levels(storeys, config=high)[:, 2] < 1).all()
+    assert ground_levels(np.zeros((0, 3), np.float32)).shape == (0, 3)
+    with pytest.raises(ConfigError, match="headroom"):
+        LevelConfig(headroom=7.0)
+    with pytest.raises(ConfigError, match="cell"):
+        ground_levels(storeys, cell=0.0)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("method", METHODS)
+def test_delft_ground_error(method: str) -> None:
+    path = DATA / "airborne" / "delft_ahn3_2.laz"
+    if not path.exists():
+        pytest.skip("airborne/delft_ahn3_2.laz is not there; set COVIEW_DATA to the folder of real scans")
+    from coview_stream.clouds import read_cloud
+
+    cloud = read_cloud(path)
+    assert cloud.classification is not None
+    label = cloud.classification == 2
+    mask = ground_mask(cloud.points, GroundConfig(method=method))
+    assert (label & ~mask).sum() / label.sum() < 0.01
+    assert (label != mask).mean() < 0.035

@@ -1,0 +1,77 @@
+"""Filters against what they must keep, drop and compute."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
+from coview_stream.errors import ConfigError
+
+RNG = np.random.default_rng(4)
+
+
+def test_outliers_go_and_the_plane_stays() -> None:
+    plane = np.column_stack([RNG.uniform(0, 20, (4000, 2)), RNG.normal(0, 0.02, 4000)])
+    stray = RNG.uniform([0, 0, 10], [20, 20, 60], (20, 3))
+    points = np.concatenate([plane, stray]).astype(np.float32)
+    kept, mask = remove_outliers(points)
+    np.testing.assert_array_equal(kept, points[mask])
+    assert kept.dtype == np.float32
+    assert not mask[4000:].any()
+    assert mask[:4000].mean() > 0.99
+
+
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_too_few_points_for_outliers_are_kept(count: int) -> None:
+    kept, mask = remove_outliers(np.zeros((count, 3), np.float32))
+    assert len(kept) == count
+    assert mask.all()
+
+
+@given(st.integers(0, 2**31), st.floats(0.05, 5.0), st.integers(1, 300))
+def test_voxel_centroids_match_a_plain_grouping(seed: int, voxel: float, count: int) -> None:
+    points = np.random.default_rng(seed).normal(0, 10, (count, 3)).astype(np.float32)
+    groups: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for point in points.astype(np.float64):
+        groups.setdefault(tuple(np.floor(point / voxel).astype(int)), []).append(point)
+    expected = [np.mean(groups[key], axis=0) for key in sorted(groups)]
+    np.testing.assert_allclose(voxel_grid(points, voxel), expected, atol=1e-5)
+
+
+def test_voxel_grid_limits() -> None:
+    assert voxel_grid(np.zeros((0, 3), np.float32), 0.5).shape == (0, 3)
+    with pytest.raises(ConfigError, match="too small"):
+        voxel_grid(np.array([[0, 0, 0], [1e7, 1e7, 1e7]], np.float32), 1e-3)
+    with pytest.raises(ConfigError, match="positive"):
+        voxel_grid(np.zeros((1, 3), np.float32), 0.0)
+
+
+def test_normals_of_a_tilted_plane_point_up() -> None:
+    xy = RNG.uniform(0, 10, (2000, 2))
+    points = np.column_stack([xy, 0.5 * xy[:, 0]]).astype(np.float32)
+    expected = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
+    for radius in (None, 1.5):
+        normals = estimate_normals(points, radius=radius)
+        assert normals.dtype == np.float32
+        np.testing.assert_allclose(normals, np.tile(expected, (2000, 1)), atol=1e-3)
+
+
+def test_lonely_points_have_a_vertical_normal() -> None:
+    normals = estimate_normals(np.array([[0, 0, 0], [50, 0, 0]], np.float32), radius=1.0)
+    np.testing.assert_array_equal(normals, [[0, 0, 1], [0, 0, 1]])
+    assert estimate_normals(np.zeros((0, 3), np.float32)).shape == (0, 3)
+
+
+def test_filters_refuse_bad_parameters() -> None:
+    points = np.zeros((5, 3), np.float32)
+    with pytest.raises(ConfigError):
+        remove_outliers(points, neighbours=0)
+    with pytest.raises(ConfigError):
+        remove_outliers(points, std_ratio=float("nan"))
+    with pytest.raises(ConfigError):
+        estimate_normals(points, k=2)
+    with pytest.raises(ConfigError):
+        estimate_normals(points, radius=0.0)
