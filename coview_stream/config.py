@@ -63,7 +63,9 @@ class DescriptorConfig:
         _positive(self, "radius", "eye", "voxel")
         _counts(self, "rings", "sectors", least=4)
         known = get_args(Channel)
-        _require(bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}")
+        _require(
+            bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}"
+        )
         _require(len(set(self.channels)) == len(self.channels), self, "channels", "without repetition")
         _require(self.visibility in get_args(Visibility), self, "visibility", "paper, eye or off")
 
@@ -88,7 +90,10 @@ class MapConfig:
         _counts(self, "normal_neighbours", least=3)
         _require(self.voxel <= self.block, self, "voxel", f"no larger than block ({self.block} m)")
         _require(
-            self.block < self.descriptor.radius, self, "block", f"below the radius ({self.descriptor.radius} m)"
+            self.block < self.descriptor.radius,
+            self,
+            "block",
+            f"below the radius ({self.descriptor.radius} m)",
         )
 
 
@@ -153,8 +158,8 @@ class ConsensusConfig:
 class RegistrationConfig:
     """Trimmed ICP (eq. 13): point-to-plane, coarse to fine.
 
-    ``keep`` is the overlap; the paper keeps 60 %, 70-80 % converge faster and as well here. ``search`` and ``track`` list the largest correspondence distances of the
-    successive scales. Points above the ground and points on it are trimmed apart, else the ground, which fits
+    ``keep`` is the overlap; the paper keeps 60 %, 70 % converges faster here and as well. ``search`` and ``track``
+    list the largest correspondence distances of the successive scales. Points above the ground and points on it are trimmed apart, else the ground, which fits
     anywhere, pushes out the facades that fix the position (KITTI 04: 0.25 m median error against 0.05 m).
     ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not independent).
     """
@@ -179,7 +184,9 @@ class RegistrationConfig:
         _positive(self, "sigma_floor", "sigma_floor_angle")
         for name in ("search", "track"):
             steps = getattr(self, name)
-            falling = bool(steps) and all(a >= b > 0 for a, b in zip(steps, (*steps[1:], steps[-1]), strict=True))
+            falling = bool(steps) and all(
+                a >= b > 0 for a, b in zip(steps, (*steps[1:], steps[-1]), strict=True)
+            )
             _require(falling, self, name, "one or more positive distances, coarse to fine")
 
 
@@ -250,7 +257,7 @@ class LocalizerConfig:
 
 
 def map_preset(name: Preset, **changes: Any) -> MapConfig:
-    """The paper's two settings: ``slam`` (radius 50 m) and ``tls`` (terrestrial scans, radius 100 m).
+    """Return one of the paper's two settings: ``slam`` (radius 50 m) and ``tls`` (terrestrial scans, radius 100 m).
 
     ``changes`` are fields of :class:`MapConfig` or :class:`DescriptorConfig` that replace the preset's. Raises
     :class:`ConfigError` for an unknown preset or field, or a value out of range.
@@ -267,5 +274,7 @@ def map_preset(name: Preset, **changes: Any) -> MapConfig:
         elif key in map_names:
             rest[key] = value
         else:
-            raise ConfigError(f"unknown map option {key!r}; choose from {sorted(descriptor_names | map_names)}")
+            raise ConfigError(
+                f"unknown map option {key!r}; choose from {sorted(descriptor_names | map_names)}"
+            )
     return MapConfig(descriptor=DescriptorConfig(**descriptor), **rest)

@@ -6,9 +6,13 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+
+_Real = TypeVar("_Real", np.float32, np.float64)
 
 Pose = npt.NDArray[np.float64]
 """A 4x4 float64 rigid transform."""
@@ -31,11 +35,12 @@ def inverse(T: Pose) -> Pose:
     return pose_from(R_t, -R_t @ T[:3, 3])
 
 
-def transform(T: Pose, points: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+def transform(T: Pose, points: npt.NDArray[_Real]) -> npt.NDArray[_Real]:
     """Apply ``T`` to (N, 3) points, in the points' own precision."""
     R = T[:3, :3].astype(points.dtype)
     t = T[:3, 3].astype(points.dtype)
-    return points @ R.T + t
+    moved: npt.NDArray[_Real] = points @ R.T + t
+    return moved
 
 
 def rot_z(yaw: float) -> npt.NDArray[np.float64]:
@@ -50,7 +55,7 @@ def yaw_of(T: Pose) -> float:
 
 
 def wrap_angle(angle: float) -> float:
-    """The same angle in [-pi, pi), radians."""
+    """Return the same angle in [-pi, pi), radians."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 

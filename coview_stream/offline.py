@@ -107,7 +107,9 @@ def locate(
         if progress:
             progress(index + 1, len(run), fix)
     if not located.fixes:
-        raise InputError(f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}")
+        raise InputError(
+            f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}"
+        )
     return located
 
 
@@ -128,7 +130,9 @@ def write(located: Located, base_map: BaseMap, out: str | os.PathLike[str], pict
         temporary.write_text(text)
         temporary.replace(folder / "result.json")
     except OSError as error:
-        raise InputError(f"{folder}: cannot write the results ({error.strerror}); choose another place") from error
+        raise InputError(
+            f"{folder}: cannot write the results ({error.strerror}); choose another place"
+        ) from error
     if pictures:
         draw(located, base_map, folder)
 
@@ -159,7 +163,7 @@ def _note(located: Located, localizer: Localizer, fix: Fix) -> None:
 
 
 def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
-    """The pose of the file's own coordinates: a single scan may be stored far from its zero."""
+    """Express the pose in the file's own coordinates: a single scan may be stored far from its zero."""
     if fix.T_map_body is None or not frame.origin.any():
         return fix
     away = pose_from(np.eye(3), -frame.origin)
@@ -168,9 +172,12 @@ def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
 
 
 def summary(located: Located) -> str:
-    """A few lines for a person."""
+    """Say it in a few lines for a person."""
     posed = located.posed
-    lines = [f"{'state':<18} {located.state.value}", f"{'localised':<18} {len(posed)} of {located.frames} frames"]
+    lines = [
+        f"{'state':<18} {located.state.value}",
+        f"{'localised':<18} {len(posed)} of {located.frames} frames",
+    ]
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")

@@ -23,7 +23,10 @@ _SAME_ANGLE = np.radians(5.0)
 _SUBMAP_KEYFRAMES = 4  # of the newest in the local scan that is registered: more are smeared by drift
 _COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through
 _COARSE_EVERY = 3  # of the source's points, for the coarse scales only every third
-_HOPELESS = 0.5  # after them, what has less than this share of the best score is not refined further
+_COARSE_ITERATIONS = 8
+_HOPELESS = (
+    0.5  # after them, what has less than this share of the best (or needed) score is not refined further
+)
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,7 @@ class GlobalSearch:
         """Take in one keyframe; ``cloud`` (N, 3) is its newest frame in the body frame."""
         self._vote(buffer, keyframe)
         hypotheses = self.consensus.hypotheses()
-        source = local_source(
-            buffer.recent(_SUBMAP_KEYFRAMES), keyframe.position, self.config.registration
-        )
+        source = local_source(buffer.recent(_SUBMAP_KEYFRAMES), keyframe.position, self.config.registration)
         candidates = self._refine(hypotheses, source, keyframe, cloud)
         return self._judge(candidates, keyframe)
 
@@ -90,17 +91,22 @@ class GlobalSearch:
     def _refine(
         self, hypotheses: list[Hypothesis], source: Source, keyframe: Keyframe, cloud: Points
     ) -> list[Candidate]:
-        """Verified candidates, best first. All go through the coarse scales, the promising ones through all."""
+        """Return verified candidates, best first. All go through the coarse scales, the promising ones through all."""
         scales = self.config.registration.search
         rough = source.every(_COARSE_EVERY)
         coarse = [
             candidate
             for hypothesis in hypotheses
-            if (candidate := self._candidate(hypothesis, None, rough, keyframe, cloud, scales[:_COARSE_SCALES]))
+            if (
+                candidate := self._candidate(
+                    hypothesis, None, rough, keyframe, cloud, scales[:_COARSE_SCALES]
+                )
+            )
         ]
         best = max((c.evidence.score for c in coarse), default=0.0)
+        enough = _HOPELESS * max(best, self.config.acceptance.score)
         fine = [
-            (c.evidence.score >= _HOPELESS * best and scales[_COARSE_SCALES:]
+            (c.evidence.score >= enough and scales[_COARSE_SCALES:]
              and self._candidate(c.hypothesis, c.T_map_odom, source, keyframe, cloud, scales[_COARSE_SCALES:]))
             or c
             for c in coarse
@@ -122,8 +128,9 @@ class GlobalSearch:
             return None
         upright = Prior(hypothesis.T_map_odom, gravity_information(self.config.registration.gravity_sigma))
         found = register(
-            source, start, target, self.config.registration, scales, upright, keyframe.position
-        )
+            source, start, target, self.config.registration, scales, upright, keyframe.position,
+            _COARSE_ITERATIONS if T_map_odom is None else None,
+        )  # fmt: skip
         if found is None or tilt_of(found.T_map_source) > self.config.acceptance.most_tilt:
             return None
         T = found.T_map_source
@@ -138,7 +145,9 @@ class GlobalSearch:
             least, most_rival, needed = rule.single_score, rule.single_rival, 1
         if not candidates:
             self._favourite, self._confirmed = None, 0
-            reason = "too few points to search with" if not len(self.consensus) else "no hypothesis fits the map"
+            reason = (
+                "too few points to search with" if not len(self.consensus) else "no hypothesis fits the map"
+            )
             return Verdict(None, KeyframeEvidence(keyframe.stamp, State.SEARCHING, reason))
         best = candidates[0]
         rival = max(
@@ -185,7 +194,11 @@ def tilt_of(T: Pose) -> float:
 
 
 def _same(
-    T_a: Pose, T_b: Pose, keyframe: Keyframe, distance: float = _SAME_DISTANCE, angle: float = float(_SAME_ANGLE)
+    T_a: Pose,
+    T_b: Pose,
+    keyframe: Keyframe,
+    distance: float = _SAME_DISTANCE,
+    angle: float = float(_SAME_ANGLE),
 ) -> bool:
     """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
     a, b = T_a @ keyframe.T_odom_body, T_b @ keyframe.T_odom_body

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from, transform
@@ -78,7 +78,7 @@ class Tracker:
             return None
         found = register(
             source, self.T_map_odom, target, self.config.registration, self.config.registration.track,
-            Prior(self.T_map_odom, np.linalg.inv(covariance)), position,
+            Prior(self.T_map_odom, np.asarray(np.linalg.inv(covariance))), position,
         )  # fmt: skip
         T = self.T_map_odom if found is None else found.T_map_source
         surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
@@ -121,11 +121,11 @@ class Tracker:
 
 
 def relative_to(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:
-    """The same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
+    """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
     return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
 
 
 def unanchored(T_map_local: Pose, anchor: npt.NDArray[np.float64], origin: npt.NDArray[np.float64]) -> Pose:
-    """``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
+    """Return ``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
     shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
     return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)

@@ -29,7 +29,9 @@ _MIN_POINTS = 1000
 _SURVEY_MARGIN = 1  # cells
 
 
-def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
+def build_arrays(
+    paths: list[Path], config: MapConfig, progress: bool = False
+) -> tuple[Arrays, dict[str, Any]]:
     """Read ``paths`` and return a map's arrays and the parameters that say where it came from.
 
     Raises:
@@ -55,7 +57,9 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
         if config.outlier_neighbours:
             points, _ = remove_outliers(points, config.outlier_neighbours, config.outlier_std_ratio)
         if len(points) < _MIN_POINTS:
-            raise MapError(f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more")
+            raise MapError(
+                f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more"
+            )
         step(2, 3)
         normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
@@ -109,7 +113,9 @@ def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8],
     cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
     low = cells.min(axis=0) - _SURVEY_MARGIN
     columns, rows = (cells - low).T
-    grid = np.zeros((int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool)
+    grid = np.zeros(
+        (int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool
+    )
     grid[rows, columns] = True
     square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
     return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block

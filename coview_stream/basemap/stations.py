@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.basemap.raster import HeightRaster
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.geometry import Points

@@ -79,7 +79,9 @@ def load(path: Path) -> tuple[Arrays, dict[str, Any], str]:
         digest = _digest(metadata["parameters"], arrays)
         parameters = json.loads(metadata["parameters"])
     except (KeyError, TypeError, ValueError, OSError) as error:
-        raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
+        raise MapError(
+            f"{path}: the map is damaged or truncated ({error}); copy or build it again"
+        ) from error
     if digest != metadata.get("sha256"):
         raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
     return arrays, parameters, digest
@@ -119,5 +121,5 @@ def _digest(parameters: str, arrays: Arrays) -> str:
         total.update(f"{name} {array.dtype.str} {array.shape}".encode())
         data = array.reshape(-1).view(np.uint8)
         for begin in range(0, len(data), _CHUNK):
-            total.update(data[begin : begin + _CHUNK])
+            total.update(data[begin : begin + _CHUNK].data)
     return total.hexdigest()

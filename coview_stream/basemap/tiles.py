@@ -47,5 +47,7 @@ def crop(
     spans = [slice(int(begin), int(end)) for begin, end in index[wanted, 2:]]
     near_points = np.concatenate([points[span] for span in spans])
     inside = np.hypot(near_points[:, 0] - centre[0], near_points[:, 1] - centre[1]) < radius
-    near_normals = np.concatenate([normals[span] for span in spans])[inside].astype(np.float32) / _NORMAL_SCALE
+    near_normals = (
+        np.concatenate([normals[span] for span in spans])[inside].astype(np.float32) / _NORMAL_SCALE
+    )
     return np.ascontiguousarray(near_points[inside]), near_normals

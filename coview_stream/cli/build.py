@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("maps", nargs="+", type=Path, metavar="MAP", help="las, laz, ply, pcd, npy or bin")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="SITE.coview")
-    parser.add_argument("--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans")
+    parser.add_argument(
+        "--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans"
+    )
     for name, (kind, text) in _OPTIONS.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N", help=text)
     parser.add_argument(
@@ -45,9 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.channels:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     begin = time.perf_counter()
-    base_map = BaseMap.build(
-        args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options
-    )
+    base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
     base_map.save(args.output)
     print(
         f"{args.output}: {base_map.parameters['source_points']} points read, {len(base_map.points)} kept, "

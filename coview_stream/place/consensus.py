@@ -36,7 +36,9 @@ class Hypothesis:
 @dataclass(frozen=True)
 class _Ballot:
     centre: npt.NDArray[np.float64]  # (3,) odometry frame, z on the ground
-    votes: npt.NDArray[np.float32]  # (S, M + 1) standardised distances; the last station is nowhere: no opinion
+    votes: npt.NDArray[
+        np.float32
+    ]  # (S, M + 1) standardised distances; the last station is nowhere: no opinion
     smallest: float  # smallest raw distance, for the paper's single-minimum rule
 
 
@@ -118,16 +120,18 @@ class Consensus:
         return self._peaks(self.scores(), self._ballots[-1].centre)
 
     def scores(self) -> Volume:
-        """Summed votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
+        """Sum the votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
         newest = self._ballots[-1]
         total = newest.votes[:, :-1].copy()
         sectors = len(total)
         for ballot in list(self._ballots)[:-1]:
             step = ballot.centre - newest.centre
             for n in range(sectors):
-                xy = rot_z(yaw_of_shift(n, sectors))[:2, :2] @ step[:2]
+                xy = rot_z(float(yaw_of_shift(n, sectors)))[:2, :2] @ step[:2]
                 moved = self.grid.moved(np.rint(xy / self.grid.block).astype(np.int64), float(step[2]))
-                total[n] += ballot.votes[n][moved]  # -1, no station there (map edge, building), finds the zero
+                total[n] += ballot.votes[n][
+                    moved
+                ]  # -1, no station there (map edge, building), finds the zero
         return np.asarray(total.T / np.float32(np.sqrt(len(self._ballots))))
 
     def _peaks(self, scores: Volume, centre: npt.NDArray[np.float64]) -> list[Hypothesis]:
@@ -151,9 +155,9 @@ class Consensus:
         return found
 
 
-def yaw_of_shift(shift: int | npt.NDArray[np.integer], sectors: int) -> float | npt.NDArray[np.float64]:
-    """Eq. 9: heading of the odometry frame's x axis in the map for shift n, radians."""
-    return -2.0 * np.pi * shift / sectors
+def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> npt.NDArray[np.float64]:
+    """Eq. 9: heading of the odometry frame's x axis in the map for shift n (any shape), radians."""
+    return np.asarray(shift, dtype=np.float64) * (-2.0 * np.pi / sectors)
 
 
 def standardised(volume: Volume) -> Volume:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
-from coview_kernels import PolarGrid
 
+import coview_kernels as kernels
+from coview_kernels import PolarGrid
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.geometry import Points
 
@@ -38,7 +38,9 @@ def channel(name: Channel, grid: PolarGrid, config: DescriptorConfig) -> Descrip
     )
 
 
-def describe(points: Points, centre: npt.NDArray[np.float64], config: DescriptorConfig) -> dict[Channel, Descriptor]:
+def describe(
+    points: Points, centre: npt.NDArray[np.float64], config: DescriptorConfig
+) -> dict[Channel, Descriptor]:
     """Descriptor channels, (R, S) each, of the virtual local scan around ``centre``.
 
     Args:
@@ -51,7 +53,7 @@ def describe(points: Points, centre: npt.NDArray[np.float64], config: Descriptor
 
 
 def ring_key(descriptor: Descriptor) -> npt.NDArray[np.float32]:
-    """The paper's rotation-invariant key (..., R): share of occupied (non-zero) sectors of every ring."""
+    """Return the paper's rotation-invariant key (..., R): share of occupied (non-zero) sectors of every ring."""
     key: npt.NDArray[np.float32] = (descriptor != 0).mean(axis=-1, dtype=np.float32)
     return key
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig
 from coview_stream.geometry import Points, Pose
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.place.descriptor import Descriptor, ring_key
 
@@ -24,7 +24,10 @@ _BLOCK = 8192
 class Stations(Protocol):
     """What retrieval needs to know of a base map."""
 
-    descriptor_config: DescriptorConfig
+    @property
+    def descriptor_config(self) -> DescriptorConfig:
+        """Return how the descriptors were made."""
+        ...
 
     def __len__(self) -> int:
         """Return the number of stations M."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry import Points, Pose, exp_se3, pose_from, transform
 from coview_stream.pose.edges import EdgeRaster, edge_raster
@@ -26,7 +26,9 @@ _CROP_STEP = 16.0  # metres between the centres of cached crops
 _STOP_SHIFT = 1e-3  # metres; below the map's own noise
 _STOP_TURN = 5e-5  # radians
 _LEAST_PAIRS = 50
-_WIDTH_SHARE = 0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
+_WIDTH_SHARE = (
+    0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
+)
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class LocalMaps:
         self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
 
     def around(self, position: npt.NDArray[np.float64]) -> LocalMap | None:
-        """The map within at least ``radius`` metres of ``position`` (3,); None where the map is (nearly) empty."""
+        """Return the map within at least ``radius`` metres of ``position`` (3,); None where the map is (nearly) empty."""
         key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
         if key not in self._crops:
             centre = np.array([key[0], key[1]]) * _CROP_STEP
@@ -121,6 +123,7 @@ def register(
     scales: tuple[float, ...],
     prior: Prior | None = None,
     centre: npt.NDArray[np.float64] | None = None,
+    iterations: int | None = None,
 ) -> Registration | None:
     """Trimmed ICP from an initial pose.
 
@@ -132,6 +135,7 @@ def register(
         scales: largest correspondence distance of each scale, metres.
         prior: belief to fuse; its mean is about ``centre`` too.
         centre: (3,) source-frame point that rotations are about (the body's position); default the mean.
+        iterations: at most this many on each scale; default the configuration's.
 
     Returns:
         The result, or None where fewer than 50 points find a partner.
@@ -140,7 +144,7 @@ def register(
     pivot = source.points.mean(axis=0, dtype=np.float64) if centre is None else centre
     total, converged, result = 0, False, None
     for scale in scales:
-        for _ in range(config.iterations):
+        for _ in range(iterations or config.iterations):
             step = _step(source, T, target, config, scale, prior, pivot)
             if step is None:
                 return None
@@ -196,6 +200,6 @@ def _step(
         scaled = prior.information * config.inflation**2  # H counts correlated points; weigh the prior alike
         information = information + scaled
         gradient = gradient + scaled @ np.concatenate([turn, shift])
-    increment = -np.linalg.solve(information + 1e-6 * np.eye(6), gradient)
+    increment = np.asarray(-np.linalg.solve(information + 1e-6 * np.eye(6), gradient))
     rmse = float(np.sqrt((weight * residual**2).sum() / weight.sum()))
     return increment, information, rmse, len(chosen)

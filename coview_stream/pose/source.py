@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import coview_kernels as kernels
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry import Points
 from coview_stream.pose.registration import Source
