@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
+from coview_stream.clouds.las_header import impossible_header
 from coview_stream.errors import CloudError
 
 CHUNK = 1_000_000
@@ -18,8 +19,6 @@ CHUNK = 1_000_000
 
 NOISE_CLASSES = (7, 18)
 """ASPRS classes low and high noise."""
-
-_SHORTEST_HEADER, _HEADER_BYTES = 227, 375
 
 _FOOT_UNITS = {9002, 9003, 9005}
 _PROJECTED_CRS_KEY, _LINEAR_UNIT_KEY = 3072, 3076
@@ -33,7 +32,9 @@ def read_las(path: Path) -> Cloud:
     """
     import laspy
 
-    _check_records(path)
+    problem = impossible_header(path)
+    if problem:
+        raise CloudError(_damaged(path, ValueError(problem)))
     try:
         with laspy.open(path) as reader:
             return _read(reader, path)
@@ -46,19 +47,6 @@ def read_las(path: Path) -> Cloud:
         if type(error).__name__ != "PanicException":
             raise
         raise CloudError(_damaged(path, error)) from error
-
-
-def _check_records(path: Path) -> None:
-    """Refuse a header that promises more records than the file can hold: laspy would read on for minutes."""
-    with path.open("rb") as stream:
-        header = stream.read(_HEADER_BYTES)
-    if len(header) < _SHORTEST_HEADER:
-        raise CloudError(_damaged(path, EOFError("the header is cut off")))
-    records = int.from_bytes(header[100:104], "little")
-    minor = header[25]
-    extended = int.from_bytes(header[243:247], "little") if minor >= 4 else 0
-    if records * 54 + extended * 60 > path.stat().st_size:
-        raise CloudError(_damaged(path, ValueError("more variable length records than fit")))
 
 
 def _read(reader: Any, path: Path) -> Cloud:
