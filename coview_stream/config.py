@@ -159,9 +159,9 @@ class RegistrationConfig:
     """Trimmed ICP (eq. 13): point-to-plane, coarse to fine.
 
     ``keep`` is the overlap; the paper keeps 60 %, 70 % converges faster here and as well. ``search`` and ``track``
-    list the largest correspondence distances of the successive scales. Points above the ground and points on it are trimmed apart, else the ground, which fits
-    anywhere, pushes out the facades that fix the position (KITTI 04: 0.25 m median error against 0.05 m).
-    ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not independent).
+    list the largest correspondence distances of the successive scales. Points above the ground and points on it are
+    trimmed apart, else the ground, which fits anywhere, pushes out the facades that fix the position (KITTI 04: 0.25 m
+    median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not independent).
     """
 
     keep: float = 0.7

@@ -12,9 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from coview_stream.basemap.ground import ground_mask
-from coview_stream.basemap.raster import aligned_corner, rasterise
-from coview_stream.basemap.stations import Progress, describe_stations, station_positions
+from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.store import Arrays
 from coview_stream.basemap.tiles import sort_by_tile
 from coview_stream.clouds.cloud import merge
@@ -24,7 +22,6 @@ from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
 from coview_stream.geometry import Points
 
-_RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
 _MIN_POINTS = 1000
 _SURVEY_MARGIN = 1  # cells
 
@@ -64,13 +61,14 @@ def build_arrays(
         normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
     with _bar(progress, "ground") as step:
-        stations = _stations(points, config)
+        stations, indoors = find_stations(points, config.block, config.levels)
+        if not len(stations):
+            raise MapError(
+                "no ground found in the base map; it needs points on the ground to put stations on"
+            )
         step(1, 1)
     with _bar(progress, "describing stations") as step:
-        corner = aligned_corner(points, config.block, _RASTER_CELL)
-        margin = int(np.ceil(config.block / _RASTER_CELL))
-        raster = rasterise(points, corner, _RASTER_CELL, config.descriptor.voxel, margin)
-        described = describe_stations(raster, stations, config.descriptor, step)
+        described = describe_storeys(points, stations, indoors, config.block, config.descriptor, step)
 
     sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
@@ -88,6 +86,7 @@ def build_arrays(
         "crs": crs,
         "sources": {path.name: _sha256(path) for path in paths},
         "source_points": source_points,
+        "indoor_stations": int(indoors.sum()),
     }
     return arrays, parameters
 
@@ -96,13 +95,6 @@ def _read(path: Path, done: int, total: int, step: Progress) -> Any:
     cloud = read_cloud(path)
     step(done + 1, total)
     return cloud
-
-
-def _stations(points: Points, config: MapConfig) -> Points:
-    ground = points[ground_mask(points)]
-    if not len(ground):
-        raise MapError("no ground found in the base map; it needs points on the ground to put stations on")
-    return station_positions(ground, config.block)
 
 
 def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float64]]:

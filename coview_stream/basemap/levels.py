@@ -49,6 +49,7 @@ def ground_levels(
     mask: npt.NDArray[np.bool_] | None = None,
     config: LevelConfig | None = None,
     ground_config: GroundConfig | None = None,
+    floors: Points | None = None,
 ) -> Points:
     """Centres (K, 3) of all walkable ``cell``-sized squares, one for each level, metres.
 
@@ -64,6 +65,7 @@ def ground_levels(
         mask: (N,) ground points if they are known already.
         config: what counts as a floor.
         ground_config: for ``ground_mask`` where ``mask`` is None.
+        floors: (F, 3) of :func:`indoor_floors` if they are known already; empty for the ground alone.
 
     Raises:
         ConfigError: ``cell`` is not positive, or the extent is absurd.
@@ -74,9 +76,27 @@ def ground_levels(
         return points.reshape(0, 3)
     config = config or LevelConfig()
     ground = points[ground_mask(points, ground_config) if mask is None else mask]
-    floors = indoor_floors(points, config)
+    floors = indoor_floors(points, config) if floors is None else floors
     base = _squares(ground, cell)
     return np.concatenate([base, _upper_squares(floors, base, cell)])
+
+
+def stands_indoors(stations: Points, floors: Points, cell: float) -> npt.NDArray[np.bool_]:
+    """Which of (M, 3) stations stand on a covered floor of their ``cell``-sized square.
+
+    ``floors`` is the answer of :func:`indoor_floors`.
+    """
+    if not len(floors) or not len(stations):
+        return np.zeros(len(stations), dtype=bool)
+    _, _, flat = cells(np.concatenate([stations, floors]), cell)
+    own, theirs = flat[: len(stations)], flat[len(stations) :]
+    order = np.argsort(theirs, kind="stable")
+    begin, end = np.searchsorted(theirs[order], own, "left"), np.searchsorted(theirs[order], own, "right")
+    indoors = np.zeros(len(stations), dtype=bool)
+    for m in np.flatnonzero(end > begin):
+        heights = floors[order[begin[m] : end[m]], 2]
+        indoors[m] = bool((np.abs(heights - stations[m, 2]) < _SAME_LEVEL).any())
+    return indoors
 
 
 def indoor_floors(points: Points, config: LevelConfig) -> Points:

@@ -46,17 +46,23 @@ def aligned_corner(points: Points, block: float, cell: float) -> npt.NDArray[np.
 
 
 def rasterise(
-    points: Points, corner: npt.NDArray[np.float64], cell: float, voxel: float, margin: int = 0
+    points: Points,
+    corner: npt.NDArray[np.float64],
+    cell: float,
+    voxel: float,
+    margin: int = 0,
+    extent: Points | None = None,
 ) -> HeightRaster:
     """Raster of (N, 3) map-frame points.
 
     The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``, not points, lest the scan pattern
-    decides; ``total`` sums one height for each of those voxels. ``margin`` adds empty cells at the upper edges.
+    decides; ``total`` sums one height for each of those voxels. The raster reaches to the
+    farthest of ``extent`` (by default the points) and ``margin`` empty cells beyond.
     """
     column, row = np.floor((points[:, :2] - corner) / cell).astype(np.int64).T
     level = np.floor(points[:, 2] / voxel).astype(np.int64)
-    # a block at the upper edge may have its centre beyond the last point
-    height, width = int(row.max()) + 1 + margin, int(column.max()) + 1 + margin
+    far = (points if extent is None else extent)[:, :2].max(axis=0)
+    width, height = (np.floor((far - corner) / cell).astype(int) + 1 + margin).tolist()
     flat = row * width + column
     # one sort by (cell, level) gives the voxels; the last point of a sorted cell is not its highest, hence maximum
     level -= level.min()
@@ -67,11 +73,10 @@ def rasterise(
     top = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(top, flat, points[:, 2])
     top[count == 0] = 0.0
-    shape = (height, width)
     return HeightRaster(
-        top.reshape(shape),
-        count.astype(np.int32).reshape(shape),
-        total.astype(np.float32).reshape(shape),
+        top.reshape(height, width),
+        count.astype(np.int32).reshape(height, width),
+        total.astype(np.float32).reshape(height, width),
         corner,
         cell,
     )

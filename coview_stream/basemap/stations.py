@@ -8,7 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.basemap.raster import HeightRaster
+from coview_stream.basemap.ground import ground_mask
+from coview_stream.basemap.levels import LevelConfig, ground_levels, indoor_floors, stands_indoors
+from coview_stream.basemap.raster import HeightRaster, aligned_corner, rasterise
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.geometry import Points
 from coview_stream.place.descriptor import channel
@@ -16,26 +18,69 @@ from coview_stream.place.descriptor import channel
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
+RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
+
 _PORTION = 512  # stations at a time: 7 MB of bins
+_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
+_BELOW_FLOOR = 1.0  # metres of what lies below the floor that still belongs to the storey
+_CEILING = 6.0  # metres: as LevelConfig.cover
 
 
-def station_positions(ground: Points, block: float) -> npt.NDArray[np.float32]:
-    """Stations (M, 3): one per ``block``-sized cell that has ground, at its centre and its median ground height.
+def find_stations(
+    points: Points, block: float, levels: bool = True
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Stations (M, 3) and which of them (M,) stand indoors, below a ceiling.
 
-    ``ground`` is (N, 3) ground points in the map frame, metres. The paper takes centroids of 3-D voxels, which
-    puts two stations into some cells and none at their centres.
+    One per ``block``-sized cell that has ground, at its centre and median ground height, and one more for every floor
+    of a building above it. (The paper's centroids of 3-D voxels put two stations into some cells.) With ``levels``
+    False the ground alone counts, and nothing is indoors.
     """
-    cells = np.floor(ground[:, :2].astype(np.float64) / block).astype(np.int64)
-    low = cells.min(axis=0)
-    width = int(cells[:, 1].max() - low[1]) + 1
-    flat = (cells[:, 0] - low[0]) * width + cells[:, 1] - low[1]
-    order = np.lexsort((ground[:, 2], flat))
-    unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-    # sorted by height within the cell, so the median is the middle one
-    z = ground[order[first + count // 2], 2]
-    row, column = np.divmod(unique, width)
-    xy = (np.column_stack([row, column]) + low + 0.5) * block
-    return np.column_stack([xy, z]).astype(np.float32)
+    nothing = np.zeros((0, 3), dtype=np.float32)
+    floors = indoor_floors(points, LevelConfig()) if levels else nothing
+    mask = ground_mask(points)
+    if not mask.any():
+        return nothing, np.zeros(0, dtype=bool)
+    stations = ground_levels(points, block, mask, floors=floors)
+    return stations, stands_indoors(stations, floors, block)
+
+
+def describe_storeys(
+    points: Points,
+    stations: npt.NDArray[np.float32],
+    indoors: npt.NDArray[np.bool_],
+    block: float,
+    config: DescriptorConfig,
+    progress: Progress | None = None,
+) -> dict[Channel, npt.NDArray[np.float16]]:
+    """Descriptor channels (M, R, S) of all stations: in the open from the whole cloud, indoors storey by storey.
+
+    Who stands below a ceiling sees the storey up to it, not the roof: stations of similar height share a raster of the
+    points between a metre below their floor and the highest ceiling that counts as one.
+    """
+    corner = aligned_corner(points, block, RASTER_CELL)
+    # a block at the upper edge may have its centre beyond the last point
+    margin = int(np.ceil(block / RASTER_CELL))
+    storey = np.where(indoors, np.round(stations[:, 2] / _STOREY), np.inf)
+    shape = (len(stations), config.rings, config.sectors)
+    described = {name: np.zeros(shape, dtype=np.float16) for name in config.channels}
+    done = 0
+    for floor in np.unique(storey):
+        chosen = np.flatnonzero(storey == floor)
+        part = points
+        if np.isfinite(floor):
+            above = points[:, 2] - floor * _STOREY
+            part = points[(above > -_BELOW_FLOOR) & (above < _CEILING)]
+        raster = rasterise(part, corner, RASTER_CELL, config.voxel, margin, points)
+        before = done
+
+        def step(count: int, _: int, before: int = before) -> None:
+            if progress:
+                progress(before + count, len(stations))
+
+        for name, values in describe_stations(raster, stations[chosen], config, step).items():
+            described[name][chosen] = values
+        done += len(chosen)
+    return described
 
 
 def describe_stations(

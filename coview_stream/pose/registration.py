@@ -54,7 +54,7 @@ class LocalMaps:
         self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
 
     def around(self, position: npt.NDArray[np.float64]) -> LocalMap | None:
-        """Return the map within at least ``radius`` metres of ``position`` (3,); None where the map is (nearly) empty."""
+        """Return the map within at least ``radius`` metres of ``position`` (3,); None if it is (nearly) empty there."""
         key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
         if key not in self._crops:
             centre = np.array([key[0], key[1]]) * _CROP_STEP
