@@ -93,12 +93,15 @@ def _header(path: Path) -> tuple[dict[str, Any], int]:
             size = int.from_bytes(file.read(8), "little")
             if not 2 <= size <= min(path.stat().st_size, 1 << 24):
                 raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
-            header = json.loads(file.read(size))
+            text = file.read(size)
+            header = json.loads(text)
     except OSError as error:
         raise MapError(f"{path}: cannot read the map ({error.strerror})") from error
     except ValueError as error:
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
-    if not isinstance(header, dict) or not isinstance(header.get("__metadata__", {}), dict):
+    # only blanks may pad it: JSON would take a damaged one that became a line end for another
+    padded = text.rstrip(b" ").endswith(b"}")
+    if not (padded and isinstance(header, dict) and isinstance(header.get("__metadata__", {}), dict)):
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again")
     return header, 8 + size
 
