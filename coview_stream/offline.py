@@ -87,7 +87,7 @@ def locate(
     A run of one frame is localized by the stationary path. A frame that cannot be read is skipped and noted.
 
     Raises:
-        CloudError, RunError: not one frame could be used; the message is the first frame's.
+        InputError: not one frame could be used; the message ends with the first frame's.
     """
     config = config or LocalizerConfig()
     if len(run) == 1:
@@ -100,7 +100,9 @@ def locate(
             begin = time.perf_counter()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         except (CloudError, RunError) as error:
-            located.skipped.append(str(error))
+            located.skipped.append(_named(str(error), run.frames_paths[index]))
+            if progress:
+                progress(index + 1, len(run), None)
             continue
         located.seconds.append(time.perf_counter() - begin)
         _note(located, localizer, _in_file_frame(fix, frame))
@@ -151,6 +153,11 @@ def draw(located: Located, base_map: BaseMap, folder: Path, truth: Any = None) -
         station = base_map.descriptors(name)[winner.station].astype(np.float32)
         titles = (f"keyframe ({name})", f"winning station {winner.station}")
         plot_descriptor_pair(located.query[name], station, winner.shift, folder / "descriptors.png", titles)
+
+
+def _named(message: str, path: Path) -> str:
+    """Lead the message with the file, which the localizer does not know."""
+    return message if path.name in message else f"{path}: {message}"
 
 
 def _note(located: Located, localizer: Localizer, fix: Fix) -> None:

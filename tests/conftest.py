@@ -63,3 +63,15 @@ def world_fixes(world_map, world_drive):
     localizer = Localizer(world_map)
     pairs = zip(world_drive.clouds, world_drive.T_odom_body, strict=True)
     return [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]
+
+
+@pytest.fixture(scope="session")
+def world_run(world_drive, tmp_path_factory):
+    """The drive on disk; read only."""
+    return small_world.write_run(tmp_path_factory.mktemp("run") / "run", world_drive, 7)
+
+
+@pytest.fixture(scope="session")
+def elsewhere_run(elsewhere, tmp_path_factory):
+    """A run outside the map, on disk; read only."""
+    return small_world.write_run(tmp_path_factory.mktemp("elsewhere") / "run", elsewhere, 3)

@@ -6,9 +6,12 @@ The tests of the engine, of the offline path and of the commands all use it; ``c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.clouds.writers import write_cloud
 from coview_stream.geometry import inverse, pose_from, rot_z, transform
 
 SENSOR_HEIGHT = 1.7
@@ -139,3 +142,12 @@ def in_map(drive: Drive, count: int) -> np.ndarray:
     """Return the first frames' points (N, 3) float32 where they truly are."""
     pairs = zip(drive.clouds[:count], drive.T_map_body, strict=False)
     return np.concatenate([transform(T, c) for c, T in pairs]).astype(np.float32)
+
+
+def write_run(folder: Path, drive: Drive, frames: int = FRAMES) -> Path:
+    """Write a run directory of the public layout."""
+    (folder / "frames").mkdir(parents=True)
+    for k in range(frames):
+        write_cloud(folder / "frames" / f"{k:06d}.ply", drive.clouds[k])
+    write_tum(folder / "odometry.tum", 100.0 + 0.5 * np.arange(frames), drive.T_odom_body[:frames])
+    return folder

@@ -1,0 +1,50 @@
+"""``coview-stream info``: what is inside, or one line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.cli import main
+
+
+def test_the_facts(world_file, capsys):
+    base_map = BaseMap.load(world_file)
+    assert main(["info", str(world_file)]) == 0
+    out = capsys.readouterr().out
+    for fact in (f"{len(base_map)}", f"{len(base_map.points)}", base_map.sha256, "site.ply", "radius = 30.0"):
+        assert fact in out
+
+
+def test_json(world_file, capsys):
+    base_map = BaseMap.load(world_file)
+    assert main(["info", str(world_file), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["stations"] == len(base_map)
+    assert facts["sha256"] == base_map.sha256
+    assert facts["parameters"]["descriptor"]["radius"] == 30.0
+    assert facts["from"][0] == pytest.approx(-34.0, abs=0.3)
+    assert facts["to"][0] == pytest.approx(34.0, abs=0.5)
+    assert facts["sources"].keys() == {"site.ply"}
+
+
+def test_the_picture(world_file, tmp_path):
+    assert main(["info", str(world_file), "--plot", str(tmp_path / "map.png")]) == 0
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("content", [None, b"", b"nonsense" * 20, "flipped", "half"])
+def test_a_damaged_map_is_one_line(world_file, tmp_path, capsys, content):
+    path = tmp_path / "site.coview"
+    whole = world_file.read_bytes()
+    at = len(whole) // 2
+    damaged = {"flipped": whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :], "half": whole[:at]}
+    if content is not None:
+        path.write_bytes(damaged[content] if isinstance(content, str) else content)
+    assert main(["info", str(path)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "site.coview" in captured.err
+    assert captured.err.count("\n") == 1

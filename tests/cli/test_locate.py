@@ -1,0 +1,125 @@
+"""``coview-stream locate``: files and exit code for success, failure and bad input."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from coview_stream.cli import main
+from coview_stream.clouds.trajectory import read_tum, write_tum
+
+
+def one_line(capsys):
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("coview-stream: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_a_run_on_the_map(world_file, world_run, world_drive, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["locate", str(world_file), str(world_run), "-o", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert "TRACKING" in captured.out
+    assert captured.err == ""
+    stamps, poses = read_tum(out / "trajectory.tum")
+    assert len(stamps) >= 2
+    index = np.round((stamps - 100.0) / 0.5).astype(int)
+    truth = np.array(world_drive.T_map_body)[index]
+    assert np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.08
+    result = json.loads((out / "result.json").read_text())
+    assert result["state"] == "TRACKING"
+    assert result["first_fix_stamp"] == pytest.approx(stamps[0])
+    assert len(result["map_sha256"]) == 64
+    assert (out / "trajectory.png").exists()
+
+
+def test_a_run_outside_the_map(world_file, elsewhere_run, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["locate", str(world_file), str(elsewhere_run), "-o", str(out), "--no-pictures"]) == 1
+    captured = capsys.readouterr()
+    assert "0 of 3 frames" in captured.out
+    assert captured.err == ""
+    assert (out / "trajectory.tum").read_text() == ""
+    result = json.loads((out / "result.json").read_text())
+    assert result["state"] in ("SEARCHING", "AMBIGUOUS")
+    assert result["T_map_odom"] is None
+    assert result["first_fix_stamp"] is None
+    assert all(k["state"] in ("SEARCHING", "AMBIGUOUS") for k in result["keyframes"])
+    assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
+
+
+def test_odometry_from_another_file_and_the_papers_retrieval(world_file, world_run, world_drive, tmp_path):
+    bare = tmp_path / "run"
+    shutil.copytree(world_run, bare)
+    (bare / "odometry.tum").rename(tmp_path / "wheel.tum")
+    out = tmp_path / "out"
+    command = ["locate", str(world_file), str(bare), "-o", str(out), "--no-pictures"]
+    code = main([*command, "--odometry", str(tmp_path / "wheel.tum"), "--retrieval", "ring_key"])
+    assert code in (0, 1)
+    # 200 of the nearest ring keys may miss the place; a wrong pose may not come of it
+    for stamp, T in zip(*read_tum(out / "trajectory.tum"), strict=True):
+        truth = world_drive.T_map_body[round((stamp - 100.0) / 0.5)]
+        assert np.linalg.norm(T[:3, 3] - truth[:3, 3]) < 0.1
+
+
+def damaged_odometry(run, kind):
+    lines = (run / "odometry.tum").read_text().splitlines()
+    if kind == "missing":
+        (run / "odometry.tum").unlink()
+        return
+    if kind == "short":
+        lines = lines[:-2]
+    elif kind == "unsorted":
+        lines[1], lines[2] = lines[2], lines[1]
+    elif kind == "nan":
+        lines[2] = lines[2].replace(lines[2].split()[1], "nan")
+    elif kind == "text":
+        lines[0] = "no numbers here"
+    (run / "odometry.tum").write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("kind", ["missing", "short", "unsorted", "nan", "text"])
+def test_bad_odometry(world_file, world_run, tmp_path, capsys, kind):
+    run = tmp_path / "run"
+    shutil.copytree(world_run, run)
+    damaged_odometry(run, kind)
+    assert main(["locate", str(world_file), str(run), "-o", str(tmp_path / "out")]) == 2
+    assert "odometry" in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_paths_and_options(world_file, world_run, tmp_path, capsys):
+    out = ["-o", str(tmp_path / "out")]
+    (tmp_path / "file").write_text("")
+    wheel = tmp_path / "wheel.tum"
+    write_tum(wheel, [1.0], [np.eye(4)])
+    for arguments, text in (
+        ([str(tmp_path / "none.coview"), str(world_run), *out], "none.coview"),
+        ([str(world_run / "odometry.tum"), str(world_run), *out], "not a coview map"),
+        ([str(world_file), str(tmp_path / "none"), *out], "none"),
+        ([str(world_file), str(tmp_path), *out], tmp_path.name),
+        ([str(world_file), str(world_run), "-o", str(tmp_path / "file")], "is a file"),
+        ([str(world_file), str(world_run), *out, "--odometry", "kiss-icp"], "not supported yet"),
+        ([str(world_file), str(world_run), *out, "--odometry", str(tmp_path / "no.tum")], "no.tum"),
+        ([str(world_file), str(world_run), *out, "--odometry", str(wheel)], "wheel.tum"),
+        ([str(world_file), str(world_run), *out, "--retrieval", "magic"], "--retrieval"),
+        ([str(world_file), *out], "RUN"),
+    ):
+        assert main(["locate", *arguments]) == 2, text
+        assert text in one_line(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_damaged_frames(world_file, world_run, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(world_run, run)
+    for path in (run / "frames").iterdir():
+        path.write_bytes(b"")
+    assert main(["locate", str(world_file), str(run), "-o", str(tmp_path / "out")]) == 2
+    assert "000000.ply" in one_line(capsys)
+    assert not (tmp_path / "out").exists()
