@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import FunctionType, ModuleType
 from typing import Any
 from unittest.mock import patch
 
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.tables import number, table
-from bench.worlds import isolated, peak_megabytes
+from bench.worlds import fingerprint, isolated, peak_megabytes
 
 MOST_SECONDS, MOST_MEGABYTES = 180.0, 4096.0
 """The target for 10 M points and 10,000 stations, on two cores."""
@@ -27,11 +28,6 @@ MOST_SECONDS, MOST_MEGABYTES = 180.0, 4096.0
 _COVERED = 0.2  # share of the ground below boxes: more than there is, lest stations fall short
 _BOX, _BOX_EVERY = (8.0, 20.0), 45.0  # metres
 _CROWNS_PER_M2 = 0.004
-_STAGES = (
-    "read_cloud", "voxel_grid", "remove_outliers", "estimate_normals", "ground_mask", "station_positions",
-    "rasterise", "describe_stations", "sort_by_tile",
-)  # fmt: skip
-
 Cloud = npt.NDArray[np.float64]
 
 
@@ -102,7 +98,7 @@ def build(files: Sequence[Path], out: Path, block: float) -> dict[str, Any]:
     from coview_stream.basemap import build as module
 
     stages: dict[str, float] = {}
-    clocks: Any = {name: _timed(name, getattr(module, name), stages) for name in _STAGES}
+    clocks: Any = {name: _timed(name, work, stages) for name, work in _steps(module).items()}
     with patch.multiple(module, **clocks):
         begin = time.perf_counter()
         base_map = BaseMap.build(files, block=block)
@@ -119,8 +115,16 @@ def build(files: Sequence[Path], out: Path, block: float) -> dict[str, Any]:
         "seconds": saved - begin,
         "open_s": time.perf_counter() - saved,
         "megabytes": peak,
+        "code": fingerprint(),
         "file_megabytes": out.stat().st_size / 1e6,
     }
+
+
+def _steps(module: ModuleType) -> dict[str, FunctionType]:
+    """Functions of other modules that ``module`` calls: the stages, whatever they come to be called."""
+    functions = {name: f for name, f in vars(module).items() if isinstance(f, FunctionType)}
+    ours = {name: f for name, f in functions.items() if f.__module__.startswith("coview_stream.")}
+    return {name: f for name, f in ours.items() if f.__module__ != module.__name__}
 
 
 def _timed(name: str, work: Callable[..., Any], stages: dict[str, float]) -> Callable[..., Any]:
@@ -148,6 +152,7 @@ def report(found: dict[str, Any]) -> str:
         f"the file has {found['file_megabytes']:.0f} MB and opens in {found['open_s']:.2f} s",
         f"{found['seconds']:.0f} s (< {MOST_SECONDS:.0f}), peak {found['megabytes']:.0f} MB "
         f"(< {MOST_MEGABYTES:.0f}): {'met' if met else 'MISSED'}",
+        f"Code {found['code']}, {time.strftime('%Y-%m-%d')}.",
     ])  # fmt: skip
 
 

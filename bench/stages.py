@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from coview_stream import BaseMap
 from coview_stream.basemap import store
-from coview_stream.basemap.raster import HeightRaster, aligned_corner, rasterise
-from coview_stream.basemap.stations import describe_stations
+from coview_stream.basemap.stations import describe_storeys, find_stations
 from coview_stream.clouds import open_run, read_tum
 from coview_stream.config import (
     Channel,
@@ -37,8 +36,6 @@ WINDOW = 5
 
 NEAR, ALIGNED = 3.0, float(np.radians(9.0))
 """A place is right within this, metres and radians: one and a half blocks, one and a half shifts."""
-
-_RASTER_CELL = 0.5  # metres, as in a map's own build; the tests hold the two together
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,6 @@ class Bank:
         arrays, self._parameters, _ = store.load(path)
         self._geometry = {name: a for name, a in arrays.items() if not name.startswith("descriptor.")}
         self.built = BaseMap(arrays, self._parameters)
-        self._raster: HeightRaster | None = None
         self._known: dict[tuple[Channel, Visibility], npt.NDArray[np.float16]] = {}
 
     def map(self, descriptor: DescriptorConfig) -> BaseMap:
@@ -96,17 +92,17 @@ class Bank:
     def _described(self, name: Channel, descriptor: DescriptorConfig) -> npt.NDArray[np.float16]:
         key = (name, descriptor.visibility if name.startswith("coview") else "off")
         if key not in self._known:
-            one = replace(descriptor, channels=(name,))
-            self._known[key] = describe_stations(self._heights(one), self.built.stations, one)[name]
+            one, block = replace(descriptor, channels=(name,)), self.built.config.block
+            points, stations = np.array(self.built.points), self.built.stations
+            self._known[key] = describe_storeys(points, stations, self._indoors(), block, one)[name]
         return self._known[key]
 
-    def _heights(self, descriptor: DescriptorConfig) -> HeightRaster:
-        if self._raster is None:
-            points, block = np.array(self.built.points), self.built.config.block
-            corner = aligned_corner(points, block, _RASTER_CELL)
-            margin = int(np.ceil(block / _RASTER_CELL))
-            self._raster = rasterise(points, corner, _RASTER_CELL, descriptor.voxel, margin)
-        return self._raster
+    def _indoors(self) -> npt.NDArray[np.bool_]:
+        """Tell which stations (M,) stand below a ceiling; maps keep only how many they are."""
+        config = self.built.config
+        if self._parameters["indoor_stations"]:
+            return find_stations(np.array(self.built.points), config.block, config.levels)[1]
+        return np.zeros(len(self.built), dtype=bool)
 
 
 def keyframes_of(
