@@ -88,6 +88,8 @@ class MapConfig:
         _positive(self, "block", "voxel", "tile", "outlier_std_ratio", "normal_radius")
         _counts(self, "outlier_neighbours", least=0)
         _counts(self, "normal_neighbours", least=3)
+        halves = self.block / 0.5  # stations must stand at the centres of the raster's cells
+        _require(abs(halves - round(halves)) < 1e-6, self, "block", "a multiple of 0.5 m")
         _require(self.voxel <= self.block, self, "voxel", f"no larger than block ({self.block} m)")
         _require(
             self.block < self.descriptor.radius,

@@ -11,7 +11,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ _CHUNK = 1 << 22
 _TYPES = {
     "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U8": "|u1",
 }  # fmt: skip
+_NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
@@ -35,8 +36,6 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
     Raises:
         MapError: the directory does not exist or cannot be written.
     """
-    from safetensors.numpy import save as serialise
-
     text = json.dumps(parameters, sort_keys=True)
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = _digest(text, contiguous)
@@ -45,7 +44,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         with os.fdopen(handle, "wb") as file:
-            file.write(serialise(contiguous, metadata))
+            _write(file, contiguous, metadata)
             file.flush()
             os.fsync(file.fileno())
         Path(temporary).chmod(0o644)
@@ -56,6 +55,29 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
     return digest
+
+
+def _write(file: BinaryIO, arrays: Arrays, metadata: dict[str, str]) -> None:
+    """Write the safetensors layout array by array: the library's own writer holds a second copy of everything."""
+    header: dict[str, Any] = {"__metadata__": metadata}
+    # the wide types first, so that every array begins at a multiple of its item size
+    names = sorted(arrays, key=lambda name: (-arrays[name].dtype.itemsize, name))
+    end = 0
+    for name in names:
+        array = arrays[name]
+        begin, end = end, end + array.nbytes
+        header[name] = {
+            "dtype": _NAMES[array.dtype.str],
+            "shape": list(array.shape),
+            "data_offsets": [begin, end],
+        }
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    file.write(len(text).to_bytes(8, "little") + text)
+    for name in names:
+        data = arrays[name].reshape(-1).view(np.uint8)
+        for begin in range(0, len(data), _CHUNK):
+            file.write(data[begin : begin + _CHUNK].data)
 
 
 def load(path: Path) -> tuple[Arrays, dict[str, Any], str]:

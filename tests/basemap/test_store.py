@@ -222,3 +222,19 @@ def test_saving_over_a_loaded_map_leaves_the_loaded_one_readable(path):
 def test_a_directory_that_does_not_exist(tmp_path):
     with pytest.raises(MapError, match=r"cannot write the map .*choose a writable place"):
         store.save(tmp_path / "no" / "site.coview", arrays(), PARAMETERS)
+
+
+def test_the_file_is_valid_safetensors(tmp_path):
+    from safetensors.numpy import load_file
+
+    arrays = {
+        "a": np.arange(5, dtype=np.int8),
+        "b": np.arange(6, dtype=np.float64).reshape(2, 3),
+        "c": np.zeros((0, 3), dtype=np.float32),
+    }
+    path = tmp_path / "site.coview"
+    store.save(path, arrays, {"answer": 42})
+    loaded = load_file(path)
+    assert sorted(loaded) == sorted(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(loaded[name], array)
