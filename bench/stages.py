@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from coview_stream import BaseMap
 from coview_stream.basemap import store
-from coview_stream.basemap.stations import describe_storeys, find_stations
+from coview_stream.basemap.stations import describe_storeys
 from coview_stream.clouds import open_run, read_tum
 from coview_stream.config import (
     Channel,
@@ -94,15 +94,8 @@ class Bank:
         if key not in self._known:
             one, block = replace(descriptor, channels=(name,)), self.built.config.block
             points, stations = np.array(self.built.points), self.built.stations
-            self._known[key] = describe_storeys(points, stations, self._indoors(), block, one)[name]
+            self._known[key] = describe_storeys(points, stations, block, one)[name]
         return self._known[key]
-
-    def _indoors(self) -> npt.NDArray[np.bool_]:
-        """Tell which stations (M,) stand below a ceiling; maps keep only how many they are."""
-        config = self.built.config
-        if self._parameters["indoor_stations"]:
-            return find_stations(np.array(self.built.points), config.block, config.levels)[1]
-        return np.zeros(len(self.built), dtype=bool)
 
 
 def keyframes_of(

@@ -19,7 +19,16 @@ if TYPE_CHECKING:
     from coview_stream.fix import Fix, State
     from coview_stream.localizer import Localizer
 
-__all__ = ["BaseMap", "CoViewError", "Fix", "Localizer", "LocalizerConfig", "MapConfig", "State", "__version__"]
+__all__ = [
+    "BaseMap",
+    "CoViewError",
+    "Fix",
+    "Localizer",
+    "LocalizerConfig",
+    "MapConfig",
+    "State",
+    "__version__",
+]
 
 __version__ = "0.1.0"
 

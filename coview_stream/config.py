@@ -163,7 +163,8 @@ class RegistrationConfig:
     ``keep`` is the overlap; the paper keeps 60 %, 70 % converges faster here and as well. ``search`` and ``track``
     list the largest correspondence distances of the successive scales. Points above the ground and points on it are
     trimmed apart, else the ground, which fits anywhere, pushes out the facades that fix the position (KITTI 04: 0.25 m
-    median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not independent).
+    median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not
+    independent).
     """
 
     keep: float = 0.7
@@ -196,18 +197,20 @@ class RegistrationConfig:
 class AcceptanceConfig:
     """What evidence makes a fix, keeps it, and loses it (see :mod:`coview_stream.pose.verification`).
 
-    A hypothesis is accepted when its score is at least ``score``, every distinct rival's is at most ``rival`` times
-    that, and it has been so for ``confirmations`` keyframes in a row, all agreeing within ``agree_distance`` and
-    ``agree_angle``. One frame alone (``stationary``) must reach ``single_score`` and ``single_rival``.
+    A hypothesis is accepted when its score is at least ``score`` and leads every distinct rival's by ``lead``, and
+    has been so for ``confirmations`` keyframes in a row, all agreeing within ``agree_distance`` and ``agree_angle``.
+    One frame alone (``stationary``) must reach ``single_score`` and ``single_lead``. Calibrated on single scans, real
+    ones of three sensors and simulated ones of two: 86 right places led by 0.04-0.8, the 4 wrong ones by 0.07 at most,
+    and outside the map nothing led by more than 0.07 at any score.
     Tracking is lost after ``patience`` keyframes in a row below ``keep_score``, or on less than ``inside`` of the
     points where the map has been surveyed.
     """
 
-    score: float = 0.3
-    rival: float = 0.85
+    score: float = 0.27
+    lead: float = 0.1
     confirmations: int = 3
-    single_score: float = 0.5
-    single_rival: float = 0.75
+    single_score: float = 0.3
+    single_lead: float = 0.2
     agree_distance: float = 1.5
     agree_angle: float = math.radians(3)
     keep_score: float = 0.22
@@ -216,7 +219,7 @@ class AcceptanceConfig:
     most_tilt: float = math.radians(8)
 
     def __post_init__(self) -> None:
-        _fraction(self, "score", "rival", "single_score", "single_rival", "keep_score", "inside")
+        _fraction(self, "score", "lead", "single_score", "single_lead", "keep_score", "inside")
         _counts(self, "confirmations", "patience")
         _positive(self, "agree_distance", "agree_angle", "most_tilt")
 

@@ -96,6 +96,7 @@ class Localizer:
         if self._doubts >= rule.patience:
             self.state = State.LOST
             self._buffer.clear()
+            self._tracker.forget()
         reason = f"evidence gone, {self._doubts} times in a row" if doubtful else "verified"
         self._evidence = KeyframeEvidence(stamp, self.state, reason, score, 0.0, evidence)
 
@@ -118,10 +119,16 @@ class Localizer:
 
     def _checked(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:
         """Finite float32 points, and the pose relative to the first one so that float32 stays exact."""
-        cloud = np.asarray(cloud)
-        if cloud.ndim != 2 or cloud.shape[1] != 3:
-            raise CloudError(f"cloud has shape {cloud.shape}; expected (N, 3)")
-        finite = np.ascontiguousarray(cloud[np.isfinite(cloud).all(axis=1)], dtype=np.float32)
+        try:
+            with np.errstate(over="ignore"):
+                rows = np.asarray(cloud).astype(np.float32, copy=False)
+        except (TypeError, ValueError) as error:
+            raise CloudError(
+                f"cloud is not an array of numbers ({error}); expected (N, 3) float32"
+            ) from error
+        if rows.ndim != 2 or rows.shape[1] != 3:
+            raise CloudError(f"cloud has shape {rows.shape}; expected (N, 3)")
+        finite = np.ascontiguousarray(rows[np.isfinite(rows).all(axis=1)])
         if len(finite) < _LEAST_POINTS:
             raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_LEAST_POINTS} or more")
         T = np.asarray(T_odom_body, dtype=np.float64)

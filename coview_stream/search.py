@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ _SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close 
 _SAME_ANGLE = np.radians(5.0)
 _SUBMAP_KEYFRAMES = 4  # of the newest in the local scan that is registered: more are smeared by drift
 _COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through
+_REMEMBERED = 2  # best candidates that the next keyframe tries again
 _COARSE_EVERY = 3  # of the source's points, for the coarse scales only every third
 _COARSE_ITERATIONS = 8
 _HOPELESS = (
@@ -61,20 +62,28 @@ class GlobalSearch:
         self.retrieval = Retrieval(base_map, config.retrieval)
         self.consensus = Consensus(base_map.stations, base_map.config.block, config.consensus)
         self.last_query: dict[Channel, Descriptor] = {}
+        self._remembered: list[Hypothesis] = []
         self._favourite: Candidate | None = None
         self._confirmed = 0
 
     def clear(self) -> None:
         """Forget all votes and confirmations."""
         self.consensus.clear()
+        self._remembered = []
         self._favourite, self._confirmed = None, 0
 
     def update(self, buffer: KeyframeBuffer, keyframe: Keyframe, cloud: Points) -> Verdict:
         """Take in one keyframe; ``cloud`` (N, 3) is its newest frame in the body frame."""
         self._vote(buffer, keyframe)
-        hypotheses = self.consensus.hypotheses()
+        # what was good at the last keyframe is tried again, whatever the votes say now
+        hypotheses = [*self.consensus.hypotheses(), *self._remembered]
         source = local_source(buffer.recent(_SUBMAP_KEYFRAMES), keyframe.position, self.config.registration)
         candidates = self._refine(hypotheses, source, keyframe, cloud)
+        self._remembered = [
+            replace(c.hypothesis, T_map_odom=c.T_map_odom)
+            for c in candidates[:_REMEMBERED]
+            if c.evidence.score >= self.config.acceptance.score
+        ]
         return self._judge(candidates, keyframe)
 
     def _vote(self, buffer: KeyframeBuffer, keyframe: Keyframe) -> None:
@@ -140,9 +149,9 @@ class GlobalSearch:
 
     def _judge(self, candidates: list[Candidate], keyframe: Keyframe) -> Verdict:
         rule = self.config.acceptance
-        least, most_rival, needed = rule.score, rule.rival, rule.confirmations
+        least, lead, needed = rule.score, rule.lead, rule.confirmations
         if self.config.stationary:
-            least, most_rival, needed = rule.single_score, rule.single_rival, 1
+            least, lead, needed = rule.single_score, rule.single_lead, 1
         if not candidates:
             self._favourite, self._confirmed = None, 0
             reason = (
@@ -159,7 +168,7 @@ class GlobalSearch:
         if score < least or best.evidence.inside < rule.inside:
             state, reason = State.SEARCHING, f"no place fits: best score {score:.2f}, {least:.2f} needed"
             self._favourite, self._confirmed = None, 0
-        elif rival > most_rival * score:
+        elif score - rival < lead:
             reason = f"two places fit: scores {score:.2f} and {rival:.2f}"
             self._favourite, self._confirmed = None, 0
         else:

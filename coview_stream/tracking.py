@@ -54,6 +54,10 @@ class Tracker:
         )
         self._recent.append(_Recent(self._travelled, points))
 
+    def forget(self) -> None:
+        """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
+        self._recent.clear()
+
     def start(self, registration: Registration) -> None:
         """Begin with an accepted fix, which may not have converged yet: its own covariance is not believed."""
         self.T_map_odom = registration.T_map_source

@@ -167,13 +167,6 @@ def test_describing_again_gives_what_the_map_was_built_with(folder, row):
     assert np.any(strict.descriptors("coview_strict") != bank.built.descriptors("coview"))
 
 
-def test_stations_indoors_are_found_again(folder, row):
-    bank = Bank(map_of(folder, TINY))
-    assert not bank._indoors().any()
-    bank._parameters["indoor_stations"] = 1  # a map that has some does not say which: they are sought anew
-    assert bank._indoors().shape == (len(bank.built),)
-
-
 def test_keyframes_come_with_their_true_place(folder, row):
     bank = Bank(map_of(folder, TINY))
     seen = list(keyframes_of(folder / world_name(TINY), bank.built.origin, bank.built.descriptor_config))

@@ -56,7 +56,7 @@ BAD = [
     (RegistrationConfig, "iterations", 0),
     (RegistrationConfig, "gravity_sigma", 0.0),
     (AcceptanceConfig, "score", 0.0),
-    (AcceptanceConfig, "rival", 1.01),
+    (AcceptanceConfig, "lead", 1.01),
     (AcceptanceConfig, "confirmations", 0),
     (AcceptanceConfig, "agree_angle", float("nan")),
     (TrackingConfig, "distance", 0.0),

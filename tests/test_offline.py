@@ -120,7 +120,7 @@ def test_a_single_scan_takes_the_stationary_path(world_map, world_drive, tmp_pat
     """One frame may be enough for a fix, but only there; a scan stored far from its zero keeps its own frame."""
     away = np.array([30_000.0, -20_000.0, 100.0])
     write_cloud(tmp_path / "scan.ply", world_drive.clouds[3].astype(np.float64), away)
-    easy = LocalizerConfig(acceptance=AcceptanceConfig(single_score=0.3, single_rival=0.9))
+    easy = LocalizerConfig(acceptance=AcceptanceConfig(single_score=0.3, single_lead=0.05))
     found = locate(world_map, open_run(tmp_path / "scan.ply"), easy)
     (fix,) = found.fixes
     assert fix.state is State.TRACKING

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -82,7 +83,8 @@ class BaseMap:
         settings = config or map_preset(preset, **options)
         arrays, parameters = build_arrays([Path(p) for p in paths], settings, progress)
         parameters["config"] = asdict(settings)
-        return cls(arrays, parameters)
+        # as it will be read back: a tuple becomes a list
+        return cls(arrays, json.loads(json.dumps(parameters)))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> BaseMap:

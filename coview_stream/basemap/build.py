@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from coview_stream.basemap.levels import below_another
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.store import Arrays
 from coview_stream.basemap.tiles import sort_by_tile
@@ -61,14 +62,14 @@ def build_arrays(
         normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
     with _bar(progress, "ground") as step:
-        stations, indoors = find_stations(points, config.block, config.levels)
+        stations = find_stations(points, config.block, config.levels)
         if not len(stations):
             raise MapError(
                 "no ground found in the base map; it needs points on the ground to put stations on"
             )
         step(1, 1)
     with _bar(progress, "describing stations") as step:
-        described = describe_storeys(points, stations, indoors, config.block, config.descriptor, step)
+        described = describe_storeys(points, stations, config.block, config.descriptor, step)
 
     sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
@@ -84,9 +85,9 @@ def build_arrays(
     }
     parameters = {
         "crs": crs,
-        "sources": {path.name: _sha256(path) for path in paths},
+        "sources": {_label(path, paths): _sha256(path) for path in paths},
         "source_points": source_points,
-        "indoor_stations": int(indoors.sum()),
+        "stations_below_another": int(below_another(stations, config.block).sum()),
     }
     return arrays, parameters
 
@@ -111,6 +112,11 @@ def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8],
     grid[rows, columns] = True
     square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
     return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block
+
+
+def _label(path: Path, paths: list[Path]) -> str:
+    """Name a source by its file name, or by its path where several have that name."""
+    return path.name if [other.name for other in paths].count(path.name) == 1 else str(path)
 
 
 def _sha256(path: Path) -> str:

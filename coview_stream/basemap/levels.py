@@ -81,22 +81,15 @@ def ground_levels(
     return np.concatenate([base, _upper_squares(floors, base, cell)])
 
 
-def stands_indoors(stations: Points, floors: Points, cell: float) -> npt.NDArray[np.bool_]:
-    """Which of (M, 3) stations stand on a covered floor of their ``cell``-sized square.
-
-    ``floors`` is the answer of :func:`indoor_floors`.
-    """
-    if not len(floors) or not len(stations):
-        return np.zeros(len(stations), dtype=bool)
-    _, _, flat = cells(np.concatenate([stations, floors]), cell)
-    own, theirs = flat[: len(stations)], flat[len(stations) :]
-    order = np.argsort(theirs, kind="stable")
-    begin, end = np.searchsorted(theirs[order], own, "left"), np.searchsorted(theirs[order], own, "right")
-    indoors = np.zeros(len(stations), dtype=bool)
-    for m in np.flatnonzero(end > begin):
-        heights = floors[order[begin[m] : end[m]], 2]
-        indoors[m] = bool((np.abs(heights - stations[m, 2]) < _SAME_LEVEL).any())
-    return indoors
+def below_another(stations: Points, cell: float) -> npt.NDArray[np.bool_]:
+    """Which of (M, 3) stations have another one above them in their ``cell``-sized square: a storey over a storey."""
+    if not len(stations):
+        return np.zeros(0, dtype=bool)
+    _, _, flat = cells(stations, cell)
+    order = np.lexsort((stations[:, 2], flat))
+    below = np.zeros(len(stations), dtype=bool)
+    below[order[:-1]] = flat[order[:-1]] == flat[order[1:]]
+    return below
 
 
 def indoor_floors(points: Points, config: LevelConfig) -> Points:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.basemap.ground import ground_mask
-from coview_stream.basemap.levels import LevelConfig, ground_levels, indoor_floors, stands_indoors
+from coview_stream.basemap.levels import LevelConfig, below_another, ground_levels, indoor_floors
 from coview_stream.basemap.raster import HeightRaster, aligned_corner, rasterise
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.geometry import Points
@@ -21,42 +21,39 @@ Progress = Callable[[int, int], None]
 RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
 
 _PORTION = 512  # stations at a time: 7 MB of bins
+_FLOORS = LevelConfig(area=25.0)  # square metres: smaller ones are overhangs more often than floors
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
 _BELOW_FLOOR = 1.0  # metres of what lies below the floor that still belongs to the storey
 _CEILING = 6.0  # metres: as LevelConfig.cover
 
 
-def find_stations(
-    points: Points, block: float, levels: bool = True
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Stations (M, 3) and which of them (M,) stand indoors, below a ceiling.
+def find_stations(points: Points, block: float, levels: bool = True) -> npt.NDArray[np.float32]:
+    """Stations (M, 3): one per ``block``-sized cell that has ground, at its centre and median ground height.
 
-    One per ``block``-sized cell that has ground, at its centre and median ground height, and one more for every floor
-    of a building above it. (The paper's centroids of 3-D voxels put two stations into some cells.) With ``levels``
-    False the ground alone counts, and nothing is indoors.
+    With ``levels`` there is one more for every floor of a building above it. (The paper's centroids of 3-D voxels put
+    two stations into some cells.)
     """
     nothing = np.zeros((0, 3), dtype=np.float32)
-    floors = indoor_floors(points, LevelConfig()) if levels else nothing
     mask = ground_mask(points)
     if not mask.any():
-        return nothing, np.zeros(0, dtype=bool)
-    stations = ground_levels(points, block, mask, floors=floors)
-    return stations, stands_indoors(stations, floors, block)
+        return nothing
+    floors = indoor_floors(points, _FLOORS) if levels else nothing
+    return ground_levels(points, block, mask, floors=floors)
 
 
 def describe_storeys(
     points: Points,
     stations: npt.NDArray[np.float32],
-    indoors: npt.NDArray[np.bool_],
     block: float,
     config: DescriptorConfig,
     progress: Progress | None = None,
 ) -> dict[Channel, npt.NDArray[np.float16]]:
-    """Descriptor channels (M, R, S) of all stations: in the open from the whole cloud, indoors storey by storey.
+    """Descriptor channels (M, R, S) of all stations, those with a storey above them storey by storey.
 
-    Who stands below a ceiling sees the storey up to it, not the roof: stations of similar height share a raster of the
+    Who stands below another floor sees up to it, not the roof: such stations of similar height share a raster of the
     points between a metre below their floor and the highest ceiling that counts as one.
     """
+    indoors = below_another(stations, block)
     corner = aligned_corner(points, block, RASTER_CELL)
     # a block at the upper edge may have its centre beyond the last point
     margin = int(np.ceil(block / RASTER_CELL))
