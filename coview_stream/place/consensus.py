@@ -39,7 +39,8 @@ class _Ballot:
     votes: npt.NDArray[
         np.float32
     ]  # (S, M + 1) standardised distances; the last station is nowhere: no opinion
-    smallest: float  # smallest raw distance, for the paper's single-minimum rule
+    smallest: float  # smallest raw distance of any channel, for the paper's single-minimum rule
+    where: tuple[int, int]  # its station and shift
 
 
 class StationGrid:
@@ -105,10 +106,11 @@ class Consensus:
         hypothesis stands out is comparable between channels and places, the distance itself is not.
         """
         votes = sum(standardised(volume) for volume in distances.values()) / np.float32(len(distances))
-        smallest = min(float(volume.min()) for volume in distances.values())
+        best = min(distances.values(), key=lambda volume: float(volume.min()))
+        station, shift = np.unravel_index(int(best.argmin()), best.shape)
         by_shift = np.zeros((np.shape(votes)[1], len(self.stations) + 1), dtype=np.float32)
         by_shift[:, :-1] = np.transpose(votes)
-        self._ballots.append(_Ballot(centre, by_shift, smallest))
+        self._ballots.append(_Ballot(centre, by_shift, float(best.min()), (int(station), int(shift))))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
@@ -116,7 +118,7 @@ class Consensus:
             return []
         if self.config.mode == "single":
             ballot = min(self._ballots, key=lambda b: b.smallest)
-            return self._peaks(ballot.votes[:, :-1].T, ballot.centre)[:1]
+            return [self._hypothesis(*ballot.where, ballot.smallest, ballot.centre)]
         return self._peaks(self.scores(), self._ballots[-1].centre)
 
     def scores(self) -> Volume:
@@ -147,12 +149,19 @@ class Consensus:
         found: list[Hypothesis] = []
         while free.any() and len(found) < self.config.peaks:
             k = int(free.argmax())
-            T = pose_from(rot_z(float(yaw[k])), xyz[k]) @ pose_from(np.eye(3), -centre)  # eq. 12, mended
-            found.append(Hypothesis(T, int(station[k]), int(shift[k]), float(flat[shortlist[k]])))
+            found.append(self._hypothesis(int(station[k]), int(shift[k]), float(flat[shortlist[k]]), centre))
             turn = np.abs((yaw - yaw[k] + np.pi) % (2 * np.pi) - np.pi)
             near = np.linalg.norm(xyz - xyz[k], axis=1) < self.config.distinct_distance
             free &= ~(near & (turn < self.config.distinct_yaw))
         return found
+
+    def _hypothesis(
+        self, station: int, shift: int, score: float, centre: npt.NDArray[np.float64]
+    ) -> Hypothesis:
+        """Eq. 12, mended: the turn is about the keyframe's centre, not about the odometry frame's origin."""
+        turn = rot_z(float(yaw_of_shift(shift, self._ballots[-1].votes.shape[0])))
+        T = pose_from(turn, self.stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
+        return Hypothesis(T, station, shift, score)
 
 
 def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> npt.NDArray[np.float64]:
