@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
@@ -192,7 +193,7 @@ class GlobalSearch:
         )
 
 
-def gravity_information(sigma: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def gravity_information(sigma: float) -> npt.NDArray[np.float64]:
     """Information (6, 6) over (rx, ry, rz, x, y, z) of "both frames are level to ``sigma`` radians"."""
     return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])
 

@@ -78,7 +78,7 @@ def ground_raster(
     corner, shape, flat = cells(ground, cell)
     order = np.lexsort((ground[:, 2], flat))
     unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-    z = np.full(shape, np.nan, dtype=np.float32)
+    z: Heights = np.full(shape, np.nan, dtype=np.float32)
     z.flat[unique] = ground[order[first + count // 2], 2]
     near = ndimage.distance_transform_edt(np.isnan(z)) * cell <= fill
     z = np.where(near, filled(z), np.float32(np.nan))

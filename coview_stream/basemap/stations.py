@@ -15,6 +15,9 @@ from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.geometry import Points
 from coview_stream.place.descriptor import channel
 
+Described = dict[Channel, npt.NDArray[np.float16]]
+"""(M, R, S) of each channel."""
+
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
@@ -47,7 +50,7 @@ def describe_storeys(
     block: float,
     config: DescriptorConfig,
     progress: Progress | None = None,
-) -> dict[Channel, npt.NDArray[np.float16]]:
+) -> Described:
     """Descriptor channels (M, R, S) of all stations, those with a storey above them storey by storey.
 
     Who stands below another floor sees up to it, not the roof: such stations of similar height share a raster of the
@@ -59,7 +62,7 @@ def describe_storeys(
     margin = int(np.ceil(block / RASTER_CELL))
     storey = np.where(indoors, np.round(stations[:, 2] / _STOREY), np.inf)
     shape = (len(stations), config.rings, config.sectors)
-    described = {name: np.zeros(shape, dtype=np.float16) for name in config.channels}
+    described: Described = {name: np.zeros(shape, dtype=np.float16) for name in config.channels}
     done = 0
     for floor in np.unique(storey):
         chosen = np.flatnonzero(storey == floor)
@@ -85,14 +88,14 @@ def describe_stations(
     stations: npt.NDArray[np.float32],
     config: DescriptorConfig,
     progress: Progress | None = None,
-) -> dict[Channel, npt.NDArray[np.float16]]:
+) -> Described:
     """Descriptor channels (M, R, S) float16 of the virtual reference scans at ``stations`` (M, 3).
 
     Works through portions of stations: only the descriptors of all stations are ever in memory, never their points.
     float16 keeps 2 cm at 30 m height, far below the noise of a maximum over a bin.
     """
     shape = (len(stations), config.rings, config.sectors)
-    described = {name: np.empty(shape, dtype=np.float16) for name in config.channels}
+    described: Described = {name: np.empty(shape, dtype=np.float16) for name in config.channels}
     rows, columns = raster.cells_of(stations[:, :2])
     for start in range(0, len(stations), _PORTION):
         part = slice(start, start + _PORTION)

@@ -77,7 +77,7 @@ def _voxel_groups(points: Points, voxel: float) -> tuple[npt.NDArray[np.intp], n
     extent = np.floor(points.max(axis=0).astype(np.float64) / voxel) - low + 1
     if float(np.prod(extent)) > _MAX_CELLS:
         raise ConfigError(f"voxel={voxel}: too small for a cloud of {(extent * voxel).round().tolist()} m")
-    keys = np.zeros(len(points), dtype=np.int64)
+    keys: npt.NDArray[np.int64] = np.zeros(len(points), dtype=np.int64)
     for axis in range(3):
         cell = np.floor(points[:, axis].astype(np.float64) / voxel) - low[axis]
         keys *= int(extent[axis])

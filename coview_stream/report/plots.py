@@ -184,7 +184,7 @@ def plot_descriptor_pair(
             axes.grid(False)
             image = axes.pcolormesh(
                 *edges,
-                np.ma.masked_invalid(values),
+                np.where(np.isfinite(values), values, np.nan),
                 cmap="viridis",
                 vmin=low,
                 vmax=high or 1.0,

@@ -116,7 +116,7 @@ def _shaded(points: npt.NDArray[np.float64]) -> tuple[Any, tuple[float, float, f
     tall = max(float(np.percentile(above[known], 98)), 0.5)
     grey = 0.93 - 0.55 * np.clip(above / tall, 0.0, 1.0) ** 0.7
     top = low + shape * cell
-    return np.ma.masked_where(~known, grey), (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
+    return np.where(known, grey, np.nan), (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
 
 
 def map_figure_size(points: Floats) -> tuple[float, float]:

@@ -107,7 +107,7 @@ def institute(rng: np.random.Generator, w: float, d: float) -> Mesh:
     if rng.random() < 0.6:
         parts.append(placed(box(7.0, 3.5, 0.3), tower, d / 2 + 1.7, 3.4))
     if rng.random() < 0.5:  # columns before the facade
-        row = np.arange(-0.45 * w, 0.45 * w, 4.5)
+        row = np.arange(-0.45 * w, 0.45 * w, 4.5).tolist()
         parts += [placed(cylinder(0.3, 3.4 + _FOOTING, 8), x, d / 2 + 1.2, -_FOOTING) for x in row]
     return join(parts)
 
@@ -123,7 +123,7 @@ def hall(rng: np.random.Generator, w: float, d: float) -> Mesh:
         parts += [placed(shed(w, d / teeth, 2.4), 0, y, h) for y in rows]
     else:
         parts.append(_flat_roof(rng, w, d, h) if kind == "flat" else placed(gable(w, d, 0.12 * d), 0, 0, h))
-    for x in np.arange(-0.4 * w, 0.1 * w, 6.0):
+    for x in np.arange(-0.4 * w, 0.1 * w, 6.0).tolist():
         parts.append(placed(_walls(3.4, 1.2, 4.2), x, -d / 2 - 0.6))
     if rng.random() < 0.6:
         parts.append(placed(_wing(rng, 0.3 * w, 8.0, rng.uniform(6, 15)), 0.3 * w, -d / 2 - 3.9))
@@ -149,8 +149,8 @@ def tanks(rng: np.random.Generator, w: float, d: float) -> Mesh:
 def containers(rng: np.random.Generator, w: float, d: float) -> Mesh:
     """Stacks of shipping containers."""
     parts = []
-    for x in np.arange(-w / 2 + 3.1, w / 2 - 3.0, 6.6):
-        for y in np.arange(-d / 2 + 1.3, d / 2 - 1.2, 2.7):
+    for x in np.arange(-w / 2 + 3.1, w / 2 - 3.0, 6.6).tolist():
+        for y in np.arange(-d / 2 + 1.3, d / 2 - 1.2, 2.7).tolist():
             stack = int(rng.integers(0, 4))
             if stack:
                 parts.append(placed(box(6.06, 2.44, 2.6 * stack + _FOOTING), x, y, -_FOOTING))

@@ -65,7 +65,8 @@ class Caster:
     ) -> Hits:
         count = len(rays)
         distance, incidence = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
-        alive, start = np.arange(count), np.zeros(count, np.float32)
+        alive: npt.NDArray[np.intp] = np.arange(count, dtype=np.intp)
+        start = np.zeros(count, np.float32)
         for layer in range(_MAX_LAYERS):
             from_here = origins[alive] + rays[alive] * start[alive, None]
             t, cosine, leaf = self._query(from_here, rays[alive])

@@ -33,7 +33,7 @@ class Site:
         self.layout = layout
         self._taken, self._road = _rasters(layout, half)
         step = max(1.0, half / 180.0)
-        self._axis = np.linspace(-half, half, 2 * int(half / step) + 1)
+        self._axis: Floats = np.linspace(-half, half, 2 * int(half / step) + 1, dtype=np.float64)
         self._heights = self._relief(rng, relief, roughness, ditch)
 
     def _relief(self, rng: np.random.Generator, relief: float, roughness: float, ditch: float) -> Floats:

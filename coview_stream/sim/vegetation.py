@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from coview_stream.sim.mesh import EMPTY, Floats, Mesh, copies, cylinder, ellipsoid, join, placed, prism
 from coview_stream.sim.site import Site
@@ -145,7 +146,7 @@ def rocks(rng: np.random.Generator, site: Site, count: int, extent: float) -> Me
     return join(parts)
 
 
-def _noise(seed: Floats, k: int | np.ndarray) -> Floats:
+def _noise(seed: Floats, k: int | npt.NDArray[np.int64]) -> Floats:
     """Repeatable numbers in [0, 1) from each tree's own seed, so that a tree keeps its shape."""
     value = np.sin(seed * 12.9898 + np.asarray(k) * 78.233) * 43758.5453
     return np.asarray(value - np.floor(value))

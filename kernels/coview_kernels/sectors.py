@@ -25,7 +25,7 @@ from coview_kernels.arrays import F32, F64, I32, I64
 @lru_cache(maxsize=64)
 def ring_edges2(rings: int, r_max: float) -> F64:
     """(R + 1,) squared ring edges, metres squared; read-only."""
-    edges: F64 = np.linspace(0.0, r_max, rings + 1) ** 2
+    edges: F64 = np.square(np.linspace(0.0, r_max, rings + 1, dtype=np.float64))
     edges.flags.writeable = False
     return edges
 
