@@ -20,7 +20,7 @@ Preset = Literal["slam", "tls"]
 def _require(ok: bool, config: object, name: str, allowed: str) -> None:
     if not ok:
         value = getattr(config, name)
-        raise ConfigError(f"{type(config).__name__}.{name} is {value!r}; it must be {allowed}")
+        raise ConfigError(f"{name} is {value!r}; it must be {allowed} ({type(config).__name__}.{name})")
 
 
 def _positive(config: object, *names: str) -> None:
@@ -61,6 +61,7 @@ class DescriptorConfig:
 
     def __post_init__(self) -> None:
         _positive(self, "radius", "eye", "voxel")
+        _require(self.radius <= 1000, self, "radius", "at most 1000 m")
         _counts(self, "rings", "sectors", least=4)
         known = get_args(Channel)
         _require(

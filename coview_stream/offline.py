@@ -26,6 +26,9 @@ Progress = Callable[[int, int, Fix | None], None]
 """Called with (frames done, frames, newest fix)."""
 
 
+_PICTURES = ("trajectory.png", "descriptors.png")
+
+
 @dataclass
 class Located:
     """What localizing a run gave.
@@ -124,6 +127,8 @@ def write(located: Located, base_map: BaseMap, out: str | os.PathLike[str], pict
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        for name in _PICTURES:  # of an earlier run: they would tell another story than the trajectory
+            (folder / name).unlink(missing_ok=True)
         posed = located.posed
         poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
         write_tum(folder / "trajectory.tum", np.array([fix.stamp for fix in posed]), poses)

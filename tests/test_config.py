@@ -66,7 +66,7 @@ BAD = [
 
 @pytest.mark.parametrize(("kind", "name", "value"), BAD)
 def test_a_value_out_of_range_is_refused_by_name(kind, name, value):
-    with pytest.raises(ConfigError, match=rf"{kind.__name__}\.{name} is .*must be"):
+    with pytest.raises(ConfigError, match=rf"{name} is .*must be .*{kind.__name__}\.{name}"):
         kind(**{name: value})
 
 

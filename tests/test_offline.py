@@ -134,3 +134,10 @@ def test_results_that_cannot_be_written_are_an_error(located, world_map, tmp_pat
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write the results"):
         write(located, world_map, tmp_path / "file" / "out", pictures=False)
+
+
+def test_pictures_of_an_earlier_run_do_not_stay(located, world_map, tmp_path):
+    write(located, world_map, tmp_path)
+    write(located, world_map, tmp_path, pictures=False)
+    assert not (tmp_path / "trajectory.png").exists()
+    assert not (tmp_path / "descriptors.png").exists()

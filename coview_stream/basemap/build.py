@@ -38,6 +38,10 @@ def build_arrays(
     """
     if not paths:
         raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
+    places = [path.resolve() for path in paths]
+    for path, place in zip(paths, places, strict=True):
+        if places.count(place) > 1:
+            raise MapError(f"{path}: given twice; name every source once")
     with _bar(progress, "reading") as step:
         clouds = [_read(path, k, len(paths), step) for k, path in enumerate(paths)]
     whole = merge(clouds)

@@ -34,8 +34,9 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
     """Write a map and return its sha256; a file that was there before stays whole until the new one is complete.
 
     Raises:
-        MapError: the directory does not exist or cannot be written.
+        MapError: the directory does not exist or cannot be written, or something else than a map is in the place.
     """
+    check_target(path)
     text = json.dumps(parameters, sort_keys=True)
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = _digest(text, contiguous)
@@ -55,6 +56,27 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
     return digest
+
+
+def check_target(path: Path) -> None:
+    """Refuse to replace anything but a map.
+
+    Raises:
+        MapError: the place is a directory, a device, another kind of file, or in no directory that exists.
+    """
+    if path.is_dir() or not path.resolve().parent.is_dir():
+        raise MapError(f"{path}: not a place for a file; give a name in a directory that exists")
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise MapError(f"{path}: not a regular file; give another name")
+    if path.stat().st_size:
+        try:
+            header, _ = _header(path)
+        except MapError:
+            header = {}
+        if header.get("__metadata__", {}).get("format") != FORMAT:
+            raise MapError(f"{path}: exists and is no coview map; delete it or give another name")
 
 
 def _write(file: BinaryIO, arrays: Arrays, metadata: dict[str, str]) -> None:
@@ -118,7 +140,7 @@ def _header(path: Path) -> tuple[dict[str, Any], int]:
             text = file.read(size)
             header = json.loads(text)
     except OSError as error:
-        raise MapError(f"{path}: cannot read the map ({error.strerror})") from error
+        raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
     except ValueError as error:
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
     # only blanks may pad it: JSON would take a damaged one that became a line end for another

@@ -38,13 +38,15 @@ def run(args: argparse.Namespace) -> int:
     """Build, save and say what came out."""
     import time
 
+    from coview_stream.basemap import store
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.errors import MapError
 
-    if args.output.is_dir() or not args.output.resolve().parent.is_dir():
-        raise MapError(f"{args.output}: not a place for a file; give a name in a directory that exists")
+    if args.output.resolve() in [path.resolve() for path in args.maps]:
+        raise MapError(f"{args.output}: is one of the scans to read; give the map another name")
+    store.check_target(args.output)
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
-    if args.channels:
+    if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     begin = time.perf_counter()
     base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)

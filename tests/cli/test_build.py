@@ -44,7 +44,7 @@ def test_a_map_is_built_and_described(cloud, tmp_path, capsys):
 def test_preset_channels_and_descriptor_options(cloud, tmp_path):
     target = tmp_path / "site.coview"
     options = ["--preset", "tls", "--channels", "density, scan_context", "--rings", "5", "--sectors", "8"]
-    assert main(["build", str(cloud), str(cloud), "-o", str(target), *options]) == 0
+    assert main(["build", str(cloud), "-o", str(target), *options]) == 0
     config = BaseMap.load(target).descriptor_config
     assert config.radius == 100.0
     assert config.channels == ("density", "scan_context")
@@ -101,3 +101,22 @@ def test_a_place_that_does_not_exist_is_refused_before_the_work(tmp_path, capsys
     for target in (tmp_path / "no" / "site.coview", tmp_path):
         assert main(["build", str(tmp_path / "none.las"), "-o", str(target)]) == 2
         assert "not a place for a file" in one_line(capsys)
+
+
+def test_nothing_but_a_map_is_ever_replaced(cloud, tmp_path, capsys):
+    before = cloud.read_bytes()
+    assert main(["build", str(cloud), "-o", str(cloud)]) == 2
+    assert "one of the scans" in one_line(capsys)
+    other = tmp_path / "thesis.txt"
+    other.write_text("years of work")
+    assert main(["build", str(cloud), "-o", str(other)]) == 2
+    assert "no coview map" in one_line(capsys)
+    assert main(["build", str(cloud), "-o", "/dev/null"]) == 2
+    assert "not a regular file" in one_line(capsys)
+    assert cloud.read_bytes() == before
+    assert other.read_text() == "years of work"
+
+
+def test_a_source_given_twice_is_refused(cloud, tmp_path, capsys):
+    assert main(["build", str(cloud), str(cloud), "-o", str(tmp_path / "site.coview")]) == 2
+    assert "given twice" in one_line(capsys)
