@@ -203,7 +203,7 @@ class AcceptanceConfig:
     One frame alone (``stationary``) must reach ``single_score`` and ``single_lead``. Calibrated on single scans, real
     ones of three sensors and simulated ones of two: 86 right places led by 0.04-0.8, the 4 wrong ones by 0.07 at most,
     and outside the map nothing led by more than 0.07 at any score.
-    Tracking is lost after ``patience`` keyframes in a row below ``keep_score``, or on less than ``inside`` of the
+    Tracking is lost after ``patience`` registrations in a row below ``keep_score``, or on less than ``inside`` of the
     points where the map has been surveyed.
     """
 
@@ -229,20 +229,24 @@ class AcceptanceConfig:
 class TrackingConfig:
     """How a fix is kept: how often to register, and how fast odometry is believed to drift.
 
-    Random-walk sigmas per square root of a metre driven. ``distance`` and ``window`` are metres: register after that
-    much driving, with the points of the last ``window`` metres (older ones are smeared by the drift) but at least
-    ``min_points``.
+    Register after ``distance`` metres of driving or ``turn`` radians of turning, with the points of the last ``window``
+    metres (older ones are smeared by the drift) but at least ``min_points``. Drifts are random-walk sigmas per square
+    root of a metre driven; ``turn_drift`` is yaw error per radian turned.
     """
 
     distance: float = 1.0
     window: float = 2.0
     min_points: int = 2500
+    turn: float = math.radians(10)
     yaw_drift: float = math.radians(0.3)
+    turn_drift: float = 0.02
     tilt_drift: float = math.radians(0.05)
     position_drift: float = 0.05
 
     def __post_init__(self) -> None:
-        _positive(self, "distance", "window", "yaw_drift", "tilt_drift", "position_drift")
+        _positive(
+            self, "distance", "window", "turn", "yaw_drift", "turn_drift", "tilt_drift", "position_drift"
+        )
         _counts(self, "min_points")
 
 

@@ -67,6 +67,11 @@ def rotation_angle(T: Pose) -> float:
     return float(np.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
 
 
+def tilt_of(T: Pose) -> float:
+    """Angle between the vertical axes of two frames, radians."""
+    return float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+
+
 def exp_se3(xi: npt.NDArray[np.float64]) -> Pose:
     """Left-multiplied pose increment from (rx, ry, rz, x, y, z): rotate, then shift."""
     return pose_from(Rotation.from_rotvec(xi[:3]).as_matrix(), xi[3:])

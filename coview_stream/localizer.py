@@ -17,6 +17,7 @@ from coview_stream.search import GlobalSearch
 from coview_stream.tracking import Tracker, relative_to, unanchored
 
 _LEAST_POINTS = 10
+_FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
 
 
 class Localizer:
@@ -68,7 +69,7 @@ class Localizer:
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body)
         if self.state is State.TRACKING:
-            if self._tracker.due:
+            if self._tracker.due or self._doubts:
                 self._track(cloud, T_odom_body, stamp)
         elif keyframe is not None:
             self._find(keyframe, cloud)
@@ -94,16 +95,23 @@ class Localizer:
         doubtful = evidence is None or score < rule.keep_score or evidence.inside < rule.inside
         self._doubts = self._doubts + 1 if doubtful else 0
         if self._doubts >= rule.patience:
-            self.state = State.LOST
-            self._buffer.clear()
-            self._tracker.forget()
+            self._lose()
         reason = f"evidence gone, {self._doubts} times in a row" if doubtful else "verified"
         self._evidence = KeyframeEvidence(stamp, self.state, reason, score, 0.0, evidence)
+
+    def _lose(self) -> None:
+        """Search again from nothing: what lost the place may be an odometry that jumped or started anew."""
+        self.state, self._anchor = State.LOST, None
+        self._buffer.clear()
+        self._search.clear()
+        self._tracker.forget()
 
     def _fix(self, T_odom_body: Pose, stamp: float) -> Fix:
         evidence = self._evidence
         if self.state is not State.TRACKING or self._anchor is None:
             return Fix(stamp, self.state, evidence=evidence)
+        if self._doubts:  # a pose that the newest registration speaks against is none
+            return Fix(stamp, State.AMBIGUOUS, evidence=evidence)
         T_map_local = orthonormal(self._tracker.T_map_odom)
         T_map_body = T_map_local @ T_odom_body
         confidence = max(0.0, evidence.score - evidence.rival) if evidence else 0.0
@@ -131,11 +139,17 @@ class Localizer:
         finite = np.ascontiguousarray(rows[np.isfinite(rows).all(axis=1)])
         if len(finite) < _LEAST_POINTS:
             raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_LEAST_POINTS} or more")
-        T = np.asarray(T_odom_body, dtype=np.float64)
-        if not np.isfinite(stamp):
+        if np.median(np.abs(finite)) > _FARTHEST:
+            raise CloudError("cloud lies kilometres from its origin; give it relative to the sensor")
+        try:
+            T = np.asarray(T_odom_body, dtype=np.float64)
+            known = bool(np.isfinite(stamp))
+        except (TypeError, ValueError) as error:
+            raise RunError(f"T_odom_body or stamp is not numeric ({error})") from error
+        if not known:
             raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
         if not is_pose(T):
             raise RunError("T_odom_body is not a finite rigid 4x4 transform; check the odometry")
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
-        return finite, relative_to(T, self._anchor)
+        return finite, relative_to(orthonormal(T), self._anchor)

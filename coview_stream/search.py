@@ -10,7 +10,17 @@ import numpy.typing as npt
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.fix import KeyframeEvidence, State
-from coview_stream.geometry import Points, Pose, inverse, rotation_angle, transform
+from coview_stream.geometry import (
+    Points,
+    Pose,
+    inverse,
+    pose_from,
+    rot_z,
+    rotation_angle,
+    tilt_of,
+    transform,
+    yaw_of,
+)
 from coview_stream.place.consensus import Consensus, Hypothesis
 from coview_stream.place.descriptor import Descriptor, describe, ground_below
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
@@ -109,38 +119,46 @@ class GlobalSearch:
             for hypothesis in hypotheses
             if (
                 candidate := self._candidate(
-                    hypothesis, None, rough, keyframe, cloud, scales[:_COARSE_SCALES]
+                    hypothesis, rough, source, keyframe, cloud, scales[:_COARSE_SCALES]
                 )
             )
         ]
-        best = max((c.evidence.score for c in coarse), default=0.0)
-        enough = _HOPELESS * max(best, self.config.acceptance.score)
-        fine = [
-            (c.evidence.score >= enough and scales[_COARSE_SCALES:]
-             and self._candidate(c.hypothesis, c.T_map_odom, source, keyframe, cloud, scales[_COARSE_SCALES:]))
-            or c
-            for c in coarse
-        ]  # fmt: skip
+        coarse.sort(key=lambda c: -c.evidence.score)
+        enough = _HOPELESS * max(coarse[0].evidence.score if coarse else 0.0, self.config.acceptance.score)
+        fine: list[Candidate] = []
+        for rank, candidate in enumerate(coarse):
+            # the best and its rival are compared on equal terms; what is far below them stays as it is
+            if coarse[0].evidence.score < enough or (rank > 1 and candidate.evidence.score < enough):
+                fine.append(candidate)
+                continue
+            again = replace(candidate.hypothesis, T_map_odom=candidate.T_map_odom)
+            refined = self._candidate(
+                again, source, source, keyframe, cloud, scales[_COARSE_SCALES:] or scales[-1:]
+            )
+            if refined is not None:
+                fine.append(refined)
         return sorted(fine, key=lambda c: -c.evidence.score)
 
     def _candidate(
         self,
         hypothesis: Hypothesis,
-        T_map_odom: Pose | None,
+        moving: Source,
         source: Source,
         keyframe: Keyframe,
         cloud: Points,
         scales: tuple[float, ...],
     ) -> Candidate | None:
-        start = hypothesis.T_map_odom if T_map_odom is None else T_map_odom
+        """Register ``moving`` from the hypothesis and verify with ``source``; None if it finds no hold or tilts."""
+        start = hypothesis.T_map_odom
         target = self.local_maps.around(transform(start, keyframe.position[None])[0])
         if target is None:
             return None
-        upright = Prior(hypothesis.T_map_odom, gravity_information(self.config.registration.gravity_sigma))
+        level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
+        upright = Prior(level, gravity_information(self.config.registration.gravity_sigma))
+        iterations = None if moving is source else _COARSE_ITERATIONS
         found = register(
-            source, start, target, self.config.registration, scales, upright, keyframe.position,
-            _COARSE_ITERATIONS if T_map_odom is None else None,
-        )  # fmt: skip
+            moving, start, target, self.config.registration, scales, upright, keyframe.position, iterations
+        )
         if found is None or tilt_of(found.T_map_source) > self.config.acceptance.most_tilt:
             return None
         T = found.T_map_source
@@ -196,11 +214,6 @@ class GlobalSearch:
 def gravity_information(sigma: float) -> npt.NDArray[np.float64]:
     """Information (6, 6) over (rx, ry, rz, x, y, z) of "both frames are level to ``sigma`` radians"."""
     return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])
-
-
-def tilt_of(T: Pose) -> float:
-    """Angle between the vertical axes of two frames, radians."""
-    return float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
 
 
 def _same(

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry import Points, Pose, inverse, pose_from, transform
+from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
@@ -42,12 +42,14 @@ class Tracker:
         self._recent: deque[_Recent] = deque(maxlen=_MOST_FRAMES)
         self._travelled = 0.0
         self._registered_at = 0.0
+        self._turned = 0.0
         self._last: Pose | None = None
 
     def observe(self, cloud: Points, T_odom_body: Pose) -> None:
         """Remember a frame's points (body frame) and how far odometry has driven."""
         if self._last is not None:
             self._travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self._last[:3, 3]))
+            self._turned += rotation_angle(inverse(self._last) @ T_odom_body)
         self._last = T_odom_body
         points, _ = kernels.transform_unique(
             cloud, T_odom_body, self.config.keyframe.voxel, self.config.keyframe.range_min
@@ -57,24 +59,26 @@ class Tracker:
     def forget(self) -> None:
         """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
         self._recent.clear()
+        self._last = None
 
     def start(self, registration: Registration) -> None:
         """Begin with an accepted fix, which may not have converged yet: its own covariance is not believed."""
         self.T_map_odom = registration.T_map_source
         self.covariance = self._posterior(registration) + _START_COVARIANCE
-        self._registered_at = self._travelled
+        self._registered_at, self._turned = self._travelled, 0.0
 
     @property
     def due(self) -> bool:
-        """Whether the robot has driven far enough for another registration."""
-        return self._travelled - self._registered_at >= self.config.tracking.distance
+        """Whether the robot has driven or turned far enough for another registration."""
+        settings = self.config.tracking
+        return self._travelled - self._registered_at >= settings.distance or self._turned >= settings.turn
 
     def update(self, cloud: Points, T_odom_body: Pose) -> Evidence | None:
         """Register the recent points from the predicted pose; None where the map offers nothing to register to."""
         position = T_odom_body[:3, 3]
         target = self.local_maps.around(transform(self.T_map_odom, position[None])[0])
         covariance = self.predicted_covariance()
-        self._registered_at, self.covariance = self._travelled, covariance
+        self._registered_at, self._turned, self.covariance = self._travelled, 0.0, covariance
         if target is None:
             return None
         source = local_source(self._window(), position, self.config.registration)
@@ -88,6 +92,8 @@ class Tracker:
         surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
         evidence = verify(source, T, cloud, T @ T_odom_body, target, surveyed)
         rule = self.config.acceptance
+        if tilt_of(T) > rule.most_tilt:
+            return None
         if found is not None and evidence.inside >= rule.inside and evidence.score >= rule.keep_score:
             self.T_map_odom = found.T_map_source
             self.covariance = self._posterior(found)
@@ -98,7 +104,8 @@ class Tracker:
         drift = self.config.tracking
         driven = self._travelled - self._registered_at
         rates = np.array([drift.tilt_drift, drift.tilt_drift, drift.yaw_drift, *[drift.position_drift] * 3])
-        return self.covariance + np.diag(rates**2 * driven)
+        turned = np.array([0.0, 0.0, drift.turn_drift, 0.0, 0.0, 0.0]) * self._turned
+        return self.covariance + np.diag(rates**2 * driven + turned**2)
 
     def reported_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), floors included, map axes."""

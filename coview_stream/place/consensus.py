@@ -171,7 +171,14 @@ def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> npt.NDArray[np.float64]:
 
 def standardised(volume: Volume) -> Volume:
     """How many robust standard deviations each distance lies from the median of all, negative is better."""
-    sample = volume.ravel()[:: max(1, volume.size // 100_000)]
-    median = np.median(sample)
-    spread = 1.4826 * np.median(np.abs(sample - median)) + 1e-6
-    return np.asarray((volume - median) / spread, dtype=np.float32)
+    scored = volume[(volume != 1.0).any(axis=1)]  # ring-key mode leaves most stations at 1, unscored
+    if not len(scored):
+        return np.zeros_like(volume)
+    step = max(1, scored.size // 100_000)
+    while np.gcd(step, scored.shape[1]) > 1:  # or the sample would hold few of the shifts
+        step += 1
+    sample = scored.ravel()[::step]
+    median = np.float32(np.median(sample))
+    spread = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
+    votes: Volume = (volume - median) / spread
+    return np.where(volume == 1.0, np.maximum(votes, np.float32(0.0)), votes)

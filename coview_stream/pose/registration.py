@@ -26,6 +26,7 @@ _CROP_STEP = 16.0  # metres between the centres of cached crops
 _STOP_SHIFT = 1e-3  # metres; below the map's own noise
 _STOP_TURN = 5e-5  # radians
 _LEAST_PAIRS = 50
+_MOST_SHARE = 5.0  # weight of a point of the rarer kind
 _WIDTH_SHARE = (
     0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
 )
@@ -179,7 +180,8 @@ def _step(
         index = np.flatnonzero(group & np.isfinite(distance))
         if len(index):
             kept = kernels.trim(distance[index], config.keep)
-            share[index] = kept * (0.5 * len(moved) / kept.sum())
+            # capped, or a handful of points would outweigh thousands
+            share[index] = kept * min(0.5 * len(moved) / kept.sum(), _MOST_SHARE)
     chosen = np.flatnonzero(share)
     if len(chosen) < _LEAST_PAIRS:
         return None

@@ -35,7 +35,7 @@ _BEAM_HITS = 2
 _SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
 _SLACK_SLOPE = 0.03
 _LEAST_STRUCTURE = 60  # fewer points cannot tell places apart
-_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of map points proves little
+_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points proves little
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,8 @@ def verify(
     found = np.isfinite(distance[high])
     near = 0.0 if few else float(found.mean())
     covered = 0.0 if few else float((found | target.edges.above(moved[high])).mean())
-    ground = float((distance[low] < _GROUND_REACH).mean()) if low.any() else 1.0
+    grounded = float((distance[low] < _GROUND_REACH).sum())
+    ground = (grounded + 0.5 * _PSEUDO) / (float(low.sum()) + _PSEUDO)
     met, passed = rays_against_map(cloud, T_map_body, target.points)
     free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
     return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)

@@ -126,7 +126,7 @@ def test_little_structure_proves_nothing():
     source = Source(field[0], height > 0.5, height)
     everywhere = np.ones(len(height), bool)
     sparse = verify(source, np.eye(4), fan(25.0), BODY, target, everywhere)
-    assert sparse.ground == 1.0
+    assert sparse.ground > 0.99
     assert sparse.near == 0.0
     assert sparse.score == 0.0
 
@@ -142,5 +142,5 @@ def test_points_off_the_survey_do_not_count(seen):
     surveyed = np.arange(len(points)) < len(target.points)
     found = verify(source, np.eye(4), fan(25.0, 5.0), BODY, target, surveyed)
     assert found.near == 1.0
-    assert found.ground == 1.0
+    assert found.ground > 0.99
     assert found.inside == 0.5
