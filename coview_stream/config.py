@@ -198,31 +198,50 @@ class RegistrationConfig:
 class AcceptanceConfig:
     """What evidence makes a fix, keeps it, and loses it (see :mod:`coview_stream.pose.verification`).
 
-    A hypothesis is accepted when its score is at least ``score`` and leads every distinct rival's by ``lead``, and
-    has been so for ``confirmations`` keyframes in a row, all agreeing within ``agree_distance`` and ``agree_angle``.
-    One frame alone (``stationary``) must reach ``single_score`` and ``single_lead``. Calibrated on single scans, real
-    ones of three sensors and simulated ones of two: 86 right places led by 0.04-0.8, the 4 wrong ones by 0.07 at most,
-    and outside the map nothing led by more than 0.07 at any score.
-    Tracking is lost after ``patience`` registrations in a row below ``keep_score``, or on less than ``inside`` of the
-    points where the map has been surveyed.
+    A hypothesis counts when its score is at least ``score``, leads every registered rival's by ``lead``, and at least
+    ``ground`` of the robot's ground lies on the map's. It is accepted when it has counted for ``confirmations``
+    keyframes in a row that agree within ``agree_distance`` and ``agree_angle``, and what its scores exceed
+    ``proof_floor`` by adds up to ``proof``: weak evidence needs more driving. One frame alone (``stationary``) must
+    reach ``single_score`` and ``single_lead``.
+
+    Calibrated on single scans (three real sensors, two simulated): 86 right places led by 0.04-0.8, 4 wrong ones by
+    0.07 at most; and on runs outside the map, where one of 16 found a place with scores of 0.3-0.5, a lead of 0.3 and
+    a ground share below 0.65 at the map's edge; right places have 0.8 or more after two keyframes.
+    Tracking is lost after ``patience`` registrations in a row below ``keep_score`` or ``keep_ground``, or on less than
+    ``inside`` of the points where the map has been surveyed.
     """
 
     score: float = 0.27
     lead: float = 0.1
+    ground: float = 0.7
     confirmations: int = 3
-    single_score: float = 0.3
+    proof: float = 1.2
+    proof_floor: float = 0.2
+    single_score: float = 0.45
     single_lead: float = 0.2
     agree_distance: float = 1.5
     agree_angle: float = math.radians(3)
     keep_score: float = 0.22
+    keep_ground: float = 0.5
     inside: float = 0.3
     patience: int = 2
     most_tilt: float = math.radians(8)
 
     def __post_init__(self) -> None:
-        _fraction(self, "score", "lead", "single_score", "single_lead", "keep_score", "inside")
+        _fraction(
+            self,
+            "score",
+            "lead",
+            "single_score",
+            "single_lead",
+            "keep_score",
+            "inside",
+            "ground",
+            "keep_ground",
+        )
         _counts(self, "confirmations", "patience")
-        _positive(self, "agree_distance", "agree_angle", "most_tilt")
+        _positive(self, "agree_distance", "agree_angle", "most_tilt", "proof")
+        _require(0 <= self.proof_floor < 1, self, "proof_floor", "in [0, 1)")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from coview_stream.place.descriptor import Descriptor
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch
-from coview_stream.tracking import Tracker, relative_to, unanchored
+from coview_stream.tracking import Tracker, kept, relative_to, unanchored
 
 _LEAST_POINTS = 10
 _FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
@@ -92,7 +92,7 @@ class Localizer:
         evidence = self._tracker.update(cloud, T_odom_body)
         rule = self.config.acceptance
         score = evidence.score if evidence else 0.0
-        doubtful = evidence is None or score < rule.keep_score or evidence.inside < rule.inside
+        doubtful = evidence is None or not kept(evidence, rule)
         self._doubts = self._doubts + 1 if doubtful else 0
         if self._doubts >= rule.patience:
             self._lose()

@@ -76,12 +76,13 @@ class GlobalSearch:
         self._remembered: list[Hypothesis] = []
         self._favourite: Candidate | None = None
         self._confirmed = 0
+        self._proof = 0.0
 
     def clear(self) -> None:
         """Forget all votes and confirmations."""
         self.consensus.clear()
         self._remembered = []
-        self._favourite, self._confirmed = None, 0
+        self._forget_favourite()
 
     def update(self, buffer: KeyframeBuffer, keyframe: Keyframe, cloud: Points) -> Verdict:
         """Take in one keyframe; ``cloud`` (N, 3) is its newest frame in the body frame."""
@@ -167,42 +168,59 @@ class GlobalSearch:
         return Candidate(hypothesis, found, evidence)
 
     def _judge(self, candidates: list[Candidate], keyframe: Keyframe) -> Verdict:
-        rule = self.config.acceptance
-        least, lead, needed = rule.score, rule.lead, rule.confirmations
-        if self.config.stationary:
-            least, lead, needed = rule.single_score, rule.single_lead, 1
+        """Accept the best candidate once it has stood alone often and clearly enough."""
         if not candidates:
-            self._favourite, self._confirmed = None, 0
-            reason = (
-                "too few points to search with" if not len(self.consensus) else "no hypothesis fits the map"
-            )
+            self._forget_favourite()
+            seen = len(self.consensus)
+            reason = "no hypothesis fits the map" if seen else "too few points to search with"
             return Verdict(None, KeyframeEvidence(keyframe.stamp, State.SEARCHING, reason))
         best = candidates[0]
         rival = max(
             (c.evidence.score for c in candidates[1:] if not _same(c.T_map_odom, best.T_map_odom, keyframe)),
             default=0.0,
         )
-        score = best.evidence.score
-        state, accepted = State.AMBIGUOUS, None
-        if score < least or best.evidence.inside < rule.inside:
-            state, reason = State.SEARCHING, f"no place fits: best score {score:.2f}, {least:.2f} needed"
-            self._favourite, self._confirmed = None, 0
-        elif score - rival < lead:
-            reason = f"two places fit: scores {score:.2f} and {rival:.2f}"
-            self._favourite, self._confirmed = None, 0
-        else:
-            self._confirmed = self._confirmed + 1 if self._agrees(best, keyframe) else 1
+        if not self._agrees(best, keyframe):
+            self._forget_favourite()
+        state, doubt = self._doubt(best.evidence, rival)
+        if doubt is None:
             self._favourite = best
-            reason = f"confirmed by {self._confirmed} of {needed} keyframes"
-            if self._confirmed >= needed:
-                state, accepted = State.TRACKING, best
+            self._confirmed += 1
+            self._proof += max(0.0, best.evidence.score - self.config.acceptance.proof_floor)
+            state, doubt = self._confirmation()
         return Verdict(
-            accepted,
+            best if state is State.TRACKING else None,
             KeyframeEvidence(
-                keyframe.stamp, state, reason, score, rival, best.evidence, best.hypothesis.station,
-                best.hypothesis.shift,
+                keyframe.stamp, state, doubt, best.evidence.score, rival, best.evidence,
+                best.hypothesis.station, best.hypothesis.shift,
             ),
         )  # fmt: skip
+
+    def _doubt(self, evidence: Evidence, rival: float) -> tuple[State, str | None]:
+        """Say why this keyframe does not count for its best candidate; None if it does."""
+        rule, alone = self.config.acceptance, self.config.stationary
+        least = rule.single_score if alone else rule.score
+        lead = rule.single_lead if alone else rule.lead
+        if evidence.score < least or evidence.inside < rule.inside:
+            return State.SEARCHING, f"no place fits: best score {evidence.score:.2f}, {least:.2f} needed"
+        if evidence.ground < rule.ground:
+            return (
+                State.AMBIGUOUS,
+                f"the ground does not fit: {evidence.ground:.2f}, {rule.ground:.2f} needed",
+            )
+        if evidence.score - rival < lead:
+            return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
+        return State.AMBIGUOUS, None
+
+    def _confirmation(self) -> tuple[State, str]:
+        rule = self.config.acceptance
+        if self.config.stationary:
+            return State.TRACKING, "one scan, and it stands alone"
+        reason = f"confirmed by {self._confirmed} keyframes, proof {self._proof:.2f} of {rule.proof:.2f}"
+        enough = self._confirmed >= rule.confirmations and self._proof >= rule.proof
+        return State.TRACKING if enough else State.AMBIGUOUS, reason
+
+    def _forget_favourite(self) -> None:
+        self._favourite, self._confirmed, self._proof = None, 0, 0.0
 
     def _agrees(self, best: Candidate, keyframe: Keyframe) -> bool:
         rule = self.config.acceptance

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import LocalizerConfig
+from coview_stream.config import AcceptanceConfig, LocalizerConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
 from coview_stream.pose.source import local_source
@@ -94,7 +94,7 @@ class Tracker:
         rule = self.config.acceptance
         if tilt_of(T) > rule.most_tilt:
             return None
-        if found is not None and evidence.inside >= rule.inside and evidence.score >= rule.keep_score:
+        if found is not None and kept(evidence, rule):
             self.T_map_odom = found.T_map_source
             self.covariance = self._posterior(found)
         return evidence
@@ -129,6 +129,15 @@ class Tracker:
             parts.append(frame.points)
             count += len(frame.points)
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
+
+
+def kept(evidence: Evidence, rule: AcceptanceConfig) -> bool:
+    """Whether a registration while tracking speaks for the place it found."""
+    return (
+        evidence.inside >= rule.inside
+        and evidence.score >= rule.keep_score
+        and evidence.ground >= rule.keep_ground
+    )
 
 
 def relative_to(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:

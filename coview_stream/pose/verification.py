@@ -24,7 +24,8 @@ from coview_stream.pose.registration import LocalMap, Source
 
 _STRUCTURE_HEIGHT = 1.0  # metres above the ground
 _STRUCTURE_REACH = 0.5  # metres: two voxels of the map
-_GROUND_REACH = 0.3
+_GROUND_SEARCH = 1.0  # metres to the next map point of the ground, which a sparse map shows every half metre
+_GROUND_REACH = 0.15  # metres off its plane
 _FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
 _FREE_EVERY = 3  # of the map's points: a share needs no more
 _FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
@@ -45,7 +46,7 @@ class Evidence:
     Attributes:
         near: points > 1 m above the ground within 0.5 m of a map point.
         covered: the same, or below an edge of the map (see :mod:`coview_stream.pose.edges`).
-        ground: points on the ground within 0.3 m of a map point.
+        ground: points on the ground within 0.15 m of the plane of a map point less than 1 m away.
         free_space: map points met by rays among those met or passed through.
         inside: points that lie where the map has been surveyed.
     """
@@ -81,18 +82,30 @@ def verify(
         surveyed: (M,) which points of ``source`` lie where the map has been surveyed.
     """
     moved = transform(T_map_source, source.points)
-    distance, _ = target.tree.query(moved, distance_upper_bound=_STRUCTURE_REACH)
+    distance, partner = target.tree.query(moved, distance_upper_bound=_GROUND_SEARCH)
     high = surveyed & (source.height > _STRUCTURE_HEIGHT)
     low = surveyed & ~source.above
     few = int(high.sum()) < _LEAST_STRUCTURE
-    found = np.isfinite(distance[high])
+    found = distance[high] < _STRUCTURE_REACH
     near = 0.0 if few else float(found.mean())
     covered = 0.0 if few else float((found | target.edges.above(moved[high])).mean())
-    grounded = float((distance[low] < _GROUND_REACH).sum())
+    grounded = float(_on_surface(moved[low], partner[low], target).sum())
     ground = (grounded + 0.5 * _PSEUDO) / (float(low.sum()) + _PSEUDO)
     met, passed = rays_against_map(cloud, T_map_body, target.points)
     free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
     return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)
+
+
+def _on_surface(
+    points: npt.NDArray[np.floating], partner: npt.NDArray[np.integer], target: LocalMap
+) -> npt.NDArray[np.bool_]:
+    """Which of (N, 3) points lie on the plane of their partner (N,), the number of map points meaning none."""
+    has = partner < len(target.points)
+    near = partner[has]
+    off = np.abs(np.einsum("ij,ij->i", points[has] - target.points[near], target.normals[near]))
+    on = np.zeros(len(points), dtype=bool)
+    on[has] = off < _GROUND_REACH
+    return on
 
 
 def rays_against_map(cloud: Points, T_map_body: Pose, points: Points) -> tuple[int, int]:
