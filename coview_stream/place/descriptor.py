@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import numpy.typing as npt
 
@@ -27,12 +29,12 @@ def channel(name: Channel, grid: PolarGrid, config: DescriptorConfig) -> Descrip
     if name == "density":
         density: Descriptor = np.log1p(grid.count).astype(np.float32)
         return density
-    vertical = "max" if name == "coview" else "off"
+    vertical: Literal["max", "off"] = "max" if name == "coview" else "off"
     return kernels.coview(
         grid.max_height,
         grid.sum_height,
         grid.count,
-        vertical=vertical,  # type: ignore[arg-type]  # mypy does not narrow the conditional to the literals
+        vertical=vertical,
         mode=config.visibility,
         eye=config.eye,
     )
