@@ -44,6 +44,7 @@ class Localizer:
         self._anchor: npt.NDArray[np.float64] | None = None
         self._evidence: KeyframeEvidence | None = None
         self._doubts = 0
+        self._doubted_at = 0.0
 
     @property
     def last_query(self) -> dict[Channel, Descriptor]:
@@ -93,7 +94,13 @@ class Localizer:
         rule = self.config.acceptance
         score = evidence.score if evidence else 0.0
         doubtful = evidence is None or not kept(evidence, rule)
-        self._doubts = self._doubts + 1 if doubtful else 0
+        driven = self._tracker.travelled - self._doubted_at
+        if not doubtful:
+            self._doubts = 0
+        elif not self._doubts or driven >= self.config.tracking.distance:
+            # every frame may clear a doubt, but only driving on adds to it: one covered frame loses nothing
+            self._doubts += 1
+            self._doubted_at = self._tracker.travelled
         if self._doubts >= rule.patience:
             self._lose()
         reason = f"evidence gone, {self._doubts} times in a row" if doubtful else "verified"

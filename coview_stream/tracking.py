@@ -31,6 +31,11 @@ class Tracker:
 
     Odometry adds random-walk noise with every metre driven; a registration of the last metres' points, with the
     predicted pose as its prior, takes it away.
+
+    Attributes:
+        T_map_odom: (4, 4) map <- odometry, the mean.
+        covariance: (6, 6) right after the newest registration.
+        travelled: metres that odometry has driven.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
@@ -40,7 +45,7 @@ class Tracker:
         self.T_map_odom: Pose = np.eye(4)
         self.covariance: npt.NDArray[np.float64] = np.eye(6)
         self._recent: deque[_Recent] = deque(maxlen=_MOST_FRAMES)
-        self._travelled = 0.0
+        self.travelled = 0.0
         self._registered_at = 0.0
         self._turned = 0.0
         self._last: Pose | None = None
@@ -48,13 +53,13 @@ class Tracker:
     def observe(self, cloud: Points, T_odom_body: Pose) -> None:
         """Remember a frame's points (body frame) and how far odometry has driven."""
         if self._last is not None:
-            self._travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self._last[:3, 3]))
+            self.travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self._last[:3, 3]))
             self._turned += rotation_angle(inverse(self._last) @ T_odom_body)
         self._last = T_odom_body
         points, _ = kernels.transform_unique(
             cloud, T_odom_body, self.config.keyframe.voxel, self.config.keyframe.range_min
         )
-        self._recent.append(_Recent(self._travelled, points))
+        self._recent.append(_Recent(self.travelled, points))
 
     def forget(self) -> None:
         """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
@@ -65,20 +70,20 @@ class Tracker:
         """Begin with an accepted fix, which may not have converged yet: its own covariance is not believed."""
         self.T_map_odom = registration.T_map_source
         self.covariance = self._posterior(registration) + _START_COVARIANCE
-        self._registered_at, self._turned = self._travelled, 0.0
+        self._registered_at, self._turned = self.travelled, 0.0
 
     @property
     def due(self) -> bool:
         """Whether the robot has driven or turned far enough for another registration."""
         settings = self.config.tracking
-        return self._travelled - self._registered_at >= settings.distance or self._turned >= settings.turn
+        return self.travelled - self._registered_at >= settings.distance or self._turned >= settings.turn
 
     def update(self, cloud: Points, T_odom_body: Pose) -> Evidence | None:
         """Register the recent points from the predicted pose; None where the map offers nothing to register to."""
         position = T_odom_body[:3, 3]
         target = self.local_maps.around(transform(self.T_map_odom, position[None])[0])
         covariance = self.predicted_covariance()
-        self._registered_at, self._turned, self.covariance = self._travelled, 0.0, covariance
+        self._registered_at, self._turned, self.covariance = self.travelled, 0.0, covariance
         if target is None:
             return None
         source = local_source(self._window(), position, self.config.registration)
@@ -97,12 +102,15 @@ class Tracker:
         if found is not None and kept(evidence, rule):
             self.T_map_odom = found.T_map_source
             self.covariance = self._posterior(found)
+        else:
+            # bad frames among the last metres' must not spoil the next registration too
+            self._recent.clear()
         return evidence
 
     def predicted_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the last registration."""
         drift = self.config.tracking
-        driven = self._travelled - self._registered_at
+        driven = self.travelled - self._registered_at
         rates = np.array([drift.tilt_drift, drift.tilt_drift, drift.yaw_drift, *[drift.position_drift] * 3])
         turned = np.array([0.0, 0.0, drift.turn_drift, 0.0, 0.0, 0.0]) * self._turned
         return self.covariance + np.diag(rates**2 * driven + turned**2)
@@ -124,7 +132,7 @@ class Tracker:
         parts: list[Points] = []
         count = 0
         for frame in reversed(self._recent):
-            if count >= settings.min_points and self._travelled - frame.travelled > settings.window:
+            if count >= settings.min_points and self.travelled - frame.travelled > settings.window:
                 break
             parts.append(frame.points)
             count += len(frame.points)
