@@ -49,9 +49,9 @@ def test_a_real_run_is_localized(located):
     assert verdict.success
     assert verdict.false_frames == 0
     assert verdict.unmatched == 0
-    assert verdict.share_localised > 0.4
-    assert verdict.translation.mean < 0.15
-    assert verdict.rotation.mean < 1.0
+    assert verdict.share_localised > 0.7
+    assert verdict.translation.mean < 0.08
+    assert verdict.rotation.mean < 0.3
     assert json.loads((out / "result.json").read_text())["state"] == "TRACKING"
 
 
