@@ -87,8 +87,8 @@ def main() -> None:
     desc = np.random.default_rng(1).normal(2.0, 1.0, (9_527, 20, 60)).astype(np.float32)
     spectra = ck.column_spectra(desc)
     for q in (1, 8):
-        blas = lambda q=q: ck.all_shift_distance(desc[:q], spectra, 60)  # noqa: E731
-        einsum = lambda q=q: _einsum_distance(desc[:q], spectra, 60)  # noqa: E731
+        blas = lambda q=q: ck.all_shift_distance(desc[:q], spectra, 60)  # noqa: E731 - the two sides of one comparison
+        einsum = lambda q=q: _einsum_distance(desc[:q], spectra, 60)  # noqa: E731 - the two sides of one comparison
         a, b = medians(blas, einsum, max(5, repeat // 3))
         print(f"{f'all_shift_distance {q} x 9527':32}{a:10.2f}{b:10.2f}{b / a:8.1f}   (beside einsum)")
 

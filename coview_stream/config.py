@@ -204,9 +204,11 @@ class AcceptanceConfig:
     and what its scores exceed ``proof_floor`` by adds up to ``proof``: weak evidence needs more driving. One frame
     alone (``stationary``) must reach ``single_score`` and ``single_lead``.
 
-    Calibrated on single scans (three real sensors, two simulated): 86 right places led by 0.04-0.8, 4 wrong ones by
-    0.07 at most; and on runs outside the map, where one of 16 found a place with scores of 0.3-0.5, a lead of 0.3 and
-    a ground share below 0.65 at the map's edge; right places have 0.8 or more after two keyframes.
+    Set by hand on few scans, with earlier forms of the score, and no command prints these figures: single scans of
+    three real and two simulated sensors, where 86 right places led by 0.04-0.8, four wrong ones by 0.07 at most and
+    two that were 1.3-2.1 m off by 0.11; and 16 runs outside the map, one of which found a place at the map's edge
+    (scores of 0.3-0.5, a lead of 0.3, a ground share below 0.65). Right places had a ground share of 0.8 or more after
+    two keyframes.
     Tracking is lost after ``patience`` registrations, ``TrackingConfig.distance`` apart, below ``keep_score`` or
     ``keep_ground``, or on less than ``inside`` of the points where the map has been surveyed; one that is not below
     clears the doubt, and meanwhile there is no pose.

@@ -1,9 +1,9 @@
 """Where the map, seen from above, must have a wall: below the edges of what stands high.
 
 An airborne scan shows roofs and few of the facades that a robot sees. But a facade stands under the edge of a roof, so
-a point there is explained by the map though no map point is near it. Measured on a campus map in which most facades are
-missing: at the right place 27-55 % of the structure has a map point within 0.5 m, and 99-100 % has one or stands below
-an edge; at the best wrong places 6-22 % and 25-44 %.
+a point there is explained by the map though no map point is near it. Seen by hand on one simulated campus (no command
+prints it) in whose map most facades are missing: at the right place 27-55 % of the structure has a map point within
+0.5 m, and 99-100 % has one or stands below an edge; at the best wrong places 6-22 % and 25-44 %.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def test_absurd_extent_is_refused() -> None:
 )
 def test_config_is_validated(field: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(field))):
-        GroundConfig(**field)  # type: ignore[arg-type]
+        GroundConfig(**field)  # type: ignore[arg-type]  # fields by name
 
 
 def test_raster_follows_a_slope_and_fills_near_holes_only() -> None:

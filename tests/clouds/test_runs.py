@@ -170,7 +170,7 @@ def test_odometry_that_is_no_text(run: Path) -> None:
         (lambda d: (d / "a.txt").touch() or d / "a.txt", "neither a run nor a cloud"),
     ],
 )
-def test_no_run_at_all(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]
+def test_no_run_at_all(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
     with pytest.raises(RunError, match=reason):
         open_run(make(tmp_path))
 
