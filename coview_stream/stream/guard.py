@@ -1,0 +1,57 @@
+"""Calls into handlers that must not bring a thread down, and logging that does not flood."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+
+class Guard:
+    """Runs handlers and logs what they raise: the first of each kind at once, then at most one line per ``interval``.
+
+    Args:
+        logger: where to.
+        interval: seconds between two lines about the same place.
+        clock: seconds, steady.
+    """
+
+    def __init__(
+        self, logger: logging.Logger, interval: float = 10.0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._logger = logger
+        self._interval = interval
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._last: dict[str, float] = {}
+        self._silent: dict[str, int] = {}
+
+    def run(self, place: str, action: Callable[[], None]) -> Exception | None:
+        """Call ``action``; return what it raised, after logging it as having happened at ``place``."""
+        try:
+            action()
+        except Exception as error:  # whatever it is, the next message deserves its chance
+            self.report(place, error)
+            return error
+        return None
+
+    def report(self, place: str, error: BaseException) -> None:
+        """Log ``error`` unless a line about ``place`` was logged less than the interval ago."""
+        with self._lock:
+            now = self._clock()
+            last = self._last.get(place)
+            if last is not None and now - last < self._interval:
+                self._silent[place] = self._silent.get(place, 0) + 1
+                return
+            self._last[place] = now
+            silent = self._silent.pop(place, 0)
+        more = f" ({silent} more since the last line)" if silent else ""
+        self._logger.error(
+            "%s: %s: %s%s",
+            place,
+            type(error).__name__,
+            error,
+            more,
+            exc_info=self._logger.isEnabledFor(logging.DEBUG),
+        )
