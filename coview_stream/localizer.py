@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -11,13 +13,21 @@ from coview_stream.errors import CloudError, RunError
 from coview_stream.fix import Fix, KeyframeEvidence, State
 from coview_stream.geometry import Points, Pose, is_pose, orthonormal, pose_from
 from coview_stream.place.descriptor import Descriptor
-from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
+from coview_stream.place.keyframes import KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps
-from coview_stream.search import GlobalSearch
+from coview_stream.pose.verification import Evidence
+from coview_stream.search import GlobalSearch, Query, Verdict
 from coview_stream.tracking import Tracker, kept, relative_to, unanchored
 
 _LEAST_POINTS = 10
 _FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
+
+
+@dataclass(frozen=True)
+class _Frame:
+    cloud: Points
+    T_odom_body: Pose  # about the anchor
+    stamp: float
 
 
 class Localizer:
@@ -29,22 +39,30 @@ class Localizer:
         state: the newest fix's state.
     """
 
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
+    def __init__(
+        self, base_map: BaseMap, config: LocalizerConfig | None = None, local_maps: LocalMaps | None = None
+    ) -> None:
+        """Localize on a map; localizers of one thread may share ``local_maps``, its cache of crops."""
         self.base_map = base_map
         self.config = config or LocalizerConfig()
-        self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
+        self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
+        self._search = GlobalSearch(base_map, self.config, self._local_maps)
+        self._generation = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget everything but the map."""
         self.state = State.SEARCHING
         self._buffer = KeyframeBuffer(self.config.keyframe)
-        self._search = GlobalSearch(self.base_map, self.config, self._local_maps)
+        self._search.clear()
+        self._search.last_query = {}
         self._tracker = Tracker(self.base_map, self.config, self._local_maps)
         self._anchor: npt.NDArray[np.float64] | None = None
         self._evidence: KeyframeEvidence | None = None
+        self._newest: _Frame | None = None
         self._doubts = 0
         self._doubted_at = 0.0
+        self._generation += 1
 
     @property
     def last_query(self) -> dict[Channel, Descriptor]:
@@ -66,34 +84,71 @@ class Localizer:
             CloudError: the cloud has another shape or fewer than 10 finite points. RunError: the pose or stamp is not
                 finite or not rigid. Neither changes the localizer: count the frame, skip it and go on.
         """
+        query = self.take(cloud, T_odom_body, stamp)
+        if query is not None:
+            self.adopt(self._search.update(query))
+        return self.fix()
+
+    def take(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Query | None:
+        """First half of :meth:`step`, which never searches the map and so is quick.
+
+        Returns:
+            What has to be searched for, if anything: hand it to a :class:`GlobalSearch`, on another thread or in
+            another process if you like, and its verdict to :meth:`adopt`, between two frames. Meanwhile frames go on.
+
+        Raises:
+            CloudError, RunError: as for :meth:`step`.
+        """
         cloud, T_odom_body = self._checked(cloud, T_odom_body, stamp)
+        self._newest = _Frame(cloud, T_odom_body, stamp)
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body)
         if self.state is State.TRACKING:
             if self._tracker.due or self._doubts:
                 self._track(cloud, T_odom_body, stamp)
         elif keyframe is not None:
-            self._find(keyframe, cloud)
-        return self._fix(T_odom_body, stamp)
+            scan = self.base_map.descriptor_config
+            return Query.of(self._buffer, keyframe, cloud, scan, self._tracker.travelled, self._generation)
+        return None
 
-    def _find(self, keyframe: Keyframe, cloud: Points) -> None:
-        """Search the whole map; start tracking when one place stands alone."""
-        verdict = self._search.update(self._buffer, keyframe, cloud)
+    def adopt(self, verdict: Verdict) -> None:
+        """Second half of :meth:`step`: take note of a search, and start tracking when one place stands alone.
+
+        A verdict from before a loss or a :meth:`reset` is ignored, and so is one that comes while tracking.
+        """
+        newest = self._newest
+        if verdict.generation != self._generation or self.state is State.TRACKING or newest is None:
+            return
         self._evidence = verdict.evidence
         if verdict.accepted is not None:
-            self._tracker.start(verdict.accepted.registration)
-            self._search.clear()
+            self._tracker.start(verdict.accepted.registration, verdict.travelled)
             self.state, self._doubts = State.TRACKING, 0
-            self._tracker.update(cloud, keyframe.T_odom_body)
+            evidence = self._tracker.update(newest.cloud, newest.T_odom_body)
+            if newest.stamp != verdict.evidence.stamp and not self._speaks_for(evidence):
+                self.suspect()  # the robot has driven on since, and what it sees now does not fit
         elif self.state is not State.LOST:
             self.state = verdict.evidence.state
+
+    def suspect(self) -> None:
+        """Give no pose until the next frames have verified the place: odometry may have jumped or paused."""
+        if self.state is State.TRACKING and not self._doubts:
+            self._doubts, self._doubted_at = 1, self._tracker.travelled
+
+    def fix(self) -> Fix:
+        """Say what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
+        if self._newest is None:
+            raise RuntimeError("no frame yet; call take or step first")
+        return self._fix(self._newest.T_odom_body, self._newest.stamp)
+
+    def _speaks_for(self, evidence: Evidence | None) -> bool:
+        return evidence is not None and kept(evidence, self.config.acceptance)
 
     def _track(self, cloud: Points, T_odom_body: Pose, stamp: float) -> None:
         """Correct the drift since the last registration, and verify again that the place is right."""
         evidence = self._tracker.update(cloud, T_odom_body)
         rule = self.config.acceptance
         score = evidence.score if evidence else 0.0
-        doubtful = evidence is None or not kept(evidence, rule)
+        doubtful = not self._speaks_for(evidence)
         driven = self._tracker.travelled - self._doubted_at
         if not doubtful:
             self._doubts = 0
@@ -110,8 +165,8 @@ class Localizer:
         """Search again from nothing: what lost the place may be an odometry that jumped or started anew."""
         self.state, self._anchor = State.LOST, None
         self._buffer.clear()
-        self._search.clear()
         self._tracker.forget()
+        self._generation += 1
 
     def _fix(self, T_odom_body: Pose, stamp: float) -> Fix:
         evidence = self._evidence

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.config import Channel, DescriptorConfig, LocalizerConfig
 from coview_stream.fix import KeyframeEvidence, State
 from coview_stream.geometry import (
     Points,
@@ -42,6 +42,49 @@ _HOPELESS = (
 
 
 @dataclass(frozen=True)
+class Query:
+    """All that a search needs to know of one keyframe; whoever searches may do it later and elsewhere.
+
+    Attributes:
+        stamp: seconds, of the keyframe.
+        T_odom_body: (4, 4) of the keyframe.
+        scan: (N, 3) float32 virtual local scan, odometry frame, metres.
+        submap: (N, 3) float32 points of the newest keyframes, odometry frame: what is registered.
+        cloud: (N, 3) float32 newest frame, body frame.
+        travelled: metres that odometry had driven.
+        generation: of the localizer's memory; a query of another generation starts the search anew.
+    """
+
+    stamp: float
+    T_odom_body: Pose
+    scan: Points
+    submap: Points
+    cloud: Points
+    travelled: float = 0.0
+    generation: int = 0
+
+    @property
+    def position(self) -> npt.NDArray[np.float64]:
+        """(3,) sensor position in the odometry frame, metres."""
+        return np.asarray(self.T_odom_body[:3, 3])
+
+    @classmethod
+    def of(
+        cls,
+        buffer: KeyframeBuffer,
+        keyframe: Keyframe,
+        cloud: Points,
+        descriptor: DescriptorConfig,
+        travelled: float = 0.0,
+        generation: int = 0,
+    ) -> Query:
+        """Ask about the newest keyframe of a buffer; ``cloud`` (N, 3) is its newest frame, body frame."""
+        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
+        submap = buffer.recent(_SUBMAP_KEYFRAMES)
+        return cls(keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation)
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A registered and verified hypothesis of ``T_map_odom``."""
 
@@ -57,10 +100,12 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What one keyframe's search came to: the accepted candidate if any, and why."""
+    """What one keyframe's search came to: the accepted candidate if any, why, and the query's book-keeping."""
 
     accepted: Candidate | None
     evidence: KeyframeEvidence
+    travelled: float = 0.0
+    generation: int = 0
 
 
 class GlobalSearch:
@@ -77,6 +122,7 @@ class GlobalSearch:
         self._favourite: Candidate | None = None
         self._confirmed = 0
         self._proof = 0.0
+        self._generation = 0
 
     def clear(self) -> None:
         """Forget all votes and confirmations."""
@@ -84,45 +130,44 @@ class GlobalSearch:
         self._remembered = []
         self._forget_favourite()
 
-    def update(self, buffer: KeyframeBuffer, keyframe: Keyframe, cloud: Points) -> Verdict:
-        """Take in one keyframe; ``cloud`` (N, 3) is its newest frame in the body frame."""
-        self._vote(buffer, keyframe)
+    def update(self, query: Query) -> Verdict:
+        """Take in one keyframe and judge; once a place is accepted, the next query starts the search anew."""
+        if query.generation != self._generation:
+            self.clear()
+            self._generation = query.generation
+        self._vote(query)
         # what was good at the last keyframe is tried again, whatever the votes say now
         hypotheses = [*self.consensus.hypotheses(), *self._remembered]
-        source = local_source(buffer.recent(_SUBMAP_KEYFRAMES), keyframe.position, self.config.registration)
-        candidates = self._refine(hypotheses, source, keyframe, cloud)
+        source = local_source(query.submap, query.position, self.config.registration)
+        candidates = self._refine(hypotheses, source, query)
         self._remembered = [
             replace(c.hypothesis, T_map_odom=c.T_map_odom)
             for c in candidates[:_REMEMBERED]
             if c.evidence.score >= self.config.acceptance.score
         ]
-        return self._judge(candidates, keyframe)
+        verdict = self._judge(candidates, query)
+        if verdict.accepted is not None:
+            self.clear()
+        return replace(verdict, travelled=query.travelled, generation=query.generation)
 
-    def _vote(self, buffer: KeyframeBuffer, keyframe: Keyframe) -> None:
+    def _vote(self, query: Query) -> None:
         descriptor = self.base_map.descriptor_config
-        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
-        if len(scan) < self.config.keyframe.min_points:
+        if len(query.scan) < self.config.keyframe.min_points:
             return
-        centre = keyframe.position.copy()
+        centre = query.position.copy()
         if descriptor.ground_zero:
-            centre[2] = ground_below(scan, keyframe.position)
-        self.last_query = describe(scan, centre, descriptor)
+            centre[2] = ground_below(query.scan, query.position)
+        self.last_query = describe(query.scan, centre, descriptor)
         self.consensus.vote(centre, self.retrieval.distances(self.last_query))
 
-    def _refine(
-        self, hypotheses: list[Hypothesis], source: Source, keyframe: Keyframe, cloud: Points
-    ) -> list[Candidate]:
+    def _refine(self, hypotheses: list[Hypothesis], source: Source, query: Query) -> list[Candidate]:
         """Return verified candidates, best first. All go through the coarse scales, the promising ones through all."""
         scales = self.config.registration.search
         rough = source.every(_COARSE_EVERY)
         coarse = [
             candidate
             for hypothesis in hypotheses
-            if (
-                candidate := self._candidate(
-                    hypothesis, rough, source, keyframe, cloud, scales[:_COARSE_SCALES]
-                )
-            )
+            if (candidate := self._candidate(hypothesis, rough, source, query, scales[:_COARSE_SCALES]))
         ]
         coarse.sort(key=lambda c: -c.evidence.score)
         enough = _HOPELESS * max(coarse[0].evidence.score if coarse else 0.0, self.config.acceptance.score)
@@ -133,9 +178,7 @@ class GlobalSearch:
                 fine.append(candidate)
                 continue
             again = replace(candidate.hypothesis, T_map_odom=candidate.T_map_odom)
-            refined = self._candidate(
-                again, source, source, keyframe, cloud, scales[_COARSE_SCALES:] or scales[-1:]
-            )
+            refined = self._candidate(again, source, source, query, scales[_COARSE_SCALES:] or scales[-1:])
             if refined is not None:
                 fine.append(refined)
         return sorted(fine, key=lambda c: -c.evidence.score)
@@ -145,41 +188,40 @@ class GlobalSearch:
         hypothesis: Hypothesis,
         moving: Source,
         source: Source,
-        keyframe: Keyframe,
-        cloud: Points,
+        query: Query,
         scales: tuple[float, ...],
     ) -> Candidate | None:
         """Register ``moving`` from the hypothesis and verify with ``source``; None if it finds no hold or tilts."""
         start = hypothesis.T_map_odom
-        target = self.local_maps.around(transform(start, keyframe.position[None])[0])
+        target = self.local_maps.around(transform(start, query.position[None])[0])
         if target is None:
             return None
         level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
         upright = Prior(level, gravity_information(self.config.registration.gravity_sigma))
         iterations = None if moving is source else _COARSE_ITERATIONS
         found = register(
-            moving, start, target, self.config.registration, scales, upright, keyframe.position, iterations
+            moving, start, target, self.config.registration, scales, upright, query.position, iterations
         )
         if found is None or tilt_of(found.T_map_source) > self.config.acceptance.most_tilt:
             return None
         T = found.T_map_source
         surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
-        evidence = verify(source, T, cloud, T @ keyframe.T_odom_body, target, surveyed)
+        evidence = verify(source, T, query.cloud, T @ query.T_odom_body, target, surveyed)
         return Candidate(hypothesis, found, evidence)
 
-    def _judge(self, candidates: list[Candidate], keyframe: Keyframe) -> Verdict:
+    def _judge(self, candidates: list[Candidate], query: Query) -> Verdict:
         """Accept the best candidate once it has stood alone often and clearly enough."""
         if not candidates:
             self._forget_favourite()
             seen = len(self.consensus)
             reason = "no hypothesis fits the map" if seen else "too few points to search with"
-            return Verdict(None, KeyframeEvidence(keyframe.stamp, State.SEARCHING, reason))
+            return Verdict(None, KeyframeEvidence(query.stamp, State.SEARCHING, reason))
         best = candidates[0]
         rival = max(
-            (c.evidence.score for c in candidates[1:] if not _same(c.T_map_odom, best.T_map_odom, keyframe)),
+            (c.evidence.score for c in candidates[1:] if not _same(c.T_map_odom, best.T_map_odom, query)),
             default=0.0,
         )
-        if not self._agrees(best, keyframe):
+        if not self._agrees(best, query):
             self._forget_favourite()
         state, doubt = self._doubt(best.evidence, rival)
         if doubt is None:
@@ -190,7 +232,7 @@ class GlobalSearch:
         return Verdict(
             best if state is State.TRACKING else None,
             KeyframeEvidence(
-                keyframe.stamp, state, doubt, best.evidence.score, rival, best.evidence,
+                query.stamp, state, doubt, best.evidence.score, rival, best.evidence,
                 best.hypothesis.station, best.hypothesis.shift,
             ),
         )  # fmt: skip
@@ -222,10 +264,10 @@ class GlobalSearch:
     def _forget_favourite(self) -> None:
         self._favourite, self._confirmed, self._proof = None, 0, 0.0
 
-    def _agrees(self, best: Candidate, keyframe: Keyframe) -> bool:
+    def _agrees(self, best: Candidate, query: Query) -> bool:
         rule = self.config.acceptance
         return self._favourite is not None and _same(
-            best.T_map_odom, self._favourite.T_map_odom, keyframe, rule.agree_distance, rule.agree_angle
+            best.T_map_odom, self._favourite.T_map_odom, query, rule.agree_distance, rule.agree_angle
         )
 
 
@@ -237,11 +279,11 @@ def gravity_information(sigma: float) -> npt.NDArray[np.float64]:
 def _same(
     T_a: Pose,
     T_b: Pose,
-    keyframe: Keyframe,
+    query: Query,
     distance: float = _SAME_DISTANCE,
     angle: float = float(_SAME_ANGLE),
 ) -> bool:
     """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
-    a, b = T_a @ keyframe.T_odom_body, T_b @ keyframe.T_odom_body
+    a, b = T_a @ query.T_odom_body, T_b @ query.T_odom_body
     apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
     return apart < distance and rotation_angle(inverse(a) @ b) < angle

@@ -66,11 +66,14 @@ class Tracker:
         self._recent.clear()
         self._last = None
 
-    def start(self, registration: Registration) -> None:
-        """Begin with an accepted fix, which may not have converged yet: its own covariance is not believed."""
+    def start(self, registration: Registration, travelled: float) -> None:
+        """Begin with an accepted fix, found where odometry had driven ``travelled`` metres.
+
+        It may not have converged yet: its own covariance is not believed.
+        """
         self.T_map_odom = registration.T_map_source
         self.covariance = self._posterior(registration) + _START_COVARIANCE
-        self._registered_at, self._turned = self.travelled, 0.0
+        self._registered_at, self._turned = travelled, 0.0
 
     @property
     def due(self) -> bool:

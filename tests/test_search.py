@@ -10,7 +10,7 @@ import small_world
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.writers import write_cloud
-from coview_stream.config import AcceptanceConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config import AcceptanceConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
 from coview_stream.fix import State
 from coview_stream.geometry import exp_se3, inverse, pose_from, rot_z, tilt_of
 from coview_stream.localizer import Localizer
@@ -18,7 +18,7 @@ from coview_stream.place.consensus import Hypothesis
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps, Registration
 from coview_stream.pose.verification import Evidence
-from coview_stream.search import Candidate, GlobalSearch, gravity_information
+from coview_stream.search import Candidate, GlobalSearch, Query, gravity_information
 
 RULE = AcceptanceConfig()
 KEYFRAME = Keyframe(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), np.empty((0, 3), np.float32))
@@ -226,31 +226,33 @@ def test_one_scan_alone_is_refused_where_two_places_are_equal(world_map, twin_ma
 
 
 def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM):
-    """Keyframes of the run, odometry near its origin, and the buffer after each."""
+    """A query for each keyframe of the run, odometry near its origin."""
     buffer = KeyframeBuffer(LocalizerConfig().keyframe)
+    descriptor = DescriptorConfig(radius=30.0)  # the small world's
     for k in range(frames):
         T = inverse(T_map_odom) @ world_drive.T_map_body[k]
-        yield buffer, buffer.add(world_drive.clouds[k], T, 0.5 * k), world_drive.clouds[k]
+        cloud = world_drive.clouds[k]
+        yield Query.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, descriptor)
 
 
 def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive, monkeypatch):
     frames = run_of(world_drive, 3)
-    assert search.update(*next(frames)).evidence.score > 0.8
+    assert search.update(next(frames)).evidence.score > 0.8
     monkeypatch.setattr(search.consensus, "hypotheses", list)
-    again = search.update(*next(frames))
+    again = search.update(next(frames))
     assert again.evidence.score > 0.8
     assert "confirmed by 2 keyframes" in again.evidence.reason
     search.clear()
-    assert search.update(*next(frames)).evidence.score == 0.0
+    assert search.update(next(frames)).evidence.score == 0.0
 
 
 def test_what_was_bad_is_not_tried_again(search, world_drive, monkeypatch):
     frames = run_of(world_drive, 2)
     wrong = Hypothesis(T_MAP_ODOM @ pose_from(rot_z(2.0), [9.0, -14.0, 0.0]), 0, 0, 0.0)
     monkeypatch.setattr(search.consensus, "hypotheses", lambda: [wrong])
-    assert search.update(*next(frames)).evidence.score < RULE.score
+    assert search.update(next(frames)).evidence.score < RULE.score
     monkeypatch.setattr(search.consensus, "hypotheses", list)
-    assert search.update(*next(frames)).evidence.score == 0.0
+    assert search.update(next(frames)).evidence.score == 0.0
 
 
 def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, most_tilt):
@@ -272,7 +274,7 @@ def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, mo
     search = GlobalSearch(world_map, config, LocalMaps(world_map, 50.0))
     upright = Hypothesis(robot, 0, 0, 0.0)
     monkeypatch.setattr(search.consensus, "hypotheses", lambda: [upright])
-    return search.update(*next(run_of(world_drive, 1, leaning)))
+    return search.update(next(run_of(world_drive, 1, leaning)))
 
 
 def test_gravity_holds_the_search_upright(world_map, world_drive, monkeypatch):

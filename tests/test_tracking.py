@@ -26,7 +26,7 @@ def registration(T_map_odom):
 def tracker_of(world_map, T_map_odom=T_MAP_ODOM, **acceptance):
     config = LocalizerConfig(acceptance=AcceptanceConfig(**acceptance))
     tracker = Tracker(world_map, config, LocalMaps(world_map, 50.0))
-    tracker.start(registration(T_map_odom))
+    tracker.start(registration(T_map_odom), 0.0)
     return tracker
 
 

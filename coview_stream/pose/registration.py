@@ -49,9 +49,10 @@ class LocalMap:
 class LocalMaps:
     """Crops of a base map by place, the recently used ones kept."""
 
-    def __init__(self, base_map: BaseMap, radius: float) -> None:
+    def __init__(self, base_map: BaseMap, radius: float, crops: int = _CACHED_CROPS) -> None:
         self._map = base_map
         self._radius = radius
+        self._most = crops
         self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
 
     def around(self, position: npt.NDArray[np.float64]) -> LocalMap | None:
@@ -64,7 +65,7 @@ class LocalMaps:
             # an unbalanced tree is built three times as fast and searched as fast
             tree = cKDTree(points, balanced_tree=False, compact_nodes=False) if enough else None
             self._crops[key] = LocalMap(points, normals, tree) if enough else None
-            if len(self._crops) > _CACHED_CROPS:
+            if len(self._crops) > self._most:
                 self._crops.popitem(last=False)
         self._crops.move_to_end(key)
         return self._crops[key]
