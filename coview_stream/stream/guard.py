@@ -6,6 +6,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
+
+
+def is_panic(error: BaseException) -> bool:
+    """Whether a Rust library panicked: pyo3's PanicException is no Exception, and nothing exports it to import."""
+    return type(error).__name__ == "PanicException"
 
 
 class Guard:
@@ -27,13 +33,18 @@ class Guard:
         self._last: dict[str, float] = {}
         self._silent: dict[str, int] = {}
 
-    def run(self, place: str, action: Callable[[], None]) -> Exception | None:
+    def run(self, place: str, action: Callable[[], Any]) -> Exception | None:
         """Call ``action``; return what it raised, after logging it as having happened at ``place``."""
         try:
             action()
         except Exception as error:  # whatever it is, the next message deserves its chance
             self.report(place, error)
             return error
+        except BaseException as error:
+            if not is_panic(error):
+                raise
+            self.report(place, error)
+            return RuntimeError(str(error))
         return None
 
     def report(self, place: str, error: BaseException) -> None:

@@ -1,0 +1,182 @@
+"""What a zenoh session is configured with: the user's file first, our defaults where it is silent."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coview_stream.errors import TransportError
+from coview_stream.stream.guard import is_panic
+
+_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
+_HOST_PORT = re.compile(r"(\[[^\]]+\]|[^:\[\]]+):(\d+)")
+
+_DEFAULTS: dict[str, Any] = {
+    # explicit endpoints only: a robot must not join whatever the next desk is testing
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
+    # zenoh's own waits grow to 4 s; a robot that stands still waiting for poses wants its router back within 2 s
+    "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2.0},
+}
+
+# zenoh switches shared memory on by itself. It saves 0.5 ms of 1.5 ms on a 1 MB cloud between processes of one machine,
+# and costs: messages lost without a word when the receiver stalls for 100 ms (zenoh#2628), segments left behind by
+# killed processes (zenoh#2571), and an error line where memory locking is limited, as it is for ordinary users.
+_SHARED_MEMORY = "transport/shared_memory/enabled"
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.S)
+
+_FILES = (
+    *(
+        f"transport/link/tls/{name}"
+        for name in (
+            "root_ca_certificate",
+            "listen_certificate",
+            "listen_private_key",
+            "connect_certificate",
+            "connect_private_key",
+        )
+    ),
+    "transport/auth/usrpwd/dictionary_file",
+)
+
+
+@contextmanager
+def zenoh_errors(what: str) -> Iterator[None]:
+    """Turn zenoh's errors, and the panics of its Rust core, into :class:`TransportError` about ``what``."""
+    import zenoh
+
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise TransportError(f"{what}: {reason(error)}") from error
+    except BaseException as error:
+        if not is_panic(error):
+            raise
+        raise TransportError(f"{what}: zenoh failed inside: {reason(error)}") from error
+
+
+def reason(error: BaseException) -> str:
+    """Return what zenoh says, on one line and without the places in its source."""
+    text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
+    return text.strip() or type(error).__name__
+
+
+def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None) -> Any:
+    """Build a ``zenoh.Config``.
+
+    The file decides whatever it sets; ``connect`` and ``listen`` replace its endpoints. Without a mode in the file we
+    are a client if there is something to connect to and nothing to listen on, else a peer: two peers do not see each
+    other through a router, a client is seen by all.
+
+    Args:
+        connect: endpoints to connect to, for example ``tcp/10.0.0.1:7447``.
+        listen: endpoints to listen on.
+        path: a zenoh configuration, JSON5 or YAML.
+
+    Raises:
+        TransportError: if the file cannot be read, is no zenoh configuration, names a missing file, or an endpoint is
+            malformed.
+    """
+    for endpoint in connect:
+        _check_endpoint(endpoint, "--connect")
+    for endpoint in listen:
+        _check_endpoint(endpoint, "--listen")
+    config, text = _load(path)
+    if connect:
+        _insert(config, "connect/endpoints", list(connect))
+    _set_listen(config, listen)
+    if _get(config, "mode") is None:
+        has_listen, has_connect = (
+            bool(_get(config, "listen/endpoints")),
+            bool(_get(config, "connect/endpoints")),
+        )
+        _insert(config, "mode", "client" if has_connect and not has_listen else "peer")
+    for key, value in _DEFAULTS.items():
+        if _get(config, key) is None:
+            _insert(config, key, value)
+    if "shared_memory" not in _COMMENT.sub("", text):  # set or not, it reads the same: ask the file's text
+        _insert(config, _SHARED_MEMORY, False)
+    _check(config, path)
+    return config
+
+
+def mode_of(config: Any) -> str:
+    """``client``, ``peer`` or ``router``."""
+    return str(_get(config, "mode"))
+
+
+def endpoints_of(config: Any) -> str:
+    """List the endpoints to connect to, for messages."""
+    found = _get(config, "connect/endpoints")
+    if isinstance(found, dict):
+        found = found.get(mode_of(config)) or []
+    return ", ".join(map(str, found)) or "no endpoint"
+
+
+def _load(path: Path | None) -> tuple[Any, str]:
+    import zenoh
+
+    if path is None:
+        return zenoh.Config(), ""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        what = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise TransportError(
+            f"zenoh configuration {path}: {what}: give a JSON5 file that can be read"
+        ) from error
+    with zenoh_errors(f"zenoh configuration {path}"):
+        return zenoh.Config.from_file(str(path)), text
+
+
+def _set_listen(config: Any, listen: Sequence[str]) -> None:
+    import zenoh
+
+    if listen:
+        _insert(config, "listen/endpoints", list(listen))
+    elif mode_of(config) != "router" and _get(config, "listen/endpoints") == _get(
+        zenoh.Config(), "listen/endpoints"
+    ):
+        _insert(config, "listen/endpoints", [])  # unset, a peer would listen on all interfaces
+
+
+def _check(config: Any, path: Path | None) -> None:
+    if _get(config, "transport/unicast/lowlatency"):
+        raise TransportError(
+            f"zenoh configuration {path}: transport/unicast/lowlatency loses messages over 64 KB: take it out"
+        )
+    for key in _FILES:
+        name = _get(config, key)
+        # zenoh would retry for ever without a word
+        if name is not None and not Path(name).is_file():
+            raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is no file")
+
+
+def _check_endpoint(endpoint: str, option: str) -> None:
+    protocol, slash, rest = endpoint.partition("/")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if protocol not in _PROTOCOLS or not slash or not address:
+        raise TransportError(
+            f"{option} {endpoint!r} is not <protocol>/<address>, such as tcp/127.0.0.1:7447; "
+            f"protocols: {', '.join(_PROTOCOLS)}"
+        )
+    if protocol in _WITH_PORT:
+        found = _HOST_PORT.fullmatch(address)
+        if not found or int(found.group(2)) > 65535:
+            raise TransportError(
+                f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447"
+            )
+
+
+def _get(config: Any, key: str) -> Any:
+    return json.loads(config.get_json(key))
+
+
+def _insert(config: Any, key: str, value: Any) -> None:
+    with zenoh_errors(f"zenoh setting {key} = {value!r}"):
+        config.insert_json5(key, json.dumps(value))
