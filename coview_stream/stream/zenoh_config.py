@@ -22,6 +22,10 @@ _DEFAULTS: dict[str, Any] = {
     "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
     # zenoh's own waits grow to 4 s; a robot that stands still waiting for poses wants its router back within 2 s
     "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2.0},
+    # a host that is off does not refuse: each attempt waits this long, and so, at worst, does the end of the process.
+    # Enough for five round trips over a satellite. connect/timeout_ms would bound the wait too, but with it a client
+    # never tries its second endpoint (zenoh#1602)
+    "transport/unicast/open_timeout": 3000,
 }
 
 # zenoh switches shared memory on by itself. It saves 0.5 ms of 1.5 ms on a 1 MB cloud between processes of one machine,
@@ -97,7 +101,7 @@ def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path 
         )
         _insert(config, "mode", "client" if has_connect and not has_listen else "peer")
     for key, value in _DEFAULTS.items():
-        if _get(config, key) is None:
+        if _is_unset(config, key):
             _insert(config, key, value)
     if "shared_memory" not in _COMMENT.sub("", text):  # set or not, it reads the same: ask the file's text
         _insert(config, _SHARED_MEMORY, False)
@@ -134,14 +138,17 @@ def _load(path: Path | None) -> tuple[Any, str]:
         return zenoh.Config.from_file(str(path)), text
 
 
-def _set_listen(config: Any, listen: Sequence[str]) -> None:
+def _is_unset(config: Any, key: str) -> bool:
     import zenoh
 
+    # zenoh does not tell what a file set; what reads as in an empty configuration counts as not set
+    return bool(_get(config, key) == _get(zenoh.Config(), key))
+
+
+def _set_listen(config: Any, listen: Sequence[str]) -> None:
     if listen:
         _insert(config, "listen/endpoints", list(listen))
-    elif mode_of(config) != "router" and _get(config, "listen/endpoints") == _get(
-        zenoh.Config(), "listen/endpoints"
-    ):
+    elif mode_of(config) != "router" and _is_unset(config, "listen/endpoints"):
         _insert(config, "listen/endpoints", [])  # unset, a peer would listen on all interfaces
 
 

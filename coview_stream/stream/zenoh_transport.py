@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -13,9 +15,10 @@ from typing import Any
 from coview_stream.errors import TransportError
 from coview_stream.stream import zenoh_config
 from coview_stream.stream.guard import Guard
-from coview_stream.stream.messages import Encoded, Sample
+from coview_stream.stream.messages import Sample
 from coview_stream.stream.transport import Connection, Policy, Publisher, Urgency
 from coview_stream.stream.zenoh_config import zenoh_errors
+from coview_stream.stream.zenoh_samples import ZenohPublisher, plain, quality
 
 _log = logging.getLogger(__name__)
 
@@ -26,7 +29,7 @@ _NO_ROUTER = (
 )
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's receiving thread, for all keys
 _JOIN = 0.4  # seconds for all our threads to end at close; they notice within 0.1
-_UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
+_EXIT = 10.0  # seconds for each to end when the process does: longer than any attempt to open
 _JSON = "application/json"
 
 
@@ -65,6 +68,8 @@ class ZenohTransport:
             SimpleQueue()
         )
         self._session: Any = None
+        # a thread inside zenoh while the interpreter goes down aborts the process: see that none is left
+        atexit.register(self._at_exit)
         self._open()
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
@@ -87,9 +92,9 @@ class ZenohTransport:
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
-        publisher = _ZenohPublisher(key, self._guard)
+        publisher = ZenohPublisher(key, self._guard)
         self._declare(
-            key, lambda session: publisher.attach(session.declare_publisher(key, **_quality(urgency)))
+            key, lambda session: publisher.attach(session.declare_publisher(key, **quality(urgency)))
         )
         return publisher
 
@@ -133,17 +138,29 @@ class ZenohTransport:
         if session is not None:
             self._guard.run("closing", session.close)
         self._queries.put(None)
+        end = time.monotonic() + _JOIN
         for thread in self._threads:
             if thread is not threading.current_thread():
-                thread.join(_JOIN)
+                thread.join(max(0.0, end - time.monotonic()))
         self._declared.clear()
+        if not any(thread.is_alive() for thread in self._threads):
+            atexit.unregister(self._at_exit)
+
+    def _at_exit(self) -> None:
+        self.close()
+        for thread in self._threads:
+            thread.join(_EXIT)
 
     # opening
 
     def _open(self) -> None:
         """Open now, so that a wrong configuration is the caller's error; a missing router is only waited for."""
         if not self._waits:
-            self._attempt()
+            try:
+                self._attempt()
+            except TransportError:
+                self.close()
+                raise
             return
         first: SimpleQueue[TransportError | None] = SimpleQueue()
         self._start("opening", lambda: self._keep_trying(first))
@@ -154,7 +171,7 @@ class ZenohTransport:
             _log.warning("no answer from a router at %s yet: going on without", where)
             return
         if error is not None and _NO_ROUTER not in str(error):
-            self._closing.set()
+            self.close()
             raise error
         if error is not None:
             _log.warning("no router at %s, or it refuses us: waiting for it", where)
@@ -213,7 +230,7 @@ class ZenohTransport:
             if self._closing.is_set():
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self._guard.run(key, lambda sample=sample: handler(_plain(sample)))  # type: ignore[misc]
+                self._guard.run(key, lambda sample=sample: handler(plain(sample)))  # type: ignore[misc]
 
     def _answer_queries(self) -> None:
         while (entry := self._queries.get()) is not None:
@@ -229,59 +246,3 @@ class ZenohTransport:
             query.reply_err(json.dumps({"error": str(error)}), encoding=_JSON)
         else:
             query.reply(key, reply, encoding=_JSON)
-
-
-class _ZenohPublisher:
-    """A publisher that may exist before the session does."""
-
-    def __init__(self, key: str, guard: Guard) -> None:
-        self._key = key
-        self._guard = guard
-        self._publisher: Any = None
-        self._closed = False
-
-    def attach(self, publisher: Any) -> None:
-        self._publisher = publisher
-        if self._closed:
-            self.close()
-
-    def put(self, message: Encoded) -> None:
-        publisher = self._publisher
-        if publisher is not None and not self._closed:
-            encoding = message.encoding or _UNSET
-            self._guard.run(
-                self._key,
-                lambda: publisher.put(message.payload, encoding=encoding, attachment=message.attachment),
-            )
-
-    def close(self) -> None:
-        self._closed = True
-        publisher, self._publisher = self._publisher, None
-        if publisher is not None:
-            self._guard.run(self._key, publisher.undeclare)
-
-
-def _plain(sample: Any) -> Sample:
-    encoding = str(sample.encoding)
-    attachment = sample.attachment
-    return Sample(
-        key=str(sample.key_expr),
-        payload=sample.payload.to_bytes(),
-        encoding="" if encoding == _UNSET else encoding,
-        attachment=None if attachment is None else attachment.to_bytes(),
-    )
-
-
-def _quality(urgency: Urgency) -> dict[str, Any]:
-    import zenoh
-
-    congestion, priority = zenoh.CongestionControl, zenoh.Priority
-    if (
-        urgency == "realtime"
-    ):  # express: not batched; 0.2 ms beside a flood of clouds on the same link instead of 8
-        return {"express": True, "priority": priority.REAL_TIME, "congestion_control": congestion.DROP}
-    if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link
-        return {"congestion_control": congestion.BLOCK}
-    # BLOCK_FIRST hands one frame to a background task and drops newer ones meanwhile: put never waits. DROP gives up a
-    # big frame half sent after 50 ms, so on a slow link none arrives
-    return {"congestion_control": getattr(congestion, "BLOCK_FIRST", congestion.DROP)}
