@@ -10,13 +10,14 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import AcceptanceConfig, LocalizerConfig
+from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
 
 _MOST_FRAMES = 40
+_ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _START_COVARIANCE = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 
 
@@ -112,18 +113,14 @@ class Tracker:
 
     def predicted_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the last registration."""
-        drift = self.config.tracking
-        driven = self.travelled - self._registered_at
-        rates = np.array([drift.tilt_drift, drift.tilt_drift, drift.yaw_drift, *[drift.position_drift] * 3])
-        turned = np.array([0.0, 0.0, drift.turn_drift, 0.0, 0.0, 0.0]) * self._turned
-        return self.covariance + np.diag(rates**2 * driven + turned**2)
+        grown = drift_covariance(self.config.tracking, self.travelled - self._registered_at, self._turned)
+        return self.covariance + grown[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)]
 
     def reported_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), floors included, map axes."""
-        order = [3, 4, 5, 0, 1, 2]
         settings = self.config.registration
         floor = np.array([settings.sigma_floor] * 3 + [settings.sigma_floor_angle] * 3) ** 2
-        return np.asarray(self.predicted_covariance()[np.ix_(order, order)] + np.diag(floor))
+        return np.asarray(self.predicted_covariance()[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)] + np.diag(floor))
 
     def _posterior(self, registration: Registration) -> npt.NDArray[np.float64]:
         information = registration.information + 1e-6 * np.eye(6)
@@ -140,6 +137,17 @@ class Tracker:
             parts.append(frame.points)
             count += len(frame.points)
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
+
+
+def drift_covariance(config: TrackingConfig, driven: float, turned: float) -> npt.NDArray[np.float64]:
+    """Covariance (6, 6) over (x, y, z, roll, pitch, yaw) that odometry gathers in metres driven and radians turned."""
+    rates = np.array(
+        [*[config.position_drift] * 3, config.tilt_drift, config.tilt_drift, config.yaw_drift],
+        dtype=np.float64,
+    )
+    variances = rates**2 * driven
+    variances[5] += (config.turn_drift * turned) ** 2
+    return np.diag(variances)
 
 
 def kept(evidence: Evidence, rule: AcceptanceConfig) -> bool:

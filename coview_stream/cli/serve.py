@@ -1,0 +1,97 @@
+"""``coview-stream serve``: the node. Lidar frames and odometry in, map-frame poses out, over zenoh."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+
+HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; values are checked where they are used."""
+    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    parser.add_argument("--robot", nargs="+", required=True, metavar="NAME", help="one or several robots")
+    network = parser.add_argument_group("network (with none of these: --listen tcp/127.0.0.1:7447)")
+    network.add_argument(
+        "--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT of a router"
+    )
+    network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for peers here")
+    network.add_argument(
+        "--config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ..."
+    )
+    keys = parser.add_argument_group("keys and encodings")
+    keys.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
+    keys.add_argument("--base", default="coview", metavar="KEY", help="first part of our keys (coview)")
+    keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
+    keys.add_argument(
+        "--cloud-key", metavar="KEY", help="instead of the preset's; {base} and {robot} are filled in"
+    )
+    keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
+    keys.add_argument("--pose-key", metavar="KEY", help="likewise")
+    keys.add_argument(
+        "--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, whatever frames say"
+    )
+    keys.add_argument("--odometry-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson, likewise")
+    keys.add_argument(
+        "--pose-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson (the preset's)"
+    )
+    limits = parser.add_argument_group("rates and limits")
+    limits.add_argument("--pose-rate", type=float, default=10.0, metavar="HZ", help="(10)")
+    limits.add_argument(
+        "--odometry-timeout", type=float, default=0.5, metavar="S", help="older: no pose (0.5)"
+    )
+    limits.add_argument(
+        "--coast", type=float, default=5.0, metavar="S", help="poses go on this long without frames (5)"
+    )
+    limits.add_argument(
+        "--max-payload", type=int, default=16 << 20, metavar="BYTES", help="larger is not looked at (16 MiB)"
+    )
+    limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
+    parser.add_argument("--quiet", action="store_true", help="log errors only")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until a signal comes; exit code 0 then."""
+    import logging
+
+    from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
+    from coview_stream.stream.config import NodeConfig
+    from coview_stream.stream.keys import robot_keys
+    from coview_stream.stream.reach import DEFAULT_ENDPOINT
+    from coview_stream.stream.serve import ServeOptions, serve
+
+    logging.basicConfig(
+        level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
+    )
+    _check("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
+    _check("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
+    _check("--pose-encoding", args.pose_encoding, POSE_CODECS)
+    keys = [
+        robot_keys(
+            args.preset, args.base, robot, args.cloud_key, args.odometry_key, args.pose_key, args.domain
+        )
+        for robot in args.robot
+    ]
+    alone = not (args.connect or args.listen or args.config)
+    node = NodeConfig(
+        pose_rate=args.pose_rate,
+        odometry_timeout=args.odometry_timeout,
+        coast=args.coast,
+        max_payload=args.max_payload,
+        deskew=not args.no_deskew,
+    )
+    return serve(
+        ServeOptions(
+            args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
+            args.cloud_encoding, args.odometry_encoding, args.pose_encoding,
+        )
+    )  # fmt: skip
+
+
+def _check(option: str, name: str | None, known: Iterable[str]) -> None:
+    from coview_stream.errors import ConfigError
+
+    if name is not None and name not in known:
+        raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")

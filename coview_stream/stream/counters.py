@@ -1,0 +1,99 @@
+"""What a robot's messages came to, and how long they took."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+_REMEMBERED = 600  # a minute of frames at 10 Hz
+
+
+@dataclass
+class Counters:
+    """Everything that can happen to a message; each is counted once, where it ends.
+
+    ``received`` clouds end as ``processed``, ``rejected`` (the engine could not use it), ``dropped`` (a newer one came
+    before its turn), ``late`` (older than the odometry that is remembered), ``out_of_order``, ``duplicate``,
+    ``no_odometry`` (none came for its stamp), ``malformed``, ``oversized``, ``unknown_encoding`` or ``engine_errors``;
+    up to six more are under way. ``missing`` is an estimate of what never arrived, from gaps between stamps or in the
+    sender's numbering.
+    """
+
+    received: int = 0
+    processed: int = 0
+    rejected: int = 0
+    dropped: int = 0
+    late: int = 0
+    out_of_order: int = 0
+    duplicate: int = 0
+    no_odometry: int = 0
+    malformed: int = 0
+    oversized: int = 0
+    unknown_encoding: int = 0
+    engine_errors: int = 0
+    missing: int = 0
+    odometry_received: int = 0
+    odometry_malformed: int = 0
+    odometry_oversized: int = 0
+    odometry_unknown_encoding: int = 0
+    odometry_duplicate: int = 0
+    odometry_out_of_order: int = 0
+    odometry_gaps: int = 0
+    odometry_jumps: int = 0
+    clock_restarts: int = 0
+    searches: int = 0
+    searches_skipped: int = 0
+    fixes: int = 0
+    losses: int = 0
+    poses: int = 0
+    engine_restarts: int = 0
+
+    def count(self, name: str, more: int = 1) -> None:
+        """Add to one counter."""
+        setattr(self, name, getattr(self, name) + more)
+
+    def to_json(self) -> dict[str, int]:
+        """Plain data for the status."""
+        return asdict(self)
+
+
+class Latency:
+    """Percentiles of the newest durations, in milliseconds."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
+
+    def add(self, seconds: float) -> None:
+        """Take in one duration."""
+        self._seconds.append(seconds)
+
+    def to_json(self) -> dict[str, float | None]:
+        """p50, p95 and p99 in milliseconds; null before the first."""
+        if not self._seconds:
+            return {"p50": None, "p95": None, "p99": None}
+        p50, p95, p99 = np.percentile(list(self._seconds), [50, 95, 99]) * 1e3
+        return {"p50": round(p50, 2), "p95": round(p95, 2), "p99": round(p99, 2)}
+
+
+class Missing:
+    """Estimates how many frames never arrived."""
+
+    def __init__(self) -> None:
+        self._gaps: deque[int] = deque(maxlen=15)
+        self._last: tuple[int, int | None] | None = None
+
+    def after(self, stamp_ns: int, sequence: int | None) -> int:
+        """Return the number of frames that seem to lie between the last one and this one."""
+        last, self._last = self._last, (stamp_ns, sequence)
+        if last is None or stamp_ns <= last[0]:
+            return 0
+        if sequence is not None and last[1] is not None:
+            return max(0, sequence - last[1] - 1) if sequence - last[1] < 1000 else 0
+        gap = stamp_ns - last[0]
+        self._gaps.append(gap)
+        usual = float(np.median(self._gaps))
+        if len(self._gaps) < 5 or not 1.5 < gap / usual < 100:
+            return 0
+        return round(gap / usual) - 1

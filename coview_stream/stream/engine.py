@@ -1,0 +1,110 @@
+"""The engine of many robots on one map, in two halves: the quick one tracks, the slow one searches.
+
+They share nothing but the map's file, so each can have a process of its own: a search of 0.3 s must delay neither the
+frames of other robots nor the pose clock.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Protocol
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.localizer import Localizer
+from coview_stream.pose.registration import LocalMaps
+from coview_stream.search import GlobalSearch, Verdict
+from coview_stream.stream.deskew import deskew
+from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
+
+_CROPS = 24  # of the map with their search trees, shared by all robots
+
+
+class Engine(Protocol):
+    """Works through jobs one at a time; an exception concerns the job's robot only."""
+
+    def run(self, job: FrameJob | SearchJob) -> FrameResult | Verdict:
+        """Do one job."""
+        ...
+
+    def forget(self, robot: str) -> None:
+        """Drop what is known of a robot."""
+        ...
+
+
+class TrackEngine:
+    """Takes in frames: keyframes, deskewing, registration around a known place."""
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
+        self.base_map = base_map
+        self.config = config or LocalizerConfig()
+        self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
+        self._robots: dict[str, tuple[int, Localizer]] = {}
+
+    def run(self, job: FrameJob | SearchJob) -> FrameResult:
+        """Take in one frame.
+
+        Raises:
+            CloudError, RunError: the frame is unusable; nothing has changed.
+        """
+        if not isinstance(job, FrameJob):
+            raise TypeError(f"{type(job).__name__} is no frame")
+        begin = time.perf_counter()
+        localizer = self._localizer(job)
+        points = job.points
+        if job.times is not None and job.segment is not None:
+            points = deskew(points, job.times, job.segment, job.stamp_ns, job.T_odom_body)
+        if job.verdict is not None:
+            localizer.adopt(job.verdict)
+        if job.suspect:
+            localizer.suspect()
+        query = localizer.take(points, job.T_odom_body, job.stamp_ns * 1e-9)
+        return FrameResult(localizer.fix(), query, time.perf_counter() - begin)
+
+    def forget(self, robot: str) -> None:
+        """Drop a robot's localizer."""
+        self._robots.pop(robot, None)
+
+    def _localizer(self, job: FrameJob) -> Localizer:
+        epoch, localizer = self._robots.get(job.robot, (None, None))
+        if localizer is None:
+            localizer = Localizer(self.base_map, self.config, self._local_maps)
+        elif epoch != job.epoch:
+            localizer.reset()
+        self._robots[job.robot] = job.epoch, localizer
+        return localizer
+
+
+class SearchEngine:
+    """Searches the whole map for keyframes; all robots share the map's spectra."""
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
+        self.base_map = base_map
+        self.config = config or LocalizerConfig()
+        self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
+        self._robots: dict[str, tuple[int, GlobalSearch]] = {}
+        self._retrieval = GlobalSearch(base_map, self.config, self._local_maps).retrieval
+
+    def run(self, job: FrameJob | SearchJob) -> Verdict:
+        """Search for one keyframe."""
+        if not isinstance(job, SearchJob):
+            raise TypeError(f"{type(job).__name__} is no search")
+        epoch, search = self._robots.get(job.robot, (None, None))
+        if search is None:
+            search = GlobalSearch(self.base_map, self.config, self._local_maps)
+            search.retrieval = self._retrieval
+        elif epoch != job.epoch:
+            search.clear()
+        self._robots[job.robot] = job.epoch, search
+        return search.update(job.query)
+
+    def forget(self, robot: str) -> None:
+        """Drop a robot's votes."""
+        self._robots.pop(robot, None)
+
+
+def open_engine(kind: str, map_path: str | Path, config: LocalizerConfig | None = None) -> Engine:
+    """Load the map and make the engine ``track`` or ``search``; raises MapError for an unusable map."""
+    base_map = BaseMap.load(map_path)
+    return TrackEngine(base_map, config) if kind == "track" else SearchEngine(base_map, config)

@@ -1,0 +1,58 @@
+"""What goes to the engine and what comes back: plain data that crosses a process boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.fix import Fix
+from coview_stream.geometry import Points, Pose
+from coview_stream.search import Query, Verdict
+from coview_stream.stream.odometry import Segment
+
+
+@dataclass(frozen=True)
+class FrameJob:
+    """One frame for the tracking engine.
+
+    Attributes:
+        robot: name.
+        epoch: of the robot's odometry frame; a new one makes the engine forget what it knew.
+        stamp_ns: sensor time, nanoseconds.
+        points: (N, 3) float32 body frame, metres.
+        T_odom_body: (4, 4) odometry at the stamp.
+        times: (N,) seconds after the stamp at which each point was measured, None if not to be deskewed.
+        segment: odometry during the sweep; goes with ``times``.
+        suspect: give no pose before this frame has verified the place.
+        verdict: of an earlier search, to be taken note of first.
+    """
+
+    robot: str
+    epoch: int
+    stamp_ns: int
+    points: Points
+    T_odom_body: Pose
+    times: npt.NDArray[np.float64] | None = None
+    segment: Segment | None = None
+    suspect: bool = False
+    verdict: Verdict | None = None
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The fix after a frame, what has to be searched for (if anything), and the seconds it took."""
+
+    fix: Fix
+    query: Query | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class SearchJob:
+    """One keyframe to search the map for; ``epoch`` as in :class:`FrameJob`."""
+
+    robot: str
+    epoch: int
+    query: Query

@@ -1,0 +1,119 @@
+"""From a map file and options to a running node, and to its end at a signal."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.errors import ConfigError, MapError
+from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
+from coview_stream.stream.config import NodeConfig
+from coview_stream.stream.keys import RobotKeys
+from coview_stream.stream.lane import DiedError, ProcessLane
+from coview_stream.stream.node import Node
+from coview_stream.stream.session import Session
+from coview_stream.stream.zenoh_transport import open_transport
+
+log = logging.getLogger("coview_stream.node")
+
+_TRACK_NICE = 4  # the engines stand back: the pose clock and the receiving threads are in this process
+_SEARCH_NICE = 10
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """What ``serve`` was asked for.
+
+    Attributes:
+        map_path: a ``.coview`` file.
+        keys: of each robot.
+        connect: endpoints to connect to.
+        listen: endpoints to listen on.
+        zenoh_config: a zenoh JSON5 file, or None.
+        node: rates and limits.
+        cloud_codec: of all clouds, whatever they say; None believes them.
+        odometry_codec: likewise.
+        pose_codec: of the poses; None is the preset's.
+    """
+
+    map_path: Path
+    keys: Sequence[RobotKeys]
+    connect: Sequence[str] = ()
+    listen: Sequence[str] = ()
+    zenoh_config: Path | None = None
+    node: NodeConfig = field(default_factory=NodeConfig)
+    cloud_codec: str | None = None
+    odometry_codec: str | None = None
+    pose_codec: str | None = None
+
+
+def open_node(options: ServeOptions) -> Node:
+    """Load the map in the engines, open the network and start; what fails leaves nothing running.
+
+    Raises:
+        MapError: the map is unusable. ConfigError: a robot is named twice. TransportError: no network.
+    """
+    names = [k.robot for k in options.keys]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--robot: {', '.join(names)}: each name once")
+    begin = time.monotonic()
+    lanes = [
+        track := ProcessLane("track", str(options.map_path), _TRACK_NICE),
+        search := ProcessLane("search", str(options.map_path), _SEARCH_NICE),
+    ]
+    transport = None
+    try:
+        base_map = BaseMap.load(
+            options.map_path
+        )  # here for its errors and its hash; the engines map it themselves
+        for lane in lanes:
+            lane.start()
+        transport = open_transport(options.connect, options.listen, options.zenoh_config)
+        codecs = (options.cloud_codec, options.odometry_codec)
+        sessions = [Session(k, base_map.sha256, options.node, options=codecs) for k in options.keys]
+        prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
+        for lane in lanes:
+            lane.wait_ready()
+        node = Node(sessions, transport, track, search, options.node, options.pose_codec)
+        node.start()
+    except BaseException as error:
+        for lane in lanes:
+            lane.close()
+        if transport is not None:
+            transport.close()
+        if isinstance(error, DiedError):
+            raise MapError(f"{options.map_path}: {error} while it opened the map") from error
+        raise
+    log.info(
+        "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
+    )
+    return node
+
+
+def serve(options: ServeOptions, ready: threading.Event | None = None) -> int:
+    """Run a node until SIGTERM or SIGINT; returns 0. Errors as :func:`open_node`."""
+    stop = threading.Event()
+
+    def ask_to_stop(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, ask_to_stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        node = open_node(options)
+        if ready is not None:
+            ready.set()
+        while not stop.wait(0.5):  # a wait without end would not be interrupted on every platform
+            pass
+        log.info("stopping")
+        node.close()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0

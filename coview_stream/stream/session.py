@@ -1,0 +1,417 @@
+"""One robot's side of the node: what its messages come to, and what can be said of its pose right now.
+
+Pure logic: no thread, no network, no clock. Times called ``now`` are local and monotonic, in seconds; stamps are the
+robot's. Every method may be called from any thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config import TrackingConfig
+from coview_stream.errors import EncodingError, MessageError
+from coview_stream.fix import Fix, KeyframeEvidence, State
+from coview_stream.geometry import Pose
+from coview_stream.search import Query, Verdict
+from coview_stream.stream.codecs import OversizedError, decode_cloud, decode_odometry
+from coview_stream.stream.config import NodeConfig
+from coview_stream.stream.counters import Counters, Latency, Missing
+from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
+from coview_stream.stream.keys import RobotKeys
+from coview_stream.stream.messages import CloudMessage, OdometryMessage, PoseMessage, Sample
+from coview_stream.stream.odometry import Intake, OdometryBuffer
+from coview_stream.tracking import drift_covariance
+
+_NS = 1_000_000_000
+_WAITING = 8  # frames that wait for their odometry
+_SWEEP_WAIT = 0.15  # seconds a frame waits for the odometry of its sweep's end
+_MOST_ERRORS = 10  # different errors that the status names
+
+
+@dataclass(frozen=True)
+class _Frame:
+    message: CloudMessage
+    received: float
+
+
+@dataclass(frozen=True)
+class _Ready:
+    job: FrameJob
+    received: float
+    travelled: float
+    turned: float
+
+
+@dataclass(frozen=True)
+class _Correction:
+    """The newest verified ``T_map_odom``, and how far odometry had driven when it was right."""
+
+    T_map_odom: Pose
+    covariance: npt.NDArray[np.float64]
+    confidence: float
+    stamp_ns: int
+    travelled: float
+    turned: float
+
+
+class Session:
+    """A robot's odometry, waiting frames, state and counters.
+
+    Attributes:
+        keys: where its messages come and go.
+        counters: what became of them.
+        errors: the newest different complaints about its input, for people.
+    """
+
+    def __init__(
+        self,
+        keys: RobotKeys,
+        map_sha256: str,
+        config: NodeConfig | None = None,
+        tracking: TrackingConfig | None = None,
+        options: tuple[str | None, str | None] = (None, None),
+    ) -> None:
+        """Begin to know nothing; ``options`` force the codecs of clouds and odometry."""
+        self.keys = keys
+        self.map_sha256 = map_sha256
+        self.config = config or NodeConfig()
+        self.tracking = tracking or TrackingConfig()
+        self.options = options
+        self._lock = threading.RLock()
+        self._epoch = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self.counters = Counters()
+        self.errors: deque[str] = deque(maxlen=_MOST_ERRORS)
+        self.latency = Latency()
+        self.engine_latency = Latency()
+        self.odometry = OdometryBuffer(self.config)
+        self.evidence: KeyframeEvidence | None = None
+        self.last_frame_ns: int | None = None
+        self.longest_wait = 0.0
+        self._missing = Missing()
+        self._processed_at: float | None = None
+        self._fix_state = State.SEARCHING
+        self._lost: str | None = None
+        self._forget_frame()
+
+    def _forget_frame(self) -> None:
+        """Forget all that refers to the odometry frame, which is no more."""
+        self._epoch += 1
+        self._waiting: deque[_Frame] = deque()
+        self._ready: _Ready | None = None
+        self._busy: _Ready | None = None
+        self._query: Query | None = None
+        self._searching = False
+        self._verdict: Verdict | None = None
+        self._correction: _Correction | None = None
+        self._suspect = False
+        self._trusted_from = -(1 << 63)
+        self._submitted_ns: int | None = None
+        self._published_ns = -(1 << 63)
+        if self._fix_state is not State.LOST:
+            self._fix_state = State.SEARCHING
+
+    # ---- what comes in
+
+    def on_cloud(self, sample: Sample, now: float) -> None:
+        """Take in a cloud: decode, check, pair with odometry. Never raises for what the sample holds."""
+        with self._lock:
+            self.counters.received += 1
+        message = self._decoded(sample, decode_cloud, "", self.options[0], self.keys.cloud_hint)
+        if message is None:
+            return
+        with self._lock:
+            stamps = [f.message.stamp_ns for f in self._waiting]
+            if message.stamp_ns == self._submitted_ns or message.stamp_ns in stamps:
+                self.counters.duplicate += 1
+            elif self._submitted_ns is not None and message.stamp_ns < self._submitted_ns:
+                self.counters.out_of_order += 1
+            else:
+                self._waiting.append(_Frame(message, now))
+                if len(self._waiting) > _WAITING:
+                    self._waiting.popleft()
+                    self.counters.dropped += 1
+                self._pair(now)
+
+    def on_odometry(self, sample: Sample, now: float) -> None:
+        """Take in an odometry sample. Never raises for what the sample holds."""
+        with self._lock:
+            self.counters.odometry_received += 1
+        hint = self.keys.odometry_hint
+        message = self._decoded(sample, decode_odometry, "odometry_", self.options[1], hint)
+        if message is None:
+            return
+        with self._lock:
+            self._continue(self.odometry.add(message, now), message)
+            self._pair(now)
+
+    def _decoded(self, sample: Sample, decode: object, prefix: str, option: str | None, hint: str | None):  # type: ignore[no-untyped-def]  # of any message
+        name, reason = "", ""
+        if len(sample.payload) > self.config.max_payload:
+            name = "oversized"
+            reason = f"{len(sample.payload)} bytes, {self.config.max_payload} are the most"
+        else:
+            try:
+                return decode(sample, option, hint)  # type: ignore[operator]
+            except EncodingError as error:
+                name, reason = "unknown_encoding", str(error)
+            except OversizedError as error:
+                name, reason = "oversized", str(error)
+            except MessageError as error:
+                name, reason = "malformed", str(error)
+        with self._lock:
+            self.counters.count(prefix + name)
+            if name != "malformed":
+                self._complain(f"{sample.key}: {reason}")
+        return None
+
+    def _complain(self, text: str) -> None:
+        if text not in self.errors:
+            self.errors.append(text)
+
+    def _continue(self, intake: Intake, message: OdometryMessage) -> None:
+        """Draw the consequences of what an odometry sample was."""
+        if intake is Intake.DUPLICATE:
+            self.counters.odometry_duplicate += 1
+        elif intake is Intake.OUT_OF_ORDER:
+            self.counters.odometry_out_of_order += 1
+        elif intake is Intake.GAP:
+            self.counters.odometry_gaps += 1
+            self._doubt(message.stamp_ns)
+        elif intake is Intake.JUMP:
+            self.counters.odometry_jumps += 1
+            self.begin_anew("odometry jumped")
+        elif intake is Intake.RESTART:
+            self.counters.clock_restarts += 1
+            self.begin_anew("the sender's clock started anew")
+
+    def _doubt(self, from_ns: int) -> None:
+        """No pose until a frame stamped ``from_ns`` or later has verified the place."""
+        if self._correction is not None or self._fix_state is State.TRACKING:
+            self._suspect = True
+        self._trusted_from = max(self._trusted_from, from_ns)
+        self._correction = None
+
+    def begin_anew(self, reason: str) -> None:
+        """Search from nothing, because what came before no longer fits. Odometry that has come stays."""
+        with self._lock:
+            if self._correction is not None or self._fix_state is State.TRACKING:
+                self._lose(reason)
+            self._forget_frame()
+
+    def reset(self) -> None:
+        """Forget everything, counters and odometry too."""
+        with self._lock:
+            self._clear()
+
+    def _lose(self, reason: str) -> None:
+        if self._lost is None:
+            self.counters.losses += 1
+        self._lost = reason
+        self._correction = None
+
+    # ---- frames and their odometry
+
+    def _pair(self, now: float) -> None:
+        """Make the newest frame ready whose odometry is there; count those that it never came for."""
+        while self._waiting:
+            frame = min(self._waiting, key=lambda f: f.message.stamp_ns)
+            where = self.odometry.covers(frame.message.stamp_ns)
+            waited = now - frame.received
+            if where > 0 and waited < self.config.pairing_wait:
+                return
+            if (
+                where == 0
+                and waited < _SWEEP_WAIT
+                and self.odometry.covers(self._sweep_end(frame.message)) > 0
+            ):
+                return
+            self._waiting.remove(frame)
+            pose = self.odometry.at(frame.message.stamp_ns) if where == 0 else None
+            if pose is None:
+                self.counters.count("late" if where < 0 else "no_odometry")
+            else:
+                self._make_ready(frame, pose)
+
+    def _sweep_end(self, message: CloudMessage) -> int:
+        if message.times is None or not self.config.deskew or not len(message.times):
+            return message.stamp_ns
+        last = float(np.nan_to_num(message.times, nan=0.0).max())
+        return message.stamp_ns + round(max(0.0, last) * _NS)
+
+    def _make_ready(self, frame: _Frame, T_odom_body: Pose) -> None:
+        message = frame.message
+        if self._ready is not None:
+            self.counters.dropped += 1
+        self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
+        self._submitted_ns = message.stamp_ns
+        times = message.times if self.config.deskew else None
+        segment = None
+        if times is not None and len(times):
+            first = message.stamp_ns + round(min(0.0, float(np.nan_to_num(times, nan=0.0).min())) * _NS)
+            segment = self.odometry.around(first, self._sweep_end(message))
+        job = FrameJob(
+            self.keys.robot, self._epoch, message.stamp_ns, message.points, T_odom_body, times, segment
+        )
+        self._ready = _Ready(job, frame.received, self.odometry.travelled, self.odometry.turned)
+
+    # ---- the engine's work
+
+    def take_frame(self) -> FrameJob | None:
+        """Hand the newest ready frame to the engine; its result or failure must be reported before the next one."""
+        with self._lock:
+            if self._ready is None or self._busy is not None:
+                return None
+            self._busy, self._ready = self._ready, None
+            job = replace(self._busy.job, suspect=self._suspect, verdict=self._verdict)
+            self._verdict = None
+            return job
+
+    def take_search(self) -> SearchJob | None:
+        """Hand the newest keyframe to the search; its verdict or failure must be reported before the next one."""
+        with self._lock:
+            if self._query is None or self._searching:
+                return None
+            job = SearchJob(self.keys.robot, self._epoch, self._query)
+            self._query, self._searching = None, True
+            return job
+
+    def frame_done(self, job: FrameJob, result: FrameResult, now: float) -> None:
+        """Take note of the fix after a frame."""
+        with self._lock:
+            self.counters.processed += 1
+            if self._processed_at is not None:
+                self.longest_wait = max(self.longest_wait, now - self._processed_at)
+            self._processed_at = now
+            self.engine_latency.add(result.seconds)
+            if self._busy is not None and job.epoch == self._epoch:
+                self.latency.add(now - self._busy.received)
+                self._note(job, result, self._busy)
+            self._busy = None if job.epoch == self._epoch else self._busy
+
+    def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> None:
+        """Take note that the engine could not use a frame (``rejected``) or failed and has forgotten the robot."""
+        with self._lock:
+            self.counters.count("rejected" if rejected else "engine_errors")
+            self._complain(reason.strip().splitlines()[-1] if reason.strip() else "unknown failure")
+            if job.epoch == self._epoch:
+                self._busy = None
+                self._verdict = self._verdict or job.verdict
+                if not rejected:
+                    self.begin_anew("the engine failed on a frame")
+
+    def search_done(self, job: SearchJob, verdict: Verdict | None) -> None:
+        """Take note of a verdict; None if the search failed, which costs this keyframe's vote only."""
+        with self._lock:
+            self.counters.searches += 1
+            if job.epoch == self._epoch:
+                self._searching = False
+                self._verdict = verdict
+
+    def engine_restarted(self) -> None:
+        """Take note that the tracking engine has forgotten all it knew."""
+        with self._lock:
+            self.counters.engine_restarts += 1
+            self.begin_anew("the engine was started again")
+
+    def _note(self, job: FrameJob, result: FrameResult, ready: _Ready) -> None:
+        fix = result.fix
+        self.last_frame_ns = job.stamp_ns
+        self.evidence = fix.evidence
+        if result.query is not None:
+            self.counters.searches_skipped += self._query is not None
+            self._query = result.query
+        self._suspect = self._suspect and not job.suspect
+        was, self._fix_state = self._fix_state, fix.state
+        if fix.T_map_odom is None:
+            if fix.state is State.LOST and was is not State.LOST and self._lost is None:
+                self._lose(fix.evidence.reason if fix.evidence else "evidence gone")
+            self._correction = None
+        elif job.stamp_ns >= self._trusted_from:
+            self._correct(fix, job, ready)
+
+    def _correct(self, fix: Fix, job: FrameJob, ready: _Ready) -> None:
+        assert fix.T_map_odom is not None
+        assert fix.covariance is not None
+        if self._correction is None:
+            self.counters.fixes += 1
+        self._lost = None
+        self._correction = _Correction(
+            fix.T_map_odom, fix.covariance, fix.confidence, job.stamp_ns, ready.travelled, ready.turned
+        )
+
+    # ---- what goes out
+
+    def tick(self, now: float) -> None:
+        """Let time pass: frames and odometry that do not come have consequences."""
+        with self._lock:
+            self._pair(now)
+            if self._correction is None:
+                return
+            silent = now - self.odometry.arrived
+            unseen = now - (self._processed_at if self._processed_at is not None else now)
+            if silent > self.config.odometry_timeout:
+                self._stop(f"no odometry for {self.config.odometry_timeout:g} s")
+            elif unseen > self.config.coast:
+                self._stop(f"no usable frame for {self.config.coast:g} s")
+
+    def _stop(self, reason: str) -> None:
+        self._suspect = True
+        self._trusted_from = (self.odometry.newest.stamp_ns if self.odometry.newest else 0) + 1
+        self._lose(reason)
+
+    def pose(self) -> PoseMessage | None:
+        """Newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING."""
+        with self._lock:
+            newest, known = self.odometry.newest, self._correction
+            if newest is None or known is None or newest.stamp_ns < self._published_ns:
+                return None
+            self._published_ns = newest.stamp_ns
+            self.counters.poses += 1
+            driven = max(0.0, self.odometry.travelled - known.travelled)
+            turned = max(0.0, self.odometry.turned - known.turned)
+            return PoseMessage(
+                stamp_ns=newest.stamp_ns,
+                robot=self.keys.robot,
+                state=State.TRACKING.value,
+                T_map_body=known.T_map_odom @ newest.T_odom_body,
+                covariance=known.covariance + drift_covariance(self.tracking, driven, turned),
+                confidence=known.confidence,
+                map_sha256=self.map_sha256,
+                age=max(0.0, (newest.stamp_ns - known.stamp_ns) / _NS),
+            )
+
+    def state(self) -> tuple[State, str]:
+        """Return the state and one clause that gives its reason."""
+        with self._lock:
+            evidence = self.evidence.reason if self.evidence else ""
+            if self._correction is not None:
+                return State.TRACKING, evidence
+            if self._lost is not None:
+                return State.LOST, self._lost
+            if self._fix_state is State.TRACKING:
+                return State.AMBIGUOUS, "verifying the place after a pause of odometry"
+            return self._fix_state, evidence if self.last_frame_ns is not None else self._why_nothing()
+
+    def _why_nothing(self) -> str:
+        counted = self.counters
+        if not counted.received:
+            return f"waiting for clouds on {self.keys.cloud}"
+        if self.odometry.newest is None:
+            return f"waiting for odometry on {self.keys.odometry}"
+        if counted.late or counted.no_odometry:
+            return "odometry and clouds have no common stamps: are both of one clock?"
+        return "no frame has been processed yet"
+
+    def age(self) -> float | None:
+        """Seconds of sensor time between the newest odometry and the frame that last corrected it; None if LOST."""
+        with self._lock:
+            newest, known = self.odometry.newest, self._correction
+            return None if newest is None or known is None else (newest.stamp_ns - known.stamp_ns) / _NS

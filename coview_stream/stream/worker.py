@@ -1,0 +1,36 @@
+"""The child process of a lane: ``python -m coview_stream.stream.worker FD KIND MAP NICE``; not for people."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from multiprocessing.connection import Connection
+
+
+def main(argv: list[str]) -> int:
+    """Open the engine, then answer jobs until the parent closes the pipe."""
+    descriptor, kind, map_path, nice = int(argv[0]), argv[1], argv[2], int(argv[3])
+    pipe = Connection(descriptor)
+    with contextlib.suppress(OSError):
+        os.nice(nice)
+    from coview_kernels import runtime
+    from coview_stream.errors import CoViewError
+    from coview_stream.stream.engine import open_engine
+    from coview_stream.stream.lane import attempt
+
+    try:
+        engine = open_engine(kind, map_path)
+        runtime.warm_up()
+    except CoViewError as error:
+        pipe.send(("error", str(error)))
+        return 1
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
+        pipe.send(("ready", None))
+        while True:
+            pipe.send(attempt(engine, pipe.recv()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
