@@ -1,0 +1,171 @@
+"""How a recorded stream of poses and statuses is scored: pure functions of what arrived when.
+
+Arrivals are seconds of a monotonic clock of the machine; stamps are nanoseconds of the robot's sensor clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+FALSE_METRES, FALSE_DEGREES = 2.0, 5.0
+"""A pose further from the truth than either is a false one."""
+
+MOST_MISMATCH_NS = 2_000_000
+"""A frame is recognised by its stamp; ages come as decimal seconds, so that stamps made of them are rounded."""
+
+
+@dataclass(frozen=True)
+class Posed:
+    """One pose as it arrived: (4, 4) map <- body, and the seconds since the frame that corrected it, if told."""
+
+    arrival: float
+    stamp_ns: int
+    T_map_body: Floats
+    age: float | None = None
+
+
+@dataclass(frozen=True)
+class Told:
+    """One status as it arrived."""
+
+    arrival: float
+    fields: dict[str, Any]
+
+    @property
+    def state(self) -> str:
+        """SEARCHING, AMBIGUOUS, TRACKING or LOST; empty if the status has none."""
+        return str(self.fields.get("state", ""))
+
+
+def errors(poses: Sequence[Posed], truth: Callable[[int], Floats]) -> tuple[Floats, Floats]:
+    """Metres and degrees between each pose and the truth at its stamp."""
+    metres, degrees = np.zeros(len(poses)), np.zeros(len(poses))
+    for k, pose in enumerate(poses):
+        apart = np.linalg.inv(truth(pose.stamp_ns)) @ pose.T_map_body
+        metres[k] = np.linalg.norm(apart[:3, 3])
+        degrees[k] = math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(apart[:3, :3]) - 1) / 2))))
+    return metres, degrees
+
+
+def false_poses(metres: Floats, degrees: Floats) -> int:
+    """How many poses are too far from the truth; one that is not a number is."""
+    return int(np.sum(~((metres <= FALSE_METRES) & (degrees <= FALSE_DEGREES))))
+
+
+def tracking_intervals(
+    arrivals: Sequence[float], told: Sequence[Told], without: Sequence[tuple[float, float]] = ()
+) -> Floats:
+    """Seconds between successive poses, where no status in between said that the robot is not tracked.
+
+    ``without`` are periods (begin, end) that are left out, such as the absence of the router: an interval that
+    touches one does not count. Any other silence does, however long: that is the point of measuring.
+    """
+    untracked = np.array([status.arrival for status in told if status.state != "TRACKING"])
+    counted = []
+    for begin, end in itertools.pairwise(arrivals):
+        silent = np.any((untracked > begin) & (untracked < end))
+        if not silent and not any(begin < last and first < end for first, last in without):
+            counted.append(end - begin)
+    return np.array(counted)
+
+
+def rate_hz(intervals: Floats) -> float | None:
+    """Poses per second over those intervals; None without any."""
+    return float(len(intervals) / intervals.sum()) if len(intervals) and intervals.sum() > 0 else None
+
+
+def jitter_ms(intervals: Floats, period: float = 0.1) -> tuple[float, float] | None:
+    """p50 and p99 of how far the intervals are from ``period`` seconds, in milliseconds; None without any."""
+    if not len(intervals):
+        return None
+    p50, p99 = np.percentile(np.abs(intervals - period) * 1e3, [50, 99])
+    return float(p50), float(p99)
+
+
+def steps_back(stamps_ns: Sequence[int]) -> int:
+    """How often a stamp is older than the one before."""
+    return sum(b < a for a, b in itertools.pairwise(stamps_ns))
+
+
+def share_posed(arrivals: Sequence[float], begin: float, end: float, bin_s: float = 0.2) -> float:
+    """Share of the ``bin_s`` long pieces of ``begin`` to ``end`` that hold a pose."""
+    count = max(1, int((end - begin) / bin_s))
+    held = {int((at - begin) / bin_s) for at in arrivals if begin <= at < begin + count * bin_s}
+    return len(held) / count
+
+
+def longest_silence(arrivals: Sequence[float], begin: float, end: float) -> float:
+    """Longest time without an arrival within ``begin`` to ``end``, seconds."""
+    inside = [begin, *(at for at in arrivals if begin < at < end), end]
+    return max(b - a for a, b in itertools.pairwise(inside))
+
+
+def jain(shares: Sequence[float]) -> float:
+    """Jain's fairness: 1 if all have the same, 1/n if one has all."""
+    squares = sum(share**2 for share in shares)
+    return sum(shares) ** 2 / (len(shares) * squares) if squares else 0.0
+
+
+def put_time(puts: Floats, stamp_ns: float) -> float | None:
+    """When the frame with that stamp was put; ``puts`` (N, 2) are stamps and times in order; None if unknown."""
+    if not len(puts):
+        return None
+    k = int(np.clip(np.searchsorted(puts[:, 0], stamp_ns), 1, max(1, len(puts) - 1)))
+    near = min((row for row in puts[k - 1 : k + 1]), key=lambda row: abs(row[0] - stamp_ns))
+    return float(near[1]) if abs(near[0] - stamp_ns) <= MOST_MISMATCH_NS else None
+
+
+def reaction(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
+    """Seconds from the put of a frame until something first told of it; ``seen`` are (arrival, stamp) in order."""
+    newest, found = -math.inf, []
+    for arrival, stamp_ns in seen:
+        if stamp_ns <= newest + MOST_MISMATCH_NS:
+            continue
+        newest = stamp_ns
+        put = put_time(puts, stamp_ns)
+        if put is not None:
+            found.append(arrival - put)
+    return np.array(found)
+
+
+def staleness(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
+    """Seconds since the put of the newest frame that each arrival tells of: its maximum is the worst starvation."""
+    known = ((arrival, put_time(puts, stamp_ns)) for arrival, stamp_ns in seen)
+    return np.array([arrival - put for arrival, put in known if put is not None])
+
+
+def percentiles_ms(seconds: Floats) -> tuple[float, float, float] | None:
+    """p50, p95, p99 in milliseconds; None without any."""
+    if not len(seconds):
+        return None
+    p50, p95, p99 = np.percentile(seconds * 1e3, [50, 95, 99])
+    return float(p50), float(p95), float(p99)
+
+
+def corrected(poses: Sequence[Posed]) -> list[tuple[float, float]]:
+    """(arrival, stamp of the frame that last corrected it) of each pose that tells its age."""
+    return [(pose.arrival, pose.stamp_ns - pose.age * 1e9) for pose in poses if pose.age is not None]
+
+
+def processed(told: Sequence[Told]) -> list[tuple[float, float]]:
+    """(arrival, stamp of the newest processed frame) of each status that tells it."""
+    seen = ((status.arrival, status.fields.get("last_frame_ns")) for status in told)
+    return [(arrival, float(stamp)) for arrival, stamp in seen if isinstance(stamp, int) and stamp > 0]
+
+
+def counter(told: Sequence[Told], name: str) -> int | None:
+    """Newest value of a counter; None if no status has it."""
+    for status in reversed(told):
+        counters = status.fields.get("counters")
+        if isinstance(counters, dict) and isinstance(counters.get(name), (int, float)):
+            return int(counters[name])
+    return None
