@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from coview_stream.errors import CoViewError
     from coview_stream.fix import Fix, State
     from coview_stream.localizer import Localizer
+    from coview_stream.stream.client import RobotClient
 
 __all__ = [
     "BaseMap",
@@ -26,6 +27,7 @@ __all__ = [
     "Localizer",
     "LocalizerConfig",
     "MapConfig",
+    "RobotClient",
     "State",
     "__version__",
 ]
@@ -39,6 +41,7 @@ _HOMES = {
     "Localizer": "localizer",
     "LocalizerConfig": "config",
     "MapConfig": "config",
+    "RobotClient": "stream.client",
     "State": "fix",
 }
 
