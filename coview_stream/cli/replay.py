@@ -1,0 +1,72 @@
+"""``coview-stream replay``: feed a recorded run as a live robot."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "feed a recorded run into zenoh as a live robot"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; ranges are checked by ReplayConfig."""
+    parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, or one cloud file")
+    parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
+    parser.add_argument(
+        "--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)"
+    )
+    parser.add_argument("--listen", action="append", metavar="EP", help="endpoint to be connected to on")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
+    parser.add_argument("--base", default="coview", help="first part of the keys (coview)")
+    parser.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="times faster than recorded (1)"
+    )
+    parser.add_argument("--loop", action="store_true", help="start over until interrupted; stamps go on")
+    parser.add_argument("--encoding", metavar="NAME", help="xyz, xyzi, foxglove or cdr (the preset's)")
+    parser.add_argument("--odometry-encoding", metavar="NAME", help="json or cdr (the preset's)")
+    parser.add_argument(
+        "--odometry-rate", type=float, metavar="HZ", help="odometry per second, interpolated (one per frame)"
+    )
+    parser.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry to use (auto)")
+    parser.add_argument(
+        "--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)"
+    )
+    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Wait for a subscriber, send the run, print what was done."""
+    from tqdm import tqdm
+
+    from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.clouds.runs import open_run
+    from coview_stream.stream.client import open_client
+    from coview_stream.stream.keys import robot_keys
+    from coview_stream.stream.reach import await_subscriber
+    from coview_stream.stream.replay import replay
+    from coview_stream.stream.schedule import ReplayConfig
+    from coview_stream.stream.sender import Sender
+
+    config = ReplayConfig(rate=args.rate, speed=args.speed, odometry_rate=args.odometry_rate, loop=args.loop)
+    keys = robot_keys(args.preset, args.base, args.robot)
+    recorded = open_run(args.run_path, args.odometry)
+    transport = open_client(args.connect, args.listen, args.config)
+    try:
+        sender = Sender(transport, keys, args.encoding, args.odometry_encoding)
+        with stop_on_signals() as stop:
+            if not await_subscriber(transport, sender.cloud_key, args.wait, stop.wait) and not stop.requested:
+                print(f"nobody subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)
+            total = None if args.loop else len(recorded)
+            quiet = not (args.progress or sys.stderr.isatty())
+            with tqdm(total=total, desc=f"replaying {args.robot}", unit="frame", disable=quiet) as bar:
+                report = replay(recorded, sender, config, stop, lambda frames: bar.update(frames - bar.n))
+        sender.settle()
+    finally:
+        transport.close()
+    print(report.text())
+    return 0
