@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import MessageError
-from coview_stream.geometry import Pose, pose_from_tum
+from coview_stream.geometry import Pose
 from coview_stream.stream.messages import PoseMessage
 
 MAX_PAYLOAD = 64 * 2**20
@@ -42,7 +42,7 @@ def check_points(count: int) -> None:
 def stamp_from(value: object) -> int:
     """Check that ``value`` is a whole number of nanoseconds in the int64 range, and return it (else MessageError)."""
     if not isinstance(value, int) or isinstance(value, bool):
-        raise MessageError(f"stamp {str(value)[:40]!r}: write it as a whole number of nanoseconds")
+        raise MessageError(f"the stamp is of type {type(value).__name__}; write a whole number of nanoseconds")
     if not -(2**63) <= value < 2**63:
         raise MessageError("the stamp lies outside the int64 range: write nanoseconds")
     return value
@@ -72,7 +72,19 @@ def pose_checked(position: Sequence[float], quaternion: Sequence[float]) -> Pose
     norm = math.hypot(*quaternion)
     if abs(norm - 1.0) > 1e-2:
         raise MessageError(f"the orientation (qx, qy, qz, qw) has norm {norm:.3g}; a rotation has 1")
-    return pose_from_tum(np.array([*position, *quaternion], dtype=np.float64))
+    return _pose(*position, *(part / norm for part in quaternion))
+
+
+def _pose(x: float, y: float, z: float, a: float, b: float, c: float, w: float) -> Pose:
+    # written out: at 16 robots x 100 Hz of odometry, SciPy's 50 us each would take a tenth of a core
+    return np.array(
+        (
+            (1 - 2 * (b * b + c * c), 2 * (a * b - c * w), 2 * (a * c + b * w), x),
+            (2 * (a * b + c * w), 1 - 2 * (a * a + c * c), 2 * (b * c - a * w), y),
+            (2 * (a * c - b * w), 2 * (b * c + a * w), 1 - 2 * (a * a + b * b), z),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+    )
 
 
 def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
