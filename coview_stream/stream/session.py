@@ -7,42 +7,34 @@ robot's. Every method may be called from any thread.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from coview_stream.config import TrackingConfig
-from coview_stream.errors import EncodingError, MessageError
 from coview_stream.fix import Fix, KeyframeEvidence, State
 from coview_stream.geometry import Pose
 from coview_stream.search import Query, Verdict
-from coview_stream.stream.codecs import OversizedError, decode_cloud, decode_odometry
+from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.counters import Counters, Latency, Missing
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.keys import RobotKeys
-from coview_stream.stream.messages import CloudMessage, OdometryMessage, PoseMessage, Sample
+from coview_stream.stream.messages import OdometryMessage, PoseMessage, Sample
 from coview_stream.stream.odometry import Intake, OdometryBuffer
+from coview_stream.stream.pairing import Pairing
+from coview_stream.stream.reception import Complaints, note, received
 from coview_stream.tracking import drift_covariance
 
 _NS = 1_000_000_000
-_WAITING = 8  # frames that wait for their odometry
-_SWEEP_WAIT = 0.15  # seconds a frame waits for the odometry of its sweep's end
-_MOST_ERRORS = 10  # different errors that the status names
-
-
-@dataclass(frozen=True)
-class _Frame:
-    message: CloudMessage
-    received: float
 
 
 @dataclass(frozen=True)
 class _Ready:
     job: FrameJob
     received: float
+    since: float  # local time from which on a frame of this robot has been waiting for the engine
     travelled: float
     turned: float
 
@@ -65,7 +57,7 @@ class Session:
     Attributes:
         keys: where its messages come and go.
         counters: what became of them.
-        errors: the newest different complaints about its input, for people.
+        complaints: about its input, for people.
     """
 
     def __init__(
@@ -84,11 +76,16 @@ class Session:
         self.options = options
         self._lock = threading.RLock()
         self._epoch = 0
+        self._ready: _Ready | None = None
+        self.counters, self.odometry = Counters(), OdometryBuffer(self.config)
+        self._pairing = Pairing(self.config, self.odometry, self.counters)
         self._clear()
 
     def _clear(self) -> None:
+        """Forget everything; what is under way is nobody's then."""
+        self._pairing, self._ready = Pairing(self.config, self.odometry, self.counters), None
         self.counters = Counters()
-        self.errors: deque[str] = deque(maxlen=_MOST_ERRORS)
+        self.complaints = Complaints()
         self.latency = Latency()
         self.engine_latency = Latency()
         self.odometry = OdometryBuffer(self.config)
@@ -103,9 +100,10 @@ class Session:
 
     def _forget_frame(self) -> None:
         """Forget all that refers to the odometry frame, which is no more."""
+        self.counters.dropped += len(self._pairing) + (self._ready is not None)
         self._epoch += 1
-        self._waiting: deque[_Frame] = deque()
-        self._ready: _Ready | None = None
+        self._pairing = Pairing(self.config, self.odometry, self.counters)
+        self._ready = None
         self._busy: _Ready | None = None
         self._query: Query | None = None
         self._searching = False
@@ -113,7 +111,6 @@ class Session:
         self._correction: _Correction | None = None
         self._suspect = False
         self._trusted_from = -(1 << 63)
-        self._submitted_ns: int | None = None
         self._published_ns = -(1 << 63)
         if self._fix_state is not State.LOST:
             self._fix_state = State.SEARCHING
@@ -122,59 +119,27 @@ class Session:
 
     def on_cloud(self, sample: Sample, now: float) -> None:
         """Take in a cloud: decode, check, pair with odometry. Never raises for what the sample holds."""
+        limit, hint = self.config.max_payload, self.keys.cloud_hint
+        message, name, reason = received(sample, decode_cloud, self.options[0], hint, limit)
         with self._lock:
             self.counters.received += 1
-        message = self._decoded(sample, decode_cloud, "", self.options[0], self.keys.cloud_hint)
-        if message is None:
-            return
-        with self._lock:
-            stamps = [f.message.stamp_ns for f in self._waiting]
-            if message.stamp_ns == self._submitted_ns or message.stamp_ns in stamps:
-                self.counters.duplicate += 1
-            elif self._submitted_ns is not None and message.stamp_ns < self._submitted_ns:
-                self.counters.out_of_order += 1
-            else:
-                self._waiting.append(_Frame(message, now))
-                if len(self._waiting) > _WAITING:
-                    self._waiting.popleft()
-                    self.counters.dropped += 1
-                self._pair(now)
+            if message is None:
+                note(self.counters, self.complaints, "", name, sample.key, reason)
+                return
+            self._pairing.add(message, now)
+            self._pair(now)
 
     def on_odometry(self, sample: Sample, now: float) -> None:
         """Take in an odometry sample. Never raises for what the sample holds."""
+        limit, hint = self.config.max_payload, self.keys.odometry_hint
+        message, name, reason = received(sample, decode_odometry, self.options[1], hint, limit)
         with self._lock:
             self.counters.odometry_received += 1
-        hint = self.keys.odometry_hint
-        message = self._decoded(sample, decode_odometry, "odometry_", self.options[1], hint)
-        if message is None:
-            return
-        with self._lock:
+            if message is None:
+                note(self.counters, self.complaints, "odometry_", name, sample.key, reason)
+                return
             self._continue(self.odometry.add(message, now), message)
             self._pair(now)
-
-    def _decoded(self, sample: Sample, decode: object, prefix: str, option: str | None, hint: str | None):  # type: ignore[no-untyped-def]  # of any message
-        name, reason = "", ""
-        if len(sample.payload) > self.config.max_payload:
-            name = "oversized"
-            reason = f"{len(sample.payload)} bytes, {self.config.max_payload} are the most"
-        else:
-            try:
-                return decode(sample, option, hint)  # type: ignore[operator]
-            except EncodingError as error:
-                name, reason = "unknown_encoding", str(error)
-            except OversizedError as error:
-                name, reason = "oversized", str(error)
-            except MessageError as error:
-                name, reason = "malformed", str(error)
-        with self._lock:
-            self.counters.count(prefix + name)
-            if name != "malformed":
-                self._complain(f"{sample.key}: {reason}")
-        return None
-
-    def _complain(self, text: str) -> None:
-        if text not in self.errors:
-            self.errors.append(text)
 
     def _continue(self, intake: Intake, message: OdometryMessage) -> None:
         """Draw the consequences of what an odometry sample was."""
@@ -217,50 +182,25 @@ class Session:
         self._lost = reason
         self._correction = None
 
-    # ---- frames and their odometry
-
     def _pair(self, now: float) -> None:
-        """Make the newest frame ready whose odometry is there; count those that it never came for."""
-        while self._waiting:
-            frame = min(self._waiting, key=lambda f: f.message.stamp_ns)
-            where = self.odometry.covers(frame.message.stamp_ns)
-            waited = now - frame.received
-            if where > 0 and waited < self.config.pairing_wait:
-                return
-            if (
-                where == 0
-                and waited < _SWEEP_WAIT
-                and self.odometry.covers(self._sweep_end(frame.message)) > 0
-            ):
-                return
-            self._waiting.remove(frame)
-            pose = self.odometry.at(frame.message.stamp_ns) if where == 0 else None
-            if pose is None:
-                self.counters.count("late" if where < 0 else "no_odometry")
-            else:
-                self._make_ready(frame, pose)
-
-    def _sweep_end(self, message: CloudMessage) -> int:
-        if message.times is None or not self.config.deskew or not len(message.times):
-            return message.stamp_ns
-        last = float(np.nan_to_num(message.times, nan=0.0).max())
-        return message.stamp_ns + round(max(0.0, last) * _NS)
-
-    def _make_ready(self, frame: _Frame, T_odom_body: Pose) -> None:
-        message = frame.message
-        if self._ready is not None:
-            self.counters.dropped += 1
-        self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
-        self._submitted_ns = message.stamp_ns
-        times = message.times if self.config.deskew else None
-        segment = None
-        if times is not None and len(times):
-            first = message.stamp_ns + round(min(0.0, float(np.nan_to_num(times, nan=0.0).min())) * _NS)
-            segment = self.odometry.around(first, self._sweep_end(message))
-        job = FrameJob(
-            self.keys.robot, self._epoch, message.stamp_ns, message.points, T_odom_body, times, segment
-        )
-        self._ready = _Ready(job, frame.received, self.odometry.travelled, self.odometry.turned)
+        """Make the newest frame ready whose odometry is there."""
+        for frame in self._pairing.paired(now):
+            since = now
+            if self._ready is not None:
+                self.counters.dropped += 1
+                since = self._ready.since
+            message = frame.message
+            self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
+            job = FrameJob(
+                self.keys.robot,
+                self._epoch,
+                message.stamp_ns,
+                message.points,
+                frame.T_odom_body,
+                message.times,
+                frame.segment,
+            )
+            self._ready = _Ready(job, frame.received, since, self.odometry.travelled, self.odometry.turned)
 
     # ---- the engine's work
 
@@ -287,12 +227,11 @@ class Session:
         """Take note of the fix after a frame."""
         with self._lock:
             self.counters.processed += 1
-            if self._processed_at is not None:
-                self.longest_wait = max(self.longest_wait, now - self._processed_at)
             self._processed_at = now
             self.engine_latency.add(result.seconds)
             if self._busy is not None and job.epoch == self._epoch:
                 self.latency.add(now - self._busy.received)
+                self.longest_wait = max(self.longest_wait, now - self._busy.since)
                 self._note(job, result, self._busy)
             self._busy = None if job.epoch == self._epoch else self._busy
 
@@ -300,7 +239,7 @@ class Session:
         """Take note that the engine could not use a frame (``rejected``) or failed and has forgotten the robot."""
         with self._lock:
             self.counters.count("rejected" if rejected else "engine_errors")
-            self._complain(reason.strip().splitlines()[-1] if reason.strip() else "unknown failure")
+            self.complaints.add((reason.strip() or "unknown failure").splitlines()[-1])
             if job.epoch == self._epoch:
                 self._busy = None
                 self._verdict = self._verdict or job.verdict

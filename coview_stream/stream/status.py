@@ -60,5 +60,5 @@ def status(
             "peers": list(connection.peers),
             "reconnects": reconnects,
         },
-        "errors": list(session.errors),
+        "errors": list(session.complaints.texts),
     }
