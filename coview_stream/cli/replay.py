@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.clouds.runs import open_run
+    from coview_stream.errors import ConfigError
     from coview_stream.stream.client import open_client
     from coview_stream.stream.keys import robot_keys
     from coview_stream.stream.reach import await_subscriber
@@ -52,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.stream.schedule import ReplayConfig
     from coview_stream.stream.sender import Sender
 
+    if not args.wait >= 0:
+        raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")
     config = ReplayConfig(rate=args.rate, speed=args.speed, odometry_rate=args.odometry_rate, loop=args.loop)
     keys = robot_keys(args.preset, args.base, args.robot)
     recorded = open_run(args.run_path, args.odometry)

@@ -1,0 +1,70 @@
+"""Poses in the rerun viewer: the robots' bodies and the ways they went, in the map frame."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from coview_stream.errors import DependencyError
+from coview_stream.geometry import pose_to_tum
+from coview_stream.stream.messages import PoseMessage
+
+_STRIP = (
+    50  # poses after which a new piece of the way starts: redrawing all of it each time would be quadratic
+)
+
+
+class PoseViewer:
+    """Opens the viewer and shows poses as they come.
+
+    The first position becomes the viewer's origin, for it draws in float32 and maps may lie at UTM coordinates.
+
+    Raises:
+        DependencyError: rerun is not installed.
+    """
+
+    def __init__(self, application: str = "coview_stream") -> None:
+        try:
+            self._rerun: Any = import_module("rerun")
+        except ImportError as error:
+            raise DependencyError(
+                "--rerun needs the rerun viewer, which is not installed: pip install 'coview-stream[viz]'"
+            ) from error
+        self._origin: np.ndarray | None = None
+        self._strips: dict[str, list[np.ndarray]] = {}
+        self._pieces: dict[str, int] = {}
+        self._rerun.init(application, spawn=True)
+
+    def show(self, pose: PoseMessage) -> None:
+        """Log one pose and the way to it."""
+        row = pose_to_tum(pose.T_map_body)
+        if self._origin is None:
+            self._origin = row[:3].copy()
+        place = row[:3] - self._origin
+        name = f"robots/{pose.robot}"
+        self._set_time(pose.stamp_ns)
+        self._rerun.log(
+            f"{name}/body",
+            self._rerun.Transform3D(
+                translation=place, rotation=self._rerun.Quaternion(xyzw=row[3:]), axis_length=1.0
+            ),
+        )
+        self._extend(name, place)
+
+    def _extend(self, name: str, place: np.ndarray) -> None:
+        strip = self._strips.setdefault(name, [])
+        strip.append(place)
+        piece = self._pieces.setdefault(name, 0)
+        if len(strip) > 1:
+            self._rerun.log(f"{name}/way/{piece}", self._rerun.LineStrips3D([np.array(strip)]))
+        if len(strip) >= _STRIP:
+            self._strips[name] = [place]
+            self._pieces[name] = piece + 1
+
+    def _set_time(self, stamp_ns: int) -> None:
+        if hasattr(self._rerun, "set_time"):
+            self._rerun.set_time("sensor", timestamp=stamp_ns * 1e-9)
+        else:  # before rerun 0.23
+            self._rerun.set_time_nanos("sensor", stamp_ns)
