@@ -13,6 +13,9 @@ import pytest
 from coview_stream.cli import COMMANDS, build_parser
 from coview_stream.clouds import read_tum
 from coview_stream.sim import SimulationConfig, simulate
+from coview_stream.stream.codecs import decode_cloud, encode_pose
+from coview_stream.stream.fake import FakeTransport
+from coview_stream.stream.messages import PoseMessage, Sample
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -61,6 +64,23 @@ def test_single_scan(tmp_path, capsys):
     assert fix.T_map_body is not None, capsys.readouterr().out
     truth = read_tum(world / "truth.tum")[1][0]
     assert np.linalg.norm(fix.T_map_body[:3, 3] - truth[:3, 3]) < 0.3
+
+
+def test_robot(world_run, capsys):
+    """A stand-in node answers every cloud with a pose of the same stamp."""
+    net = FakeTransport()
+
+    def answer(sample):
+        pose = PoseMessage(decode_cloud(sample).stamp_ns, "r1", "TRACKING", np.eye(4), np.eye(6), 0.9, "ab")
+        net.publish(Sample("coview/r1/out/pose", encode_pose(pose, "json").payload))
+
+    net.subscribe("coview/r1/in/cloud", answer, "newest")
+    net.publish(Sample("coview/r1/out/status", b"{}"))
+    assert example("robot.py")(world_run, "r1", seconds=0.0, transport=net) == 7
+    out = capsys.readouterr().out
+    assert "100.00 s: x 0.00  y 0.00  z 0.00  (0.90)" in out
+    assert [s.key for s in net.samples("coview/r1/in/*")] == ["coview/r1/in/odom", "coview/r1/in/cloud"] * 7
+    assert net.raised == []
 
 
 def test_every_example_is_tested_and_short():
