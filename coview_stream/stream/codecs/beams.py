@@ -37,8 +37,7 @@ _LONGEST = 1.0  # seconds: no lidar frame lasts longer
 
 def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Times | None:
     """(N,) seconds after ``stamp_ns``; 0 where a point is not finite. None if they make no sense."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
+    measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])  # many times faster than all(axis=1)
     complete = bool(measured.all())
     if not measured.any():
         return None

@@ -64,7 +64,9 @@ def codec_for(
     else:
         name = by_key or hint or _by_magic(sample)
     if name not in names:
-        raise EncodingError(f"{sample.key}: encoding {sample.encoding[:80]!r} cannot carry {channel}")
+        raise EncodingError(
+            f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {channel}"
+        )
     return name
 
 

@@ -51,6 +51,11 @@ def read_table(table: Table, stamp_ns: int) -> CloudMessage:
     _check_extent(table)
     if table.height == 1:  # nobody needs its row step, which some drivers get wrong
         table = replace(table, row_step=table.width * table.step)
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite; some NaN signal
+        return _read(table, known, stamp_ns)
+
+
+def _read(table: Table, known: dict[str, Field], stamp_ns: int) -> CloudMessage:
     points = _points(table, known)
     time = next((known[name] for name in TIME_NAMES if name in known), None)
     ring = next((known[name] for name in RING_NAMES if name in known), None)
@@ -92,9 +97,8 @@ def _points(table: Table, known: dict[str, Field]) -> Points:
     if table.step == 12 and (x[1:], y[1:], z[1:]) == (("<f4", 0), ("<f4", 4), ("<f4", 8)):
         return np.ascontiguousarray(table.column(x, 3), dtype=np.float32)
     points = np.empty((table.width * table.height, 3), np.float32)
-    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, like other points of no use
-        for axis, field in enumerate((x, y, z)):  # seven times as fast as copying rows of three
-            points[:, axis] = table.column(field)[:, 0]
+    for axis, field in enumerate((x, y, z)):  # seven times as fast as copying rows of three
+        points[:, axis] = table.column(field)[:, 0]
     return points
 
 

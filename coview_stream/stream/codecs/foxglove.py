@@ -66,7 +66,7 @@ def read_cloud(payload: bytes | memoryview) -> CloudMessage:
     T = _pose(cloud.pose.position, cloud.pose.orientation)
     if np.array_equal(T, np.eye(4)):
         return message
-    with np.errstate(invalid="ignore"):  # points at infinity
+    with np.errstate(over="ignore", invalid="ignore"):  # points at infinity
         return replace(message, points=transform(T, message.points))
 
 
