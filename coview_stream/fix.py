@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Any
 
@@ -63,6 +63,16 @@ class KeyframeEvidence:
             "station": self.station,
             "shift": self.shift,
         }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
+        """Read back what :meth:`to_json` wrote; KeyError or ValueError if it is something else."""
+        names = [f.name for f in fields(Evidence)]
+        parts = Evidence(**{n: float(data[n]) for n in names}) if names[0] in data else None
+        return cls(
+            float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
+            float(data["rival"]), parts, data["station"], data["shift"],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.fix import Fix, KeyframeEvidence, State
-from coview_stream.geometry import pose_from
+from coview_stream.geometry import pose_from, pose_from_tum
 from coview_stream.localizer import Localizer
 from coview_stream.place.descriptor import Descriptor
 
@@ -37,7 +38,7 @@ class Located:
         fixes: one per frame that could be used, in order.
         keyframes: evidence of every keyframe.
         skipped: file and reason of every frame that could not be used.
-        seconds: time each step took.
+        seconds: time each step took; empty if that is not known.
         query: descriptors of the keyframe that won the first fix, if there was one.
         winner: its evidence: station and shift.
     """
@@ -68,7 +69,9 @@ class Located:
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres."""
         last = self.posed[-1] if self.posed else None
-        latency = np.quantile(self.seconds, [0.5, 0.95, 0.99]) if self.seconds else np.zeros(3)
+        latency = (
+            np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
+        )
         return {
             "state": self.state.value,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
@@ -77,7 +80,7 @@ class Located:
             "posed": len(self.posed),
             "skipped": self.skipped,
             "map_sha256": base_map.sha256,
-            "timings_s": dict(zip(("p50", "p95", "p99"), latency.round(6).tolist(), strict=True)),
+            "timings_s": dict(zip(("p50", "p95", "p99"), latency, strict=True)),
             "keyframes": [keyframe.to_json() for keyframe in self.keyframes],
         }
 
@@ -115,6 +118,34 @@ def locate(
         raise InputError(
             f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}"
         )
+    return located
+
+
+def from_stream(
+    stamps: Sequence[float], poses: Sequence[dict[str, Any]], statuses: Sequence[dict[str, Any]]
+) -> Located:
+    """Sort what a node published (JSON poses and statuses) under a run's frames, by stamp in seconds.
+
+    A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. The others
+    have the state that the newest status before them names.
+    """
+    known = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
+    told = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
+    located = Located(len(stamps))
+    for stamp in stamps:
+        pose = known.get(round(stamp * 1e6))
+        if pose is None:
+            before = bisect_right(told, round(stamp * 1e9), key=lambda t: t[0])
+            located.fixes.append(Fix(stamp, State(told[before - 1][1]) if before else State.SEARCHING))
+        else:
+            T = pose_from_tum([*pose["position"], *pose["orientation"]])
+            covariance = np.array(pose["covariance"], dtype=np.float64).reshape(6, 6)
+            located.fixes.append(Fix(stamp, State.TRACKING, T, None, covariance, float(pose["confidence"])))
+    for status in statuses:
+        if status.get("evidence"):
+            evidence = KeyframeEvidence.from_json(status["evidence"])
+            if not located.keyframes or located.keyframes[-1].stamp != evidence.stamp:
+                located.keyframes.append(evidence)
     return located
 
 

@@ -1,4 +1,4 @@
-"""``coview-stream demo``: the whole way from a laser scan to poses, without input and without network."""
+"""``coview-stream demo``: the whole way from a laser scan to live poses, without input and without a network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -31,9 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
     parser.add_argument("--size", type=float, default=180.0, help="side of the map, metres (180)")
     parser.add_argument("--length", type=float, default=40.0, help="distance driven, metres (40)")
+    parser.add_argument(
+        "--offline", action="store_true", help="frames straight from file to localizer, no zenoh"
+    )
     parser.epilog = (
-        "Offline: frames go straight from file to localizer. Streaming them over zenoh comes with `serve`, "
-        "which is not there yet. Exit code 0 if the robot was localised rightly, 1 if not."
+        "Runs `serve`, `replay` and `watch` as processes of their own, which talk over zenoh on the loopback "
+        "interface; at the robot's own pace. Exit code 0 if the robot was localised rightly, 1 if not."
     )
 
 
@@ -56,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
         base_map = BaseMap.build(world / "base.laz", progress=shown)
         base_map.save(out / "site.coview")
     with _step(seconds, "locate", f"driving {args.length:g} m without knowing where"):
-        located = _locate(base_map, open_run(world / "run"), shown)
+        recorded = open_run(world / "run")
+        located = _locate(base_map, recorded, shown) if args.offline else _live(recorded, out, shown)
     with _step(seconds, "report", "comparing with the truth, drawing"):
         verdict = _report(located, base_map, read_tum(world / "truth.tum"), out)
     _write_report(verdict, config, seconds, out)
@@ -108,6 +112,26 @@ def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> Located:
                 bar.set_postfix_str(fix.state.value)
 
         return locate(base_map, recorded, progress=step)
+
+
+def _live(recorded: Run, out: Path, shown: bool) -> Located:
+    """Serve, replay and watch; what was published, frame by frame."""
+    from tqdm import tqdm
+
+    from coview_stream.offline import from_stream
+    from coview_stream.stream.live import stream
+
+    stamps = recorded.stamps.tolist()
+    with tqdm(total=len(recorded), desc="driving", unit="frame", disable=not shown, leave=False) as bar:
+
+        def heard(record: dict[str, Any]) -> None:
+            if "counters" in record:
+                bar.update(int(record["counters"]["received"]) - bar.n)
+                bar.set_postfix_str(str(record["state"]))
+
+        (out / "logs").mkdir(exist_ok=True)
+        recording = stream(out / "site.coview", recorded.path, out / "logs", heard)
+    return from_stream(stamps, recording.poses, recording.statuses)
 
 
 def _report(located: Located, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:

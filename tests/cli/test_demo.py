@@ -18,7 +18,22 @@ PICTURES = ("map.png", "trajectory.png", "errors.png", "descriptors.png")
 def demo(tmp_path_factory):
     """(exit code, directory) of one demo."""
     out = tmp_path_factory.mktemp("demo") / "out"
-    return main(["demo", "--out", str(out), *SMALL]), out
+    return main(["demo", "--offline", "--out", str(out), *SMALL]), out
+
+
+def test_live_it_runs_a_node_a_robot_and_a_watcher(tmp_path):
+    out = tmp_path / "out"
+    assert main(["demo", "--out", str(out), *SMALL]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["success"] is True
+    assert report["false_frames"] == 0
+    assert report["posed"] > 10
+    for name in ("map.png", "trajectory.png", "errors.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG"), name
+    result = json.loads((out / "result.json").read_text())
+    assert result["posed"] == report["posed"]
+    assert result["keyframes"][-1]["score"] > 0.2
+    assert {log.name for log in (out / "logs").iterdir()} == {"serve.log", "replay.log", "watch.log"}
 
 
 def test_it_localises_and_says_so(demo):
@@ -55,7 +70,7 @@ def test_without_a_fix_it_exits_with_one_and_leaves_no_old_result(demo, tmp_path
     out = tmp_path / "again"
     shutil.copytree(demo[1], out)
     # two metres are one keyframe, and one is not enough to be believed
-    assert main(["demo", "--out", str(out), *SMALL, "--length", "1"]) == 1
+    assert main(["demo", "--offline", "--out", str(out), *SMALL, "--length", "1"]) == 1
     captured = capsys.readouterr()
     assert "never" in captured.out
     assert "reason" in captured.out

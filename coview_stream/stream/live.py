@@ -1,0 +1,149 @@
+"""A node, a robot and a watcher as three processes on loopback: the demo, and a pattern for tests of a site."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from coview_stream.errors import TransportError
+
+ROBOT = "demo"
+
+_START = 30.0  # seconds for the node to say something; a first run compiles its kernels
+_END = 5.0  # seconds for a process to end after a signal
+
+
+@dataclass
+class Recording:
+    """What the watcher saw: poses and statuses as published, in order."""
+
+    poses: list[dict[str, Any]] = field(default_factory=list)
+    statuses: list[dict[str, Any]] = field(default_factory=list)
+
+    def take(self, record: dict[str, Any]) -> None:
+        """Sort one line of the watcher in."""
+        (self.poses if str(record.get("key", "")).endswith("/out/pose") else self.statuses).append(record)
+
+
+def stream(
+    map_path: Path, run_path: Path, logs: Path, heard: Callable[[dict[str, Any]], None] = lambda record: None
+) -> Recording:
+    """Serve a map, replay a run to it at its own pace, and record what is published.
+
+    Args:
+        map_path: a ``.coview`` file.
+        run_path: a run directory.
+        logs: directory for what the three processes say.
+        heard: called with every pose and status, as they come.
+
+    Raises:
+        TransportError: a process failed; the message ends with what it said.
+    """
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    recording = Recording()
+    with contextlib.ExitStack() as stack:
+
+        def start(name: str, *args: str) -> subprocess.Popen[bytes]:
+            return stack.enter_context(_process(logs / f"{name}.log", name, *args))
+
+        node = start("serve", str(map_path), "--robot", ROBOT, "--listen", endpoint)
+        watcher = start("watch", "--json", "--robot", ROBOT, "--connect", endpoint)
+        lines = _lines(watcher)
+        _await_first(lines, recording, (node, watcher), logs)
+        robot = start("replay", str(run_path), "--robot", ROBOT, "--connect", endpoint)
+        while robot.poll() is None or not lines.empty():
+            with contextlib.suppress(queue.Empty):
+                record = lines.get(timeout=0.1)
+                recording.take(record)
+                heard(record)
+            if node.poll() is not None or watcher.poll() is not None:
+                raise _failure("serve" if node.poll() is not None else "watch", logs)
+        if robot.returncode:
+            raise _failure("replay", logs)
+        time.sleep(0.3)  # the last frame is still under way
+        _end(node)
+        with contextlib.suppress(queue.Empty):
+            while True:
+                recording.take(lines.get(timeout=0.5))
+    return recording
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def _process(log: Path, *args: str) -> Iterator[subprocess.Popen[bytes]]:
+    paths = os.pathsep.join(p for p in sys.path if p)
+    with log.open("wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "coview_stream", *args],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE if args[0] == "watch" else subprocess.DEVNULL,
+            stderr=errors,
+            env=os.environ | {"PYTHONPATH": paths},
+            start_new_session=True,  # an interrupt at the terminal is ours to pass on
+        )
+        try:
+            yield process
+        finally:
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(timeout=_END)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _lines(watcher: subprocess.Popen[bytes]) -> queue.Queue[dict[str, Any]]:
+    found: queue.Queue[dict[str, Any]] = queue.Queue()
+
+    def read(stream: IO[bytes]) -> None:
+        for line in stream:
+            with contextlib.suppress(ValueError):
+                found.put(json.loads(line))
+
+    if watcher.stdout is not None:
+        threading.Thread(target=read, args=(watcher.stdout,), daemon=True).start()
+    return found
+
+
+def _await_first(
+    lines: queue.Queue[dict[str, Any]],
+    recording: Recording,
+    processes: tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]],
+    logs: Path,
+) -> None:
+    deadline = time.monotonic() + _START
+    while time.monotonic() < deadline:
+        with contextlib.suppress(queue.Empty):
+            recording.take(lines.get(timeout=0.1))
+            return
+        for name, process in zip(("serve", "watch"), processes, strict=True):
+            if process.poll() is not None:
+                raise _failure(name, logs)
+    raise TransportError(f"the node has said nothing for {_START:g} s; see {logs / 'serve.log'}")
+
+
+def _failure(name: str, logs: Path) -> TransportError:
+    said = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
+    return TransportError(f"`coview-stream {name}` ended: {said[-1] if said else 'it said nothing'}")
