@@ -14,6 +14,7 @@ from coview_stream.stream.messages import PoseMessage
 _STRIP = (
     50  # poses after which a new piece of the way starts: redrawing all of it each time would be quadratic
 )
+_COLOURS = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up
 
 
 class PoseViewer:
@@ -44,12 +45,13 @@ class PoseViewer:
             self._origin = row[:3].copy()
         place = row[:3] - self._origin
         name = f"robots/{pose.robot}"
+        if name not in self._strips:
+            axes = self._rerun.Arrows3D(vectors=np.eye(3), colors=_COLOURS)
+            self._rerun.log(f"{name}/body", axes, static=True)
         self._set_time(pose.stamp_ns)
         self._rerun.log(
             f"{name}/body",
-            self._rerun.Transform3D(
-                translation=place, rotation=self._rerun.Quaternion(xyzw=row[3:]), axis_length=1.0
-            ),
+            self._rerun.Transform3D(translation=place, rotation=self._rerun.Quaternion(xyzw=row[3:])),
         )
         self._extend(name, place)
 

@@ -70,7 +70,9 @@ class ReplayReport:
         ]
         late = sum(ms > 1e3 * _LATE for ms in self.late_ms)
         if late:
-            lines.append(f"{late} frames were sent more than {1e3 * _LATE:.0f} ms late: lower the rate")
+            lines.append(
+                f"{late} frames were sent more than {1e3 * _LATE:.0f} ms late: is the machine busy, or the disk slow?"
+            )
         if self.damaged:
             lines.append(f"{self.damaged} damaged frames left out, the first: {self.first_error}")
         return "\n".join(lines)

@@ -38,6 +38,7 @@ class RobotView:
     heard: float
     pose: PoseMessage | None = None
     status: dict[str, Any] = field(default_factory=dict)
+    status_heard: float = -math.inf
     arrivals: deque[float] = field(default_factory=deque)
 
     def pose_rate(self, now: float) -> float:
@@ -48,8 +49,11 @@ class RobotView:
         return (len(self.arrivals) - 1) / span if span > 0 else 0.0
 
     def fresh_pose(self, now: float) -> PoseMessage | None:
-        """Return the pose, unless it is stale: a robot that lost its way must not look localised."""
-        return self.pose if self.arrivals and now - self.arrivals[-1] < STALE else None
+        """Return the pose, unless it is stale or the state since is another: who is lost must not look localised."""
+        if not self.arrivals or now - self.arrivals[-1] >= STALE:
+            return None
+        lost = self.status.get("state", "TRACKING") != "TRACKING" and self.status_heard > self.arrivals[-1]
+        return None if lost else self.pose
 
 
 class Fleet:
@@ -66,7 +70,8 @@ class Fleet:
 
     def add_status(self, robot: str, status: dict[str, Any], now: float) -> None:
         """Take in a status that arrived at ``now``; no field of it is required."""
-        self._view(robot, now).status = status
+        view = self._view(robot, now)
+        view.status, view.status_heard = status, now
 
     def table(self, now: float, header: bool = True) -> list[str]:
         """Lines of text, one per robot, sorted by name."""

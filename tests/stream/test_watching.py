@@ -48,6 +48,15 @@ def test_a_stale_pose_is_no_longer_shown():
     assert line.split()[:3] == ["r1", "LOST", "-"]
 
 
+def test_a_robot_that_got_lost_shows_no_pose():
+    fleet = Fleet()
+    fleet.add_pose(POSE, 10.0)
+    fleet.add_status("r1", {"state": "LOST"}, 10.1)
+    assert "412000.12" not in fleet.table(10.2)[1]
+    fleet.add_pose(POSE, 10.3)  # found again; the status that says so comes later
+    assert "412000.12" in fleet.table(10.4)[1]
+
+
 def test_a_robot_that_went_silent_says_so():
     fleet = Fleet()
     fleet.add_status("r1", STATUS, 10.0)
