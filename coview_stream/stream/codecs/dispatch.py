@@ -18,13 +18,14 @@ _MIMES: dict[
     "": (),
     "application/octet-stream": ("xyz", "xyzi"),
     "zenoh/bytes": ("xyz", "xyzi"),
+    "zenoh/string": (),
     "application/cdr": ("cdr",),
     "application/protobuf": ("foxglove", "keelson"),
     "application/x-protobuf": ("foxglove", "keelson"),
     "application/json": ("json",),
     "text/json": ("json",),
 }
-_MUTE = ("", "application/octet-stream", "zenoh/bytes")  # without a schema they say nothing
+_MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # without a schema they say nothing
 _WITHOUT_SCHEMA = ("application/json", "text/json")  # what follows is a charset or the like
 _SCHEMAS: dict[str, tuple[str, tuple[Channel, ...]]] = {
     "xyz": ("xyz", ("cloud",)),

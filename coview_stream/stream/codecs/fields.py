@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -49,8 +49,6 @@ def read_table(table: Table, stamp_ns: int) -> CloudMessage:
     if not table.width * table.height:
         return CloudMessage(stamp_ns, np.zeros((0, 3), np.float32))
     _check_extent(table)
-    if table.height == 1:  # nobody needs its row step, which some drivers get wrong
-        table = replace(table, row_step=table.width * table.step)
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite; some NaN signal
         return _read(table, known, stamp_ns)
 

@@ -91,7 +91,9 @@ def test_option_beats_encoding_beats_key_beats_hint_beats_magic():
     assert cloud_codec(cdr, "", NATIVE) == "cdr"
 
 
-@pytest.mark.parametrize("mute", ["", "zenoh/bytes", "application/octet-stream", " Zenoh/Bytes "])
+@pytest.mark.parametrize(
+    "mute", ["", "zenoh/bytes", "zenoh/string", "application/octet-stream", " Zenoh/Bytes "]
+)
 def test_encodings_that_say_nothing_go_on_to_key_hint_and_magic(mute):
     assert cloud_codec(b"?", mute, RMW) == "cdr"
     assert cloud_codec(b"?", mute, NATIVE, hint="xyz") == "xyz"
@@ -102,7 +104,7 @@ def test_encodings_that_say_nothing_go_on_to_key_hint_and_magic(mute):
 
 
 def test_bare_protobuf_is_whatever_key_or_hint_make_of_it():
-    assert cloud_codec(encoding="application/protobuf", key=KEELSON) == "keelson"
+    assert cloud_codec(encoding="application/protobuf", key=KEELSON, hint="foxglove") == "keelson"
     assert cloud_codec(encoding="application/protobuf", hint="keelson") == "keelson"
     assert cloud_codec(encoding="application/protobuf", hint="cdr") == "foxglove"
 

@@ -103,8 +103,9 @@ def test_an_organised_cloud_with_padded_rows():
     np.testing.assert_array_equal(codecs.decode_cloud(Sample("k", payload)).points, grid.reshape(-1, 3))
 
 
-def test_the_row_step_of_a_single_row_does_not_matter():
-    payload = cdr_cloud(POINTS.tobytes(), XYZ, 12, 2, row_step=0)
+@pytest.mark.parametrize("row_step", [0, 1, 2**32 - 1])  # some drivers get it wrong
+def test_the_row_step_of_a_single_row_does_not_matter(row_step):
+    payload = cdr_cloud(POINTS.tobytes(), XYZ, 12, 2, row_step=row_step)
     np.testing.assert_array_equal(codecs.decode_cloud(Sample("k", payload)).points, POINTS)
 
 
