@@ -62,7 +62,9 @@ class Guard:
             "%s: %s: %s%s",
             place,
             type(error).__name__,
-            error,
+            str(
+                error
+            ),  # the error itself would keep its frames, and what they hold, alive with the log record
             more,
             exc_info=self._logger.isEnabledFor(logging.DEBUG),
         )

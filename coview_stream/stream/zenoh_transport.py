@@ -49,6 +49,9 @@ def open_transport(
     Raises:
         TransportError: if the configuration is wrong or an endpoint cannot be listened on.
     """
+    import zenoh
+
+    zenoh.try_init_log_from_env()  # RUST_LOG=zenoh=warn says why a router refuses us; silent without it
     return ZenohTransport(zenoh_config.compose(connect, listen, config))
 
 
@@ -174,7 +177,7 @@ class ZenohTransport:
             self.close()
             raise error
         if error is not None:
-            _log.warning("no router at %s, or it refuses us: waiting for it", where)
+            _log.warning("no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where)
 
     def _keep_trying(self, first: SimpleQueue[TransportError | None]) -> None:
         while not self._closing.is_set():
