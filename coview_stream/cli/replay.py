@@ -8,6 +8,8 @@ from pathlib import Path
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
+_SPARSE = 0.4  # seconds; the node takes odometry older than 0.5 s for lost, and some jitter has to fit in
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by ReplayConfig."""
@@ -50,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.stream.keys import robot_keys
     from coview_stream.stream.reach import await_subscriber
     from coview_stream.stream.replay import replay
-    from coview_stream.stream.schedule import ReplayConfig
+    from coview_stream.stream.schedule import ReplayConfig, odometry_spacing
     from coview_stream.stream.sender import Sender
 
     if not args.wait >= 0:
@@ -61,6 +63,11 @@ def run(args: argparse.Namespace) -> int:
     transport = open_client(args.connect, args.listen, args.config)
     try:
         sender = Sender(transport, keys, args.encoding, args.odometry_encoding)
+        if (spacing := odometry_spacing(recorded, config)) > _SPARSE:
+            print(
+                f"one odometry sample in {spacing:.2f} s is too few for a node's defaults; see --odometry-rate",
+                file=sys.stderr,
+            )
         with stop_on_signals() as stop:
             if not await_subscriber(transport, sender.cloud_key, args.wait, stop.wait) and not stop.requested:
                 print(f"nobody subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)

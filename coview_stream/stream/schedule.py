@@ -90,6 +90,14 @@ def frame_times(run: Run, config: ReplayConfig) -> Times:
     return times
 
 
+def odometry_spacing(run: Run, config: ReplayConfig) -> float:
+    """Seconds from one odometry sample to the next, as a rule: of sensor time or of real time, whichever is longer."""
+    dues = frame_times(run, config)
+    real = _period(dues, 0.0)
+    parts = max(1, round(real * (config.odometry_rate or 0.0)))
+    return max(real, _period(run.stamps, 0.0)) / parts
+
+
 def _period(times: Times, lone: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else lone
 

@@ -94,6 +94,7 @@ def test_nobody_there(node, run_folder, capsys):
     captured = capsys.readouterr()
     assert "nobody subscribes to coview/r1/in/cloud" in captured.err
     assert "6 frames" in captured.out
+    assert "one odometry sample in 1.00 s is too few" in captured.err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -102,7 +103,7 @@ def test_a_signal_ends_a_loop_cleanly(node, run_folder, number):
     command = [sys.executable, "-m", "coview_stream", "replay", str(run_folder), "--robot", "r1"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(
-        [*command, "--connect", node.endpoint, "--loop", "--rate", "50"],
+        [*command, "--connect", node.endpoint, "--loop", "--rate", "50", "--odometry-rate", "200"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env=environment,

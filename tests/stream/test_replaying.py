@@ -17,7 +17,7 @@ from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.fake import FakeTransport
 from coview_stream.stream.keys import robot_keys
 from coview_stream.stream.replay import SteadyClock, replay
-from coview_stream.stream.schedule import ReplayConfig, beats, frame_times
+from coview_stream.stream.schedule import ReplayConfig, beats, frame_times, odometry_spacing
 from coview_stream.stream.sender import Sender, nanoseconds
 
 STAMPS = np.array([1000.0, 1000.1, 1000.2, 1000.35])
@@ -211,6 +211,16 @@ def test_bad_options(options, text):
 def test_a_schedule_without_loop_ends(run):
     assert [beat.frame for beat in beats(run, ReplayConfig())] == [0, 1, 2, 3]
     assert frame_times(run, ReplayConfig(rate=10.0)) == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+def test_how_far_apart_odometry_comes(run, run_folder):
+    assert odometry_spacing(run, ReplayConfig()) == pytest.approx(0.1)
+    assert odometry_spacing(run, ReplayConfig(odometry_rate=50.0)) == pytest.approx(0.02)
+    assert odometry_spacing(run, ReplayConfig(speed=0.1)) == pytest.approx(1.0)
+    assert odometry_spacing(run, ReplayConfig(rate=100.0)) == pytest.approx(
+        0.1
+    )  # the stamps stay what they are
+    assert odometry_spacing(open_run(run_folder / "frames" / "000000.ply"), ReplayConfig()) == 0.0
 
 
 def test_the_steady_clock():
