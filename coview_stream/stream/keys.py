@@ -18,6 +18,7 @@ POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _CLOUD_DDS = dds_type("sensor_msgs/msg/PointCloud2")
 _ODOMETRY_DDS = dds_type("nav_msgs/msg/Odometry")
 _POSE_DDS = dds_type(POSE_TYPE)
+_RMW_KEY = re.compile(r"\d+(/[^/]+)+/[^/]+/[^/]+")
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,8 @@ def robot_keys(
         robot: the robot's name, one chunk; in ROS its namespace.
         cloud: key expression instead of the preset's; ``{base}``, ``{robot}`` and ``{domain}`` are filled in.
         odometry: the same for odometry.
-        pose: the same for poses; a plain key, without wildcards.
+        pose: the same for poses; a plain key, without wildcards; with ``rmw_zenoh`` it keeps
+            the convention's form, and ``{pose_hash}`` is filled in too.
         domain: ROS domain id, 0 to 232.
         humble: name types as ROS 2 Humble does, without a hash.
 
@@ -166,11 +168,16 @@ def robot_keys(
     if row.rmw:
         values["pose_hash"] = type_hash(POSE_TYPE, humble)
     own = f"{base}/{robot}"
+    pose_key = _filled(pose or row.pose, values, "--pose-key", wildcards=False)
+    if row.rmw and not _RMW_KEY.fullmatch(pose_key):
+        raise ConfigError(
+            f"--pose-key {pose_key!r} is no rmw_zenoh key: <domain>/<topic>/<type>/<hash>, such as {row.pose!r}"
+        )
     return RobotKeys(
         robot=robot,
         cloud=_filled(cloud or row.cloud, values, "--cloud-key"),
         odometry=_filled(odometry or row.odometry, values, "--odometry-key"),
-        pose=_filled(pose or row.pose, values, "--pose-key", wildcards=False),
+        pose=pose_key,
         status=f"{own}/out/status",
         alive=f"{own}/alive",
         relocalize=f"{own}/rpc/relocalize",

@@ -7,13 +7,11 @@ holds a token. Formats as in ROS 2 Jazzy and newer; Humble differs in the type h
 from __future__ import annotations
 
 import hashlib
-import secrets
 import struct
-import time
 from collections.abc import Callable
 
 from coview_stream.stream.messages import Encoded
-from coview_stream.stream.transport import Publisher, Transport, Urgency
+from coview_stream.stream.transport import Publisher
 
 NO_HASH = "TypeHashNotSupported"
 """In place of the type hash, from ROS 2 Humble."""
@@ -67,40 +65,6 @@ def publisher_token(key: str, zid: str, node: str, entity_id: int, node_id: int 
     domain, *topic, kind, digest = key.split("/")
     name = _ROOT + _ROOT.join(topic)
     return f"@ros2_lv/{domain}/{zid}/{node_id}/{entity_id}/MP/{_ROOT}/{_ROOT}/{node}/{name}/{kind}/{digest}/{_QOS}"
-
-
-class RmwNode:
-    """A node in the ROS 2 graph that lives as long as the transport: ``ros2 node list`` shows it.
-
-    Args:
-        transport: where its tokens are held and its messages go.
-        name: the node's ROS name.
-        domain: ROS domain id.
-        now_ns: wall clock, nanoseconds, for the source time that ROS tools measure latency with.
-        zid: identity of the process in the graph, 32 hexadecimal digits; random by default.
-    """
-
-    def __init__(
-        self,
-        transport: Transport,
-        name: str,
-        domain: int = 0,
-        now_ns: Callable[[], int] = time.time_ns,
-        zid: str | None = None,
-    ) -> None:
-        self._transport = transport
-        self._name = name
-        self._now_ns = now_ns
-        self._zid = zid or secrets.token_hex(_GID)
-        self._entities = 0
-        transport.announce(node_token(domain, self._zid, name))
-
-    def publisher(self, key: str, urgency: Urgency = "realtime") -> RmwPublisher:
-        """Announce and declare a publisher on ``key``, a full rmw_zenoh key with type and hash."""
-        self._entities += 1
-        token = publisher_token(key, self._zid, self._name, self._entities)
-        self._transport.announce(token)
-        return RmwPublisher(self._transport.publisher(key, urgency), token, self._now_ns)
 
 
 class RmwPublisher:

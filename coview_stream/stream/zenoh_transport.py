@@ -51,7 +51,8 @@ def open_transport(
     """
     import zenoh
 
-    zenoh.try_init_log_from_env()  # RUST_LOG=zenoh=warn says why a router refuses us; silent without it
+    # RUST_LOG=zenoh=warn says why a router refuses us; without it this is silent
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
     return ZenohTransport(zenoh_config.compose(connect, listen, config))
 
 
@@ -177,7 +178,9 @@ class ZenohTransport:
             self.close()
             raise error
         if error is not None:
-            _log.warning("no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where)
+            _log.warning(
+                "no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where
+            )
 
     def _keep_trying(self, first: SimpleQueue[TransportError | None]) -> None:
         while not self._closing.is_set():

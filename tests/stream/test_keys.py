@@ -67,6 +67,16 @@ def test_overrides_fill_placeholders_once() -> None:
     assert robot_keys("native", "fleet", "{domain}").cloud == "fleet/{domain}/in/cloud"
 
 
+def test_a_ros_pose_key_keeps_the_convention() -> None:
+    keys = robot_keys(
+        "rmw_zenoh", "coview", "r1", pose="{domain}/{robot}/located/my_msgs::msg::dds_::Pose_/{pose_hash}"
+    )
+    assert keys.pose == f"0/r1/located/my_msgs::msg::dds_::Pose_/{POSE_HASH}"
+    for wrong in ("{base}/pose", "7/pose/type", "x/topic/type/hash"):
+        with pytest.raises(ConfigError, match="--pose-key.*rmw_zenoh"):
+            robot_keys("rmw_zenoh", "coview", "r1", pose=wrong)
+
+
 @pytest.mark.parametrize("robot", ["", "a/b", "a*", "a$", "a?", "#1", "@home", "tab\t"])
 def test_bad_robot_names_name_the_option(robot: str) -> None:
     with pytest.raises(ConfigError, match="--robot"):

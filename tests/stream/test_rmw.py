@@ -8,7 +8,7 @@ from coview_stream.stream.fake import FakeTransport
 from coview_stream.stream.keys import robot_keys
 from coview_stream.stream.messages import Encoded, Sample
 from coview_stream.stream.rmw import (
-    RmwNode,
+    RmwPublisher,
     attachment,
     dds_type,
     gid_of,
@@ -64,22 +64,22 @@ def test_tokens_are_spelled_as_rmw_zenoh_does() -> None:
     )
 
 
-def test_a_node_announces_itself_and_its_publishers_and_counts_messages() -> None:
+def test_a_publisher_counts_and_signs_its_messages_and_names_no_encoding() -> None:
     net = FakeTransport()
-    node = RmwNode(net, "coview", domain=7, now_ns=lambda: 123, zid=ZID)
     keys = [robot_keys("rmw_zenoh", "coview", name, domain=7).pose for name in ("a", "b")]
-    first, second = (node.publisher(key) for key in keys)
-    tokens = [
-        node_token(7, ZID, "coview"),
-        *(publisher_token(key, ZID, "coview", n) for n, key in enumerate(keys, 1)),
-    ]
-    assert list(net.tokens) == tokens
-    for token in tokens:
+    tokens = [publisher_token(key, ZID, "coview", number) for number, key in enumerate(keys, 1)]
+    for token in (*tokens, node_token(7, ZID, "coview")):
         assert str(zenoh.KeyExpr(token)) == token
+    first, second = (
+        RmwPublisher(net.publisher(key, "realtime"), token, lambda: 123)
+        for key, token in zip(keys, tokens, strict=True)
+    )
     first.put(Encoded(b"x", "application/cdr;whatever"))
     first.put(Encoded(b"y"))
     second.put(Encoded(b"z"))
-    gids = [gid_of(token) for token in tokens[1:]]
+    second.close()
+    second.put(Encoded(b"late"))
+    gids = [gid_of(token) for token in tokens]
     assert len(set(gids)) == 2
     assert net.published == [
         Sample(keys[0], b"x", "", attachment(1, 123, gids[0])),
