@@ -20,10 +20,17 @@ SETTLED = 20.0
 
 
 def judge_return(
-    outcome: Outcome, stage: Stage, what: str, moment: float, limit: float, end: float = float("inf")
+    outcome: Outcome,
+    stage: Stage,
+    what: str,
+    moment: float,
+    limit: float,
+    first_ns: int,
+    last_ns: int | None = None,
 ) -> None:
-    """Judge how soon after ``moment`` poses came again."""
-    poses = stage.recorder.poses("r1", moment, end)
+    """Judge how soon after ``moment`` poses came again that are stamped ``first_ns`` or later (to ``last_ns``)."""
+    newer = [pose for pose in stage.recorder.poses("r1", moment) if pose.stamp_ns >= first_ns]
+    poses = [pose for pose in newer if last_ns is None or pose.stamp_ns <= last_ns]
     after = poses[0].arrival - moment if poses else None
     outcome.judge(what, after, f"<= {limit:.0f}", after is not None and after <= limit)
 
@@ -37,6 +44,11 @@ def judge_common(outcome: Outcome, stage: Stage, numbers: dict[str, Any]) -> Non
     outcome.tell("first fix, s / m", (numbers["first_fix_s"], numbers["first_fix_m"]))
     outcome.tell("states", " ".join(numbers["states"]))
     outcome.tell("counters", numbers["counters"])
+    lost = scores.unaccounted(numbers["counters"])
+    outcome.judge(
+        "frames received of unknown fate", lost, "<= 3 underway", lost is not None and 0 <= lost <= 3
+    )
+    outcome.tell("errors told", numbers["node_errors"])
     lines = len(stage.node.log_lines())
     outcome.judge("lines of log", lines, f"<= {MOST_LOG}", lines <= MOST_LOG)
 
@@ -89,7 +101,7 @@ def flood(setting: Setting) -> Outcome:
         }
         share = scores.share_posed(within, start + begin, start + end)
         outcome.tell("time posed during the flood", share)
-        judge_return(outcome, stage, "poses after the flood, s", start + end, BACK_SOON)
+        judge_return(outcome, stage, "poses after the flood, s", start + end, BACK_SOON, stamp_of(end))
     return outcome
 
 
@@ -169,10 +181,18 @@ def backwards(setting: Setting) -> Outcome:
         for name, (begin, end) in {"old among new": late, "twins": twice}.items():
             share = scores.share_posed(arrivals, start + begin, start + end)
             outcome.judge(f"time posed with {name}", share, ">= 0.95", share >= 0.95)
-        judge_return(outcome, stage, "poses after time ran backwards, s", start + reverse[1] + 0.3, BACK_SOON)
+        judge_return(
+            outcome,
+            stage,
+            "poses after time ran backwards, s",
+            start + reverse[1],
+            BACK_SOON,
+            stamp_of(reverse[1]),
+        )
         silence = scores.longest_silence(arrivals, start + future[0], start + restart[0])
         outcome.judge("longest silence after a stamp of tomorrow, s", silence, "<= 2", silence <= 2.0)
+        restarted = start + restart[0]
         judge_return(
-            outcome, stage, "poses after the clock restarted, s", start + restart[0] + 0.3, BACK_EVENTUALLY
+            outcome, stage, "poses after the clock restarted, s", restarted, BACK_EVENTUALLY, 0, stamp_of(0)
         )
     return outcome

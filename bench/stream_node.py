@@ -89,6 +89,15 @@ class Node:
             return []
 
 
+def foreign_seconds() -> float:
+    """Processor time of everybody but this process and its descendants, since the machine started."""
+    times = psutil.cpu_times()
+    machine = sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
+    own = psutil.Process()
+    family = [own, *own.children(recursive=True)]
+    return float(machine - sum(_or_zero(lambda m=member: sum(m.cpu_times()[:4])) for member in family))
+
+
 def _or_zero(read: Callable[[], float]) -> float:
     """Nothing, for a process that ended in the meantime."""
     try:

@@ -6,7 +6,7 @@ import time
 
 from bench.stream_attacks import BACK_SOON, SETTLED, judge_common, judge_return
 from bench.stream_client import wait_until
-from bench.stream_drive import Phase, RobotPlan
+from bench.stream_drive import Phase, RobotPlan, stamp_of
 from bench.stream_stage import Outcome, Setting, Stage, measure, until
 
 LONGEST_LEFT, MOST_TERM = 1.0, 2.0
@@ -33,7 +33,9 @@ def router(setting: Setting) -> Outcome:
         told = stage.recorder.told("r1", back)
         ticks = stage.recorder.ticks(back)
         outcome.tell("the recorder itself was back after, s", ticks[0] - back if ticks else None)
-        judge_return(outcome, stage, "poses back after the router's return, s", back, BACK_SOON)
+        judge_return(
+            outcome, stage, "poses back after the router's return, s", back, BACK_SOON, stamp_of(back - start)
+        )
         after = told[-1].fields if told else {}
         kept = after.get("uptime_s", 0.0) > before.get("uptime_s", 0.0)
         outcome.judge("uptime goes on, s", (before.get("uptime_s"), after.get("uptime_s")), "grows", kept)
@@ -71,7 +73,7 @@ def odometry(setting: Setting) -> Outcome:
         outcome.judge("state meanwhile", " ".join(dict.fromkeys(states)), "LOST", "LOST" in states)
         reasons = {str(status.fields.get("reason")) for status in told if status.state == "LOST"}
         outcome.tell("reason told", "; ".join(sorted(reasons)))
-        judge_return(outcome, stage, "poses after it returned, s", start + end, BACK_SOON)
+        judge_return(outcome, stage, "poses after it returned, s", start + end, BACK_SOON, stamp_of(end))
     return outcome
 
 

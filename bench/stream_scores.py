@@ -162,6 +162,18 @@ def processed(told: Sequence[Told]) -> list[tuple[float, float]]:
     return [(arrival, float(stamp)) for arrival, stamp in seen if isinstance(stamp, int) and stamp > 0]
 
 
+FATES = (
+    "processed", "rejected", "dropped", "late", "out_of_order", "duplicate", "no_odometry", "malformed", "oversized",
+    "unknown_encoding", "engine_errors",
+)  # fmt: skip
+"""What may become of a received frame."""
+
+
+def unaccounted(counters: dict[str, Any] | None) -> int | None:
+    """Received frames that no other counter tells the fate of; None if there are no counters."""
+    return counters["received"] - sum(counters.get(fate, 0) for fate in FATES) if counters else None
+
+
 def counter(told: Sequence[Told], name: str) -> int | None:
     """Newest value of a counter; None if no status has it."""
     for status in reversed(told):

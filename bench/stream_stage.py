@@ -15,7 +15,7 @@ import numpy as np
 from bench import stream_scores as scores
 from bench.stream_client import Helper, Recorder, Sent, free_port, route, send, wait_until
 from bench.stream_drive import Drive, RobotPlan, content_of
-from bench.stream_node import Node
+from bench.stream_node import Node, foreign_seconds
 
 _READY = 90.0  # seconds in which the node must announce all its robots
 MOST_JITTER, RATE, RATE_SHARE, LEAST_POSED, MOST_FIRST_FIX = 15.0, 10.0, 0.02, 0.95, 20.0
@@ -93,6 +93,7 @@ class Stage:
         self.node = Node(self.command, log)
         up = wait_until(lambda: all(map(self.recorder.alive, self.robots)) or not self.node.running(), _READY)
         self.start_s = time.monotonic() - begin
+        self._began = (time.monotonic(), foreign_seconds())
         if not up or not self.node.running():
             tail = "\n".join(self.node.log_lines()[-15:])
             self.__exit__()
@@ -105,6 +106,11 @@ class Stage:
                 helper.kill()
         self.node.__exit__()
         self.recorder.__exit__()
+
+    def foreign_cores(self) -> float:
+        """Processors that other programs kept busy since the node was ready: the noise in every jitter."""
+        begin, seconds = self._began
+        return (foreign_seconds() - seconds) / (time.monotonic() - begin)
 
     def start_router(self) -> None:
         """Start the router; also again, at the same port."""
@@ -181,6 +187,7 @@ def measure(
         "clouds_sent": len(puts),
         "node_start_s": stage.start_s,
         "node_megabytes": stage.node.megabytes(),
+        "foreign_cores": stage.foreign_cores(),
     }
 
 
@@ -205,7 +212,10 @@ def report_stream(outcome: Outcome, numbers: dict[str, Any], label: str = "", ji
         f"p99 < {MOST_JITTER:.0f}" if jitter else "",
         still if jitter else None,
     )
-    outcome.tell(f"{label}... of the machine itself, ms", numbers["machine_jitter_ms"])
+    outcome.tell(
+        f"{label}... of the machine itself, ms; cores others used",
+        (numbers["machine_jitter_ms"], numbers["foreign_cores"]),
+    )
     back = numbers["steps_back"]
     outcome.judge(f"{label}stamps that go back", back, "0", back == 0)
     share = numbers["share_posed"]
