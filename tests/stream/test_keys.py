@@ -73,7 +73,7 @@ def test_a_ros_pose_key_keeps_the_convention() -> None:
     )
     assert keys.pose == f"0/r1/located/my_msgs::msg::dds_::Pose_/{POSE_HASH}"
     for wrong in ("{base}/pose", "7/pose/type", "x/topic/type/hash"):
-        with pytest.raises(ConfigError, match="--pose-key.*rmw_zenoh"):
+        with pytest.raises(ConfigError, match=r"--pose-key.*rmw_zenoh"):
             robot_keys("rmw_zenoh", "coview", "r1", pose=wrong)
 
 
