@@ -56,11 +56,12 @@ def run(args: argparse.Namespace) -> int:
     """Run until a signal comes; exit code 0 then."""
     import logging
 
+    from coview_stream.cli.signals import stop_on_signals
     from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.config import NodeConfig
     from coview_stream.stream.keys import robot_keys
     from coview_stream.stream.reach import DEFAULT_ENDPOINT
-    from coview_stream.stream.serve import ServeOptions, serve
+    from coview_stream.stream.serve import ServeOptions, open_node
 
     logging.basicConfig(
         level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
@@ -82,12 +83,18 @@ def run(args: argparse.Namespace) -> int:
         max_payload=args.max_payload,
         deskew=not args.no_deskew,
     )
-    return serve(
-        ServeOptions(
-            args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
-            args.cloud_encoding, args.odometry_encoding, args.pose_encoding,
-        )
+    options = ServeOptions(
+        args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
+        args.cloud_encoding, args.odometry_encoding, args.pose_encoding,
     )  # fmt: skip
+    with stop_on_signals() as stop:
+        running = open_node(options)
+        try:
+            while not stop.wait(60.0):
+                pass
+        finally:
+            running.close()
+    return 0
 
 
 def _check(option: str, name: str | None, known: Iterable[str]) -> None:

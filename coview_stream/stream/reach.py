@@ -78,7 +78,7 @@ def await_subscriber(
 
 def _session_of(transport: Transport) -> Any:
     """Return the zenoh session of a transport; None while it waits for its first router."""
-    return getattr(transport, "session", getattr(transport, "_session", None))
+    return getattr(transport, "session", None)
 
 
 def _json_object(key: str, payload: bytes) -> dict[str, Any]:

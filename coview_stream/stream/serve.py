@@ -1,15 +1,12 @@
-"""From a map file and options to a running node, and to its end at a signal."""
+"""From a map file and options to a running node."""
 
 from __future__ import annotations
 
 import logging
-import signal
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import ConfigError, MapError
@@ -95,25 +92,3 @@ def open_node(options: ServeOptions) -> Node:
         "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
     )
     return node
-
-
-def serve(options: ServeOptions, ready: threading.Event | None = None) -> int:
-    """Run a node until SIGTERM or SIGINT; returns 0. Errors as :func:`open_node`."""
-    stop = threading.Event()
-
-    def ask_to_stop(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, ask_to_stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        node = open_node(options)
-        if ready is not None:
-            ready.set()
-        while not stop.wait(0.5):  # a wait without end would not be interrupted on every platform
-            pass
-        log.info("stopping")
-        node.close()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    return 0

@@ -122,6 +122,11 @@ class ZenohTransport:
         """Hold a liveliness token until :meth:`close`. Errors as in :meth:`subscribe`."""
         self._declare(key, lambda session: self._declared.append(session.liveliness().declare_token(key)))
 
+    @property
+    def session(self) -> Any:
+        """The zenoh session; None while closed or waiting for the first router."""
+        return self._session
+
     def connection(self) -> Connection:
         """Whom we are connected to right now; nobody while closed or waiting for the first router."""
         with self._lock:
