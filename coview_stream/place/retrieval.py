@@ -54,6 +54,17 @@ class Retrieval:
         """
         return {name: self._channel(name, descriptor) for name, descriptor in query.items()}
 
+    def prepare(self) -> None:
+        """Make now the spectra that are kept, rather than at the first query."""
+        if self.config.mode == "exhaustive" and self._kept():
+            for name in self.stations.descriptor_config.channels:
+                next(self._blocks(name))
+
+    def _kept(self) -> bool:
+        config = self.stations.descriptor_config
+        size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
+        return size <= _CACHE_BYTES
+
     def _channel(self, name: Channel, query: Descriptor) -> Volume:
         if self.config.mode == "ring_key":
             return self._by_ring_key(name, query)
@@ -62,10 +73,8 @@ class Retrieval:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _blocks(self, name: Channel) -> Iterator[Spectra]:
-        config = self.stations.descriptor_config
         descriptors = self.stations.descriptors(name)
-        size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
-        if size > _CACHE_BYTES:
+        if not self._kept():
             for start in range(0, len(descriptors), _BLOCK):
                 yield kernels.column_spectra(descriptors[start : start + _BLOCK].astype(np.float32))
             return

@@ -32,6 +32,10 @@ class Engine(Protocol):
         """Drop what is known of a robot."""
         ...
 
+    def prepare(self) -> None:
+        """Do what would make the first job slow; called when there may be time."""
+        ...
+
 
 class TrackEngine:
     """Takes in frames: keyframes, deskewing, registration around a known place."""
@@ -65,6 +69,9 @@ class TrackEngine:
     def forget(self, robot: str) -> None:
         """Drop a robot's localizer."""
         self._robots.pop(robot, None)
+
+    def prepare(self) -> None:
+        """Nothing: the map is cropped where robots are."""
 
     def _localizer(self, job: FrameJob) -> Localizer:
         epoch, localizer = self._robots.get(job.robot, (None, None))
@@ -102,6 +109,10 @@ class SearchEngine:
     def forget(self, robot: str) -> None:
         """Drop a robot's votes."""
         self._robots.pop(robot, None)
+
+    def prepare(self) -> None:
+        """Make the stations' spectra."""
+        self._retrieval.prepare()
 
 
 def open_engine(kind: str, map_path: str | Path, config: LocalizerConfig | None = None) -> Engine:

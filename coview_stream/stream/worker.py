@@ -27,6 +27,7 @@ def main(argv: list[str]) -> int:
         return 1
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
         pipe.send(("ready", None))
+        engine.prepare()
         while True:
             pipe.send(attempt(engine, pipe.recv()))
     return 0

@@ -82,6 +82,22 @@ def test_blocks_equal_the_cache(stations, query, monkeypatch, block):
     assert set(cached._spectra) == set(query)
 
 
+def test_prepared_spectra_are_not_made_again(stations, query, monkeypatch):
+    expected = Retrieval(stations, RetrievalConfig()).distances(query)
+    prepared = Retrieval(stations, RetrievalConfig())
+    prepared.prepare()
+    monkeypatch.delattr(retrieval.kernels, "column_spectra")
+    for name, volume in prepared.distances(query).items():
+        np.testing.assert_array_equal(volume, expected[name])
+
+
+def test_what_does_not_fit_or_is_not_needed_is_not_prepared(stations, monkeypatch):
+    monkeypatch.delattr(retrieval.kernels, "column_spectra")
+    Retrieval(stations, RetrievalConfig(mode="ring_key")).prepare()
+    monkeypatch.setattr(retrieval, "_CACHE_BYTES", 10)
+    Retrieval(stations, RetrievalConfig()).prepare()
+
+
 def test_ring_key_scores_its_candidates_only(stations, query):
     exhaustive = Retrieval(stations, RetrievalConfig()).distances(query)
     found = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=6)).distances(query)
