@@ -186,3 +186,121 @@ def test_reset_forgets_all_but_the_map(world_map, world_drive, world_fixes):
     metres, degrees = pose_error(again[-1].T_map_body, world_drive.T_map_body[5])
     assert metres < 0.08
     assert degrees < 0.3
+
+
+@pytest.fixture(scope="module")
+def verdicts(world_map, world_drive):
+    """What the searches of the drive say, up to the one that accepts a place; good for every fresh localizer."""
+    localizer, said = Localizer(world_map), []
+    for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
+        said.append(localizer._search.update(localizer.take(cloud, T, 0.5 * k)))
+        if said[-1].accepted is not None:
+            return said
+        localizer.adopt(said[-1])
+    raise AssertionError("no place was accepted")
+
+
+def searched(world_map, drive, verdicts):
+    """A localizer that has taken every frame up to the decisive one; its verdict is not adopted yet."""
+    localizer = Localizer(world_map)
+    for k, verdict in enumerate(verdicts):
+        localizer.take(drive.clouds[k], drive.T_odom_body[k], 0.5 * k)
+        if verdict.accepted is None:
+            localizer.adopt(verdict)
+    return localizer, verdicts[-1], len(verdicts) - 1
+
+
+def garbage(seed=1):
+    return np.random.default_rng(seed).uniform([-20, -20, -1.5], [20, 20, 6], (6000, 3)).astype(np.float32)
+
+
+def test_take_and_adopt_are_a_step(world_map, world_drive, world_fixes, verdicts):
+    localizer = Localizer(world_map)
+    for k, reference in enumerate(world_fixes[:7]):
+        query = localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        assert (query is not None) == (k < len(verdicts))  # tracking asks for nothing
+        if query is not None:
+            localizer.adopt(verdicts[k])
+        fix = localizer.fix()
+        assert fix.state is reference.state
+        assert fix.evidence == reference.evidence
+        if reference.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, reference.T_map_body, atol=1e-9)
+            np.testing.assert_allclose(fix.covariance, reference.covariance, atol=1e-12)
+
+
+def test_no_fix_before_the_first_frame(world_map):
+    with pytest.raises(RuntimeError, match="no frame"):
+        Localizer(world_map).fix()
+
+
+def test_a_verdict_of_another_life_is_ignored(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.reset()
+    localizer.adopt(verdict)  # before any frame
+    localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    localizer.adopt(verdict)
+    assert localizer.state is State.SEARCHING
+    assert localizer.fix().T_map_body is None
+    assert localizer.fix().evidence is None
+
+
+def test_a_verdict_from_before_a_loss_is_ignored(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.adopt(verdict)
+    for n in range(1, 4):
+        localizer.take(garbage(n), world_drive.T_odom_body[k + n], 0.5 * (k + n))
+    assert localizer.state is State.LOST
+    localizer.adopt(verdict)
+    assert localizer.state is State.LOST
+    assert localizer.fix().T_map_body is None
+
+
+def test_a_verdict_while_tracking_is_ignored(world_map, world_drive, verdicts):
+    localizer, verdict, _ = searched(world_map, world_drive, verdicts)
+    localizer.adopt(verdict)
+    before = localizer.fix()
+    localizer.adopt(verdict)
+    np.testing.assert_array_equal(localizer.fix().T_map_body, before.T_map_body)
+    np.testing.assert_array_equal(localizer.fix().covariance, before.covariance)
+
+
+def test_a_late_verdict_is_right_where_the_robot_is_now(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    for n in (k + 1, k + 2):
+        localizer.take(world_drive.clouds[n], world_drive.T_odom_body[n], 0.5 * n)
+    assert localizer.fix().T_map_body is None
+    localizer.adopt(verdict)
+    fix = localizer.fix()
+    assert fix.state is State.TRACKING
+    metres, degrees = pose_error(fix.T_map_body, world_drive.T_map_body[k + 2])
+    assert metres < 0.08
+    assert degrees < 0.3
+
+
+def test_a_late_verdict_that_the_newest_frame_does_not_fit_gives_no_pose(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    for n in (k + 1, k + 2):
+        localizer.take(garbage(n), world_drive.T_odom_body[n], 0.5 * n)
+    localizer.adopt(verdict)
+    fix = localizer.fix()
+    assert fix.state is State.AMBIGUOUS
+    assert fix.T_map_body is None
+    # and what follows decides
+    localizer.take(world_drive.clouds[k + 3], world_drive.T_odom_body[k + 3], 0.5 * (k + 3))
+    assert localizer.fix().state is State.TRACKING
+
+
+def test_suspicion_takes_the_pose_until_a_frame_has_verified_it(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.suspect()  # nothing to suspect yet
+    localizer.adopt(verdict)
+    assert localizer.fix().state is State.TRACKING
+    localizer.suspect()
+    assert localizer.fix().state is State.AMBIGUOUS
+    assert localizer.fix().T_map_body is None
+    # the robot stands still: nothing is due, and yet it is verified
+    fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
+    assert fix.state is State.TRACKING
+    assert fix.evidence.stamp == 0.5 * k + 0.1
+    assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
