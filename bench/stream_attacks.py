@@ -73,6 +73,7 @@ def flood(setting: Setting) -> Outcome:
         after = stage.node.megabytes()
         numbers = measure(stage, plan, sent, start)
         judge_common(outcome, stage, numbers)
+        outcome.judge_machine(sent)
         outcome.tell(
             "flood: frames put, longest lag / put, s",
             (poured.messages, poured.longest_lag, poured.longest_put),
@@ -143,6 +144,7 @@ def random(setting: Setting) -> Outcome:
         sent = sender.result()
         numbers = measure(stage, plan, sent, start)
         judge_common(outcome, stage, numbers)
+        outcome.judge_machine(sent)
         report_stream(outcome, numbers, "good stream after: ")
     return outcome
 
@@ -168,6 +170,7 @@ def backwards(setting: Setting) -> Outcome:
         sent = sender.result()
         numbers = measure(stage, plan, sent, start)
         judge_common(outcome, stage, numbers)
+        outcome.judge_machine(sent)
         told = stage.recorder.told("r1", start)
         for name in ("out_of_order", "duplicate"):
             value = scores.counter(told, name)

@@ -30,6 +30,7 @@ def router(setting: Setting) -> Outcome:
         sent = sender.result()
         numbers = measure(stage, plan, sent, start, without=[(gone - 0.2, back)])
         judge_common(outcome, stage, numbers)
+        outcome.judge_machine(sent)
         told = stage.recorder.told("r1", back)
         ticks = stage.recorder.ticks(back)
         outcome.tell("the recorder itself was back after, s", ticks[0] - back if ticks else None)
@@ -59,6 +60,7 @@ def odometry(setting: Setting) -> Outcome:
         sent = sender.result()
         numbers = measure(stage, plan, sent, start)
         judge_common(outcome, stage, numbers)
+        outcome.judge_machine(sent)
         poses = stage.recorder.poses("r1", start, start + end)
         left = poses[-1].arrival - start - begin if poses else None
         soon = left is not None and left <= LONGEST_LEFT

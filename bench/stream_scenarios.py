@@ -25,6 +25,7 @@ def _stream(setting: Setting, outcome: Outcome, label: str, plan: RobotPlan, *ar
         numbers["log_lines"] = len(stage.node.log_lines())
         outcome.numbers[label.strip() or "stream"] = numbers
         report_stream(outcome, numbers, label)
+        outcome.judge_machine(sent, label)
 
 
 def raw(setting: Setting) -> Outcome:
@@ -70,6 +71,7 @@ def jitter(setting: Setting) -> Outcome:
         outcome.numbers["r2"] = {"states": sorted({status.state for status in told})}
         outcome.numbers["r2"]["counters"] = told[-1].fields.get("counters") if told else None
         report_stream(outcome, numbers)
+        outcome.judge_machine(sent)
         poses = len(stage.recorder.poses("r2", start))
         outcome.judge("r2, elsewhere: poses", poses, "0", poses == 0)
         worked = scores.counter(told, "processed")
@@ -108,6 +110,8 @@ def robots(setting: Setting) -> Outcome:
         outcome.tell(
             "rubbish sent to the sixteenth; its state", (outcome.numbers["rubbish"], _state(stage, names[-1]))
         )
+        for part in sent:
+            outcome.judge_machine(part)
         outcome.tell("processor, cores", used)
         outcome.tell("memory first / last / most, MB", (memory[0], memory[-1], max(memory)))
     return outcome
@@ -122,6 +126,9 @@ def _robot(stage: Stage, plan: RobotPlan, sent: Any, start: float) -> dict[str, 
     numbers["longest_starvation_s"] = float(stale.max()) if len(stale) else None
     numbers["longest_without_correction_s"] = float(aged.max()) if len(aged) else None
     numbers["processed"] = scores.counter(told, "processed")
+    ends = np.arange(start + 10.0, start + plan.seconds + 1.0, 10.0)
+    done = [scores.counter(stage.recorder.told(plan.robot, start, end), "processed") or 0 for end in ends]
+    numbers["processed_per_10_s"] = np.diff([0, *done]).tolist()
     return numbers
 
 
@@ -158,6 +165,11 @@ def _report_fleet(outcome: Outcome, rows: dict[str, dict[str, Any]], alive: bool
     fair = scores.jain(done)
     outcome.judge("Jain fairness of frames processed", fair, f">= {LEAST_JAIN}", fair >= LEAST_JAIN)
     outcome.tell("frames processed of those sent, least / most", (min(shares), max(shares)))
+    outcome.tell(
+        "processed each 10 s by all", np.sum([r["processed_per_10_s"] for r in rows.values()], 0).tolist()
+    )
+    searched = [(row["counters"] or {}).get("searches", 0) for row in rows.values()]
+    outcome.tell("searches per robot, least / most", (min(searched), max(searched)))
     false = sum(row["false"] for row in rows.values())
     outcome.judge("false poses", f"{false} of {sum(row['poses'] for row in rows.values())}", "0", false == 0)
     fixed = [row for row in rows.values() if row["first_fix_s"] is not None]
@@ -173,4 +185,8 @@ def _report_fleet(outcome: Outcome, rows: dict[str, dict[str, Any]], alive: bool
         "pose rates, least / most Hz", (min(rates), max(rates)) if rates else None, "10 +- 2%", steady
     )
     p99 = [row["jitter_ms"][1] for row in fixed if row["jitter_ms"]]
+    floor = next(iter(rows.values()))
+    outcome.tell(
+        "the machine's jitter, ms; cores others used", (floor["machine_jitter_ms"], floor["foreign_cores"])
+    )
     outcome.tell("jitter p99, median / most ms", (float(np.median(p99)), max(p99)) if p99 else None)

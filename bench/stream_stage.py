@@ -21,6 +21,9 @@ _READY = 90.0  # seconds in which the node must announce all its robots
 MOST_JITTER, RATE, RATE_SHARE, LEAST_POSED, MOST_FIRST_FIX = 15.0, 10.0, 0.02, 0.95, 20.0
 """Targets: ms, Hz, share of it, share of the time from the first fix on, metres."""
 
+MOST_LAG = 0.3
+"""Seconds; where a sender was later than that, the machine was too busy for any of the figures to mean anything."""
+
 
 @dataclass
 class Outcome:
@@ -33,6 +36,11 @@ class Outcome:
     def judge(self, what: str, measured: Any, target: str, met: bool | None) -> None:
         """Add a line with a verdict."""
         self.lines.append((what, shown(measured), target, met))
+
+    def judge_machine(self, sent: Sent, label: str = "") -> None:
+        """Say whether the measurement itself can be trusted."""
+        lag = sent.longest_lag
+        self.judge(f"{label}sender late by, s (else: measure again)", lag, f"<= {MOST_LAG}", lag <= MOST_LAG)
 
     def tell(self, what: str, measured: Any) -> None:
         """Add a line without one."""
