@@ -1,0 +1,150 @@
+"""``coview-stream doctor``: check the machine, a map, the network and what robots send."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coview_stream.errors import ConfigError, TransportError
+
+if TYPE_CHECKING:
+    from coview_stream.checkup.finding import Finding
+    from coview_stream.stream.keys import RobotKeys
+
+HELP = "check this machine, a map, the network and what robots send, and say what to do"
+
+_LONGEST = 600.0  # seconds
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; keys and encodings are those of ``serve``."""
+    parser.add_argument("map", type=Path, nargs="?", metavar="SITE.coview", help="a base map to look at")
+    parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="robots to listen to")
+    network = parser.add_argument_group("network (looked at if one of these, or --robot, is given)")
+    network.add_argument("--connect", action="append", default=[], metavar="EP", help="(tcp/127.0.0.1:7447)")
+    network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for others here")
+    network.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
+    network.add_argument("--seconds", type=float, default=3.0, metavar="S", help="to listen to robots (3)")
+    keys = parser.add_argument_group("keys and encodings, as for serve")
+    keys.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
+    keys.add_argument("--base", default="coview", metavar="KEY", help="first part of our keys (coview)")
+    keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
+    keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's")
+    keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
+    keys.add_argument("--cloud-encoding", metavar="CODEC", help="whatever frames say")
+    keys.add_argument("--odometry-encoding", metavar="CODEC", help="likewise")
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a line per finding; exit code 1 if something will not work."""
+    from coview_stream.checkup.finding import failed
+
+    keys = _checked(args)
+    findings: list[Finding] = []
+    for finding in _checkup(args, keys):
+        findings.append(finding)
+        if not args.json:
+            print(finding.line(), flush=True)  # the next one may take seconds
+    if args.json:
+        print(json.dumps([finding.to_json() for finding in findings], indent=1))
+    return 1 if failed(findings) else 0
+
+
+def _checked(args: argparse.Namespace) -> list[RobotKeys]:
+    """Refuse wrong options before anything slow is done, and return the robots' keys."""
+    from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS
+    from coview_stream.stream.keys import robot_keys
+
+    if not 0 < args.seconds <= _LONGEST:
+        raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0, {_LONGEST:g} at most")
+    for option, name, known in (
+        ("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS),
+        ("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS),
+    ):
+        if name is not None and name not in known:
+            raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")
+    names = dict.fromkeys(args.robot or ["any"])
+    made = [
+        robot_keys(args.preset, args.base, name, args.cloud_key, args.odometry_key, None, args.domain)
+        for name in names
+    ]
+    return made if args.robot else []
+
+
+def _checkup(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
+    from coview_stream.checkup.machine import machine_findings, memory
+    from coview_stream.checkup.site import open_site, site_findings
+
+    connect = _endpoints(args)
+    zenoh = connect is not None and _zenoh_takes(args, connect)
+    yield from machine_findings()
+    sha256 = None
+    if args.map is not None:
+        base_map, finding = open_site(args.map)
+        yield finding
+        if base_map is not None:
+            sha256 = base_map.sha256
+            yield from site_findings(base_map, args.map.stat().st_size, memory()[1])
+    if connect is not None and zenoh:
+        yield from _network(args, connect, keys, sha256)
+
+
+def _zenoh_takes(args: argparse.Namespace, connect: list[str]) -> bool:
+    """Report wrong endpoints and files before anything slow; False if there is no zenoh, which is a finding."""
+    try:
+        import zenoh  # noqa: F401
+    except ImportError:
+        return False
+    from coview_stream.stream.zenoh_config import compose
+
+    compose(connect, args.listen, args.config)
+    return True
+
+
+def _endpoints(args: argparse.Namespace) -> list[str] | None:
+    """Endpoints to connect to; None if the network is not asked for."""
+    from coview_stream.stream.reach import DEFAULT_ENDPOINT
+
+    if not (args.robot or args.connect or args.listen or args.config):
+        return None
+    return args.connect or ([] if args.listen or args.config else [DEFAULT_ENDPOINT])
+
+
+def _network(
+    args: argparse.Namespace, connect: list[str], keys: list[RobotKeys], sha256: str | None
+) -> Iterator[Finding]:
+    from coview_stream.checkup.finding import from_error
+    from coview_stream.checkup.network import reach_finding, robots_findings
+    from coview_stream.stream.zenoh_transport import open_transport
+
+    try:
+        with _silence("coview_stream.stream"):  # what the transport would log is a finding here
+            transport = open_transport(connect, args.listen, args.config)
+    except TransportError as error:
+        yield from_error("network", error)
+        return
+    try:
+        reached = reach_finding(transport, connect)
+        yield reached
+        if reached.verdict != "FAIL":
+            codecs = (args.cloud_encoding, args.odometry_encoding)
+            yield from robots_findings(transport, keys, args.seconds, codecs, sha256)
+    finally:
+        transport.close()
+
+
+@contextlib.contextmanager
+def _silence(name: str) -> Iterator[None]:
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
