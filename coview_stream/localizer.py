@@ -130,7 +130,8 @@ class Localizer:
             self.state = verdict.evidence.state
 
     def suspect(self) -> None:
-        """Give no pose until the next frames have verified the place: odometry may have jumped or paused."""
+        """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
+        self._tracker.forget_points()
         if self.state is State.TRACKING and not self._doubts:
             self._doubts, self._doubted_at = 1, self._tracker.travelled
 

@@ -64,8 +64,12 @@ class Tracker:
 
     def forget(self) -> None:
         """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
-        self._recent.clear()
+        self.forget_points()
         self._last = None
+
+    def forget_points(self) -> None:
+        """Drop the points that the next registration would use beside the next frame's."""
+        self._recent.clear()
 
     def start(self, registration: Registration, travelled: float) -> None:
         """Begin with an accepted fix, found where odometry had driven ``travelled`` metres.

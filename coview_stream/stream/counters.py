@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+_STRAY_NS = 5_000_000_000  # a stamp that lies farther back than this is a new beginning
 _REMEMBERED = 600  # a minute of frames at 10 Hz
 
 
@@ -17,7 +18,7 @@ class Counters:
     ``received`` clouds end as ``processed``, ``rejected`` (the engine could not use it), ``dropped`` (a newer one came
     before its turn), ``late`` (older than the odometry that is remembered), ``out_of_order``, ``duplicate``,
     ``no_odometry`` (none came for its stamp), ``malformed``, ``oversized``, ``unknown_encoding`` or ``engine_errors``;
-    up to six more are under way. ``missing`` is an estimate of what never arrived, from gaps between stamps or in the
+    up to ten more are under way. ``missing`` is an estimate of what never arrived, from gaps between stamps or in the
     sender's numbering.
     """
 
@@ -86,8 +87,11 @@ class Missing:
 
     def after(self, stamp_ns: int, sequence: int | None) -> int:
         """Return the number of frames that seem to lie between the last one and this one."""
-        last, self._last = self._last, (stamp_ns, sequence)
-        if last is None or stamp_ns <= last[0]:
+        last = self._last
+        if last is not None and last[0] - _STRAY_NS < stamp_ns <= last[0]:
+            return 0
+        self._last = stamp_ns, sequence
+        if last is None or stamp_ns < last[0]:
             return 0
         if sequence is not None and last[1] is not None:
             return max(0, sequence - last[1] - 1) if sequence - last[1] < 1000 else 0

@@ -21,12 +21,14 @@ from coview_stream.stream import rmw
 from coview_stream.stream import status as statuses
 from coview_stream.stream.codecs import encode_pose
 from coview_stream.stream.config import NodeConfig
+from coview_stream.stream.guard import Guard
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.lane import DiedError, FailedError, Lane, RejectedError
 from coview_stream.stream.messages import Encoded, Sample
 from coview_stream.stream.session import Session
 from coview_stream.stream.transport import Connection, Publisher, Transport
+from coview_stream.stream.turns import Turns
 
 log = logging.getLogger("coview_stream.node")
 
@@ -61,6 +63,8 @@ class Node:
         self._pose_format = pose_format
         self._lanes = {"track": track, "search": search}
         self._wake = threading.Condition()
+        self._turns = {name: Turns(len(self.sessions)) for name in self._lanes}
+        self._guard = Guard(log)
         self._stopping = threading.Event()
         self._changed = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -159,24 +163,20 @@ class Node:
     # ---- the engine's work, one thread for each lane
 
     def _feed(self, name: str) -> None:
-        turn = 0
         while not self._stopping.is_set():
-            job, session, turn = self._next(name, turn)
-            if job is None or session is None:
+            found = self.next_job(name)
+            if found is None:
                 with self._wake:
                     self._wake.wait(timeout=0.05)
-                continue
-            self.work(name, session, job)
+            else:
+                self.work(name, *found)
 
-    def _next(self, name: str, turn: int) -> tuple[FrameJob | SearchJob | None, Session | None, int]:
-        """Find the next robot that has something to do, after the one that was served last."""
-        count = len(self.sessions)
-        for k in range(count):
-            session = self.sessions[(turn + k) % count]
-            job = session.take_frame() if name == "track" else session.take_search()
-            if job is not None:
-                return job, session, (turn + k + 1) % count
-        return None, None, turn
+    def next_job(self, name: str) -> tuple[Session, FrameJob | SearchJob] | None:
+        """Return whose turn it is in a lane, and with which job; None if there is nothing to do."""
+        if name == "track":
+            return self._turns[name].next(self.sessions, Session.take_frame)
+        # who has a candidate already needs but a few more searches; all the others have to start from nothing
+        return self._turns[name].next(self.sessions, Session.take_search, Session.hopeful)
 
     def work(self, name: str, session: Session, job: FrameJob | SearchJob) -> None:
         """Do one job; what goes wrong is counted and concerns this robot, unless the engine died."""
@@ -191,11 +191,15 @@ class Node:
             if self._stopping.is_set():
                 return
             log.error("%s; starting it again", error)
-            self._report(session, job, str(error), rejected=True)
             if name == "track":
                 for each in self.sessions:
                     each.engine_restarted()
+            self._report(session, job, str(error), rejected=False)
             self._changed.set()
+            self._stopping.wait(0.2)
+        except Exception as error:  # nobody thought of it, but the other robots' work goes on
+            log.exception("%s: unexpected error in the %s lane", job.robot, name)
+            self._report(session, job, repr(error), rejected=False)
             self._stopping.wait(0.2)
         else:
             if isinstance(job, FrameJob) and isinstance(result, FrameResult):
@@ -221,16 +225,19 @@ class Node:
     def publish_poses(self, now: float) -> None:
         """Let time pass in every session and publish the poses that are known."""
         for session in self.sessions:
-            session.tick(now)
-            robot = session.keys.robot
-            pose = session.pose()
-            if pose is not None:
-                encoded = encode_pose(pose, self._pose_format or session.keys.pose_format)
-                bare = session.keys.bare and self._pose_format is None
-                self._poses[robot].put(Encoded(encoded.payload) if bare else encoded)
-                self._rates[robot].add(now)
-            if session.state()[0] is not self._told.get(robot):
-                self._changed.set()
+            self._guard.run(session.keys.robot, partial(self._publish_pose, session, now))
+
+    def _publish_pose(self, session: Session, now: float) -> None:
+        session.tick(now)
+        robot = session.keys.robot
+        pose = session.pose()
+        if pose is not None:
+            encoded = encode_pose(pose, self._pose_format or session.keys.pose_format)
+            bare = session.keys.bare and self._pose_format is None
+            self._poses[robot].put(Encoded(encoded.payload) if bare else encoded)
+            self._rates[robot].add(now)
+        if session.state()[0] is not self._told.get(robot):
+            self._changed.set()
 
     def _at_rate(self, rate: float, act: Callable[[float], None], wait: Callable[[float], bool]) -> None:
         """Call ``act`` at absolute times; after a pause of the machine go on, do not catch up."""
@@ -283,6 +290,8 @@ class Node:
         state = State(document["state"])
         if closing:
             document["reason"] = "the node is shutting down"
+            if state is State.TRACKING:  # nobody tracks it any more
+                document["state"] = State.LOST.value
         elif state is not self._told.get(robot):
             log.info("%s: %s (%s)", robot, state.value, document["reason"])
         self._told[robot] = state

@@ -35,6 +35,17 @@ class Intake(str, Enum):
 
 
 @dataclass(frozen=True)
+class _Entry:
+    sample: OdometryMessage
+    travelled: float
+    turned: float
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.sample.stamp_ns
+
+
+@dataclass(frozen=True)
 class Segment:
     """Odometry around a frame: stamps (K,) int64 ns and poses (K, 4, 4) odometry <- body."""
 
@@ -61,7 +72,7 @@ class OdometryBuffer:
         self.newest: OdometryMessage | None = None
         self.arrived = float("-inf")
         self.travelled = self.turned = 0.0
-        self._samples: deque[OdometryMessage] = deque()
+        self._samples: deque[_Entry] = deque()
         self._strange: deque[tuple[float, int]] = deque(maxlen=_STEADY)  # local time, stamp
         self._strange_since = float("inf")
 
@@ -77,7 +88,7 @@ class OdometryBuffer:
             self.travelled += float(np.linalg.norm(step[:3, 3]))
             self.turned += rotation_angle(step)
         self.newest, self.arrived = sample, now
-        self._samples.append(sample)
+        self._samples.append(_Entry(sample, self.travelled, self.turned))
         self._strange.clear()
         self._strange_since = float("inf")
         oldest = sample.stamp_ns - round(self.config.horizon * _NS)
@@ -130,18 +141,25 @@ class OdometryBuffer:
         k = bisect_left(self._samples, stamp_ns, key=lambda s: s.stamp_ns)
         after = self._samples[k]
         if after.stamp_ns == stamp_ns:
-            return after.T_odom_body
+            return after.sample.T_odom_body
         before = self._samples[k - 1]
         if after.stamp_ns - before.stamp_ns > self.config.max_gap * _NS:
             return None
-        return _between(before, after, stamp_ns)
+        return _between(before.sample, after.sample, stamp_ns)
+
+    def driven_since(self, stamp_ns: int) -> tuple[float, float]:
+        """Metres driven and radians turned from a stamp, or the oldest sample that is remembered, until now."""
+        if not self._samples:
+            return 0.0, 0.0
+        k = max(0, bisect_left(self._samples, stamp_ns + 1, key=lambda s: s.stamp_ns) - 1)
+        return self.travelled - self._samples[k].travelled, self.turned - self._samples[k].turned
 
     def around(self, begin_ns: int, end_ns: int) -> Segment:
         """Return the samples from the last one before ``begin_ns`` to the first one after ``end_ns``."""
         stamps = [s.stamp_ns for s in self._samples]
         first = max(0, bisect_left(stamps, begin_ns + 1) - 1)
         last = min(len(stamps), bisect_left(stamps, end_ns) + 1)
-        poses = [self._samples[k].T_odom_body for k in range(first, last)]
+        poses = [self._samples[k].sample.T_odom_body for k in range(first, last)]
         return Segment(np.array(stamps[first:last], dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
 
 

@@ -82,7 +82,7 @@ class Session:
         self._clear()
 
     def _clear(self) -> None:
-        """Forget everything; what is under way is nobody's then."""
+        """Forget everything."""
         self._pairing, self._ready = Pairing(self.config, self.odometry, self.counters), None
         self.counters = Counters()
         self.complaints = Complaints()
@@ -97,6 +97,7 @@ class Session:
         self._fix_state = State.SEARCHING
         self._lost: str | None = None
         self._forget_frame()
+        self._first_epoch = self._epoch  # what was under way before is nobody's
 
     def _forget_frame(self) -> None:
         """Forget all that refers to the odometry frame, which is no more."""
@@ -126,6 +127,7 @@ class Session:
             if message is None:
                 note(self.counters, self.complaints, "", name, sample.key, reason)
                 return
+            self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
             self._pairing.add(message, now)
             self._pair(now)
 
@@ -159,8 +161,7 @@ class Session:
 
     def _doubt(self, from_ns: int) -> None:
         """No pose until a frame stamped ``from_ns`` or later has verified the place."""
-        if self._correction is not None or self._fix_state is State.TRACKING:
-            self._suspect = True
+        self._suspect = True
         self._trusted_from = max(self._trusted_from, from_ns)
         self._correction = None
 
@@ -190,7 +191,6 @@ class Session:
                 self.counters.dropped += 1
                 since = self._ready.since
             message = frame.message
-            self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
             job = FrameJob(
                 self.keys.robot,
                 self._epoch,
@@ -200,7 +200,12 @@ class Session:
                 message.times,
                 frame.segment,
             )
-            self._ready = _Ready(job, frame.received, since, self.odometry.travelled, self.odometry.turned)
+            self._ready = _Ready(job, frame.received, since, *self._driven_at(message.stamp_ns))
+
+    def _driven_at(self, stamp_ns: int) -> tuple[float, float]:
+        """Metres driven and radians turned when the frame was taken, which may be a while ago."""
+        driven, turned = self.odometry.driven_since(stamp_ns)
+        return self.odometry.travelled - driven, self.odometry.turned - turned
 
     # ---- the engine's work
 
@@ -223,9 +228,15 @@ class Session:
             self._query, self._searching = None, True
             return job
 
+    def hopeful(self) -> bool:
+        """Whether a place has been found that only needs confirmation."""
+        return self._fix_state is State.AMBIGUOUS
+
     def frame_done(self, job: FrameJob, result: FrameResult, now: float) -> None:
         """Take note of the fix after a frame."""
         with self._lock:
+            if job.epoch < self._first_epoch:
+                return
             self.counters.processed += 1
             self._processed_at = now
             self.engine_latency.add(result.seconds)
@@ -238,6 +249,8 @@ class Session:
     def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> None:
         """Take note that the engine could not use a frame (``rejected``) or failed and has forgotten the robot."""
         with self._lock:
+            if job.epoch < self._first_epoch:
+                return
             self.counters.count("rejected" if rejected else "engine_errors")
             self.complaints.add((reason.strip() or "unknown failure").splitlines()[-1])
             if job.epoch == self._epoch:
@@ -249,10 +262,14 @@ class Session:
     def search_done(self, job: SearchJob, verdict: Verdict | None) -> None:
         """Take note of a verdict; None if the search failed, which costs this keyframe's vote only."""
         with self._lock:
+            if job.epoch < self._first_epoch:
+                return
             self.counters.searches += 1
             if job.epoch == self._epoch:
                 self._searching = False
-                self._verdict = verdict
+                # an acceptance waits for the next frame; what is found meanwhile comes from a search begun anew
+                if verdict is not None and (self._verdict is None or self._verdict.accepted is None):
+                    self._verdict = verdict
 
     def engine_restarted(self) -> None:
         """Take note that the tracking engine has forgotten all it knew."""
@@ -267,13 +284,14 @@ class Session:
         if result.query is not None:
             self.counters.searches_skipped += self._query is not None
             self._query = result.query
-        self._suspect = self._suspect and not job.suspect
+        if job.suspect and job.stamp_ns >= self._trusted_from:
+            self._suspect = False
         was, self._fix_state = self._fix_state, fix.state
         if fix.T_map_odom is None:
             if fix.state is State.LOST and was is not State.LOST and self._lost is None:
                 self._lose(fix.evidence.reason if fix.evidence else "evidence gone")
             self._correction = None
-        elif job.stamp_ns >= self._trusted_from:
+        elif not self._suspect and job.stamp_ns >= self._trusted_from:
             self._correct(fix, job, ready)
 
     def _correct(self, fix: Fix, job: FrameJob, ready: _Ready) -> None:

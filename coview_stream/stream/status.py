@@ -25,9 +25,10 @@ class PoseRate:
 
     def rate(self, now: float) -> float:
         """Return poses per second; 0 if the newest is older than two seconds."""
-        if len(self._times) < 2 or now - self._times[-1] > 2.0:
+        span = self._times[-1] - self._times[0] if self._times else 0.0
+        if span <= 0.0 or now - self._times[-1] > 2.0:
             return 0.0
-        return round((len(self._times) - 1) / (self._times[-1] - self._times[0]), 2)
+        return round((len(self._times) - 1) / span, 2)
 
 
 def status(

@@ -26,6 +26,8 @@ _DEFAULTS: dict[str, Any] = {
     # Enough for five round trips over a satellite. connect/timeout_ms would bound the wait too, but with it a client
     # never tries its second endpoint (zenoh#1602)
     "transport/unicast/open_timeout": 3000,
+    # poses are express, a batch each, and dropped after a millisecond without a free one: room for a fleet's at once
+    "transport/link/tx/queue/size/real_time": 16,
 }
 
 # zenoh switches shared memory on by itself. It saves 0.5 ms of 1.5 ms on a 1 MB cloud between processes of one machine,

@@ -149,7 +149,7 @@ def test_close_says_goodbye_once(site):
     site.status("r1")
     site.node.close()
     last = site.statuses("r1")[-1]
-    assert (last["state"], last["reason"]) == ("TRACKING", "the node is shutting down")
+    assert (last["state"], last["reason"]) == ("LOST", "the node is shutting down")
     assert site.net.closed
     assert site.net.tokens == ()
     assert (site.track.closed, site.search.closed) == (1, 1)

@@ -100,12 +100,12 @@ def test_robots_take_turns():
     names = ("r1", "r2", "r3", "r4")
     site = Site(*names)
     site.node.declare()
-    served, turn = [], 0
+    served = []
     for k in range(40):
         for name in names:
             for flood in range(10 if name == "r2" else 1):  # one sends ten times as much
                 site.sees(name, STEP * k + 0.001 * flood)
-        job, session, turn = site.node._next("track", turn)
+        session, job = site.node.next_job("track")
         served.append(job.robot)
         site.node.work("track", session, job)
     assert served == list(names) * 10
