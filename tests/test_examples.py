@@ -97,7 +97,9 @@ def test_the_readmes_python_runs(world, monkeypatch, capsys):
 
 
 def test_the_readmes_commands_are_understood():
-    lines = [line.split("#")[0] for name in ("command 1", "live", "commands") for line in block(name).splitlines()]
+    lines = [
+        line.split("#")[0] for name in ("command 1", "live", "commands") for line in block(name).splitlines()
+    ]
     calls = [line.split("coview-stream ")[1] for line in lines if "coview-stream " in line]
     assert len(calls) == 9
     for call in calls:

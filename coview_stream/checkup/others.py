@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from coview_stream.stream.keyexpr import matches
-from coview_stream.stream.reach import _session_of
+from coview_stream.stream.reach import session_of
 from coview_stream.stream.transport import Transport
 from coview_stream.stream.zenoh_config import zenoh_errors
 
@@ -17,7 +17,7 @@ def tokens(transport: Transport, expression: str, timeout: float = _PATIENCE) ->
     if hasattr(transport, "query"):  # the fake network
         held: tuple[str, ...] = getattr(transport, "tokens", ())
         return sorted({token for token in held if matches(expression, token)})
-    session: Any = _session_of(transport)
+    session: Any = session_of(transport)
     if session is None:
         return []
     with zenoh_errors(f"tokens {expression!r}"):
@@ -26,8 +26,8 @@ def tokens(transport: Transport, expression: str, timeout: float = _PATIENCE) ->
 
 
 def connected(transport: Transport) -> dict[str, int]:
-    """How many ``router``, ``peer`` and ``client`` sessions are connected; :class:`Connection` knows no clients."""
-    session: Any = _session_of(transport)
+    """How many ``router``, ``peer`` and ``client`` sessions are connected."""
+    session: Any = session_of(transport)
     if session is None:
         connection = transport.connection()
         return {"router": len(connection.routers), "peer": len(connection.peers), "client": 0}

@@ -304,7 +304,7 @@ class Node:
             self._reconnects += 1
             log.info("connected again: routers %s, peers %s", connection.routers, connection.peers)
         elif not anybody and self._was_connected:
-            log.warning("connection lost; trying again")
+            log.warning("nobody is connected any more")
         self._was_connected = anybody
         self._ever_connected |= anybody
         self._connection = connection

@@ -39,7 +39,7 @@ def ask(
     import zenoh
 
     deadline = time.monotonic() + timeout
-    while (session := _session_of(transport)) is None and time.monotonic() < deadline:
+    while (session := session_of(transport)) is None and time.monotonic() < deadline:
         time.sleep(_POLL)
     if session is not None:
         left = max(_POLL, deadline - time.monotonic())
@@ -64,7 +64,7 @@ def await_subscriber(
     deadline = time.monotonic() + seconds
     try:
         while True:
-            session = _session_of(transport)
+            session = session_of(transport)
             if probe is None and session is not None:
                 probe = session.declare_publisher(key)
             if probe is not None and probe.matching_status.matching:
@@ -76,7 +76,7 @@ def await_subscriber(
             probe.undeclare()
 
 
-def _session_of(transport: Transport) -> Any:
+def session_of(transport: Transport) -> Any:
     """Return the zenoh session of a transport; None while it waits for its first router."""
     return getattr(transport, "session", None)
 

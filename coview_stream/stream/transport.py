@@ -30,7 +30,7 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True)
 class Connection:
-    """Whom a transport is connected to: zenoh identities, sorted."""
+    """Whom a transport is connected to, zenoh identities, sorted; clients of a listening session count as peers."""
 
     routers: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()

@@ -132,9 +132,9 @@ class ZenohTransport:
         with self._lock:
             if self._session is None:
                 return Connection()
-            info = self._session.info
-            routers, peers = info.routers_zid(), info.peers_zid()
-        return Connection(tuple(sorted(map(str, routers))), tuple(sorted(map(str, peers))))
+            others = [(str(o.whatami), str(o.zid)) for o in self._session.info.transports()]
+        routers = sorted(zid for kind, zid in others if kind == "router")
+        return Connection(tuple(routers), tuple(sorted(zid for kind, zid in others if kind != "router")))
 
     def close(self) -> None:
         """Undeclare everything and end the threads; takes well under a second. Idempotent."""
