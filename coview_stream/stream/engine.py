@@ -12,6 +12,7 @@ from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.errors import MapError
 from coview_stream.localizer import Localizer
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch, Verdict
@@ -115,7 +116,11 @@ class SearchEngine:
         self._retrieval.prepare()
 
 
-def open_engine(kind: str, map_path: str | Path, config: LocalizerConfig | None = None) -> Engine:
-    """Load the map and make the engine ``track`` or ``search``; raises MapError for an unusable map."""
+def open_engine(
+    kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None
+) -> Engine:
+    """Load the map and make the engine ``track`` or ``search``; MapError for an unusable map, or another one."""
     base_map = BaseMap.load(map_path)
+    if base_map.sha256 != sha256:
+        raise MapError(f"{map_path}: has been replaced by another map; start the node again")
     return TrackEngine(base_map, config) if kind == "track" else SearchEngine(base_map, config)

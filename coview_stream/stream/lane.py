@@ -71,13 +71,15 @@ class ProcessLane:
     Args:
         kind: ``track`` or ``search``.
         map_path: the map's file, which every process maps for itself.
+        sha256: what the map has to be; if the file was replaced meanwhile, poses would be of another map than is said.
         nice: how far the child stands back from us, so that the clock here is never late.
         patience: seconds after which a job counts as hung.
     """
 
-    def __init__(self, kind: str, map_path: str, nice: int = 0, patience: float = 30.0) -> None:
+    def __init__(self, kind: str, map_path: str, sha256: str, nice: int = 0, patience: float = 30.0) -> None:
         self.kind = kind
         self.map_path = map_path
+        self.sha256 = sha256
         self.nice = nice
         self.patience = patience
         self._closed = False
@@ -100,7 +102,7 @@ class ProcessLane:
             with theirs:
                 self._child = subprocess.Popen(
                     [sys.executable, "-m", "coview_stream.stream.worker", str(theirs.fileno()), self.kind,
-                     self.map_path, str(self.nice)],
+                     self.map_path, self.sha256, str(self.nice)],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     env=_environment(),

@@ -34,6 +34,7 @@ log = logging.getLogger("coview_stream.node")
 
 _JSON = "application/json"
 _ROS_NODE = "coview_stream"
+_LONGEST_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
 
 
 class Node:
@@ -63,6 +64,7 @@ class Node:
         self._pose_format = pose_format
         self._lanes = {"track": track, "search": search}
         self._wake = threading.Condition()
+        self._deaths = dict.fromkeys(self._lanes, 0)  # in a row
         self._turns = {name: Turns(len(self.sessions)) for name in self._lanes}
         self._guard = Guard(log)
         self._stopping = threading.Event()
@@ -196,12 +198,14 @@ class Node:
                     each.engine_restarted()
             self._report(session, job, str(error), rejected=False)
             self._changed.set()
-            self._stopping.wait(0.2)
+            self._deaths[name] += 1
+            self._stopping.wait(min(0.1 * 2.0 ** self._deaths[name], _LONGEST_PAUSE))
         except Exception as error:  # nobody thought of it, but the other robots' work goes on
             log.exception("%s: unexpected error in the %s lane", job.robot, name)
             self._report(session, job, repr(error), rejected=False)
             self._stopping.wait(0.2)
         else:
+            self._deaths[name] = 0
             if isinstance(job, FrameJob) and isinstance(result, FrameResult):
                 session.frame_done(job, result, time.monotonic())
             elif isinstance(job, SearchJob) and isinstance(result, Verdict):

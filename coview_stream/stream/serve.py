@@ -61,15 +61,14 @@ def open_node(options: ServeOptions) -> Node:
     if len(set(names)) < len(names):
         raise ConfigError(f"--robot: {', '.join(names)}: each name once")
     begin = time.monotonic()
+    base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
+    path = str(options.map_path)
     lanes = [
-        track := ProcessLane("track", str(options.map_path), _TRACK_NICE),
-        search := ProcessLane("search", str(options.map_path), _SEARCH_NICE),
+        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE),
+        search := ProcessLane("search", path, base_map.sha256, _SEARCH_NICE),
     ]
     transport = None
     try:
-        base_map = BaseMap.load(
-            options.map_path
-        )  # here for its errors and its hash; the engines map it themselves
         for lane in lanes:
             lane.start()
         transport = open_transport(options.connect, options.listen, options.zenoh_config)

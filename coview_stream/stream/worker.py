@@ -1,4 +1,4 @@
-"""The child process of a lane: ``python -m coview_stream.stream.worker FD KIND MAP NICE``; not for people."""
+"""The child process of a lane: ``python -m coview_stream.stream.worker FD KIND MAP SHA256 NICE``; not for people."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection
 
 def main(argv: list[str]) -> int:
     """Open the engine, then answer jobs until the parent closes the pipe."""
-    descriptor, kind, map_path, nice = int(argv[0]), argv[1], argv[2], int(argv[3])
+    descriptor, kind, map_path, sha256, nice = int(argv[0]), argv[1], argv[2], argv[3], int(argv[4])
     pipe = Connection(descriptor)
     with contextlib.suppress(OSError):
         os.nice(nice)
@@ -20,7 +20,7 @@ def main(argv: list[str]) -> int:
     from coview_stream.stream.lane import attempt
 
     try:
-        engine = open_engine(kind, map_path)
+        engine = open_engine(kind, map_path, sha256)
         runtime.warm_up()
     except CoViewError as error:
         pipe.send(("error", str(error)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_world import pose_error
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, MapError, RunError
 from coview_stream.fix import State
 from coview_stream.geometry import inverse, pose_from, rot_z, transform
@@ -182,7 +183,10 @@ def test_work_of_the_other_half_is_refused(engines, world_drive):
 
 
 def test_engines_from_a_file(world_file, tmp_path):
-    assert isinstance(open_engine("track", world_file), TrackEngine)
-    assert isinstance(open_engine("search", world_file), SearchEngine)
-    with pytest.raises(MapError):
-        open_engine("track", tmp_path / "none.coview")
+    sha256 = BaseMap.load(world_file).sha256
+    assert isinstance(open_engine("track", world_file, sha256), TrackEngine)
+    assert isinstance(open_engine("search", world_file, sha256), SearchEngine)
+    with pytest.raises(MapError, match="replaced"):
+        open_engine("track", world_file, "0" * 64)
+    with pytest.raises(MapError, match="none"):
+        open_engine("track", tmp_path / "none.coview", sha256)

@@ -10,6 +10,7 @@ import pytest
 from live import until
 from robots import tracking
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, CoViewError
 from coview_stream.fix import State
 from coview_stream.stream.jobs import FrameJob
@@ -71,7 +72,7 @@ def alive(pid):
 
 
 def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
-    lane = ProcessLane("track", str(world_file))
+    lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256)
     good = job(world_drive.clouds[0])
     try:
         lane.start()
@@ -107,7 +108,7 @@ def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
 def test_a_map_that_cannot_be_opened(tmp_path):
     broken = tmp_path / "broken.coview"
     broken.write_bytes(b"no map at all")
-    lane = ProcessLane("search", str(broken))
+    lane = ProcessLane("search", str(broken), "0" * 64)
     try:
         lane.start()
         with pytest.raises(CoViewError, match=r"broken\.coview"):
