@@ -46,6 +46,23 @@ def cases() -> Iterator[Case]:
         grids = tuple(np.ascontiguousarray(a[:m]) for a in stations)
         yield f"coview {m}", lambda g=grids: ck.coview(*g), lambda g=grids: reference.coview(*g)
 
+    # a street: ground and two walls, a point every quarter metre; the twin is SciPy's k-d tree, its queries alone
+    along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))
+    flat = np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])
+    walls = [
+        np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)
+    ]
+    street = np.concatenate([flat, *walls]).astype(np.float32) + rng.normal(0, 0.02, (3 * along.size, 3))
+    grid = ck.PointGrid(street)
+    scan = street[rng.permutation(len(street))[:5_000]] + rng.normal(0, 0.1, (5_000, 3))
+    for radius in (0.4, 3.0):
+        query = (scan.astype(np.float32), radius)
+        yield (
+            f"nearest 5000, {radius} m",
+            lambda a=query: ck.nearest(grid, *a),
+            lambda a=query: reference.nearest(grid.tree, *a),
+        )
+
     for n in (2_000, 30_000):
         source = cloud[:n]
         pair = (source, source + np.float32(0.1), np.ones(n, np.float32), T, origin)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from small_world import pose_error
 
 from coview_stream.config import AcceptanceConfig, LocalizerConfig, RegistrationConfig, TrackingConfig
@@ -162,7 +161,7 @@ def test_where_the_map_says_nothing_the_prior_comes_through_as_it_was(world_map)
     side = np.arange(-15, 15, 0.25)
     floor = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     points = np.column_stack([floor, np.zeros(len(floor))]).astype(np.float32)
-    target = LocalMap(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)), cKDTree(points))
+    target = LocalMap(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)))
     scan = Source(points[::7], np.zeros(len(points[::7]), bool), points[::7, 2])
     config = RegistrationConfig()
     sigma = np.array([0.01, 0.01, 0.02, 0.2, 0.3, 0.1])

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.geometry import Points, Pose, inverse, transform
 from coview_stream.pose.registration import LocalMap, Source
 
@@ -83,7 +84,7 @@ def verify(
         surveyed: (M,) which points of ``source`` lie where the map has been surveyed.
     """
     moved = transform(T_map_source, source.points)
-    distance, partner = target.tree.query(moved, distance_upper_bound=_GROUND_SEARCH)
+    distance, partner = kernels.nearest(target.grid, moved, _GROUND_SEARCH)
     high = surveyed & (source.height > _STRUCTURE_HEIGHT)
     low = surveyed & ~source.above
     few = int(high.sum()) < _LEAST_STRUCTURE

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview, visible
+from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit, warm_up
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
@@ -16,11 +17,13 @@ from coview_kernels.trimmed_icp import normal_equations, trim
 from coview_kernels.voxel import transform_unique
 
 __all__ = [
+    "PointGrid",
     "PolarGrid",
     "all_shift_distance",
     "backend",
     "column_spectra",
     "coview",
+    "nearest",
     "normal_equations",
     "polar_bin",
     "shutdown",

@@ -219,6 +219,7 @@ def warm_up() -> None:
     cloud = np.ones((2, 3), dtype=np.float32)
     eye, origin = np.eye(4), np.zeros(3)
     api.transform_unique(cloud, eye, 1.0)
+    api.nearest(api.PointGrid(cloud), cloud, 1.0)
     grid, _ = api.polar_bin(cloud, origin, 2, 4, 8.0)
     one = np.zeros(1, dtype=np.int32)
     api.station_bins(np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, one, one, one, 2, 4, 2.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from coview_stream.geometry import transform
 from coview_stream.pose.registration import LocalMap, Source
@@ -38,7 +37,7 @@ def courtyard():
 
 
 def local_map(points, normals) -> LocalMap:
-    return LocalMap(points, normals, cKDTree(points))
+    return LocalMap(points, normals)
 
 
 def source_of(points, T_map_source, ground=0.0) -> Source:

@@ -7,8 +7,17 @@ Functions here trust their arguments; the public twins in :mod:`coview_kernels` 
 from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
+from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import polar_bin, station_bins
 from coview_kernels.reference.trimmed_icp import normal_equations
 from coview_kernels.reference.voxel import transform_unique
 
-__all__ = ["coview", "normal_equations", "polar_bin", "station_bins", "transform_unique", "visible"]
+__all__ = [
+    "coview",
+    "nearest",
+    "normal_equations",
+    "polar_bin",
+    "station_bins",
+    "transform_unique",
+    "visible",
+]
