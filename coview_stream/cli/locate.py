@@ -12,9 +12,15 @@ HELP = "localize a recorded run on a base map, offline"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("map", type=Path, metavar="SITE.coview")
-    parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, or one cloud file")
+    parser.add_argument(
+        "run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="directory to write")
     parser.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry to use (auto)")
+    parser.add_argument(
+        "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
+    )
+    parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
@@ -36,7 +42,9 @@ def run(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     base_map = BaseMap.load(args.map)
-    recorded = open_run(args.run_path, args.odometry)
+    recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic)
+    for note in recorded.notes:
+        print(note, file=sys.stderr)
     config = LocalizerConfig(retrieval=RetrievalConfig(mode=args.retrieval))
     quiet = not (args.progress or sys.stderr.isatty())
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:

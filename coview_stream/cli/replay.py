@@ -13,7 +13,9 @@ _SPARSE = 0.4  # seconds; the node takes odometry older than 0.5 s for lost, and
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by ReplayConfig."""
-    parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, or one cloud file")
+    parser.add_argument(
+        "run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag"
+    )
     parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
     parser.add_argument(
         "--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)"
@@ -35,6 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--odometry-rate", type=float, metavar="HZ", help="odometry per second, interpolated (one per frame)"
     )
     parser.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry to use (auto)")
+    parser.add_argument(
+        "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
+    )
+    parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
     parser.add_argument(
         "--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)"
     )
@@ -59,7 +65,9 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")
     config = ReplayConfig(rate=args.rate, speed=args.speed, odometry_rate=args.odometry_rate, loop=args.loop)
     keys = robot_keys(args.preset, args.base, args.robot)
-    recorded = open_run(args.run_path, args.odometry)
+    recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic)
+    for note in recorded.notes:
+        print(note, file=sys.stderr)
     transport = open_client(args.connect, args.listen, args.config)
     try:
         sender = Sender(transport, keys, args.encoding, args.odometry_encoding)

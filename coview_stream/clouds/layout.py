@@ -21,7 +21,10 @@ from coview_stream.geometry import Pose, inverse
 
 _KITTI_COLUMNS = 12
 _BAGS = (".mcap", ".db3", ".bag")
-_LAYOUTS = "frames/NNNNNN.pcd with odometry.tum, or KITTI's velodyne/*.bin with times.txt and poses.txt"
+_LAYOUTS = (
+    "frames/NNNNNN.pcd with odometry.tum, KITTI's velodyne/*.bin with times.txt and poses.txt, "
+    "or a ROS recording (rosbag2 directory, .mcap, .bag)"
+)
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,6 @@ def find_layout(path: Path) -> Layout:
     """
     if not path.exists():
         raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
-    _refuse_bags(path)
     if path.is_file():
         if not is_cloud_name(path):
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
@@ -60,10 +62,25 @@ def find_layout(path: Path) -> Layout:
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
 
 
-def _refuse_bags(path: Path) -> None:
-    files = [path] if path.is_file() else [path / "metadata.yaml", *path.iterdir()]
-    if any(file.suffix in _BAGS or file.name == "metadata.yaml" for file in files if file.is_file()):
-        raise RunError(f"{path}: mcap and rosbag2 are not supported yet; export {_LAYOUTS}")
+def find_bag(path: Path) -> Path | None:
+    """Return the recording at ``path``: a file, or a rosbag2 directory; None if it is something else.
+
+    Raises:
+        RunError: a directory holds several recordings, and no ``metadata.yaml`` says that they belong together.
+    """
+    if not path.is_dir():
+        return path if path.suffix in _BAGS and path.is_file() else None
+    if (path / "frames").is_dir() or (path / "velodyne").is_dir():
+        return None
+    if (path / "metadata.yaml").is_file():
+        return path
+    files = sorted(file for file in path.iterdir() if file.suffix in _BAGS and file.is_file())
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files[:5])
+        raise RunError(
+            f"{path}: several recordings ({names}) without metadata.yaml; name one file, or run: ros2 bag reindex"
+        )
+    return files[0] if files else None
 
 
 def _frames(folder: Path) -> tuple[Path, ...]:

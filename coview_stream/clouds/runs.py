@@ -6,11 +6,13 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.clouds.layout import Layout, find_layout, read_odometry
+from coview_stream.clouds.cloud import Cloud
+from coview_stream.clouds.layout import Layout, find_bag, find_layout, read_odometry
 from coview_stream.clouds.readers import read_cloud
 from coview_stream.clouds.trajectory import Poses, Stamps
 from coview_stream.errors import CloudError, RunError
@@ -40,21 +42,33 @@ class Frame:
     dropped: int = 0
 
 
+class CloudSource(Protocol):
+    """Where the clouds of a run come from, if not from one file each."""
+
+    def read(self, index: int) -> Cloud:
+        """Frame ``index`` in the body frame at its stamp, metres; CloudError if it cannot be had."""
+        ...
+
+
 @dataclass(frozen=True)
 class Run:
     """A validated run. Iterating reads lazily: one frame is in memory at a time.
 
     Attributes:
-        path: the directory or the single cloud file.
-        frames_paths: (N) files in order.
+        path: the directory, the single cloud file, or the recording.
+        frames_paths: (N) files in order; of a recording its path, N times.
         stamps: (N,) seconds, strictly increasing.
         poses: (N, 4, 4), odometry <- body, metres.
+        source: reads the clouds of a recording; None if each is a file.
+        notes: what was left out or taken for granted when the run was opened, a line each.
     """
 
     path: Path
     frames_paths: tuple[Path, ...]
     stamps: Stamps
     poses: Poses
+    source: CloudSource | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames_paths)
@@ -73,7 +87,7 @@ class Run:
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path}: no frame {index} among {len(self)}")
         path = self.frames_paths[index]
-        cloud = read_cloud(path)
+        cloud = read_cloud(path) if self.source is None else self.source.read(index)
         if len(self) > 1 and cloud.origin.any():
             raise CloudError(
                 f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "
@@ -100,22 +114,37 @@ class Run:
         return replace(self, poses=poses)
 
 
-def open_run(path: str | os.PathLike[str], odometry: str | os.PathLike[str] = "auto") -> Run:
+def open_run(
+    path: str | os.PathLike[str],
+    odometry: str | os.PathLike[str] = "auto",
+    cloud_topic: str | None = None,
+    odometry_topic: str | None = None,
+) -> Run:
     """Open a run and validate all but the clouds themselves.
 
     Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
     ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); one cloud file, or
-    one frame without odometry, is a run of one frame with stamp 0 and the identity.
+    one frame without odometry, is a run of one frame with stamp 0 and the identity; a recording with PointCloud2 and
+    Odometry (rosbag2 directory, ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry at the stamps
+    in their headers, interpolated, and are deskewed by it where their points have times.
 
     Args:
-        path: directory or cloud file.
+        path: directory, cloud file or recording.
         odometry: ``"auto"`` takes what the layout brings; otherwise a TUM file, or KITTI poses (12 columns)
-            where the run has a ``times.txt``.
+            where the run has a ``times.txt``. For a recording a TUM file with poses at any stamps.
+        cloud_topic: which clouds of a recording, if it has several topics with PointCloud2.
+        odometry_topic: which odometry of a recording, if it has several topics with Odometry.
 
     Raises:
         RunError: no frames, no odometry or odometry that does not fit; the message names file and line.
     """
     path = Path(path)
+    if (bag := find_bag(path)) is not None:
+        return _recorded(bag, None if odometry == "auto" else Path(odometry), cloud_topic, odometry_topic)
+    if path.exists() and (cloud_topic is not None or odometry_topic is not None):
+        raise RunError(
+            f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out"
+        )
     layout = find_layout(path)
     count = len(layout.frames)
     explicit = None if odometry == "auto" else Path(odometry)
@@ -132,3 +161,12 @@ def open_run(path: str | os.PathLike[str], odometry: str | os.PathLike[str] = "a
 
 def _single(layout: Layout) -> Run:
     return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None])
+
+
+def _recorded(bag: Path, explicit: Path | None, cloud_topic: str | None, odometry_topic: str | None) -> Run:
+    # imported here, for bags are read by the decoders of live messages, and those read no runs
+    from coview_stream.clouds.bags import open_bag
+
+    opened = open_bag(bag, explicit, cloud_topic, odometry_topic)
+    paths = (bag,) * len(opened.stamps)
+    return Run(bag, paths, opened.stamps / 1e9, opened.poses, opened.source, opened.notes)

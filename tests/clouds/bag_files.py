@@ -1,0 +1,118 @@
+"""Small recordings, written by rosbags' own writers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+CLOUD = "sensor_msgs/msg/PointCloud2"
+ODOMETRY = "nav_msgs/msg/Odometry"
+KINDS = {"f4": 7, "u4": 6, "f8": 8}
+LATE = 777_000_000_000  # ns: the recorder's clock is another one
+
+
+def message(name: str, /, **values: object) -> object:
+    return STORE.types[name](**values)
+
+
+def header(stamp_ns: int, frame: str) -> object:
+    stamp = message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def cloud(
+    stamp_ns: int, points: np.ndarray, times: np.ndarray | None = None, order: str = "<", frame: str = "body"
+):
+    columns = [(name, "f4", points[:, k]) for k, name in enumerate("xyz")]
+    if times is not None:
+        columns.append(("time", "f4", times))
+    rows = np.empty(len(points), [(name, order + kind) for name, kind, _ in columns])
+    for name, _, values in columns:
+        rows[name] = values
+    fields = [
+        message("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=KINDS[kind], count=1)
+        for k, (name, kind, _) in enumerate(columns)
+    ]
+    step, data = rows.dtype.itemsize, np.frombuffer(rows.tobytes(), np.uint8)
+    return message(
+        CLOUD,
+        header=header(stamp_ns, frame),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        is_bigendian=order == ">",
+        point_step=step,
+        row_step=step * len(rows),
+        data=data,
+        is_dense=True,
+    )
+
+
+def odometry(stamp_ns: int, T: np.ndarray, child: str = "body"):
+    x, y, z = T[:3, 3]
+    qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
+    pose = message(
+        "geometry_msgs/msg/Pose",
+        position=message("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    )
+    zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    return message(
+        ODOMETRY,
+        header=header(stamp_ns, "odom"),
+        child_frame_id=child,
+        pose=message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+        twist=message(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=message("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+            covariance=np.zeros(36),
+        ),
+    )
+
+
+def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compression: str = "") -> Path:
+    """Write messages, or raw CDR bytes (as clouds), by topic; all topics arrive side by side."""
+    if path.suffix == ".bag":
+        return _write_ros1(path, topics)
+    plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compression:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, _type(m), typestore=STORE) for topic, m in topics.items()
+        }
+        for arrived, topic, kind, item in _in_turn(topics):
+            data = item if isinstance(item, bytes) else STORE.serialize_cdr(item, kind)
+            writer.write(connections[topic], arrived, data)
+    return path
+
+
+def _write_ros1(path: Path, topics: dict[str, list]) -> Path:
+    with Ros1Writer(path) as writer:
+        connections = {
+            topic: writer.add_connection(topic, _type(m), typestore=ROS1) for topic, m in topics.items()
+        }
+        for arrived, topic, kind, item in _in_turn(topics):
+            raw = STORE.cdr_to_ros1(bytes(STORE.serialize_cdr(item, kind)), kind)
+            writer.write(connections[topic], arrived, raw)
+    return path
+
+
+def _type(messages: list) -> str:
+    return getattr(messages[0], "__msgtype__", CLOUD) if messages else CLOUD
+
+
+def _in_turn(topics: dict[str, list]):
+    longest = max(map(len, topics.values()), default=0)
+    for topic, messages in topics.items():
+        for k, item in enumerate(messages):
+            arrived = LATE + round(k * longest / len(messages)) * 1000
+            yield arrived, topic, _type(messages), item
