@@ -43,6 +43,18 @@ def transform(T: Pose, points: npt.NDArray[_Real]) -> npt.NDArray[_Real]:
     return moved
 
 
+def lengths(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) -> npt.NDArray[_Real]:
+    """Distance (N,) of each of (N, 3) points from ``origin`` (3,), by default the frame's, in the points' precision."""
+    # by columns: np.linalg.norm along the short axis takes ten times as long, for the same numbers
+    x, y, z = (points[:, d].copy() if origin is None else points[:, d] - origin[d] for d in range(3))
+    x *= x
+    y *= y
+    z *= z
+    x += y
+    x += z
+    return np.asarray(np.sqrt(x))
+
+
 def rot_z(yaw: float) -> npt.NDArray[np.float64]:
     """Rotation matrix (3, 3) about z by ``yaw`` radians."""
     c, s = np.cos(yaw), np.sin(yaw)

@@ -20,6 +20,7 @@ from coview_stream.search import GlobalSearch, Query, Verdict
 from coview_stream.tracking import Tracker, kept, relative_to, unanchored
 
 _LEAST_POINTS = 10
+_LOOKED_AT = 2000  # of a frame's points, to see how far they lie
 _FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
 
 
@@ -102,7 +103,7 @@ class Localizer:
         cloud, T_odom_body = self._checked(cloud, T_odom_body, stamp)
         self._newest = _Frame(cloud, T_odom_body, stamp)
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
-        self._tracker.observe(cloud, T_odom_body)
+        self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
         if self.state is State.TRACKING:
             if self._tracker.due or self._doubts:
                 self._track(cloud, T_odom_body, stamp)
@@ -199,10 +200,12 @@ class Localizer:
             ) from error
         if rows.ndim != 2 or rows.shape[1] != 3:
             raise CloudError(f"cloud has shape {rows.shape}; expected (N, 3)")
-        finite = np.ascontiguousarray(rows[np.isfinite(rows).all(axis=1)])
+        whole = np.isfinite(rows).all()
+        # a copy even so: the caller may write the next frame into the same array
+        finite = rows.copy(order="C") if whole else rows.compress(np.isfinite(rows).all(axis=1), axis=0)
         if len(finite) < _LEAST_POINTS:
             raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_LEAST_POINTS} or more")
-        if np.median(np.abs(finite)) > _FARTHEST:
+        if np.median(np.abs(finite[:: 1 + len(finite) // _LOOKED_AT])) > _FARTHEST:
             raise CloudError("cloud lies kilometres from its origin; give it relative to the sensor")
         try:
             T = np.asarray(T_odom_body, dtype=np.float64)

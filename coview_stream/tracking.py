@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
+from coview_stream.place.keyframes import thinned
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
@@ -51,15 +51,16 @@ class Tracker:
         self._turned = 0.0
         self._last: Pose | None = None
 
-    def observe(self, cloud: Points, T_odom_body: Pose) -> None:
-        """Remember a frame's points (body frame) and how far odometry has driven."""
+    def observe(self, cloud: Points, T_odom_body: Pose, thin: Points | None = None) -> None:
+        """Remember a frame's points (body frame) and how far odometry has driven.
+
+        ``thin`` is what :func:`coview_stream.place.keyframes.thinned` makes of it, if that is known already.
+        """
         if self._last is not None:
             self.travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self._last[:3, 3]))
             self._turned += rotation_angle(inverse(self._last) @ T_odom_body)
         self._last = T_odom_body
-        points, _ = kernels.transform_unique(
-            cloud, T_odom_body, self.config.keyframe.voxel, self.config.keyframe.range_min
-        )
+        points = thinned(cloud, T_odom_body, self.config.keyframe) if thin is None else thin
         self._recent.append(_Recent(self.travelled, points))
 
     def forget(self) -> None:

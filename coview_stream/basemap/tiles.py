@@ -46,8 +46,10 @@ def crop(
         return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.float32)
     spans = [slice(int(begin), int(end)) for begin, end in index[wanted, 2:]]
     near_points = np.concatenate([points[span] for span in spans])
-    inside = np.hypot(near_points[:, 0] - centre[0], near_points[:, 1] - centre[1]) < radius
-    near_normals = (
-        np.concatenate([normals[span] for span in spans])[inside].astype(np.float32) / _NORMAL_SCALE
-    )
-    return np.ascontiguousarray(near_points[inside]), near_normals
+    dx, dy = near_points[:, 0] - np.float64(centre[0]), near_points[:, 1] - np.float64(centre[1])
+    inside = dx * dx + dy * dy < radius * radius
+    # compress: a boolean index of rows takes five times as long
+    packed = np.concatenate([normals[span] for span in spans]).compress(inside, axis=0)
+    near_normals = packed.astype(np.float32)
+    near_normals /= _NORMAL_SCALE
+    return near_points.compress(inside, axis=0), near_normals

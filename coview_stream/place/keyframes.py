@@ -35,22 +35,33 @@ class Keyframe:
         return np.asarray(self.T_odom_body[:3, 3])
 
 
+def thinned(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Points:
+    """Points (K, 3) of a frame (N, 3) in the odometry frame, one per voxel, without those near the sensor."""
+    return kernels.transform_unique(cloud, T_odom_body, config.voxel, config.range_min)[0]
+
+
 class KeyframeBuffer:
     """Turns frames into keyframes and keeps the newest ``capacity`` of them.
 
     All coordinates are in the odometry frame, which must be gravity aligned and near its own origin.
+
+    Attributes:
+        keyframes: the newest ones, oldest first.
+        newest: (N, 3) float32 points of the newest frame, one per voxel.
+        travelled: metres between keyframes.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self.config = config
         self.keyframes: deque[Keyframe] = deque(maxlen=config.capacity)
         self.travelled = 0.0
+        self.newest: Points = np.empty((0, 3), dtype=np.float32)
         self._pending: list[Points] = []
 
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
         """Take in one frame (N, 3) in the body frame; return the keyframe it completes, if it does."""
-        points, _ = kernels.transform_unique(cloud, T_odom_body, self.config.voxel, self.config.range_min)
-        self._pending.append(points)
+        self.newest = thinned(cloud, T_odom_body, self.config)
+        self._pending.append(self.newest)
         if sum(map(len, self._pending)) > _PENDING_POINTS:
             self._pending = [self._unique(np.concatenate(self._pending))]
         if self.keyframes:

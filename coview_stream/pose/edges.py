@@ -41,9 +41,11 @@ class EdgeRaster:
 
 def edge_raster(points: Points) -> EdgeRaster:
     """Edges of (K, 3) map points. Cells without points count as low: below a roof's edge there often are none."""
-    corner = points[:, :2].min(axis=0).astype(np.float64) - 2 * _CELL
-    cells = np.floor((points[:, :2] - corner) / _CELL).astype(np.int64)
-    top = np.full(cells.max(axis=0) + 3, _NOTHING, dtype=np.float32)
-    np.maximum.at(top, (cells[:, 0], cells[:, 1]), points[:, 2])
+    corner = np.array([points[:, d].min() for d in range(2)], dtype=np.float64) - 2 * _CELL
+    i, j = (np.floor((points[:, d] - corner[d]) / _CELL).astype(np.int64) for d in range(2))
+    rows, columns = int(i.max()) + 3, int(j.max()) + 3
+    flat = np.full(rows * columns, _NOTHING, dtype=np.float32)
+    np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
+    top = flat.reshape(rows, columns)
     edge = np.where(top - ndimage.minimum_filter(top, size=_REACH) > _DROP, top, np.float32(_NOTHING))
     return EdgeRaster(ndimage.maximum_filter(edge, size=_OVERHANG), corner)

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry import Points
+from coview_stream.geometry import Points, lengths
 from coview_stream.pose.registration import Source
 
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
@@ -28,7 +28,7 @@ def local_source(points: Points, position: npt.NDArray[np.float64], config: Regi
         The thinned points and, for each, its height above the lowest ground nearby. The choice is random but
         seeded: equal input gives equal output.
     """
-    near = points[np.linalg.norm(points - position.astype(np.float32), axis=1) < config.source_range]
+    near = points.compress(lengths(points, position.astype(np.float32)) < config.source_range, axis=0)
     thin, _ = kernels.transform_unique(near, np.eye(4), config.source_voxel)
     height = height_above_lowest(thin)
     if len(thin) > config.source_points:
@@ -45,10 +45,13 @@ def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
     """
     if not len(points):
         return np.empty(0, dtype=np.float32)
-    cells = np.floor(points[:, :2] / _CELL).astype(np.int64)
-    cells -= cells.min(axis=0)
-    lowest = np.full(cells.max(axis=0) + 1, np.inf, dtype=np.float32)
-    np.minimum.at(lowest, (cells[:, 0], cells[:, 1]), points[:, 2])
-    around = ndimage.minimum_filter(lowest, size=3, mode="constant", cval=np.inf)
-    height: npt.NDArray[np.float32] = points[:, 2] - around[cells[:, 0], cells[:, 1]]
+    i, j = (np.floor(points[:, d] / _CELL).astype(np.int64) for d in range(2))
+    i -= i.min()
+    j -= j.min()
+    rows, columns = int(i.max()) + 1, int(j.max()) + 1
+    cell = i * columns + j
+    lowest = np.full(rows * columns, np.inf, dtype=np.float32)
+    np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
+    around = ndimage.minimum_filter(lowest.reshape(rows, columns), size=3, mode="constant", cval=np.inf)
+    height: npt.NDArray[np.float32] = points[:, 2] - around.ravel()[cell]
     return height

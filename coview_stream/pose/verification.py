@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.geometry import Points, Pose, inverse, transform
+from coview_stream.geometry import Points, Pose, inverse, lengths, transform
 from coview_stream.pose.registration import LocalMap, Source
 
 _STRUCTURE_HEIGHT = 1.0  # metres above the ground
@@ -121,23 +121,26 @@ def rays_against_map(cloud: Points, T_map_body: Pose, points: Points) -> tuple[i
         T_map_body: (4, 4).
         points: (K, 3) map points, map frame.
     """
-    ranges = np.linalg.norm(cloud, axis=1)
+    ranges = lengths(cloud)
     usable = ranges > 1.0
-    cell = _beam_cells(cloud[usable], ranges[usable])
+    ranges = ranges[usable]
+    cell = _beam_cells(cloud.compress(usable, axis=0), ranges)
     nearest = np.full(_CELLS, np.inf, dtype=np.float32)
     farthest = np.zeros(_CELLS, dtype=np.float32)
-    np.minimum.at(nearest, cell, ranges[usable])
-    np.maximum.at(farthest, cell, ranges[usable])
+    np.minimum.at(nearest, cell, ranges)
+    np.maximum.at(farthest, cell, ranges)
     hits = np.bincount(cell, minlength=_CELLS)
 
     position = T_map_body[:3, 3]
     points = points[::_FREE_EVERY]
-    near = np.hypot(points[:, 0] - position[0], points[:, 1] - position[1]) < _FREE_RANGE
-    body = transform(inverse(T_map_body), points[near].astype(np.float64))
-    floor = _floor_below(cloud)
-    body = body[points[near][:, 2] > position[2] + floor + _FREE_HEIGHT]
-    distance = np.linalg.norm(body, axis=1)
-    body, distance = body[distance > 1.0], distance[distance > 1.0]
+    dx, dy = points[:, 0] - position[0], points[:, 1] - position[1]
+    wanted = (dx * dx + dy * dy < _FREE_RANGE**2) & (
+        points[:, 2] > position[2] + _floor_below(cloud) + _FREE_HEIGHT
+    )
+    body = transform(inverse(T_map_body), points.compress(wanted, axis=0).astype(np.float64))
+    distance = lengths(body)
+    off = distance > 1.0
+    body, distance = body.compress(off, axis=0), distance[off]
     seen = _beam_cells(body, distance)
     looked = hits[seen] >= _BEAM_HITS
     slack = _SLACK + _SLACK_SLOPE * distance
@@ -156,5 +159,5 @@ def _beam_cells(points: npt.NDArray[np.floating], ranges: npt.NDArray[np.floatin
 
 def _floor_below(cloud: Points) -> float:
     """Height of the ground relative to the sensor: a low percentile of the points within 10 m, never above it."""
-    near = cloud[np.hypot(cloud[:, 0], cloud[:, 1]) < 10.0]
-    return min(0.0, float(np.percentile(near[:, 2], 5))) if len(near) >= 20 else 0.0
+    near = cloud[:, 2][np.hypot(cloud[:, 0], cloud[:, 1]) < 10.0]
+    return min(0.0, float(np.percentile(near, 5))) if len(near) >= 20 else 0.0
