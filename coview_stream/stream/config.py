@@ -19,9 +19,11 @@ class NodeConfig:
         pairing_wait: a frame waits this long (local time) for the odometry around its stamp.
         horizon: odometry is remembered for this long (sensor time); an older frame is late.
         max_gap: odometry is interpolated between samples no farther apart than this.
-        max_speed: two odometry samples farther apart than this allows, and than a metre, are a jump.
+        max_outage: a longer pause of odometry (sensor time) is a new beginning: the robot may have been carried.
+        max_speed: faster motion between two odometry samples is a jump; see :mod:`coview_stream.stream.odometry`.
         max_turn_rate: likewise for headings, radians per second, and 20 degrees.
         max_payload: a larger message is counted as oversized and not looked at.
+        max_points: of a larger frame only every n-th point is used, so that no robot holds up the others.
         restart_after: stamps that run on steadily, but not from where they were, are a restarted clock after this.
         deskew: move points to the frame's stamp where the sender gives each point's time.
     """
@@ -33,9 +35,11 @@ class NodeConfig:
     pairing_wait: float = 0.3
     horizon: float = 5.0
     max_gap: float = 0.5
+    max_outage: float = 2.0
     max_speed: float = 50.0
     max_turn_rate: float = 20.0
     max_payload: int = 16 << 20
+    max_points: int = 200_000
     restart_after: float = 1.0
     deskew: bool = True
 

@@ -46,6 +46,7 @@ class Counters:
     clock_restarts: int = 0
     searches: int = 0
     searches_skipped: int = 0
+    search_errors: int = 0
     fixes: int = 0
     losses: int = 0
     poses: int = 0

@@ -19,12 +19,14 @@ class Sample:
         payload: its bytes.
         encoding: MIME type with its schema (``type;schema``), empty if the sender set none.
         attachment: bytes beside the payload, None if there are none.
+        size: bytes of a payload that was too large to be taken in; ``payload`` is empty then. None otherwise.
     """
 
     key: str
     payload: bytes
     encoding: str = ""
     attachment: bytes | None = None
+    size: int | None = None
 
 
 @dataclass(frozen=True)

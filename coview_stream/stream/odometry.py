@@ -16,7 +16,10 @@ from coview_stream.stream.messages import OdometryMessage
 
 _NS = 1_000_000_000
 _STEADY = 5  # samples that must run on before a clock counts as restarted
-_JUMP_DISTANCE = 1.0  # metres: less is within what a slow sample or a rough stamp can do
+_SLACK = 0.5  # metres that a sample may always be off: corrections by a lidar odometry, rough stamps
+_SLACK_SPEED = 3.0  # metres per second by which any robot may have sped up meanwhile
+_SPEED_FACTOR = 3.0  # times its speed of the last seconds
+_RECENT = 2 * _NS
 _JUMP_ANGLE = np.radians(20.0)
 
 
@@ -25,7 +28,9 @@ class Intake(str, Enum):
 
     CONTINUES = "continues"
     GAP = "gap"
-    """It comes after a pause: the robot may have been carried meanwhile."""
+    """It comes after a short pause: the place has to be verified again."""
+    OUTAGE = "outage"
+    """It comes after a long pause: the robot may have been carried anywhere."""
     JUMP = "jump"
     """It is farther away than the robot can have driven: odometry started anew."""
     RESTART = "restart"
@@ -81,7 +86,7 @@ class OdometryBuffer:
         verdict = self._classify(sample, now)
         if verdict in (Intake.DUPLICATE, Intake.OUT_OF_ORDER):
             return verdict
-        if verdict in (Intake.JUMP, Intake.RESTART):
+        if verdict in (Intake.JUMP, Intake.RESTART, Intake.OUTAGE):
             self.clear()
         elif self.newest is not None:
             step = inverse(self.newest.T_odom_body) @ sample.T_odom_body
@@ -108,7 +113,9 @@ class OdometryBuffer:
         if seconds < 0 or ahead:
             if not self._runs_on(sample.stamp_ns, now):
                 return Intake.OUT_OF_ORDER
-            return Intake.RESTART if seconds < 0 else Intake.GAP
+            return Intake.RESTART if seconds < 0 else Intake.OUTAGE
+        if seconds > self.config.max_outage:
+            return Intake.OUTAGE
         step = inverse(last.T_odom_body) @ sample.T_odom_body
         if self._impossible(step, seconds):
             return Intake.JUMP
@@ -124,9 +131,18 @@ class OdometryBuffer:
         return len(self._strange) == _STEADY and now - self._strange_since >= self.config.restart_after
 
     def _impossible(self, step: Pose, seconds: float) -> bool:
-        far = max(_JUMP_DISTANCE, self.config.max_speed * seconds)
+        far = _SLACK + min(self.config.max_speed, self._usual_speed()) * seconds
         wide = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
         return bool(np.linalg.norm(step[:3, 3]) > far or rotation_angle(step) > wide)
+
+    def _usual_speed(self) -> float:
+        """Metres per second that the robot may be driving now, by what it did lately; infinite while unknown."""
+        newest = self._samples[-1]
+        past = next(s for s in self._samples if s.stamp_ns >= newest.stamp_ns - _RECENT)
+        seconds = (newest.stamp_ns - past.stamp_ns) / _NS
+        if seconds < 0.2:
+            return float("inf")
+        return _SLACK_SPEED + _SPEED_FACTOR * (newest.travelled - past.travelled) / seconds
 
     def covers(self, stamp_ns: int) -> int:
         """-1 if the buffer starts after ``stamp_ns``, 1 if it has not come that far yet, 0 if the stamp lies within."""

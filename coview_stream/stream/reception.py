@@ -2,30 +2,47 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
+
+import numpy as np
 
 from coview_stream.errors import EncodingError, MessageError
 from coview_stream.stream.codecs import OversizedError
 from coview_stream.stream.counters import Counters
-from coview_stream.stream.messages import Sample
+from coview_stream.stream.messages import CloudMessage, Sample
 
 _MOST_ERRORS = 10  # different complaints that are kept
+_MOST_LOGGED = 20  # complaints about one robot's input that are logged, ever: its sender may invent new ones
+
+log = logging.getLogger("coview_stream.node")
 
 Message = TypeVar("Message")
 
 
 class Complaints:
-    """The newest different complaints, each once."""
+    """The newest different complaints, each once; the first few are logged as well."""
 
     def __init__(self) -> None:
         self.texts: deque[str] = deque(maxlen=_MOST_ERRORS)
+        self._logged = 0
 
     def add(self, text: str) -> None:
         """Remember a complaint unless it is known."""
         if text not in self.texts:
             self.texts.append(text)
+            if self._logged < _MOST_LOGGED:
+                self._logged += 1
+                log.warning("%s", text)
+
+    def add_first(self, kind: str, text: str) -> None:
+        """Remember only the first complaint of a kind, where every one would be worded differently."""
+        start = f"{kind}; the first: "
+        if not any(known.startswith(start) for known in self.texts):
+            self.add(start + text)
 
 
 def received(
@@ -40,8 +57,9 @@ def received(
     Returns:
         The message, or None with the name of the counter that it belongs to (see :class:`Counters`) and the reason.
     """
-    if len(sample.payload) > max_payload:
-        return None, "oversized", f"{len(sample.payload)} bytes, {max_payload} are the most"
+    size = len(sample.payload) if sample.size is None else sample.size
+    if sample.size is not None or size > max_payload:
+        return None, "oversized", f"{size} bytes, {max_payload} are the most"
     try:
         return decode(sample, option, hint), "", ""
     except EncodingError as error:
@@ -55,8 +73,17 @@ def received(
 def note(counters: Counters, complaints: Complaints, prefix: str, name: str, key: str, reason: str) -> None:
     """Count what could not be decoded; name it, unless every such message would have a reason of its own."""
     counters.count(prefix + name)
-    if name == "malformed":
-        reason = "malformed messages; the first one: " + reason
-        if any(text.startswith(f"{key}: malformed") for text in complaints.texts):
-            return
-    complaints.add(f"{key}: {reason}")
+    if name == "unknown_encoding":
+        complaints.add(reason)
+    else:
+        complaints.add_first(f"{key}: {name} messages", reason.removeprefix(f"{key}: "))
+
+
+def thinned(message: CloudMessage, most: int) -> CloudMessage:
+    """Return the cloud with every n-th point only, if it has more than ``most``."""
+    step = -(-len(message.points) // most)
+    if step <= 1:
+        return message
+    times = None if message.times is None else message.times[::step]
+    rings = None if message.rings is None else message.rings[::step]
+    return replace(message, points=np.ascontiguousarray(message.points[::step]), times=times, rings=rings)

@@ -9,23 +9,19 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, replace
 
-import numpy as np
-import numpy.typing as npt
-
 from coview_stream.config import TrackingConfig
 from coview_stream.fix import Fix, KeyframeEvidence, State
-from coview_stream.geometry import Pose
 from coview_stream.search import Query, Verdict
 from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.config import NodeConfig
+from coview_stream.stream.correction import Correction
 from coview_stream.stream.counters import Counters, Latency, Missing
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.messages import OdometryMessage, PoseMessage, Sample
 from coview_stream.stream.odometry import Intake, OdometryBuffer
 from coview_stream.stream.pairing import Pairing
-from coview_stream.stream.reception import Complaints, note, received
-from coview_stream.tracking import drift_covariance
+from coview_stream.stream.reception import Complaints, note, received, thinned
 
 _NS = 1_000_000_000
 
@@ -35,18 +31,6 @@ class _Ready:
     job: FrameJob
     received: float
     since: float  # local time from which on a frame of this robot has been waiting for the engine
-    travelled: float
-    turned: float
-
-
-@dataclass(frozen=True)
-class _Correction:
-    """The newest verified ``T_map_odom``, and how far odometry had driven when it was right."""
-
-    T_map_odom: Pose
-    covariance: npt.NDArray[np.float64]
-    confidence: float
-    stamp_ns: int
     travelled: float
     turned: float
 
@@ -89,7 +73,6 @@ class Session:
         self.latency = Latency()
         self.engine_latency = Latency()
         self.odometry = OdometryBuffer(self.config)
-        self.evidence: KeyframeEvidence | None = None
         self.last_frame_ns: int | None = None
         self.longest_wait = 0.0
         self._missing = Missing()
@@ -103,16 +86,17 @@ class Session:
         """Forget all that refers to the odometry frame, which is no more."""
         self.counters.dropped += len(self._pairing) + (self._ready is not None)
         self._epoch += 1
+        self.evidence: KeyframeEvidence | None = None
         self._pairing = Pairing(self.config, self.odometry, self.counters)
         self._ready = None
         self._busy: _Ready | None = None
         self._query: Query | None = None
         self._searching = False
         self._verdict: Verdict | None = None
-        self._correction: _Correction | None = None
+        self._correction: Correction | None = None
         self._suspect = False
         self._trusted_from = -(1 << 63)
-        self._published_ns = -(1 << 63)
+        self._published: PoseMessage | None = None
         if self._fix_state is not State.LOST:
             self._fix_state = State.SEARCHING
 
@@ -128,7 +112,7 @@ class Session:
                 note(self.counters, self.complaints, "", name, sample.key, reason)
                 return
             self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
-            self._pairing.add(message, now)
+            self._pairing.add(thinned(message, self.config.max_points), now)
             self._pair(now)
 
     def on_odometry(self, sample: Sample, now: float) -> None:
@@ -151,7 +135,14 @@ class Session:
             self.counters.odometry_out_of_order += 1
         elif intake is Intake.GAP:
             self.counters.odometry_gaps += 1
-            self._doubt(message.stamp_ns)
+            if self._correction is None and self._fix_state is not State.TRACKING:
+                # frames from before and after the pause must not be searched for as one place
+                self.begin_anew("odometry paused")
+            else:
+                self._doubt(message.stamp_ns)
+        elif intake is Intake.OUTAGE:
+            self.counters.odometry_gaps += 1
+            self.begin_anew(f"odometry was away for more than {self.config.max_outage:g} s")
         elif intake is Intake.JUMP:
             self.counters.odometry_jumps += 1
             self.begin_anew("odometry jumped")
@@ -252,7 +243,9 @@ class Session:
             if job.epoch < self._first_epoch:
                 return
             self.counters.count("rejected" if rejected else "engine_errors")
-            self.complaints.add((reason.strip() or "unknown failure").splitlines()[-1])
+            kind = "frames of no use" if rejected else "frames that the engine failed at"
+            last_line = (reason.strip() or "unknown failure").splitlines()[-1]
+            self.complaints.add_first(f"{self.keys.robot}: {kind}", last_line)
             if job.epoch == self._epoch:
                 self._busy = None
                 self._verdict = self._verdict or job.verdict
@@ -271,11 +264,21 @@ class Session:
                 if verdict is not None and (self._verdict is None or self._verdict.accepted is None):
                     self._verdict = verdict
 
-    def engine_restarted(self) -> None:
-        """Take note that the tracking engine has forgotten all it knew."""
+    def search_failed(self, job: SearchJob, reason: str) -> None:
+        """Take note that the search engine failed, which costs this keyframe's vote only."""
+        with self._lock:
+            self.counters.search_errors += 1
+            last_line = (reason.strip() or "unknown failure").splitlines()[-1]
+            self.complaints.add_first(f"{self.keys.robot}: failed searches", last_line)
+            if job.epoch == self._epoch:
+                self._searching = False
+
+    def engine_restarted(self, kind: str = "track") -> None:
+        """Take note that an engine has forgotten all it knew; only that of ``track`` knew where the robot is."""
         with self._lock:
             self.counters.engine_restarts += 1
-            self.begin_anew("the engine was started again")
+            if kind == "track":
+                self.begin_anew("the engine was started again")
 
     def _note(self, job: FrameJob, result: FrameResult, ready: _Ready) -> None:
         fix = result.fix
@@ -295,14 +298,10 @@ class Session:
             self._correct(fix, job, ready)
 
     def _correct(self, fix: Fix, job: FrameJob, ready: _Ready) -> None:
-        assert fix.T_map_odom is not None
-        assert fix.covariance is not None
         if self._correction is None:
             self.counters.fixes += 1
         self._lost = None
-        self._correction = _Correction(
-            fix.T_map_odom, fix.covariance, fix.confidence, job.stamp_ns, ready.travelled, ready.turned
-        )
+        self._correction = Correction.of(fix, job.stamp_ns, ready.travelled, ready.turned)
 
     # ---- what goes out
 
@@ -327,23 +326,17 @@ class Session:
     def pose(self) -> PoseMessage | None:
         """Newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING."""
         with self._lock:
-            newest, known = self.odometry.newest, self._correction
-            if newest is None or known is None or newest.stamp_ns < self._published_ns:
+            if self._correction is None:
                 return None
-            self._published_ns = newest.stamp_ns
+            pose = self._correction.pose(self.odometry, self.tracking, self.keys.robot, self.map_sha256)
+            before = self._published
+            if pose is None or (before is not None and pose.stamp_ns < before.stamp_ns):
+                return None
+            if before is not None and pose.stamp_ns == before.stamp_ns:
+                pose = before  # what has been said of a time is not said otherwise later
+            self._published = pose
             self.counters.poses += 1
-            driven = max(0.0, self.odometry.travelled - known.travelled)
-            turned = max(0.0, self.odometry.turned - known.turned)
-            return PoseMessage(
-                stamp_ns=newest.stamp_ns,
-                robot=self.keys.robot,
-                state=State.TRACKING.value,
-                T_map_body=known.T_map_odom @ newest.T_odom_body,
-                covariance=known.covariance + drift_covariance(self.tracking, driven, turned),
-                confidence=known.confidence,
-                map_sha256=self.map_sha256,
-                age=max(0.0, (newest.stamp_ns - known.stamp_ns) / _NS),
-            )
+            return pose
 
     def state(self) -> tuple[State, str]:
         """Return the state and one clause that gives its reason."""
@@ -362,13 +355,22 @@ class Session:
         if not counted.received:
             return f"waiting for clouds on {self.keys.cloud}"
         if self.odometry.newest is None:
-            return f"waiting for odometry on {self.keys.odometry}"
+            unread = counted.odometry_received > 0
+            return (
+                "no odometry could be read; see errors"
+                if unread
+                else f"waiting for odometry on {self.keys.odometry}"
+            )
+        if counted.rejected:
+            return f"{counted.rejected} frames were of no use; see errors"
         if counted.late or counted.no_odometry:
             return "odometry and clouds have no common stamps: are both of one clock?"
+        if counted.received == counted.malformed + counted.oversized + counted.unknown_encoding:
+            return "not one cloud could be read; see errors"
         return "no frame has been processed yet"
 
     def age(self) -> float | None:
-        """Seconds of sensor time between the newest odometry and the frame that last corrected it; None if LOST."""
+        """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
         with self._lock:
             newest, known = self.odometry.newest, self._correction
-            return None if newest is None or known is None else (newest.stamp_ns - known.stamp_ns) / _NS
+            return None if newest is None or known is None else known.age(newest.stamp_ns)

@@ -80,7 +80,32 @@ def test_a_gap_while_the_first_fix_is_under_way():
     assert robot.session.pose() is None
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
     robot.saw(2.05)
-    assert robot.session.take_frame().suspect
+    assert robot.session.take_frame().epoch > busy.epoch  # the search begins anew
+
+
+def test_a_long_outage_of_odometry_is_a_new_beginning():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    assert robot.session.pose() is not None
+    robot.moved(2.7, x=0.6, now=robot.now + 2.4)
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.LOST, "odometry was away for more than 2 s")
+
+
+def test_a_stamp_is_not_given_two_poses():
+    robot = Robot().localized(0.0)
+    first = robot.session.pose()
+    robot.saw(0.0)
+    robot.drive(0.05, 0.1)
+    robot.saw(0.1)
+    job = robot.session.take_frame()
+    before = robot.session.pose()
+    robot.session.frame_done(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
+    assert robot.session.pose() is before
+    robot.drive(0.15, 0.2)
+    after = robot.session.pose()
+    assert after.stamp_ns > before.stamp_ns >= first.stamp_ns
+    assert abs(after.T_map_body[0, 3] - before.T_map_body[0, 3]) > 1.0
 
 
 def test_covariance_of_a_cloud_that_comes_late():
@@ -112,9 +137,9 @@ def test_a_frame_that_came_is_not_missing():
     robot.saw(0.0, attachment=numbered(1, 0.0))
     robot.session.take_frame()
     robot.saw(0.3, attachment=numbered(2, 0.3))
-    robot.session.tick(1000.0)
-    robot.moved(0.7, x=0.0)  # a gap: no odometry for the second
-    robot.saw(0.7, attachment=numbered(3, 0.7))
+    robot.session.tick(robot.now + 1.0)  # the second found none
+    robot.moved(0.45, x=0.0)
+    robot.saw(0.45, attachment=numbered(3, 0.45))
     assert (robot.counters.no_odometry, robot.counters.missing) == (1, 0)
 
 

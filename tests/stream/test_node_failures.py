@@ -43,7 +43,7 @@ def test_one_robots_garbage_and_failures_are_its_own(pair):
     bad, good = pair.status("r1"), pair.status("r2")
     assert bad["counters"]["engine_errors"] == 10
     assert bad["counters"]["malformed"] + bad["counters"]["unknown_encoding"] == 50
-    assert "ZeroDivisionError: boom" in bad["errors"]
+    assert any("ZeroDivisionError: boom" in error for error in bad["errors"])
     assert good["state"] == "TRACKING"
     assert good["errors"] == []
     assert {n: c for n, c in good["counters"].items() if c} == {
@@ -62,7 +62,7 @@ def test_a_rejected_frame_leaves_the_pose(site):
     assert site.poses("r1")[-1].stamp_ns == ns(STEP)
     status = site.status("r1")
     assert (status["state"], status["counters"]["rejected"]) == ("TRACKING", 1)
-    assert status["errors"] == ["cloud has 3 finite points"]
+    assert status["errors"] == ["r1: frames of no use; the first: cloud has 3 finite points"]
 
 
 def test_an_engine_that_died_has_forgotten_all_robots(pair):

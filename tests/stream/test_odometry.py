@@ -90,7 +90,14 @@ def test_turns_add_up_whatever_their_sense():
 
 
 @pytest.mark.parametrize(
-    ("pause", "intake"), [(0.5, Intake.CONTINUES), (0.51, Intake.GAP), (4.9, Intake.GAP)]
+    ("pause", "intake"),
+    [
+        (0.5, Intake.CONTINUES),
+        (0.51, Intake.GAP),
+        (1.9, Intake.GAP),
+        (2.1, Intake.OUTAGE),
+        (4.9, Intake.OUTAGE),
+    ],
 )
 def test_a_pause_of_the_stamps_is_a_gap(pause, intake):
     odometry = buffer((1.0, 0.0))
@@ -98,9 +105,10 @@ def test_a_pause_of_the_stamps_is_a_gap(pause, intake):
     assert odometry.newest.stamp_ns == ns(1.0 + pause)
 
 
-def test_a_long_pause_in_both_clocks_is_a_gap():
+def test_a_long_pause_in_both_clocks_is_an_outage():
     odometry = buffer((1.0, 0.0))
-    assert odometry.add(message(601.0, 0.0), 601.0) is Intake.GAP
+    assert odometry.add(message(601.0, 0.0), 601.0) is Intake.OUTAGE
+    assert odometry.covers(ns(1.0)) == -1
 
 
 def test_a_duplicate_leaves_no_trace():
@@ -135,10 +143,20 @@ def test_farther_than_the_robot_can_have_come_is_a_jump(x, yaw, intake):
 
 
 def test_what_is_possible_grows_with_time():
-    assert buffer((0.0, 0.0)).add(message(0.1, 4.9), 0.1) is Intake.CONTINUES
-    assert buffer((0.0, 0.0)).add(message(0.1, 5.1), 0.1) is Intake.JUMP
+    assert buffer((0.0, 0.0)).add(message(0.1, 5.4), 0.1) is Intake.CONTINUES
+    assert buffer((0.0, 0.0)).add(message(0.1, 5.6), 0.1) is Intake.JUMP
     assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 1.9), 0.1) is Intake.CONTINUES
     assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 2.1), 0.1) is Intake.JUMP
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0])
+def test_what_is_possible_depends_on_what_the_robot_does(speed):
+    """Half a metre, and three times its speed of the last seconds and three metres per second more."""
+    most = 0.5 + 0.1 * (3.0 * speed + 3.0)
+    for off, intake in ((-0.05, Intake.CONTINUES), (0.05, Intake.JUMP)):
+        odometry = buffer(*((0.1 * k, 0.1 * k * speed) for k in range(11)))
+        fast = min(most, 0.5 + 0.1 * 50.0)
+        assert odometry.add(message(1.1, speed + fast + off), 1.1) is intake
 
 
 def test_a_jump_forgets_what_was_before():
@@ -187,11 +205,11 @@ def test_a_slow_clock_needs_five_samples():
     assert verdicts == [Intake.OUT_OF_ORDER] * 4 + [Intake.RESTART, Intake.GAP]
 
 
-def test_a_clock_set_forward_is_a_gap_once_it_has_run_on():
+def test_a_clock_set_forward_is_an_outage_once_it_has_run_on():
     odometry = buffer()
     steady(odometry, 0.0, 1.0)
     verdicts = [odometry.add(message(3600.0 + 0.05 * k, 2.0), 1.05 + 0.05 * k) for k in range(23)]
-    at = verdicts.index(Intake.GAP)
+    at = verdicts.index(Intake.OUTAGE)
     assert set(verdicts[:at]) == {Intake.OUT_OF_ORDER}
     assert 20 <= at <= 21
     assert set(verdicts[at + 1 :]) == {Intake.CONTINUES}

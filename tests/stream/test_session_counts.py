@@ -40,7 +40,9 @@ def test_rejected(robot):
     robot.saw(0.0)
     robot.session.frame_failed(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
     assert counted(robot) == {"received": 1, "rejected": 1, "odometry_received": 5}
-    assert list(robot.session.complaints.texts) == ["cloud has 3 finite points"]
+    assert list(robot.session.complaints.texts) == [
+        "r1: frames of no use; the first: cloud has 3 finite points"
+    ]
 
 
 def test_engine_errors_are_told_by_their_last_line(robot):
@@ -49,7 +51,9 @@ def test_engine_errors_are_told_by_their_last_line(robot):
     trace = "Traceback:\n  somewhere\nValueError: boom\n"
     robot.session.frame_failed(robot.session.take_frame(), trace, rejected=False)
     assert counted(robot) == {"received": 1, "engine_errors": 1, "odometry_received": 5}
-    assert list(robot.session.complaints.texts) == ["ValueError: boom"]
+    assert list(robot.session.complaints.texts) == [
+        "r1: frames that the engine failed at; the first: ValueError: boom"
+    ]
 
 
 def test_dropped_because_a_newer_frame_came(robot):
