@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
@@ -21,9 +22,12 @@ from coview_stream.errors import CoViewError
 from coview_stream.search import Verdict
 from coview_stream.stream.engine import Engine
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
+from coview_stream.stream.watchdog import Watchdog
 
 Job = FrameJob | SearchJob
 Result = FrameResult | Verdict
+
+_GLANCE = 0.1  # seconds between two looks at whether the opening has been cancelled
 
 
 class RejectedError(Exception):
@@ -36,6 +40,10 @@ class FailedError(Exception):
 
 class DiedError(Exception):
     """The engine's process died or hung; it has forgotten all robots."""
+
+
+class CancelledError(Exception):
+    """Whoever waited for the engine no longer wants it."""
 
 
 class Lane(Protocol):
@@ -66,7 +74,7 @@ class InlineLane:
 
 
 class ProcessLane:
-    """Runs jobs in a child process.
+    """Runs jobs in a child process. A child that hangs, wherever, is killed.
 
     Args:
         kind: ``track`` or ``search``.
@@ -74,19 +82,30 @@ class ProcessLane:
         sha256: what the map has to be; if the file was replaced meanwhile, poses would be of another map than is said.
         nice: how far the child stands back from us, so that the clock here is never late.
         patience: seconds after which a job counts as hung.
+        opening: seconds after which opening the map, or preparing for the first job, does.
     """
 
-    def __init__(self, kind: str, map_path: str, sha256: str, nice: int = 0, patience: float = 30.0) -> None:
+    def __init__(
+        self,
+        kind: str,
+        map_path: str,
+        sha256: str,
+        nice: int = 0,
+        patience: float = 30.0,
+        opening: float = 120.0,
+    ) -> None:
         self.kind = kind
         self.map_path = map_path
         self.sha256 = sha256
         self.nice = nice
         self.patience = patience
+        self.opening = opening
         self._closed = False
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
-        self._fresh = False
+        self._awaited: list[str] = []  # what a fresh child has yet to say
+        self._watchdog = Watchdog(f"coview-watch-{kind}", self._kill)
 
     @property
     def pid(self) -> int | None:
@@ -109,58 +128,69 @@ class ProcessLane:
                     start_new_session=True,  # an interrupt at the terminal is for us to pass on
                 )  # fmt: skip
             self._pipe = Connection(ours.detach())
-            self._fresh = True
+            self._awaited = ["ready", "prepared"]
 
-    def wait_ready(self) -> None:
+    def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until the child has opened the map.
 
+        Args:
+            cancelled: asked ten times a second whether to give up.
+
         Raises:
-            CoViewError: it could not, and says why. DiedError: it died.
+            CoViewError: it could not, and says why. DiedError: it died or hung. CancelledError: as asked.
         """
-        kind, value = self._receive()
-        self._fresh = False
-        if kind == "error":
-            raise CoViewError(value)
+        if "ready" in self._awaited:
+            self._await("ready", cancelled)
 
     def run(self, job: Job) -> Result:
         """Do one job; a child that died before is started again first."""
         if self._pipe is None:
             self.start()
-        if self._fresh:
-            try:
-                self.wait_ready()
-            except CoViewError as error:
-                self._end()
-                raise DiedError(str(error)) from error
         try:
-            assert self._pipe is not None
-            self._pipe.send(job)
-        except (OSError, AttributeError, AssertionError) as error:
+            for word in list(self._awaited):
+                self._await(word)
+        except CoViewError as error:
             self._end()
-            raise DiedError(f"the {self.kind} engine died") from error
-        return unwrap(*self._receive())
+            raise DiedError(str(error)) from error
+        return unwrap(*self._exchange(lambda pipe: pipe.send(job), self.patience))
 
     def close(self) -> None:
-        """End the child at once; it keeps nothing that would have to be saved."""
+        """Kill the child at once; it keeps nothing that would have to be saved."""
         with self._lock:
             self._closed = True
         self._end()
+        self._watchdog.close()
 
-    def _receive(self) -> tuple[str, Any]:
+    def _await(self, word: str, cancelled: Callable[[], bool] = lambda: False) -> None:
+        def look(pipe: Connection) -> None:
+            while not pipe.poll(_GLANCE):
+                if cancelled():
+                    raise CancelledError(f"the {self.kind} engine is no longer wanted")
+
+        kind, value = self._exchange(look, self.opening)
+        if kind == "error":
+            raise CoViewError(value)
+        self._awaited.remove(word)
+
+    def _exchange(self, begin: Callable[[Connection], object], seconds: float) -> tuple[str, Any]:
+        """Do ``begin`` and receive; sending, waiting and receiving may all hang, and together have ``seconds``."""
         pipe = self._pipe
         try:
             if pipe is None:
                 raise EOFError
-            if not pipe.poll(self.patience):
-                raise DiedError(f"the {self.kind} engine has not answered for {self.patience:g} s")
-            kind, value = pipe.recv()
-            return str(kind), value
-        except DiedError:
+            with self._watchdog.limit(seconds):
+                begin(pipe)
+                kind, value = pipe.recv()
+        except (EOFError, OSError, TypeError) as error:  # the last one: closed by another thread meanwhile
             self._end()
-            raise
-        except (EOFError, OSError) as error:
-            self._end()
-            raise DiedError(f"the {self.kind} engine died") from error
+            hung = f" had no answer for {seconds:g} s and was ended"
+            raise DiedError(f"the {self.kind} engine{hung if self._watchdog.acted else ' died'}") from error
+        return str(kind), value
+
+    def _kill(self) -> None:
+        child = self._child
+        if child is not None:
+            child.kill()
 
     def _end(self) -> None:
         with self._lock:

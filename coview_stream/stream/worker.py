@@ -28,6 +28,7 @@ def main(argv: list[str]) -> int:
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
         pipe.send(("ready", None))
         engine.prepare()
+        pipe.send(("prepared", None))
         while True:
             pipe.send(attempt(engine, pipe.recv()))
     return 0

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
+import subprocess
+import sys
+import threading
+from multiprocessing.connection import Connection
 
 import numpy as np
 import pytest
@@ -14,7 +19,14 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, CoViewError
 from coview_stream.fix import State
 from coview_stream.stream.jobs import FrameJob
-from coview_stream.stream.lane import DiedError, FailedError, InlineLane, ProcessLane, RejectedError
+from coview_stream.stream.lane import (
+    CancelledError,
+    DiedError,
+    FailedError,
+    InlineLane,
+    ProcessLane,
+    RejectedError,
+)
 
 
 def job(points=None, robot="r1"):
@@ -116,3 +128,68 @@ def test_a_map_that_cannot_be_opened(tmp_path):
     finally:
         lane.close()
     assert lane.pid is None
+
+
+def test_a_worker_that_stands_still_is_ended_even_with_a_frame_half_sent(world_file, world_drive):
+    lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
+    good = job(world_drive.clouds[0])
+    try:
+        lane.start()
+        lane.run(good)
+        first = lane.pid
+        os.kill(first, signal.SIGSTOP)
+        lane.patience = 0.3
+        with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
+            lane.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
+        until(lambda: not alive(first), 5.0)
+        lane.patience = 30.0
+        assert lane.run(good).query is not None
+    finally:
+        lane.close()
+
+
+def with_child(lane, program):
+    """Give a lane a child that runs ``program``, which finds its end of the pipe as ``fd``."""
+    ours, theirs = socket.socketpair()
+    with theirs:
+        code = f"import os, time; fd = {theirs.fileno()}\n{program}"
+        lane._child = subprocess.Popen([sys.executable, "-c", code], pass_fds=[theirs.fileno()])
+    lane._pipe = Connection(ours.detach())
+
+
+def test_an_answer_that_breaks_off_ends_the_worker():
+    lane = ProcessLane("search", "unused", "0" * 64, patience=0.3)
+    with_child(lane, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
+    child = lane.pid
+    with pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
+        lane.run(job())
+    until(lambda: not alive(child), 5.0)
+    lane.close()
+
+
+def test_opening_has_a_limit_of_its_own_and_can_be_cancelled():
+    lane = ProcessLane("track", "unused", "0" * 64, patience=0.01, opening=0.3)
+    with_child(lane, "time.sleep(60)")
+    lane._awaited = ["ready", "prepared"]
+    asked = []
+
+    def cancelled():
+        asked.append(1)
+        return len(asked) == 2
+
+    with pytest.raises(CancelledError, match="track"):
+        lane.wait_ready(cancelled)
+    with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
+        lane.wait_ready()
+    lane.close()
+
+
+def test_closing_ends_a_job_under_way():
+    lane = ProcessLane("track", "unused", "0" * 64)
+    with_child(lane, "time.sleep(60)")
+    timer = threading.Timer(0.2, lane.close)
+    timer.start()
+    with pytest.raises(DiedError, match="died"):
+        lane.run(job())
+    timer.join()
+    until(lambda: "coview-watch-track" not in [thread.name for thread in threading.enumerate()])
