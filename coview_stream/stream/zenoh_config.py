@@ -11,6 +11,7 @@ from typing import Any
 
 from coview_stream.errors import TransportError
 from coview_stream.stream.guard import is_panic
+from coview_stream.stream.zenoh_words import reason
 
 _PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
@@ -64,12 +65,6 @@ def zenoh_errors(what: str) -> Iterator[None]:
         if not is_panic(error):
             raise
         raise TransportError(f"{what}: zenoh failed inside: {reason(error)}") from error
-
-
-def reason(error: BaseException) -> str:
-    """Return what zenoh says, on one line and without the places in its source."""
-    text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
-    return text.strip() or type(error).__name__
 
 
 def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None) -> Any:
@@ -176,10 +171,13 @@ def _check_endpoint(endpoint: str, option: str) -> None:
         )
     if protocol in _WITH_PORT:
         found = _HOST_PORT.fullmatch(address)
-        if not found or int(found.group(2)) > 65535:
+        if not found:
             raise TransportError(
                 f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447"
             )
+        lowest = 0 if option == "--listen" else 1  # listening on 0 takes any that is free
+        if not lowest <= int(found.group(2)) <= 65535:
+            raise TransportError(f"{option} {endpoint!r}: port must be 1..65535, such as 7447")
 
 
 def _get(config: Any, key: str) -> Any:
