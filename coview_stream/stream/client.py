@@ -6,13 +6,14 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.errors import MessageError
+from coview_stream.errors import MessageError, TransportError
 from coview_stream.geometry import Pose
 from coview_stream.stream.keys import RobotKeys, robot_keys
 from coview_stream.stream.mailbox import Mailbox
@@ -21,6 +22,7 @@ from coview_stream.stream.reach import DEFAULT_ENDPOINT, ask, await_subscriber
 from coview_stream.stream.records import read_status
 from coview_stream.stream.sender import Sender, nanoseconds
 from coview_stream.stream.transport import Transport
+from coview_stream.stream.watching import STALE
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +36,7 @@ class RobotClient:
     """Streams one robot to a node and receives its poses; a context manager.
 
     >>> with RobotClient("rover1", "tcp/127.0.0.1:7447") as robot:     # doctest: +SKIP
+    ...     robot.wait_for_node(10)                                    # what is sent before it is there is lost
     ...     robot.send_odometry(T_odom_body, stamp)                    # before the cloud that it belongs to
     ...     robot.send_cloud(points, stamp)
     ...     for pose in robot.poses():
@@ -77,7 +80,7 @@ class RobotClient:
         self._transport = transport if transport is not None else open_client(endpoint, listen, config)
         self._poses: Mailbox[PoseMessage] = Mailbox(POSES_KEPT)
         self._statuses: Mailbox[dict[str, Any]] = Mailbox(STATUSES_KEPT)
-        self._latest_pose: PoseMessage | None = None
+        self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
         self._latest_status: dict[str, Any] | None = None
         self._malformed = 0
         self._closed = False
@@ -97,12 +100,19 @@ class RobotClient:
 
     @property
     def latest_pose(self) -> PoseMessage | None:
-        """The newest pose received; None before the first. It does not vanish when poses stop: see its stamp."""
-        return self._latest_pose
+        """The newest pose received, while it holds.
+
+        None before the first, as soon as a status says another state than TRACKING, and when none has come for 2 s of
+        local time: a robot that is lost, or has lost its node, must not drive by where it once was.
+        """
+        newest = self._latest_pose
+        if newest is None or monotonic() - newest[0] >= STALE or not self._tracking():
+            return None
+        return newest[1]
 
     @property
     def latest_status(self) -> dict[str, Any] | None:
-        """The newest status received; None before the first."""
+        """The newest status received; None before the first. Its ``stamp_ns`` is the node's clock, since 1970."""
         return self._latest_status
 
     @property
@@ -113,7 +123,7 @@ class RobotClient:
     def send_cloud(
         self, points: npt.ArrayLike, stamp: float, times: npt.NDArray[np.float64] | None = None
     ) -> None:
-        """Publish one lidar frame; it is dropped if the link is busy with the one before.
+        """Publish one lidar frame; it is dropped if the link is busy with the one before, or nobody listens.
 
         Args:
             points: (N, 3), or (N, 4) with an intensity that is not used: body frame (x forward, z up), metres.
@@ -122,8 +132,10 @@ class RobotClient:
                 rows cannot carry them: a client without an explicit encoding sends such a frame as foxglove.PointCloud.
 
         Raises:
-            InputError: an array has the wrong shape, or the stamp is not in seconds.
+            InputError: an array has the wrong shape, no point is finite, or the stamp is not in seconds.
+            TransportError: the client is closed.
         """
+        self._check_open()
         self._sender.put_cloud(self._sender.cloud(points, nanoseconds(stamp), times))
 
     def send_odometry(self, T_odom_body: Pose, stamp: float) -> None:
@@ -131,7 +143,9 @@ class RobotClient:
 
         Raises:
             InputError: the matrix is no rigid transform, or the stamp is not in seconds.
+            TransportError: the client is closed.
         """
+        self._check_open()
         self._sender.put_odometry(self._sender.odometry(T_odom_body, nanoseconds(stamp)))
 
     def poses(self, timeout: float | None = None) -> Iterator[PoseMessage]:
@@ -147,19 +161,28 @@ class RobotClient:
         return _drain(self._statuses, timeout)
 
     def wait_for_node(self, seconds: float) -> bool:
-        """Wait until somebody subscribes to this robot's clouds; False if nobody did for ``seconds``."""
+        """Wait until somebody subscribes to this robot's clouds; False if nobody did for ``seconds``.
+
+        What is sent before is lost.
+
+        Raises:
+            TransportError: the client is closed.
+        """
+        self._check_open()
         return await_subscriber(self._transport, self._sender.cloud_key, seconds)
 
     def relocalize(self, timeout: float = 5.0) -> dict[str, Any]:
         """Make the node forget the pose and search again; returns its reply.
 
         Raises:
-            TransportError: nobody answered within ``timeout`` seconds, or the node refused.
+            TransportError: nobody answered within ``timeout`` seconds, the node refused, or the client is closed.
         """
+        self._check_open()
         return ask(self._transport, self.keys.relocalize, timeout=timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:
         """Make the node forget everything about this robot; returns its reply. Errors as :meth:`relocalize`."""
+        self._check_open()
         return ask(self._transport, self.keys.reset, timeout=timeout)
 
     def close(self) -> None:
@@ -181,6 +204,15 @@ class RobotClient:
     ) -> None:
         self.close()
 
+    def _check_open(self) -> None:
+        if self._closed:
+            raise TransportError(f"the client of robot {self.robot!r} is closed: open another one")
+
+    def _tracking(self) -> bool:
+        """Whether poses may be believed; True without a status, which access rules may keep from us."""
+        status = self._latest_status
+        return status is None or status.get("state", "TRACKING") == "TRACKING"
+
     def _on_pose(self, sample: Sample) -> None:
         from coview_stream.stream.codecs import decode_pose
 
@@ -191,7 +223,7 @@ class RobotClient:
             return
         if not pose.robot:
             pose = replace(pose, robot=self.robot)
-        self._latest_pose = pose
+        self._latest_pose = monotonic(), pose
         self._poses.put(pose)
 
     def _on_status(self, sample: Sample) -> None:
@@ -201,6 +233,8 @@ class RobotClient:
             self._reject(sample, error)
             return
         self._latest_status = status
+        if not self._tracking():
+            self._latest_pose = None  # also for the time after: only a new pose brings it back
         self._statuses.put(status)
 
     def _reject(self, sample: Sample, error: MessageError) -> None:

@@ -12,6 +12,7 @@ from live import free_endpoint, until
 from coview_stream import RobotClient
 from coview_stream.errors import ConfigError, InputError, TransportError
 from coview_stream.geometry import pose_from, rot_z
+from coview_stream.stream import client as client_module
 from coview_stream.stream.client import POSES_KEPT
 from coview_stream.stream.codecs import decode_cloud, decode_odometry, encode_pose
 from coview_stream.stream.fake import FakeTransport
@@ -56,8 +57,8 @@ def test_other_arrays_that_mean_the_same(client, net):
     client.send_cloud(np.asfortranarray(CLOUD), 1.0)
     client.send_cloud(CLOUD.tolist(), np.float32(1.0))
     assert len({(s.payload, s.attachment) for s in net.published}) == 1
-    client.send_cloud(np.zeros((0, 3)), 2.0)  # a lidar that sees nothing is no error
-    assert net.published[-1].payload == b""
+    client.send_cloud(np.vstack([CLOUD, [np.nan] * 3]), 2.0)  # directions without an echo are no error
+    assert len(net.published[-1].payload) == 5 * 12
 
 
 def test_odometry_on_the_wire(client, net):
@@ -90,7 +91,20 @@ def test_times_of_points_arrive(client, net):
     [
         (lambda c: c.send_cloud(np.zeros((4, 2)), 1.0), "shape"),
         (lambda c: c.send_cloud(np.zeros(3), 1.0), "shape"),
+        (lambda c: c.send_cloud(None, 1.0), "shape"),
+        (lambda c: c.send_cloud([["a", "b", "c"]], 1.0), "points .*no array of numbers"),
+        (lambda c: c.send_cloud([[1, 2, 3], [4]], 1.0), "points .*no array of numbers"),
+        (lambda c: c.send_cloud(np.zeros((0, 3)), 1.0), "0 points"),
+        (lambda c: c.send_cloud(np.full((4, 3), np.nan), 1.0), "4 points, none of them finite"),
+        (lambda c: c.send_cloud(np.where(np.eye(3), np.inf, 1.0), 1.0), "none of them finite"),
         (lambda c: c.send_cloud(CLOUD, 1.0, np.zeros(3)), "times"),
+        (lambda c: c.send_cloud(CLOUD, 1.0, ["x"] * 4), "times .*no array of numbers"),
+        (lambda c: c.send_cloud(CLOUD, None), "stamp None: give seconds"),
+        (lambda c: c.send_cloud(CLOUD, "now"), "stamp 'now': give seconds"),
+        (lambda c: c.send_cloud(CLOUD, np.zeros(2)), "seconds"),
+        (lambda c: c.send_odometry(np.eye(4), None), "stamp None: give seconds"),
+        (lambda c: c.send_odometry("here", 1.0), "T_odom_body"),
+        (lambda c: c.send_odometry(None, 1.0), "T_odom_body"),
         (lambda c: c.send_cloud(CLOUD, 1_700_000_000_000_000_000), "seconds"),
         (lambda c: c.send_cloud(CLOUD, float("nan")), "seconds"),
         (lambda c: c.send_odometry(np.zeros((4, 4)), 1.0), "T_odom_body"),
@@ -179,8 +193,62 @@ def test_closing_ends_iterators_and_leaves_a_given_transport_open(net):
     robot.close()
     assert list(poses) == []
     assert not net.closed
-    robot.send_cloud(CLOUD, 1.0)  # nobody hears it, nothing breaks
     assert len(net.published) == 1
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda c: c.send_cloud(CLOUD, 1.0),
+        lambda c: c.send_odometry(T, 1.0),
+        lambda c: c.relocalize(),
+        lambda c: c.reset(),
+        lambda c: c.wait_for_node(0.0),
+    ],
+)
+def test_a_closed_client_says_so(net, call):
+    robot = RobotClient("r1", transport=net)
+    robot.close()
+    with pytest.raises(TransportError, match="'r1' is closed"):
+        call(robot)
+    assert net.published == []
+
+
+def status(net, state):
+    net.publish(Sample("coview/r1/out/status", json.dumps({"state": state}).encode()))
+
+
+@pytest.mark.parametrize("state", ["LOST", "SEARCHING", "AMBIGUOUS"])
+def test_the_latest_pose_ends_with_tracking(client, net, state):
+    status(net, "TRACKING")
+    published(net, encode_pose(pose_message(1), "json"))
+    assert client.latest_pose.stamp_ns == 1
+    status(net, state)
+    assert client.latest_pose is None
+    published(net, encode_pose(pose_message(2), "json"))  # was under way when the state changed
+    assert client.latest_pose is None
+    status(net, "TRACKING")
+    published(net, encode_pose(pose_message(3), "json"))
+    assert client.latest_pose.stamp_ns == 3
+
+
+def test_a_pose_of_before_does_not_come_back_with_tracking(client, net):
+    published(net, encode_pose(pose_message(1), "json"))
+    status(net, "LOST")
+    status(net, "TRACKING")
+    assert client.latest_pose is None
+
+
+def test_the_latest_pose_ages(client, net, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(client_module, "monotonic", lambda: now[0])
+    published(net, encode_pose(pose_message(1), "json"))
+    now[0] += 1.9
+    assert client.latest_pose.stamp_ns == 1
+    now[0] += 0.2
+    assert client.latest_pose is None
+    published(net, encode_pose(pose_message(2), "json"))
+    assert client.latest_pose.stamp_ns == 2
 
 
 def test_questions(client, net):
