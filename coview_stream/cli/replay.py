@@ -8,6 +8,7 @@ from pathlib import Path
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
+_LOOK = 0.5  # seconds; a session learns of subscribers a moment after it first asks
 _SPARSE = 0.4  # seconds; the node takes odometry older than 0.5 s for lost, and some jitter has to fit in
 
 
@@ -45,10 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)"
     )
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+    parser.epilog = "Exit code 1 if nobody subscribed to the clouds, neither at the beginning nor at the end."
 
 
 def run(args: argparse.Namespace) -> int:
-    """Wait for a subscriber, send the run, print what was done."""
+    """Wait for a subscriber, send the run, print what was done; exit code 1 if nobody ever listened."""
     from tqdm import tqdm
 
     from coview_stream.cli.signals import stop_on_signals
@@ -77,14 +79,16 @@ def run(args: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
         with stop_on_signals() as stop:
-            if not await_subscriber(transport, sender.cloud_key, args.wait, stop.wait) and not stop.requested:
+            heard = await_subscriber(transport, sender.cloud_key, args.wait, stop.wait)
+            if not heard and not stop.requested:
                 print(f"nobody subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)
             total = None if args.loop else len(recorded)
             quiet = not (args.progress or sys.stderr.isatty())
             with tqdm(total=total, desc=f"replaying {args.robot}", unit="frame", disable=quiet) as bar:
                 report = replay(recorded, sender, config, stop, lambda frames: bar.update(frames - bar.n))
+        report.heard = heard or await_subscriber(transport, sender.cloud_key, _LOOK)
         sender.settle()
     finally:
         transport.close()
     print(report.text())
-    return 0
+    return 0 if report.heard else 1

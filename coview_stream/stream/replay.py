@@ -42,12 +42,13 @@ class ReplayReport:
         frames: clouds sent.
         odometry: odometry samples sent.
         points: in all clouds sent.
-        damaged: frames that could not be read, and so were not sent.
+        damaged: frames that could not be read, or have no finite point, and so were not sent.
         first_error: of these, or None.
         seconds: from the first message to the last.
         put_ms: how long publishing each cloud took, milliseconds.
         late_ms: how long after its deadline each frame was sent, milliseconds.
         finished: False if it was told to end before its end.
+        heard: False if nobody is known to have listened; whoever has looked says so.
     """
 
     frames: int = 0
@@ -59,6 +60,7 @@ class ReplayReport:
     put_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
     finished: bool = False
+    heard: bool = True
 
     def text(self) -> str:
         """Summary in a few lines."""
@@ -75,6 +77,10 @@ class ReplayReport:
             )
         if self.damaged:
             lines.append(f"{self.damaged} damaged frames left out, the first: {self.first_error}")
+        if not self.heard:
+            lines.append(
+                "nobody listened: is a node running, connected, and for this --robot, --base and --preset?"
+            )
         return "\n".join(lines)
 
 
@@ -149,9 +155,9 @@ def _parcel(run: Run, beat: Beat, sender: Sender, odometry: Encoded) -> _Parcel:
         return _Parcel(beat.due, odometry)
     try:
         points = run.read(beat.frame).points
+        cloud = sender.cloud(points, nanoseconds(beat.stamp))
     except CloudError as error:
         return _Parcel(beat.due, odometry, error=error)
-    cloud = sender.cloud(points, nanoseconds(beat.stamp))
     return _Parcel(beat.due, odometry, cloud, len(points))
 
 

@@ -15,6 +15,7 @@ from coview_stream.cli import main
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.clouds.writers import write_cloud
 from coview_stream.geometry import pose_from
+from coview_stream.stream import replay
 from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.zenoh_transport import open_transport
 
@@ -90,11 +91,26 @@ def test_as_a_ros_bridge_would(node, run_folder, capsys):
 
 def test_nobody_there(node, run_folder, capsys):
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "100"]
-    assert main([*command, "--wait", "0.1"]) == 0
+    assert main([*command, "--wait", "0.1"]) == 1
     captured = capsys.readouterr()
     assert "nobody subscribes to coview/r1/in/cloud" in captured.err
     assert "6 frames" in captured.out
+    assert captured.out.splitlines()[-1].startswith("nobody listened: ")
     assert "one odometry sample in 1.00 s is too few" in captured.err
+
+
+def test_somebody_who_came_late_has_listened(node, run_folder, capsys, monkeypatch):
+    def subscribe_late(*arguments):
+        node.subscribe()
+        return inner(*arguments)
+
+    inner = replay.replay
+    monkeypatch.setattr(replay, "replay", subscribe_late)
+    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "20"]
+    assert main([*command, "--wait", "0"]) == 0
+    captured = capsys.readouterr()
+    assert "nobody subscribes" in captured.err
+    assert "nobody listened" not in captured.out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

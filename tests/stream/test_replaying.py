@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from coview_stream.clouds import open_run
+from coview_stream.clouds.runs import Run
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.clouds.writers import write_cloud
 from coview_stream.errors import CloudError, ConfigError
@@ -165,6 +167,19 @@ def test_damaged_frames_are_left_out_and_counted(run_folder, tmp_path):
         (folder / "frames" / f"{k:06d}.ply").write_bytes(b"no cloud")
     with pytest.raises(CloudError, match=r"000000\.ply"):
         recorded(open_run(folder), ReplayConfig())
+
+
+def test_a_frame_without_a_finite_point_ends_nothing(run, monkeypatch):
+    inner = Run.read
+
+    def read(self, index):
+        frame = inner(self, index)
+        return replace(frame, points=frame.points * np.float32(np.nan)) if index == 1 else frame
+
+    monkeypatch.setattr(Run, "read", read)
+    report, _ = recorded(run, ReplayConfig())
+    assert (report.frames, report.damaged, report.finished) == (3, 1, True)
+    assert "none of them finite" in report.text()
 
 
 def test_one_cloud_is_a_run_too(run_folder):
