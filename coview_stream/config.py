@@ -211,7 +211,7 @@ class AcceptanceConfig:
     two keyframes.
     Tracking is lost after ``patience`` registrations, ``TrackingConfig.distance`` apart, below ``keep_score`` or
     ``keep_ground``, or on less than ``inside`` of the points where the map has been surveyed; one that is not below
-    clears the doubt, and meanwhile there is no pose.
+    clears the doubt, and meanwhile there is no pose. A doubt that lasts ``patience_seconds`` loses it too.
     """
 
     score: float = 0.27
@@ -228,6 +228,7 @@ class AcceptanceConfig:
     keep_ground: float = 0.5
     inside: float = 0.3
     patience: int = 2
+    patience_seconds: float = 10.0
     most_tilt: float = math.radians(8)
 
     def __post_init__(self) -> None:
@@ -243,7 +244,7 @@ class AcceptanceConfig:
             "keep_ground",
         )
         _counts(self, "confirmations", "patience")
-        _positive(self, "agree_distance", "agree_angle", "most_tilt", "proof")
+        _positive(self, "agree_distance", "agree_angle", "most_tilt", "proof", "patience_seconds")
         _require(0 <= self.proof_floor < 1, self, "proof_floor", "in [0, 1)")
 
 
@@ -251,12 +252,14 @@ class AcceptanceConfig:
 class TrackingConfig:
     """How a fix is kept: how often to register, and how fast odometry is believed to drift.
 
-    Register after ``distance`` metres of driving or ``turn`` radians of turning, with the points of the last ``window``
+    Register after ``distance`` metres of driving or ``turn`` radians of turning, or ``seconds`` (sensor time) whatever
+    odometry says, for wheels slip, drivers hang and robots are carried; with the points of the last ``window``
     metres (older ones are smeared by the drift) but at least ``min_points``. Drifts are random-walk sigmas per square
     root of a metre driven; ``turn_drift`` is yaw error per radian turned.
     """
 
     distance: float = 1.0
+    seconds: float = 1.0
     window: float = 2.0
     min_points: int = 2500
     turn: float = math.radians(10)
@@ -267,7 +270,15 @@ class TrackingConfig:
 
     def __post_init__(self) -> None:
         _positive(
-            self, "distance", "window", "turn", "yaw_drift", "turn_drift", "tilt_drift", "position_drift"
+            self,
+            "distance",
+            "seconds",
+            "window",
+            "turn",
+            "yaw_drift",
+            "turn_drift",
+            "tilt_drift",
+            "position_drift",
         )
         _counts(self, "min_points")
 

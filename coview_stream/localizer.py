@@ -62,7 +62,8 @@ class Localizer:
         self._evidence: KeyframeEvidence | None = None
         self._newest: _Frame | None = None
         self._doubts = 0
-        self._doubted_at = 0.0
+        self._doubted_at = 0.0  # metres driven
+        self._doubted = self._registered = 0.0  # stamps of the first doubt and of the newest registration
         self._generation += 1
 
     @property
@@ -105,8 +106,9 @@ class Localizer:
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
         if self.state is State.TRACKING:
-            if self._tracker.due or self._doubts:
-                self._track(cloud, T_odom_body, stamp)
+            due = self._tracker.due or self._doubts > 0
+            if due or stamp - self._registered >= self.config.tracking.seconds:
+                self._track(cloud, T_odom_body, stamp, idle=not due)
         elif keyframe is not None:
             scan = self.base_map.descriptor_config
             return Query.of(self._buffer, keyframe, cloud, scan, self._tracker.travelled, self._generation)
@@ -124,9 +126,9 @@ class Localizer:
         if verdict.accepted is not None:
             self._tracker.start(verdict.accepted.registration, verdict.travelled)
             self.state, self._doubts = State.TRACKING, 0
-            evidence = self._tracker.update(newest.cloud, newest.T_odom_body)
-            if newest.stamp != verdict.evidence.stamp and not self._speaks_for(evidence):
-                self.suspect()  # the robot has driven on since, and what it sees now does not fit
+            self._registered = newest.stamp
+            if not self._speaks_for(self._tracker.update(newest.cloud, newest.T_odom_body)):
+                self.suspect()  # what it sees now does not fit: it may have driven on or been carried since
         elif self.state is not State.LOST:
             self.state = verdict.evidence.state
 
@@ -135,6 +137,7 @@ class Localizer:
         self._tracker.forget_points()
         if self.state is State.TRACKING and not self._doubts:
             self._doubts, self._doubted_at = 1, self._tracker.travelled
+            self._doubted = self._newest.stamp if self._newest else 0.0
 
     def fix(self) -> Fix:
         """Say what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
@@ -145,9 +148,13 @@ class Localizer:
     def _speaks_for(self, evidence: Evidence | None) -> bool:
         return evidence is not None and kept(evidence, self.config.acceptance)
 
-    def _track(self, cloud: Points, T_odom_body: Pose, stamp: float) -> None:
-        """Correct the drift since the last registration, and verify again that the place is right."""
-        evidence = self._tracker.update(cloud, T_odom_body)
+    def _track(self, cloud: Points, T_odom_body: Pose, stamp: float, idle: bool) -> None:
+        """Correct the drift since the last registration, and verify again that the place is right.
+
+        ``idle``: by its odometry the robot stands still. It may be carried, so what it saw before does not count.
+        """
+        evidence = self._tracker.update(cloud, T_odom_body, idle)
+        self._registered = stamp
         rule = self.config.acceptance
         score = evidence.score if evidence else 0.0
         doubtful = not self._speaks_for(evidence)
@@ -156,9 +163,10 @@ class Localizer:
             self._doubts = 0
         elif not self._doubts or driven >= self.config.tracking.distance:
             # every frame may clear a doubt, but only driving on adds to it: one covered frame loses nothing
+            self._doubted = self._doubted if self._doubts else stamp
             self._doubts += 1
             self._doubted_at = self._tracker.travelled
-        if self._doubts >= rule.patience:
+        if self._doubts >= rule.patience or (doubtful and stamp - self._doubted >= rule.patience_seconds):
             self._lose()
         reason = f"evidence gone, {self._doubts} times in a row" if doubtful else "verified"
         self._evidence = KeyframeEvidence(stamp, self.state, reason, score, 0.0, evidence)

@@ -18,6 +18,7 @@ from coview_stream.pose.verification import Evidence, verify
 
 _MOST_FRAMES = 40
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
+_IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
 _START_COVARIANCE = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 
 
@@ -49,6 +50,7 @@ class Tracker:
         self.travelled = 0.0
         self._registered_at = 0.0
         self._turned = 0.0
+        self._unseen = 0  # frames since the last update
         self._last: Pose | None = None
 
     def observe(self, cloud: Points, T_odom_body: Pose, thin: Points | None = None) -> None:
@@ -62,6 +64,7 @@ class Tracker:
         self._last = T_odom_body
         points = thinned(cloud, T_odom_body, self.config.keyframe) if thin is None else thin
         self._recent.append(_Recent(self.travelled, points))
+        self._unseen += 1
 
     def forget(self) -> None:
         """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
@@ -87,11 +90,21 @@ class Tracker:
         settings = self.config.tracking
         return self.travelled - self._registered_at >= settings.distance or self._turned >= settings.turn
 
-    def update(self, cloud: Points, T_odom_body: Pose) -> Evidence | None:
-        """Register the recent points from the predicted pose; None where the map offers nothing to register to."""
+    def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False) -> Evidence | None:
+        """Register the recent points from the predicted pose; None where the map offers nothing to register to.
+
+        ``idle``: use only frames since the last update, for a robot that by its odometry stands still, and believe the
+        odometry a little less: standing and looking again and again must not add up to certainty.
+        """
+        if idle:
+            while len(self._recent) > max(1, self._unseen):
+                self._recent.popleft()
+        self._unseen = 0
         position = T_odom_body[:3, 3]
         target = self.local_maps.around(transform(self.T_map_odom, position[None])[0])
         covariance = self.predicted_covariance()
+        if idle:
+            covariance = covariance + _angles_first(drift_covariance(self.config.tracking, _IDLE_DRIVE, 0.0))
         self._registered_at, self._turned, self.covariance = self.travelled, 0.0, covariance
         if target is None:
             return None
@@ -119,7 +132,7 @@ class Tracker:
     def predicted_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the last registration."""
         grown = drift_covariance(self.config.tracking, self.travelled - self._registered_at, self._turned)
-        return self.covariance + grown[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)]
+        return self.covariance + _angles_first(grown)
 
     def reported_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), floors included, map axes."""
@@ -153,6 +166,11 @@ def drift_covariance(config: TrackingConfig, driven: float, turned: float) -> np
     variances = rates**2 * driven
     variances[5] += (config.turn_drift * turned) ** 2
     return np.diag(variances)
+
+
+def _angles_first(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(6, 6) over (x, y, z, roll, pitch, yaw) as over (rx, ry, rz, x, y, z), or the other way round."""
+    return np.asarray(covariance[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)])
 
 
 def kept(evidence: Evidence, rule: AcceptanceConfig) -> bool:

@@ -7,11 +7,13 @@ import pytest
 import small_world
 from small_world import pose_error
 
+from coview_stream import tracking
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, RunError
 from coview_stream.fix import State
 from coview_stream.geometry import pose_from, rot_z
 from coview_stream.localizer import Localizer
+from coview_stream.place import keyframes
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
@@ -293,7 +295,6 @@ def test_a_late_verdict_that_the_newest_frame_does_not_fit_gives_no_pose(world_m
 
 def test_suspicion_takes_the_pose_until_a_frame_has_verified_it(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
-    localizer.suspect()  # nothing to suspect yet
     localizer.adopt(verdict)
     assert localizer.fix().state is State.TRACKING
     localizer.suspect()
@@ -304,3 +305,59 @@ def test_suspicion_takes_the_pose_until_a_frame_has_verified_it(world_map, world
     assert fix.state is State.TRACKING
     assert fix.evidence.stamp == 0.5 * k + 0.1
     assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
+
+
+def test_what_was_found_before_a_suspicion_waits_for_a_frame_after_it(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.suspect()
+    localizer.adopt(verdict)
+    assert localizer.fix().T_map_body is None
+    fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
+    assert fix.state is State.TRACKING
+
+
+def test_a_frame_is_thinned_once_and_kept_apart_from_the_callers_array(world_map, world_drive, monkeypatch):
+    """A driver may reuse its array for the next frame; adopting a verdict later still looks at the newest one."""
+    thinned, made = keyframes.thinned, []
+    monkeypatch.setattr(keyframes, "thinned", lambda *a: made.append(thinned(*a)) or made[-1])
+    monkeypatch.setattr(tracking, "thinned", None)
+    localizer = Localizer(world_map)
+    array = world_drive.clouds[0].copy()
+    localizer.take(array, world_drive.T_odom_body[0], 0.0)
+    array[:] = 0.0
+    np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
+    assert len(made) == 1
+    np.testing.assert_array_equal(localizer._tracker._window(), made[0])
+
+
+def standing(localizer, cloud, T_odom_body, seconds, start):
+    """Fixes at 10 Hz while odometry stands still."""
+    return [localizer.step(cloud, T_odom_body, start + 0.1 * k) for k in range(round(10 * seconds))]
+
+
+def tracking_localizer(world_map, world_drive, frames=6):
+    localizer = Localizer(world_map)
+    for k in range(frames):
+        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    assert fix.state is State.TRACKING
+    return localizer, 0.5 * frames
+
+
+def test_a_robot_that_is_carried_while_its_odometry_hangs_is_found_out(world_map, world_drive):
+    localizer, now = tracking_localizer(world_map, world_drive)
+    elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
+    fixes = standing(localizer, elsewhere, world_drive.T_odom_body[5], 14.0, now)
+    assert all(fix.T_map_body is None for fix in fixes[12:])  # a second, and a frame for rounding
+    assert fixes[30].state is State.AMBIGUOUS
+    assert fixes[-1].state is State.LOST
+
+
+def test_a_robot_that_stands_still_stays_found_and_grows_no_surer(world_map, world_drive):
+    localizer, now = tracking_localizer(world_map, world_drive)
+    fixes = standing(localizer, world_drive.clouds[5], world_drive.T_odom_body[5], 20.0, now)
+    assert all(fix.state is State.TRACKING for fix in fixes)
+    metres, degrees = small_world.pose_error(fixes[-1].T_map_body, world_drive.T_map_body[5])
+    assert metres < 0.05
+    assert degrees < 0.3
+    early, late = (np.sqrt(np.diag(fixes[k].covariance))[:2].max() for k in (20, -1))
+    assert late > 0.8 * early
