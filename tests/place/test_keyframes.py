@@ -91,3 +91,10 @@ def test_clear_forgets_all():
     assert len(buffer.recent(5)) == 0
     # the next frame is a keyframe wherever it is
     assert buffer.add(cloud(2), at(1.0), 0.2) is not None
+
+
+def test_the_newest_frame_is_at_hand_as_it_was_thinned():
+    buffer = KeyframeBuffer(CONFIG)
+    for k in range(3):
+        buffer.add(np.repeat(cloud(k), 2, axis=0), at(0.5 * k), float(k))
+        np.testing.assert_array_equal(buffer.newest, keyframes.thinned(cloud(k), at(0.5 * k), CONFIG))
