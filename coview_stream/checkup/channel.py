@@ -17,7 +17,8 @@ from coview_stream.stream.config import NodeConfig
 
 _NODE = NodeConfig()
 _SLOWEST, _FASTEST = 2.0, 30.0  # clouds per second; at 2 Hz and 5 m/s there are 2.5 m between frames
-_SLOWEST_ODOMETRY = 10.0  # per second: poses go out at 10 Hz, and each is the newest odometry's
+_SLOWEST_ODOMETRY = 5.0  # per second; between poses, at 10 Hz, each is the newest odometry's
+_PER_CLOUD = 0.9  # odometry samples for each cloud, less what two ways of counting differ by
 _FEWEST_POINTS = 1000
 _NEAR, _FAR = 0.3, 300.0  # metres: the median of a lidar's ranges lies between, in any surroundings
 _FLAT = 1e-9  # radians
@@ -76,7 +77,7 @@ def _unreadable(
 
 def rate(seen: Sequence[Seen]) -> float | None:
     """Messages per second by their arrival; None for fewer than two."""
-    span = seen[-1].arrived - seen[0].arrived
+    span = seen[-1].arrived - seen[0].arrived if seen else 0.0
     return (len(seen) - 1) / span if span > 0 else None
 
 
@@ -133,6 +134,10 @@ def _odometry(seen: list[Seen], heard: Heard) -> Finding:
         return Finding("FAIL", "odometry", found, remedy, robot)
     if often is None or often < _SLOWEST_ODOMETRY:
         return Finding("warn", "odometry", found, "poses repeat stamps: send 20 to 100 a second", robot)
+    frames = rate([s for s in heard.clouds if s.stamp_ns is not None])
+    if frames is not None and often < _PER_CLOUD * frames:
+        remedy = f"more rarely than clouds ({frames:.1f} Hz): send one with each at least, better 20 to 100 a second"
+        return Finding("warn", "odometry", found, remedy, robot)
     return Finding("ok", "odometry", found, robot=robot)
 
 

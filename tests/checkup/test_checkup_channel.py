@@ -135,7 +135,21 @@ def test_odometry_with_a_pause_and_too_rare():
     ended = odometry_of([p for p in pairs if p[0] < 2.0])["odometry"]
     assert ended.verdict == "FAIL"
     assert "a pause of 1.0 s" in ended.found
-    assert odometry_of(pairs[::10])["odometry"].verdict == "warn"
+    assert odometry_of(pairs[::12])["odometry"].verdict == "warn"
+
+
+@pytest.mark.parametrize(
+    ("clouds", "samples", "verdict"),
+    [(10, 10, "ok"), (5, 5, "ok"), (20, 10, "warn"), (10, 9.8, "ok"), (2, 4, "warn"), (0, 8, "ok")],
+)
+def test_odometry_with_every_frame_is_enough(clouds, samples, verdict):
+    robot = heard(
+        [(t + 0.05, cloud(t)) for t in steps(clouds)] if clouds else [],
+        [(t, odometry(t)) for t in steps(samples)],
+    )
+    found = next(f for f in odometry_findings(robot, "") if f.what == "odometry")
+    assert found.verdict == verdict, found.line()
+    assert ("more rarely than clouds (20.0 Hz)" in found.remedy) == (clouds == 20)
 
 
 @pytest.mark.parametrize(
