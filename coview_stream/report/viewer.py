@@ -31,7 +31,7 @@ class PoseViewer:
             self._rerun: Any = import_module("rerun")
         except ImportError as error:
             raise DependencyError(
-                "--rerun needs the rerun viewer, which is not installed: pip install 'coview-stream[viz]'"
+                "--rerun needs the rerun viewer, which is not installed; in a checkout: pip install '.[viz]'"
             ) from error
         self._origin: np.ndarray | None = None
         self._strips: dict[str, list[np.ndarray]] = {}

@@ -144,6 +144,15 @@ def test_private_keys_are_private(certificates: Path) -> None:
         assert key.stat().st_mode & 0o077 == 0
 
 
+def test_what_certificates_need_is_named() -> None:
+    program = EXAMPLES / "mtls" / "make_certificates.py"
+    code = f"import runpy, sys; sys.modules['cryptography'] = None; runpy.run_path({str(program)!r})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.endswith("pip install cryptography\n")
+
+
 def test_every_example_is_run_here() -> None:
     names = {path.relative_to(EXAMPLES).as_posix() for path in EXAMPLES.rglob("*.json5")}
     assert names == {
