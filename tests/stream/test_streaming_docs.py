@@ -10,11 +10,12 @@ import numpy as np
 
 from coview_stream.cli import build_parser
 from coview_stream.stream import client
-from coview_stream.stream.codecs import decode_cloud, decode_odometry, encode_pose
+from coview_stream.stream.codecs import decode_cloud, decode_odometry, decode_pose, encode_pose
 from coview_stream.stream.counters import Counters
 from coview_stream.stream.fake import FakeTransport
 from coview_stream.stream.keys import PRESETS, robot_keys
 from coview_stream.stream.messages import PoseMessage, Sample
+from coview_stream.stream.records import pose_record
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "streaming.md").read_text(encoding="utf-8")
 
@@ -56,6 +57,21 @@ def test_encodings_in_the_table_are_those_that_are_written():
     for name in ("json", "cdr", "foxglove"):
         assert f"`{encode_pose(pose, name).encoding}`" in TEXT
     assert f"`serve --pose-encoding cdr` ({len(encode_pose(pose, 'cdr').payload)} bytes)" in TEXT
+
+
+def test_what_smaller_poses_leave_out():
+    full = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32, 0.25)
+    missing = {}
+    for name in ("cdr", "foxglove"):
+        encoded = encode_pose(full, name)
+        record = pose_record(
+            decode_pose(Sample("k", encoded.payload, encoded.encoding)), Sample("k", encoded.payload)
+        )
+        missing[name] = {field for field, value in record.items() if not value} | {"state"}
+    assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s"}
+    assert missing["foxglove"] == missing["cdr"] | {"covariance"}
+    said = re.search(r"These leave out .*?`covariance`", TEXT, re.DOTALL)[0]
+    assert set(re.findall(r"`(\w+)`", said)) == missing["foxglove"]
 
 
 def test_the_clients_five_lines_run(monkeypatch, capsys):
