@@ -19,7 +19,7 @@ from coview_stream.search import GlobalSearch, Verdict
 from coview_stream.stream.deskew import deskew
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 
-_CROPS = 24  # of the map with their search trees, shared by all robots
+_CROPS = 24  # of the map with their search grids, shared by all robots
 
 
 class Engine(Protocol):
