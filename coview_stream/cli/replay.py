@@ -56,9 +56,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.clouds.runs import open_run
     from coview_stream.errors import ConfigError
-    from coview_stream.stream.client import open_client
     from coview_stream.stream.keys import robot_keys
-    from coview_stream.stream.reach import await_subscriber
+    from coview_stream.stream.reach import await_subscriber, open_client
     from coview_stream.stream.replay import replay
     from coview_stream.stream.schedule import ReplayConfig, odometry_spacing
     from coview_stream.stream.sender import Sender

@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
     from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.stream.client import open_client
+    from coview_stream.stream.reach import open_client
     from coview_stream.stream.watching import Fleet
 
     if args.seconds is not None and not args.seconds > 0:

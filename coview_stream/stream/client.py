@@ -18,7 +18,7 @@ from coview_stream.geometry import Pose
 from coview_stream.stream.keys import RobotKeys, robot_keys
 from coview_stream.stream.mailbox import Mailbox
 from coview_stream.stream.messages import PoseMessage, Sample
-from coview_stream.stream.reach import DEFAULT_ENDPOINT, ask, await_subscriber
+from coview_stream.stream.reach import ask, await_subscriber, open_client
 from coview_stream.stream.records import read_status
 from coview_stream.stream.sender import Sender, nanoseconds
 from coview_stream.stream.transport import Transport
@@ -241,28 +241,6 @@ class RobotClient:
         self._malformed += 1
         if self._malformed == 1:  # once: a sender that is wrong is wrong ten times a second
             _log.warning("%s: %s", sample.key, error)
-
-
-def open_client(
-    endpoint: str | Sequence[str] | None = None,
-    listen: str | Sequence[str] | None = None,
-    config: str | Path | None = None,
-) -> Transport:
-    """Open a zenoh session for a client: to ``tcp/127.0.0.1:7447`` if nothing is said.
-
-    Raises:
-        TransportError: as :func:`coview_stream.stream.zenoh_transport.open_transport`.
-    """
-    from coview_stream.stream.zenoh_transport import open_transport
-
-    connect = _listed(endpoint)
-    if not connect and not _listed(listen) and config is None:
-        connect = [DEFAULT_ENDPOINT]
-    return open_transport(connect, _listed(listen), None if config is None else Path(config))
-
-
-def _listed(endpoints: str | Sequence[str] | None) -> list[str]:
-    return [endpoints] if isinstance(endpoints, str) else list(endpoints or ())
 
 
 def _drain(box: Mailbox[_Item], timeout: float | None) -> Iterator[_Item]:

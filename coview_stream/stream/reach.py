@@ -1,10 +1,11 @@
-"""What a robot or a person wants of a transport beyond publish and subscribe: ask, and know that somebody listens."""
+"""What a robot or a person wants of a network beyond publish and subscribe: reach it, ask, know who listens."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from coview_stream.errors import TransportError
@@ -14,6 +15,28 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a client looks when nothing is said: zenoh's usual port, on this machine only."""
 
 _POLL = 0.02  # seconds; a look at the matching status costs microseconds
+
+
+def open_client(
+    endpoint: str | Sequence[str] | None = None,
+    listen: str | Sequence[str] | None = None,
+    config: str | Path | None = None,
+) -> Transport:
+    """Open a zenoh session for a client: to ``tcp/127.0.0.1:7447`` if nothing is said.
+
+    Raises:
+        TransportError: as :func:`coview_stream.stream.zenoh_transport.open_transport`.
+    """
+    from coview_stream.stream.zenoh_transport import open_transport
+
+    connect = _listed(endpoint)
+    if not connect and not _listed(listen) and config is None:
+        connect = [DEFAULT_ENDPOINT]
+    return open_transport(connect, _listed(listen), None if config is None else Path(config))
+
+
+def _listed(endpoints: str | Sequence[str] | None) -> list[str]:
+    return [endpoints] if isinstance(endpoints, str) else list(endpoints or ())
 
 
 def ask(
