@@ -79,6 +79,11 @@ def note(counters: Counters, complaints: Complaints, prefix: str, name: str, key
         complaints.add_first(f"{key}: {name} messages", reason.removeprefix(f"{key}: "))
 
 
+def last_line(text: str) -> str:
+    """Return what a traceback ends with."""
+    return (text.strip() or "unknown failure").splitlines()[-1]
+
+
 def thinned(message: CloudMessage, most: int) -> CloudMessage:
     """Return the cloud with every n-th point only, if it has more than ``most``."""
     step = -(-len(message.points) // most)

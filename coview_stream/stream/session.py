@@ -7,32 +7,24 @@ robot's. Every method may be called from any thread.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
 
 from coview_stream.config import TrackingConfig
-from coview_stream.fix import Fix, KeyframeEvidence, State
-from coview_stream.search import Query, Verdict
+from coview_stream.fix import KeyframeEvidence, State
+from coview_stream.search import Verdict
 from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.correction import Correction
 from coview_stream.stream.counters import Counters, Latency, Missing
+from coview_stream.stream.desk import Desk, Ready
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.messages import OdometryMessage, PoseMessage, Sample
 from coview_stream.stream.odometry import Intake, OdometryBuffer
 from coview_stream.stream.pairing import Pairing
-from coview_stream.stream.reception import Complaints, note, received, thinned
+from coview_stream.stream.reasons import why_nothing
+from coview_stream.stream.reception import Complaints, last_line, note, received, thinned
 
 _NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class _Ready:
-    job: FrameJob
-    received: float
-    since: float  # local time from which on a frame of this robot has been waiting for the engine
-    travelled: float
-    turned: float
 
 
 class Session:
@@ -60,19 +52,22 @@ class Session:
         self.options = options
         self._lock = threading.RLock()
         self._epoch = 0
-        self._ready: _Ready | None = None
+        self._desk = Desk(keys.robot, 0)
         self.counters, self.odometry = Counters(), OdometryBuffer(self.config)
         self._pairing = Pairing(self.config, self.odometry, self.counters)
         self._clear()
 
     def _clear(self) -> None:
         """Forget everything."""
-        self._pairing, self._ready = Pairing(self.config, self.odometry, self.counters), None
         self.counters = Counters()
         self.complaints = Complaints()
         self.latency = Latency()
         self.engine_latency = Latency()
         self.odometry = OdometryBuffer(self.config)
+        self._pairing, self._desk = (
+            Pairing(self.config, self.odometry, self.counters),
+            Desk(self.keys.robot, 0),
+        )
         self.last_frame_ns: int | None = None
         self.longest_wait = 0.0
         self._missing = Missing()
@@ -84,15 +79,11 @@ class Session:
 
     def _forget_frame(self) -> None:
         """Forget all that refers to the odometry frame, which is no more."""
-        self.counters.dropped += len(self._pairing) + (self._ready is not None)
+        self.counters.dropped += len(self._pairing) + self._desk.waiting
         self._epoch += 1
         self.evidence: KeyframeEvidence | None = None
         self._pairing = Pairing(self.config, self.odometry, self.counters)
-        self._ready = None
-        self._busy: _Ready | None = None
-        self._query: Query | None = None
-        self._searching = False
-        self._verdict: Verdict | None = None
+        self._desk = Desk(self.keys.robot, self._epoch)
         self._correction: Correction | None = None
         self._suspect = False
         self._trusted_from = -(1 << 63)
@@ -177,21 +168,8 @@ class Session:
     def _pair(self, now: float) -> None:
         """Make the newest frame ready whose odometry is there."""
         for frame in self._pairing.paired(now):
-            since = now
-            if self._ready is not None:
-                self.counters.dropped += 1
-                since = self._ready.since
-            message = frame.message
-            job = FrameJob(
-                self.keys.robot,
-                self._epoch,
-                message.stamp_ns,
-                message.points,
-                frame.T_odom_body,
-                message.times,
-                frame.segment,
-            )
-            self._ready = _Ready(job, frame.received, since, *self._driven_at(message.stamp_ns))
+            driven = self._driven_at(frame.message.stamp_ns)
+            self.counters.dropped += self._desk.put_frame(frame, now, *driven)
 
     def _driven_at(self, stamp_ns: int) -> tuple[float, float]:
         """Metres driven and radians turned when the frame was taken, which may be a while ago."""
@@ -203,21 +181,12 @@ class Session:
     def take_frame(self) -> FrameJob | None:
         """Hand the newest ready frame to the engine; its result or failure must be reported before the next one."""
         with self._lock:
-            if self._ready is None or self._busy is not None:
-                return None
-            self._busy, self._ready = self._ready, None
-            job = replace(self._busy.job, suspect=self._suspect, verdict=self._verdict)
-            self._verdict = None
-            return job
+            return self._desk.take_frame(self._suspect)
 
     def take_search(self) -> SearchJob | None:
         """Hand the newest keyframe to the search; its verdict or failure must be reported before the next one."""
         with self._lock:
-            if self._query is None or self._searching:
-                return None
-            job = SearchJob(self.keys.robot, self._epoch, self._query)
-            self._query, self._searching = None, True
-            return job
+            return self._desk.take_search()
 
     def hopeful(self) -> bool:
         """Whether a place has been found that only needs confirmation."""
@@ -231,11 +200,11 @@ class Session:
             self.counters.processed += 1
             self._processed_at = now
             self.engine_latency.add(result.seconds)
-            if self._busy is not None and job.epoch == self._epoch:
-                self.latency.add(now - self._busy.received)
-                self.longest_wait = max(self.longest_wait, now - self._busy.since)
-                self._note(job, result, self._busy)
-            self._busy = None if job.epoch == self._epoch else self._busy
+            busy = self._desk.frame_over() if job.epoch == self._epoch else None
+            if busy is not None:
+                self.latency.add(now - busy.received)
+                self.longest_wait = max(self.longest_wait, now - busy.since)
+                self._note(result, busy, job.suspect)
 
     def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> None:
         """Take note that the engine could not use a frame (``rejected``) or failed and has forgotten the robot."""
@@ -244,11 +213,9 @@ class Session:
                 return
             self.counters.count("rejected" if rejected else "engine_errors")
             kind = "frames of no use" if rejected else "frames that the engine failed at"
-            last_line = (reason.strip() or "unknown failure").splitlines()[-1]
-            self.complaints.add_first(f"{self.keys.robot}: {kind}", last_line)
+            self.complaints.add_first(f"{self.keys.robot}: {kind}", last_line(reason))
             if job.epoch == self._epoch:
-                self._busy = None
-                self._verdict = self._verdict or job.verdict
+                self._desk.frame_over(unused=job.verdict)
                 if not rejected:
                     self.begin_anew("the engine failed on a frame")
 
@@ -259,19 +226,15 @@ class Session:
                 return
             self.counters.searches += 1
             if job.epoch == self._epoch:
-                self._searching = False
-                # an acceptance waits for the next frame; what is found meanwhile comes from a search begun anew
-                if verdict is not None and (self._verdict is None or self._verdict.accepted is None):
-                    self._verdict = verdict
+                self._desk.search_over(verdict)
 
     def search_failed(self, job: SearchJob, reason: str) -> None:
         """Take note that the search engine failed, which costs this keyframe's vote only."""
         with self._lock:
             self.counters.search_errors += 1
-            last_line = (reason.strip() or "unknown failure").splitlines()[-1]
-            self.complaints.add_first(f"{self.keys.robot}: failed searches", last_line)
+            self.complaints.add_first(f"{self.keys.robot}: failed searches", last_line(reason))
             if job.epoch == self._epoch:
-                self._searching = False
+                self._desk.search_over(None)
 
     def engine_restarted(self, kind: str = "track") -> None:
         """Take note that an engine has forgotten all it knew; only that of ``track`` knew where the robot is."""
@@ -280,14 +243,13 @@ class Session:
             if kind == "track":
                 self.begin_anew("the engine was started again")
 
-    def _note(self, job: FrameJob, result: FrameResult, ready: _Ready) -> None:
-        fix = result.fix
+    def _note(self, result: FrameResult, ready: Ready, suspected: bool) -> None:
+        fix, job = result.fix, ready.job
         self.last_frame_ns = job.stamp_ns
         self.evidence = fix.evidence
         if result.query is not None:
-            self.counters.searches_skipped += self._query is not None
-            self._query = result.query
-        if job.suspect and job.stamp_ns >= self._trusted_from:
+            self.counters.searches_skipped += self._desk.put_query(result.query)
+        if suspected and job.stamp_ns >= self._trusted_from:
             self._suspect = False
         was, self._fix_state = self._fix_state, fix.state
         if fix.T_map_odom is None:
@@ -295,13 +257,9 @@ class Session:
                 self._lose(fix.evidence.reason if fix.evidence else "evidence gone")
             self._correction = None
         elif not self._suspect and job.stamp_ns >= self._trusted_from:
-            self._correct(fix, job, ready)
-
-    def _correct(self, fix: Fix, job: FrameJob, ready: _Ready) -> None:
-        if self._correction is None:
-            self.counters.fixes += 1
-        self._lost = None
-        self._correction = Correction.of(fix, job.stamp_ns, ready.travelled, ready.turned)
+            self.counters.fixes += self._correction is None
+            self._lost = None
+            self._correction = Correction.of(fix, job.stamp_ns, ready.travelled, ready.turned)
 
     # ---- what goes out
 
@@ -348,26 +306,9 @@ class Session:
                 return State.LOST, self._lost
             if self._fix_state is State.TRACKING:
                 return State.AMBIGUOUS, "verifying the place after a pause of odometry"
-            return self._fix_state, evidence if self.last_frame_ns is not None else self._why_nothing()
-
-    def _why_nothing(self) -> str:
-        counted = self.counters
-        if not counted.received:
-            return f"waiting for clouds on {self.keys.cloud}"
-        if self.odometry.newest is None:
-            unread = counted.odometry_received > 0
-            return (
-                "no odometry could be read; see errors"
-                if unread
-                else f"waiting for odometry on {self.keys.odometry}"
+            return self._fix_state, evidence if self.last_frame_ns is not None else why_nothing(
+                self.keys, self.counters, self.odometry.newest is not None
             )
-        if counted.rejected:
-            return f"{counted.rejected} frames were of no use; see errors"
-        if counted.late or counted.no_odometry:
-            return "odometry and clouds have no common stamps: are both of one clock?"
-        if counted.received == counted.malformed + counted.oversized + counted.unknown_encoding:
-            return "not one cloud could be read; see errors"
-        return "no frame has been processed yet"
 
     def age(self) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
