@@ -3,7 +3,8 @@
 A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Whatever is heavy
 it imports inside ``run``, for ``coview-stream --help`` must answer at once.
 
-Exit codes: 0 done; 1 could not localise (files are written all the same); 2 bad usage or input;
+Exit codes: 0 done; 1 could not localise (files are written all the same), nobody listened (replay), a check failed
+(doctor); 2 bad usage or input;
 130 interrupted; 141 the reader of a pipe went away.
 """
 
