@@ -11,9 +11,10 @@ from coview_stream.stream.messages import Encoded, Sample
 Policy = Literal["newest", "all"]
 """``newest``: a slow reader sees only the newest sample (a ring of one). ``all``: every sample, in order."""
 
-Urgency = Literal["realtime", "data", "bulk"]
-"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (status, odometry): blocks rather
-than drops. ``bulk``: clouds: the newest frame matters, one that does not fit is dropped."""
+Urgency = Literal["realtime", "data", "report", "bulk"]
+"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks rather than
+drops. ``report``: statuses: who has stopped reading misses some and holds nobody up. ``bulk``: clouds: the newest frame
+matters, one that does not fit is dropped."""
 
 
 class Publisher(Protocol):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from typing import Any
 
 from coview_stream.stream.guard import Guard
@@ -9,6 +11,7 @@ from coview_stream.stream.messages import Encoded, Sample
 from coview_stream.stream.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
+_JSON = "application/json"
 
 
 class ZenohPublisher:
@@ -44,16 +47,34 @@ class ZenohPublisher:
             self._guard.run(self._key, publisher.undeclare)
 
 
-def plain(sample: Any) -> Sample:
-    """Return a zenoh sample as plain data. Copies the payload once: zenoh's Python types share no memory."""
-    encoding = str(sample.encoding)
+def plain(sample: Any, max_payload: int | None = None) -> Sample:
+    """Return a zenoh sample as plain data. Copies the payload once: zenoh's Python types share no memory.
+
+    Payload and attachment that are together larger than ``max_payload`` are not copied, which would hold up every other
+    thread, but for their size.
+    """
+    key, encoding = str(sample.key_expr), str(sample.encoding)
+    encoding = "" if encoding == _UNSET else encoding
     attachment = sample.attachment
+    size = len(sample.payload) + (0 if attachment is None else len(attachment))
+    if max_payload is not None and size > max_payload:
+        return Sample(key, b"", encoding, size=size)
     return Sample(
-        key=str(sample.key_expr),
-        payload=sample.payload.to_bytes(),
-        encoding="" if encoding == _UNSET else encoding,
-        attachment=None if attachment is None else attachment.to_bytes(),
+        key, sample.payload.to_bytes(), encoding, None if attachment is None else attachment.to_bytes()
     )
+
+
+def answer_query(
+    guard: Guard, key: str, query: Any, handler: Callable[[dict[str, str]], dict[str, Any]]
+) -> None:
+    """Reply to a zenoh query with what ``handler`` makes of its parameters, or with the error that it raises."""
+    try:
+        reply = json.dumps(handler({str(name): str(value) for name, value in query.parameters}))
+    except Exception as error:
+        guard.report(key, error)
+        query.reply_err(json.dumps({"error": str(error)}), encoding=_JSON)
+    else:
+        query.reply(key, reply, encoding=_JSON)
 
 
 def quality(urgency: Urgency) -> dict[str, Any]:
@@ -65,6 +86,8 @@ def quality(urgency: Urgency) -> dict[str, Any]:
         urgency == "realtime"
     ):  # express: not batched; 0.2 ms beside a flood of clouds on the same link instead of 8
         return {"express": True, "priority": priority.REAL_TIME, "congestion_control": congestion.DROP}
+    if urgency == "report":
+        return {"congestion_control": congestion.DROP}
     if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link
         return {"congestion_control": congestion.BLOCK}
     # BLOCK_FIRST hands one frame to a background task and drops newer ones meanwhile: put never waits. DROP gives up a

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import atexit
-import json
 import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -18,7 +18,7 @@ from coview_stream.stream.guard import Guard
 from coview_stream.stream.messages import Sample
 from coview_stream.stream.transport import Connection, Policy, Publisher, Urgency
 from coview_stream.stream.zenoh_config import zenoh_errors
-from coview_stream.stream.zenoh_samples import ZenohPublisher, plain, quality
+from coview_stream.stream.zenoh_samples import ZenohPublisher, answer_query, plain, quality
 
 _log = logging.getLogger(__name__)
 
@@ -30,11 +30,13 @@ _NO_ROUTER = (
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's receiving thread, for all keys
 _JOIN = 0.4  # seconds for all our threads to end at close; they notice within 0.1
 _EXIT = 10.0  # seconds for each to end when the process does: longer than any attempt to open
-_JSON = "application/json"
 
 
 def open_transport(
-    connect: Sequence[str] = (), listen: Sequence[str] = (), config: Path | None = None
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    config: Path | None = None,
+    max_payload: int | None = None,
 ) -> ZenohTransport:
     """Open a zenoh session.
 
@@ -45,6 +47,7 @@ def open_transport(
         connect: endpoints to connect to, for example ``tcp/127.0.0.1:7447``.
         listen: endpoints to listen on.
         config: zenoh configuration file; it wins over our defaults, ``connect`` and ``listen`` win over it.
+        max_payload: of a larger message, in bytes, only the size is handed on; None takes in all.
 
     Raises:
         TransportError: if the configuration is wrong or an endpoint cannot be listened on.
@@ -53,14 +56,15 @@ def open_transport(
 
     # RUST_LOG=zenoh=warn says why a router refuses us; without it this is silent
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
-    return ZenohTransport(zenoh_config.compose(connect, listen, config))
+    return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload)
 
 
 class ZenohTransport:
     """A zenoh session; made by :func:`open_transport`. All methods may be called from any thread."""
 
-    def __init__(self, config: Any) -> None:
+    def __init__(self, config: Any, max_payload: int | None = None) -> None:
         self._config = config
+        self._max_payload = max_payload
         self._waits = zenoh_config.mode_of(config) == "client"
         self._guard = Guard(_log)
         self._lock = threading.Lock()
@@ -241,19 +245,15 @@ class ZenohTransport:
             if self._closing.is_set():
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self._guard.run(key, lambda sample=sample: handler(plain(sample)))  # type: ignore[misc]
+                self._guard.run(key, partial(_hand, sample, self._max_payload, handler))
+            del sample  # however large, it need not live until the next one comes
 
     def _answer_queries(self) -> None:
         while (entry := self._queries.get()) is not None:
             key, query, handler = entry
-            self._guard.run(key, lambda: self._answer(key, query, handler))  # noqa: B023 - called at once
+            self._guard.run(key, partial(answer_query, self._guard, key, query, handler))
             del entry, query  # a query is finished for its sender when nobody holds it
 
-    def _answer(self, key: str, query: Any, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
-        try:
-            reply = json.dumps(handler({str(name): str(value) for name, value in query.parameters}))
-        except Exception as error:
-            self._guard.report(key, error)
-            query.reply_err(json.dumps({"error": str(error)}), encoding=_JSON)
-        else:
-            query.reply(key, reply, encoding=_JSON)
+
+def _hand(sample: Any, max_payload: int | None, handler: Callable[[Sample], None]) -> None:
+    handler(plain(sample, max_payload))
