@@ -6,7 +6,6 @@ and the status clock wait for nobody.
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
@@ -15,10 +14,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from coview_stream.fix import State
 from coview_stream.search import Verdict
 from coview_stream.stream import rmw
-from coview_stream.stream import status as statuses
 from coview_stream.stream.codecs import encode_pose
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.guard import Guard
@@ -26,15 +23,19 @@ from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.lane import DiedError, FailedError, Lane, RejectedError
 from coview_stream.stream.messages import Encoded, Sample
+from coview_stream.stream.metronome import Metronome
+from coview_stream.stream.reporting import Reporter
 from coview_stream.stream.session import Session
-from coview_stream.stream.transport import Connection, Publisher, Transport
+from coview_stream.stream.transport import Publisher, Transport
 from coview_stream.stream.turns import Turns
 
 log = logging.getLogger("coview_stream.node")
 
-_JSON = "application/json"
 _ROS_NODE = "coview_stream"
 _LONGEST_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
+_AFTER_SURPRISE = 0.2  # seconds of pause after an error that nobody thought of
+_GOODBYE = 1.5  # seconds for everything to end; whoever runs us may promise two
+_LAST_WORK = 0.3  # of these, for the threads to finish what they are at
 
 
 class Node:
@@ -68,30 +69,22 @@ class Node:
         self._turns = {name: Turns(len(self.sessions)) for name in self._lanes}
         self._guard = Guard(log)
         self._stopping = threading.Event()
-        self._changed = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._started = time.monotonic()
         self._identity = uuid.uuid4().hex  # of our ROS node, where there is one
-        self._connection = Connection()
-        self._reconnects = 0
-        self._was_connected = self._ever_connected = False
-        self._told: dict[str, State] = {}
-        self._rates = {s.keys.robot: statuses.PoseRate() for s in self.sessions}
+        self._reporter = Reporter(self.sessions, transport, self._guard)
         self._poses: dict[str, Publisher] = {}
-        self._statuses: dict[str, Publisher] = {}
+        self._ending: threading.Thread | None = None
 
     # ---- life
 
     def start(self) -> None:
         """Declare everything and start the threads."""
         self.declare()
-        for name, work in (
-            ("track", partial(self._feed, "track")),
-            ("search", partial(self._feed, "search")),
-            ("poses", self._run_poses),
-            ("status", self._run_statuses),
-        ):
-            thread = threading.Thread(target=work, name=f"coview-{name}", daemon=True)
+        work: dict[str, Callable[[], None]] = {name: partial(self._feed, name) for name in self._lanes}
+        work["poses"] = self._run_poses
+        work["status"] = partial(self._reporter.run, self.config.status_rate, self._stopping)
+        for name, target in work.items():
+            thread = threading.Thread(target=target, name=f"coview-{name}", daemon=True)
             self._threads.append(thread)
             thread.start()
 
@@ -100,65 +93,63 @@ class Node:
         for session in self.sessions:
             keys = session.keys
             self._poses[keys.robot] = self._pose_publisher(keys)
-            self._statuses[keys.robot] = self.transport.publisher(keys.status, "data")
-            self.transport.subscribe(keys.odometry, partial(self._on_odometry, session), "all")
-            self.transport.subscribe(keys.cloud, partial(self._on_cloud, session), "newest")
-            self.transport.answer(keys.relocalize, partial(self._relocalize, session))
-            self.transport.answer(keys.reset, partial(self._reset, session))
+            self._reporter.declare(session)
+            self.transport.subscribe(keys.odometry, partial(self._receive, session.on_odometry), "all")
+            self.transport.subscribe(keys.cloud, partial(self._receive, session.on_cloud), "newest")
+            begin_anew = partial(session.begin_anew, "asked to search again")
+            self.transport.answer(keys.relocalize, partial(self._ask, session, begin_anew))
+            self.transport.answer(keys.reset, partial(self._ask, session, session.reset))
             self.transport.announce(keys.alive)
 
     def _pose_publisher(self, keys: RobotKeys) -> Publisher:
         publisher = self.transport.publisher(keys.pose, "realtime")
         if not keys.rmw:
             return publisher
-        domain = int(keys.pose.split("/")[0])
         entity = len(self._poses) + 1
         token = rmw.publisher_token(keys.pose, self._identity, _ROS_NODE, entity)
         if entity == 1:
-            self.transport.announce(rmw.node_token(domain, self._identity, _ROS_NODE))
+            self.transport.announce(rmw.node_token(int(keys.pose.split("/")[0]), self._identity, _ROS_NODE))
         self.transport.announce(token)
         return rmw.RmwPublisher(publisher, token, time.time_ns)
 
-    def close(self) -> None:
-        """Publish a last status, undeclare, end the engines; idempotent."""
-        if self._stopping.is_set():
-            return
-        self._stopping.set()
-        self._changed.set()
-        with self._wake:
-            self._wake.notify_all()
+    def close(self, patience: float = _GOODBYE) -> bool:
+        """Publish a last status, undeclare, end the engines; later calls only wait.
+
+        Returns:
+            Whether all is done; False after ``patience`` seconds if the network holds up the thread that does it.
+        """
+        if not self._stopping.is_set():
+            self._stopping.set()
+            self._reporter.changed.set()
+            self._poke()
+            self._ending = threading.Thread(target=self._end, name="coview-end", daemon=True)
+            self._ending.start()
+        if self._ending is not None:
+            self._ending.join(max(0.0, patience))
+        return self._ending is None or not self._ending.is_alive()
+
+    def _end(self) -> None:
         for lane in self._lanes.values():
-            lane.close()
+            self._guard.run("ending an engine", lane.close)
+        last = time.monotonic() + _LAST_WORK
         for thread in self._threads:
-            thread.join(timeout=0.5)
-        for session in self.sessions:
-            self._tell(session, time.monotonic(), closing=True)
+            thread.join(timeout=max(0.0, last - time.monotonic()))
+        self._reporter.say_goodbye(time.monotonic())
         self.transport.close()
 
     # ---- what comes in, on the transport's threads
 
-    def _on_cloud(self, session: Session, sample: Sample) -> None:
-        session.on_cloud(sample, time.monotonic())
-        self._poke()
-
-    def _on_odometry(self, session: Session, sample: Sample) -> None:
-        session.on_odometry(sample, time.monotonic())
+    def _receive(self, take: Callable[[Sample, float], None], sample: Sample) -> None:
+        take(sample, time.monotonic())
         self._poke()
 
     def _poke(self) -> None:
         with self._wake:
             self._wake.notify_all()
 
-    def _relocalize(self, session: Session, parameters: dict[str, str]) -> dict[str, Any]:
-        session.begin_anew("asked to search again")
-        return self._reply(session)
-
-    def _reset(self, session: Session, parameters: dict[str, str]) -> dict[str, Any]:
-        session.reset()
-        return self._reply(session)
-
-    def _reply(self, session: Session) -> dict[str, Any]:
-        self._changed.set()
+    def _ask(self, session: Session, act: Callable[[], None], parameters: dict[str, str]) -> dict[str, Any]:
+        act()
+        self._reporter.changed.set()
         state, reason = session.state()
         return {"ok": True, "robot": session.keys.robot, "state": state.value, "reason": reason}
 
@@ -166,12 +157,16 @@ class Node:
 
     def _feed(self, name: str) -> None:
         while not self._stopping.is_set():
-            found = self.next_job(name)
-            if found is None:
-                with self._wake:
-                    self._wake.wait(timeout=0.05)
-            else:
-                self.work(name, *found)
+            if self._guard.run(f"the {name} lane", partial(self._feed_one, name)):
+                self._stopping.wait(_AFTER_SURPRISE)
+
+    def _feed_one(self, name: str) -> None:
+        found = self.next_job(name)
+        if found is not None:
+            self.work(name, *found)
+            return
+        with self._wake:
+            self._wake.wait(timeout=0.05)
 
     def next_job(self, name: str) -> tuple[Session, FrameJob | SearchJob] | None:
         """Return whose turn it is in a lane, and with which job; None if there is nothing to do."""
@@ -185,46 +180,54 @@ class Node:
         try:
             result = self._lanes[name].run(job)
         except RejectedError as error:
-            self._report(session, job, str(error), rejected=True)
+            self._failed(session, job, error)
         except FailedError as error:
-            log.error("%s: the %s engine failed on a frame:\n%s", job.robot, name, error)
-            self._report(session, job, str(error), rejected=False)
+            self._guard.report(f"{job.robot}: the {name} engine", error)
+            self._failed(session, job, error)
         except DiedError as error:
-            if self._stopping.is_set():
-                return
-            log.error("%s; starting it again", error)
-            if name == "track":
-                for each in self.sessions:
-                    each.engine_restarted()
-            self._report(session, job, str(error), rejected=False)
-            self._changed.set()
-            self._deaths[name] += 1
-            self._stopping.wait(min(0.1 * 2.0 ** self._deaths[name], _LONGEST_PAUSE))
+            if not self._stopping.is_set():
+                self._died(name, error)
+                self._failed(session, job, error)
+                self._deaths[name] += 1
+                self._stopping.wait(min(0.1 * 2.0 ** self._deaths[name], _LONGEST_PAUSE))
         except Exception as error:  # nobody thought of it, but the other robots' work goes on
-            log.exception("%s: unexpected error in the %s lane", job.robot, name)
-            self._report(session, job, repr(error), rejected=False)
-            self._stopping.wait(0.2)
+            self._guard.report(f"{job.robot}: unexpected, in the {name} lane", error)
+            self._failed(session, job, error)
+            self._stopping.wait(_AFTER_SURPRISE)
         else:
             self._deaths[name] = 0
-            if isinstance(job, FrameJob) and isinstance(result, FrameResult):
-                session.frame_done(job, result, time.monotonic())
-            elif isinstance(job, SearchJob) and isinstance(result, Verdict):
-                session.search_done(job, result)
-            if session.state()[0] is not self._told.get(session.keys.robot):
-                self._changed.set()
-            if result is not None:
-                self._poke()
+            self._done(session, job, result)
 
-    def _report(self, session: Session, job: FrameJob | SearchJob, reason: str, rejected: bool) -> None:
+    def _done(self, session: Session, job: FrameJob | SearchJob, result: FrameResult | Verdict) -> None:
+        if isinstance(job, FrameJob) and isinstance(result, FrameResult):
+            session.frame_done(job, result, time.monotonic())
+        elif isinstance(job, SearchJob) and isinstance(result, Verdict):
+            session.search_done(job, result)
+        if self._reporter.has_news(session):
+            self._reporter.changed.set()
+        self._poke()  # a frame may have asked for a search
+
+    def _died(self, name: str, error: DiedError) -> None:
+        self._guard.report(f"the {name} engine is started again", error)
+        for each in self.sessions:
+            each.engine_restarted(name)
+        self._reporter.changed.set()
+
+    def _failed(self, session: Session, job: FrameJob | SearchJob, error: Exception) -> None:
+        reason = str(error) if isinstance(error, (RejectedError, FailedError, DiedError)) else repr(error)
         if isinstance(job, FrameJob):
-            session.frame_failed(job, reason, rejected)
+            session.frame_failed(job, reason, isinstance(error, RejectedError))
         else:
-            session.search_done(job, None)
+            session.search_failed(job, reason)
 
-    # ---- the clocks
+    # ---- the pose clock
 
     def _run_poses(self) -> None:
-        self._at_rate(self.config.pose_rate, self.publish_poses, self._stopping.wait)
+        clock = Metronome(self.config.pose_rate, time.monotonic())
+        while not self._stopping.wait(clock.remaining(time.monotonic())):
+            now = time.monotonic()
+            if clock.beat(now):
+                self._guard.run("the pose clock", partial(self.publish_poses, now))
 
     def publish_poses(self, now: float) -> None:
         """Let time pass in every session and publish the poses that are known."""
@@ -239,76 +242,10 @@ class Node:
             encoded = encode_pose(pose, self._pose_format or session.keys.pose_format)
             bare = session.keys.bare and self._pose_format is None
             self._poses[robot].put(Encoded(encoded.payload) if bare else encoded)
-            self._rates[robot].add(now)
-        if session.state()[0] is not self._told.get(robot):
-            self._changed.set()
-
-    def _at_rate(self, rate: float, act: Callable[[float], None], wait: Callable[[float], bool]) -> None:
-        """Call ``act`` at absolute times; after a pause of the machine go on, do not catch up."""
-        period = 1.0 / rate
-        due = time.monotonic()
-        while not self._stopping.is_set():
-            now = time.monotonic()
-            if now < due:
-                wait(due - now)
-                continue
-            try:
-                act(now)
-            except Exception:
-                log.exception("the pose clock goes on after an unexpected error")
-            due += period
-            if now - due > period:
-                due = now + period
-
-    def _run_statuses(self) -> None:
-        period = 1.0 / self.config.status_rate
-        due = time.monotonic()
-        while not self._stopping.is_set():
-            changed = self._changed.wait(timeout=max(0.0, due - time.monotonic()))
-            self._changed.clear()
-            if self._stopping.is_set():
-                return
-            now = time.monotonic()
-            regular = now >= due
-            try:
-                self.publish_statuses(now, everyone=regular)
-            except Exception:
-                log.exception("the status clock goes on after an unexpected error")
-            if regular:
-                due = max(due + period, now)
-            elif changed:
-                self._stopping.wait(0.01)  # many changes at once are one status each, not a flood
+            self._reporter.rates[robot].add(now)
+        if self._reporter.has_news(session):
+            self._reporter.changed.set()
 
     def publish_statuses(self, now: float, everyone: bool = True) -> None:
         """Publish the status of every robot, or of those whose state has changed."""
-        if everyone:
-            self._look_at_connection()
-        for session in self.sessions:
-            if everyone or session.state()[0] is not self._told.get(session.keys.robot):
-                self._tell(session, now)
-
-    def _tell(self, session: Session, now: float, closing: bool = False) -> None:
-        robot = session.keys.robot
-        rate = self._rates[robot].rate(now)
-        document = statuses.status(session, self._connection, self._reconnects, rate, now - self._started)
-        state = State(document["state"])
-        if closing:
-            document["reason"] = "the node is shutting down"
-            if state is State.TRACKING:  # nobody tracks it any more
-                document["state"] = State.LOST.value
-        elif state is not self._told.get(robot):
-            log.info("%s: %s (%s)", robot, state.value, document["reason"])
-        self._told[robot] = state
-        self._statuses[robot].put(Encoded(json.dumps(document).encode(), _JSON))
-
-    def _look_at_connection(self) -> None:
-        connection = self.transport.connection()
-        anybody = bool(connection.routers or connection.peers)
-        if anybody and not self._was_connected and self._ever_connected:
-            self._reconnects += 1
-            log.info("connected again: routers %s, peers %s", connection.routers, connection.peers)
-        elif not anybody and self._was_connected:
-            log.warning("nobody is connected any more")
-        self._was_connected = anybody
-        self._ever_connected |= anybody
-        self._connection = connection
+        self._reporter.publish(now, everyone)

@@ -41,7 +41,7 @@ def test_keys_and_urgencies(pair):
     }
     urgencies = {p.key: p.urgency for p in pair.net.publishers}
     assert urgencies["coview/r1/out/pose"] == "realtime"
-    assert urgencies["coview/r2/out/status"] == "data"
+    assert urgencies["coview/r2/out/status"] == "report"
     assert set(pair.net.tokens) == {"coview/r1/alive", "coview/r2/alive"}
 
 
@@ -188,3 +188,29 @@ def test_with_threads():
     assert site.net.closed
     assert not [t for t in threading.enumerate() if t.name in THREADS]
     assert "shutting down" in site.statuses("r1")[-1]["reason"]
+
+
+def test_the_end_waits_for_no_network():
+    site = Site("r1")
+    site.node.start()
+    stuck = threading.Event()
+    site.net.close = stuck.wait
+    begin = time.monotonic()
+    assert site.node.close(patience=0.6) is False
+    assert time.monotonic() - begin < 5.0
+    assert (site.track.closed, site.search.closed) == (1, 1)
+    assert "shutting down" in site.statuses("r1")[-1]["reason"]
+    stuck.set()
+    until(lambda: site.node.close(patience=0.0))
+
+
+def test_the_end_waits_for_no_reader_of_a_last_status():
+    site = Site("r1")
+    site.node.declare()
+    stuck = threading.Event()
+    for publisher in site.net.publishers:
+        publisher.put = lambda message: stuck.wait()
+    assert site.node.close(patience=0.3) is False
+    stuck.set()
+    until(lambda: site.node.close(patience=0.0))
+    assert site.net.closed

@@ -6,10 +6,12 @@ import time
 
 import numpy as np
 import pytest
+from live import until
 from robots import ns, query, unknown
 from sites import STEP, Site
 
 from coview_stream.errors import CloudError
+from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.messages import Sample
 
 
@@ -91,9 +93,11 @@ def test_a_search_engine_that_died_loses_no_place(pair):
     pair.work("r2")
     assert pair.status("r1")["state"] == "TRACKING"
     status = pair.status("r2")
-    assert status["counters"]["searches"] == 1
+    counters = status["counters"]
+    assert (counters["searches"], counters["search_errors"], counters["engine_restarts"]) == (0, 1, 1)
+    assert any("engine died" in text for text in status["errors"])
     pair.frame("r2", STEP)
-    assert pair.status("r2")["counters"]["searches"] == 2
+    assert pair.status("r2")["counters"]["searches"] == 1
 
 
 def test_robots_take_turns():
@@ -109,3 +113,86 @@ def test_robots_take_turns():
         served.append(job.robot)
         site.node.work("track", session, job)
     assert served == list(names) * 10
+
+
+def test_a_search_engine_that_fails_is_named(site):
+    class Broken:
+        def run(self, job):
+            raise ValueError("the spectra are gone")
+
+        def forget(self, robot):
+            pass
+
+    site.engine.answer = lambda job: unknown(job, ask=query())
+    site.search.engine = Broken()
+    for k in range(5):
+        site.frame("r1", STEP * k)
+    status = site.status("r1")
+    assert (status["counters"]["searches"], status["counters"]["search_errors"]) == (0, 5)
+    assert any("the spectra are gone" in text for text in status["errors"])
+    site.search.engine = site.engine
+    site.frame("r1", 1.0)
+    assert site.status("r1")["counters"]["searches"] == 1
+
+
+def test_failures_on_every_frame_do_not_flood_the_log(site, caplog):
+    site.engine.failing["r1"] = ValueError("bad frame")
+    for k in range(50):
+        site.frame("r1", STEP * k)
+    assert site.status("r1")["counters"]["engine_errors"] == 50
+    lines = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert len(lines) == 1
+    assert "r1: the track engine" in lines[0]
+    assert "bad frame" in lines[0]
+    site.track.run = lambda job: 1 / 0
+    site.node._stopping.set()  # no pauses
+    for k in range(50, 60):
+        site.frame("r1", STEP * k)
+    assert len([r for r in caplog.records if "unexpected" in r.getMessage()]) == 1
+
+
+class Unsayable:
+    """Evidence that cannot be written."""
+
+    reason = "none"
+
+    def to_json(self):
+        raise RuntimeError("cannot be said")
+
+
+def test_one_robots_status_that_raises_silences_nobody(pair):
+    pair.sessions["r1"].evidence = Unsayable()
+    for _ in range(3):
+        pair.node.publish_statuses(time.monotonic())
+    assert len(pair.statuses("r2")) == 3
+    assert pair.statuses("r1") == []
+    pair.sessions["r1"].evidence = None
+    assert pair.status("r1")["robot"] == "r1"
+
+
+def test_an_unknown_connection_silences_nobody(pair):
+    def fail():
+        raise RuntimeError("cannot ask")
+
+    pair.net.connection = fail
+    assert pair.status("r1")["connection"] == {"routers": [], "peers": [], "reconnects": 0}
+    assert len(pair.statuses("r2")) == 1
+
+
+def test_a_status_that_raises_is_not_tried_over_and_over():
+    config = NodeConfig(pose_rate=200.0, status_rate=2.0)
+    site = Site("r1", config=config)
+    asked = []
+
+    class Counting(Unsayable):
+        def to_json(self):
+            asked.append(time.monotonic())
+            return super().to_json()
+
+    site.sessions["r1"].evidence = Counting()
+    site.node.start()
+    try:
+        until(lambda: len(asked) >= 3)
+    finally:
+        site.node.close()
+    assert asked[2] - asked[0] > 0.5
