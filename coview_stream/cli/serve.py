@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import threading
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coview_stream.cli.signals import Stop
+    from coview_stream.stream.node import Node
+    from coview_stream.stream.serve import ServeOptions
+
+_ENDING = 1.5  # seconds for everything to end after a signal: we promise two
 
 HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
 
@@ -26,6 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument("--base", default="coview", metavar="KEY", help="first part of our keys (coview)")
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument(
+        "--humble", action="store_true", help="for rmw_zenoh: name types as ROS 2 Humble does, without a hash"
+    )
+    keys.add_argument(
         "--cloud-key", metavar="KEY", help="instead of the preset's; {base} and {robot} are filled in"
     )
     keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
@@ -41,6 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limits.add_argument("--pose-rate", type=float, default=10.0, metavar="HZ", help="(10)")
     limits.add_argument(
         "--odometry-timeout", type=float, default=0.5, metavar="S", help="older: no pose (0.5)"
+    )
+    limits.add_argument(
+        "--max-outage", type=float, default=2.0, metavar="S", help="after longer without: search anew (2)"
+    )
+    limits.add_argument(
+        "--max-speed", type=float, default=50.0, metavar="M/S", help="odometry that is faster has jumped (50)"
     )
     limits.add_argument(
         "--coast", type=float, default=5.0, metavar="S", help="poses go on this long without frames (5)"
@@ -61,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.stream.config import NodeConfig
     from coview_stream.stream.keys import robot_keys
     from coview_stream.stream.reach import DEFAULT_ENDPOINT
-    from coview_stream.stream.serve import ServeOptions, open_node
+    from coview_stream.stream.serve import ServeOptions
 
     logging.basicConfig(
         level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
@@ -69,16 +87,15 @@ def run(args: argparse.Namespace) -> int:
     _check("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     _check("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     _check("--pose-encoding", args.pose_encoding, POSE_CODECS)
-    keys = [
-        robot_keys(
-            args.preset, args.base, robot, args.cloud_key, args.odometry_key, args.pose_key, args.domain
-        )
-        for robot in args.robot
-    ]
+    given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
+    keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
     alone = not (args.connect or args.listen or args.config)
     node = NodeConfig(
         pose_rate=args.pose_rate,
         odometry_timeout=args.odometry_timeout,
+        max_gap=max(0.5, args.odometry_timeout),  # a pause that keeps the pose up keeps its frames as well
+        max_outage=args.max_outage,
+        max_speed=args.max_speed,
         coast=args.coast,
         max_payload=args.max_payload,
         deskew=not args.no_deskew,
@@ -88,13 +105,54 @@ def run(args: argparse.Namespace) -> int:
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding,
     )  # fmt: skip
     with stop_on_signals() as stop:
-        running = open_node(options)
-        try:
-            while not stop.wait(60.0):
-                pass
-        finally:
-            running.close()
+        ended = _serve(options, stop)
+    if not ended:
+        _leave()
     return 0
+
+
+def _serve(options: ServeOptions, stop: Stop) -> bool:
+    """Open the node and run it until asked to stop; False if something does not end then.
+
+    Opening has a thread of its own, for a signal must end even what waits for a host that does not answer.
+    """
+    from coview_stream.stream.lane import CancelledError
+    from coview_stream.stream.serve import open_node
+
+    opened: list[Node] = []
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            opened.append(open_node(options, lambda: stop.requested))
+        except CancelledError:
+            pass
+        except BaseException as error:
+            failed.append(error)
+
+    opening = threading.Thread(target=work, name="coview-open", daemon=True)
+    opening.start()
+    while opening.is_alive() and not stop.wait(0.05):
+        pass
+    while not (failed or stop.wait(60.0)):
+        pass
+    if failed and not stop.requested:
+        raise failed[0]
+    end = stop.now() + _ENDING
+    opening.join(_ENDING)
+    return not opening.is_alive() and all(node.close(end - stop.now()) for node in opened)
+
+
+def _leave() -> None:
+    """End the process though a thread is stuck in the network, which a regular exit would wait for."""
+    import logging
+    import os
+    import sys
+
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _check(option: str, name: str | None, known: Iterable[str]) -> None:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.errors import ConfigError, MapError
+from coview_stream.errors import MapError, TransportError
+from coview_stream.stream.apart import check_apart
 from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.keys import RobotKeys
-from coview_stream.stream.lane import DiedError, ProcessLane
+from coview_stream.stream.lane import CancelledError, DiedError, ProcessLane
 from coview_stream.stream.node import Node
 from coview_stream.stream.session import Session
+from coview_stream.stream.transport import Transport
 from coview_stream.stream.zenoh_transport import open_transport
 
 log = logging.getLogger("coview_stream.node")
@@ -51,15 +53,19 @@ class ServeOptions:
     pose_codec: str | None = None
 
 
-def open_node(options: ServeOptions) -> Node:
+def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
     """Load the map in the engines, open the network and start; what fails leaves nothing running.
 
+    Args:
+        options: what to serve, and where.
+        cancelled: asked now and then whether to give up.
+
     Raises:
-        MapError: the map is unusable. ConfigError: a robot is named twice. TransportError: no network.
+        MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
+        CancelledError: as asked.
     """
+    check_apart(options.keys)
     names = [k.robot for k in options.keys]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"--robot: {', '.join(names)}: each name once")
     begin = time.monotonic()
     base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
     path = str(options.map_path)
@@ -71,12 +77,17 @@ def open_node(options: ServeOptions) -> Node:
     try:
         for lane in lanes:
             lane.start()
-        transport = open_transport(options.connect, options.listen, options.zenoh_config)
+        transport = open_transport(
+            options.connect, options.listen, options.zenoh_config, options.node.max_payload
+        )
+        warn_of_others(transport, options.keys)
         codecs = (options.cloud_codec, options.odometry_codec)
         sessions = [Session(k, base_map.sha256, options.node, options=codecs) for k in options.keys]
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
         for lane in lanes:
-            lane.wait_ready()
+            lane.wait_ready(cancelled)
+        if cancelled():
+            raise CancelledError("the node is no longer wanted")
         node = Node(sessions, transport, track, search, options.node, options.pose_codec)
         node.start()
     except BaseException as error:
@@ -91,3 +102,23 @@ def open_node(options: ServeOptions) -> Node:
         "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
     )
     return node
+
+
+def warn_of_others(transport: Transport, keys: Sequence[RobotKeys]) -> None:
+    """Say which of the robots another node serves as well, as far as can be seen from here."""
+    from coview_stream.checkup.others import tokens
+
+    try:
+        # one question for all robots of a base: chunks of the key are base, name and "alive"
+        everybody = {k.alive.rsplit("/", 2)[0] + "/*/alive" for k in keys}
+        held = {token for expression in everybody for token in tokens(transport, expression)}
+    except TransportError as error:
+        log.warning("cannot see whether another node is there: %s", error)
+        return
+    for robot, token in ((k.robot, k.alive) for k in keys):
+        if token in held:
+            log.warning(
+                "another node serves %s already (it holds %s): poses of both go to one key; end one of them",
+                robot,
+                token,
+            )
