@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from typing import Any
 
 from coview_stream.stream.guard import Guard
@@ -11,7 +9,6 @@ from coview_stream.stream.messages import Encoded, Sample
 from coview_stream.stream.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
-_JSON = "application/json"
 
 
 class ZenohPublisher:
@@ -62,19 +59,6 @@ def plain(sample: Any, max_payload: int | None = None) -> Sample:
     return Sample(
         key, sample.payload.to_bytes(), encoding, None if attachment is None else attachment.to_bytes()
     )
-
-
-def answer_query(
-    guard: Guard, key: str, query: Any, handler: Callable[[dict[str, str]], dict[str, Any]]
-) -> None:
-    """Reply to a zenoh query with what ``handler`` makes of its parameters, or with the error that it raises."""
-    try:
-        reply = json.dumps(handler({str(name): str(value) for name, value in query.parameters}))
-    except Exception as error:
-        guard.report(key, error)
-        query.reply_err(json.dumps({"error": str(error)}), encoding=_JSON)
-    else:
-        query.reply(key, reply, encoding=_JSON)
 
 
 def quality(urgency: Urgency) -> dict[str, Any]:

@@ -17,8 +17,9 @@ from coview_stream.stream import zenoh_config
 from coview_stream.stream.guard import Guard
 from coview_stream.stream.messages import Sample
 from coview_stream.stream.transport import Connection, Policy, Publisher, Urgency
+from coview_stream.stream.zenoh_answers import Answers
 from coview_stream.stream.zenoh_config import zenoh_errors
-from coview_stream.stream.zenoh_samples import ZenohPublisher, answer_query, plain, quality
+from coview_stream.stream.zenoh_samples import ZenohPublisher, plain, quality
 
 _log = logging.getLogger(__name__)
 
@@ -72,9 +73,7 @@ class ZenohTransport:
         self._threads: list[threading.Thread] = []
         self._declared: list[Any] = []  # zenoh undeclares what nobody holds
         self._pending: list[Callable[[Any], None]] = []
-        self._queries: SimpleQueue[tuple[str, Any, Callable[[dict[str, str]], dict[str, Any]]] | None] = (
-            SimpleQueue()
-        )
+        self._answers = Answers(self._guard)
         self._session: Any = None
         # a thread inside zenoh while the interpreter goes down aborts the process: see that none is left
         atexit.register(self._at_exit)
@@ -110,15 +109,11 @@ class ZenohTransport:
         """Answer queries with JSON; all handlers of a transport share one thread. Errors as in :meth:`subscribe`."""
         import zenoh
 
-        # queries are rare: one thread for all keys instead of one each, which would wake ten times a second for nothing
-        def enqueue(query: Any) -> None:
-            self._queries.put((key, query, handler))
-
         def declare(session: Any) -> None:
-            callback = zenoh.handlers.Callback(enqueue, indirect=False)
+            callback = zenoh.handlers.Callback(self._answers.callback(key, handler), indirect=False)
             self._declared.append(session.declare_queryable(key, callback))
             if not any(thread.name == "coview answers" for thread in self._threads):
-                self._start("answers", self._answer_queries)
+                self._start("answers", self._answers.run)
 
         self._declare(key, declare)
 
@@ -150,7 +145,7 @@ class ZenohTransport:
             self._pending.clear()
         if session is not None:
             self._guard.run("closing", session.close)
-        self._queries.put(None)
+        self._answers.end()
         end = time.monotonic() + _JOIN
         for thread in self._threads:
             if thread is not threading.current_thread():
@@ -247,12 +242,6 @@ class ZenohTransport:
             if sample.kind == zenoh.SampleKind.PUT:
                 self._guard.run(key, partial(_hand, sample, self._max_payload, handler))
             del sample  # however large, it need not live until the next one comes
-
-    def _answer_queries(self) -> None:
-        while (entry := self._queries.get()) is not None:
-            key, query, handler = entry
-            self._guard.run(key, partial(answer_query, self._guard, key, query, handler))
-            del entry, query  # a query is finished for its sender when nobody holds it
 
 
 def _hand(sample: Any, max_payload: int | None, handler: Callable[[Sample], None]) -> None:
