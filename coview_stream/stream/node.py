@@ -153,7 +153,7 @@ class Node:
         state, reason = session.state()
         return {"ok": True, "robot": session.keys.robot, "state": state.value, "reason": reason}
 
-    # ---- the engine's work, one thread for each lane
+    # ---- the engine's work
 
     def _feed(self, name: str) -> None:
         while not self._stopping.is_set():
@@ -236,8 +236,7 @@ class Node:
 
     def _publish_pose(self, session: Session, now: float) -> None:
         session.tick(now)
-        robot = session.keys.robot
-        pose = session.pose()
+        robot, pose = session.keys.robot, session.pose()
         if pose is not None:
             encoded = encode_pose(pose, self._pose_format or session.keys.pose_format)
             bare = session.keys.bare and self._pose_format is None
