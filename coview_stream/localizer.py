@@ -21,6 +21,7 @@ from coview_stream.tracking import Tracker, kept, relative_to, unanchored
 
 _LEAST_POINTS = 10
 _LOOKED_AT = 2000  # of a frame's points, to see how far they lie
+_HURRIED = 3.0  # times as far apart are registrations in a hurry
 _FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
 
 
@@ -91,8 +92,14 @@ class Localizer:
             self.adopt(self._search.update(query))
         return self.fix()
 
-    def take(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Query | None:
+    def take(self, cloud: Points, T_odom_body: Pose, stamp: float, hurry: bool = False) -> Query | None:
         """First half of :meth:`step`, which never searches the map and so is quick.
+
+        Args:
+            cloud: as for :meth:`step`.
+            T_odom_body: as for :meth:`step`.
+            stamp: as for :meth:`step`.
+            hurry: others wait: while tracking, put registrations off that can wait, to every third metre.
 
         Returns:
             What has to be searched for, if anything: hand it to a :class:`GlobalSearch`, on another thread or in
@@ -106,8 +113,9 @@ class Localizer:
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
         if self.state is State.TRACKING:
-            due = self._tracker.due or self._doubts > 0
-            if due or stamp - self._registered >= self.config.tracking.seconds:
+            patience = _HURRIED if hurry else 1.0
+            due = self._tracker.due(patience) or self._doubts > 0
+            if due or stamp - self._registered >= patience * self.config.tracking.seconds:
                 self._track(cloud, T_odom_body, stamp, idle=not due)
         elif keyframe is not None:
             scan = self.base_map.descriptor_config

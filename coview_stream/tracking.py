@@ -84,11 +84,11 @@ class Tracker:
         self.covariance = self._posterior(registration) + _START_COVARIANCE
         self._registered_at, self._turned = travelled, 0.0
 
-    @property
-    def due(self) -> bool:
-        """Whether the robot has driven or turned far enough for another registration."""
+    def due(self, patience: float = 1.0) -> bool:
+        """Whether the robot has driven or turned far enough for another registration; ``patience`` times as far."""
+        driven, turned = self.travelled - self._registered_at, self._turned
         settings = self.config.tracking
-        return self.travelled - self._registered_at >= settings.distance or self._turned >= settings.turn
+        return driven >= patience * settings.distance or turned >= patience * settings.turn
 
     def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False) -> Evidence | None:
         """Register the recent points from the predicted pose; None where the map offers nothing to register to.

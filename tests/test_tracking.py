@@ -44,7 +44,7 @@ def still(world_map, world_drive):
 
     def see(x=0.0, yaw=0.0):
         tracker.observe(cloud, pose_from(rot_z(yaw), [x, 0.0, 0.0]))
-        return tracker.due
+        return tracker.due()
 
     see()
     return tracker, see
@@ -74,7 +74,7 @@ def test_an_update_is_not_due_again_at_once(still, world_drive):
     tracker, see = still
     assert see(x=1.1 * DISTANCE, yaw=1.1 * TURN)
     tracker.update(world_drive.clouds[0], pose_from(rot_z(1.1 * TURN), [1.1 * DISTANCE, 0.0, 0.0]))
-    assert not tracker.due
+    assert not tracker.due()
     assert not see(x=1.1 * DISTANCE, yaw=1.1 * TURN)
 
 
@@ -121,7 +121,7 @@ def test_a_doubtful_registration_is_not_believed(world_map, world_drive, rule):
     np.testing.assert_array_equal(tracker.T_map_odom, T_start)
     assert error > 0.2
     assert (np.diag(tracker.predicted_covariance()) >= np.diag(tracker_of(world_map).covariance)).all()
-    assert not tracker.due
+    assert not tracker.due()
 
 
 def test_garbage_does_not_move_the_pose(world_map, world_drive):
@@ -224,3 +224,15 @@ def test_after_a_loss_the_search_starts_from_nothing(world_map, world_drive):
     assert min(fix.evidence.score for fix in found) > 0.9
     newest = anew.T_map_body[patience + confirmations - 1]
     assert pose_error(found[-1].T_map_body, newest)[0] < 0.08
+
+
+def test_in_a_hurry_registrations_are_three_times_as_far_apart(world_map):
+    config = LocalizerConfig()
+    tracker = Tracker(world_map, config, LocalMaps(world_map, 50.0))
+    cloud = np.zeros((20, 3), np.float32)
+    due = []
+    for k in range(8):
+        tracker.observe(cloud, pose_from(np.eye(3), [0.5 * k * DISTANCE, 0.0, 0.0]))
+        due.append((tracker.due(), tracker.due(3.0)))
+    assert [d for d, _ in due].index(True) == 2
+    assert [d for _, d in due].index(True) == 6

@@ -49,10 +49,11 @@ class Desk:
         return int(self._ready is not None)
 
     def put_frame(self, frame: Paired, now: float, travelled: float, turned: float) -> bool:
-        """Make a frame the next one; return whether another had to make room for it."""
+        """Make a frame the next one; return whether another had to make room for it: then there is a hurry."""
         message = frame.message
         job = FrameJob(
-            self.robot, self.epoch, message.stamp_ns, message.points, frame.T_odom_body, message.times, frame.segment
+            self.robot, self.epoch, message.stamp_ns, message.points, frame.T_odom_body, message.times,
+            frame.segment, hurry=self._ready is not None,
         )  # fmt: skip
         before = self._ready
         since = now if before is None else before.since

@@ -64,7 +64,7 @@ class TrackEngine:
             localizer.adopt(job.verdict)
         if job.suspect:
             localizer.suspect()
-        query = localizer.take(points, job.T_odom_body, job.stamp_ns * 1e-9)
+        query = localizer.take(points, job.T_odom_body, job.stamp_ns * 1e-9, job.hurry)
         return FrameResult(localizer.fix(), query, time.perf_counter() - begin)
 
     def forget(self, robot: str) -> None:

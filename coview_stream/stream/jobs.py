@@ -27,6 +27,7 @@ class FrameJob:
         segment: odometry during the sweep; goes with ``times``.
         suspect: give no pose before this frame has verified the place.
         verdict: of an earlier search, to be taken note of first.
+        hurry: the engine is behind with its work: leave what can wait.
     """
 
     robot: str
@@ -38,6 +39,7 @@ class FrameJob:
     segment: Segment | None = None
     suspect: bool = False
     verdict: Verdict | None = None
+    hurry: bool = False
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,12 @@ class Metronome:
     Args:
         rate: beats per second.
         now: local time in seconds; the first beat is due at once.
+        slack: seconds by which it may be behind and still catch up.
     """
 
-    def __init__(self, rate: float, now: float) -> None:
+    def __init__(self, rate: float, now: float, slack: float = 0.0) -> None:
         self.period = 1.0 / rate
+        self.slack = slack
         self.due = now
 
     def remaining(self, now: float) -> float:
@@ -24,6 +26,6 @@ class Metronome:
         if now < self.due:
             return False
         self.due += self.period
-        if now > self.due:
+        if now > self.due + self.slack:
             self.due = now + self.period
         return True

@@ -32,6 +32,7 @@ from coview_stream.stream.turns import Turns
 log = logging.getLogger("coview_stream.node")
 
 _ROS_NODE = "coview_stream"
+_MOST_BEATS = 200.0  # of the pose clock, per second
 _LONGEST_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
 _AFTER_SURPRISE = 0.2  # seconds of pause after an error that nobody thought of
 _GOODBYE = 1.5  # seconds for everything to end; whoever runs us may promise two
@@ -223,15 +224,23 @@ class Node:
     # ---- the pose clock
 
     def _run_poses(self) -> None:
-        clock = Metronome(self.config.pose_rate, time.monotonic())
+        # robots are served one after the other over the period: poses of many at once are more than the queues of
+        # zenoh and of a router hold for urgent messages, and those that came last would be dropped
+        rate = self.config.pose_rate
+        groups = max(1, min(len(self.sessions), int(_MOST_BEATS / rate)))
+        clock = Metronome(rate * groups, time.monotonic(), slack=0.5 / rate)
+        group = 0
         while not self._stopping.wait(clock.remaining(time.monotonic())):
             now = time.monotonic()
             if clock.beat(now):
-                self._guard.run("the pose clock", partial(self.publish_poses, now))
+                self._guard.run(
+                    "the pose clock", partial(self.publish_poses, now, self.sessions[group::groups])
+                )
+                group = (group + 1) % groups
 
-    def publish_poses(self, now: float) -> None:
-        """Let time pass in every session and publish the poses that are known."""
-        for session in self.sessions:
+    def publish_poses(self, now: float, sessions: Sequence[Session] | None = None) -> None:
+        """Let time pass in every session, or in some, and publish the poses that are known."""
+        for session in self.sessions if sessions is None else sessions:
             self._guard.run(session.keys.robot, partial(self._publish_pose, session, now))
 
     def _publish_pose(self, session: Session, now: float) -> None:

@@ -40,3 +40,14 @@ def test_how_long_to_wait():
     metronome.beat(0.0)
     assert metronome.remaining(0.1) == pytest.approx(0.15)
     assert metronome.remaining(5.0) == 0.0
+
+
+def test_with_slack_a_late_beat_does_not_shift_the_later_ones():
+    clock = Metronome(100.0, 0.0, slack=0.05)
+    assert clock.beat(0.0)
+    assert clock.beat(0.045)  # due at 0.01; the next ones are caught up
+    assert [clock.beat(0.045), clock.beat(0.0451), clock.beat(0.0452), clock.beat(0.0453)] == [True, True, True, False]
+    assert clock.remaining(0.0453) == pytest.approx(0.0047)
+    assert clock.beat(0.2)  # later than the slack: go on from here
+    assert not clock.beat(0.2)
+    assert clock.remaining(0.2) == pytest.approx(0.01)

@@ -155,3 +155,15 @@ def test_options_force_the_codecs():
     session.on_cloud(Sample(sample.key, sample.payload, "video/raw", sample.attachment), 0.0)
     session.on_odometry(Sample(moved.key, moved.payload, "video/raw"), 0.0)
     assert session.take_frame() is not None
+
+
+def test_a_frame_that_took_anothers_place_is_in_a_hurry():
+    robot = Robot()
+    robot.drive(-0.1, 0.5)
+    robot.saw(0.0)
+    robot.saw(0.1)
+    job = robot.session.take_frame()
+    assert (job.stamp_ns, job.hurry) == (ns(0.1), True)
+    robot.session.frame_done(job, tracking(job), robot.now)
+    robot.saw(0.2)
+    assert not robot.session.take_frame().hurry
