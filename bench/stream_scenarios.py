@@ -119,7 +119,8 @@ def robots(setting: Setting) -> Outcome:
 
 def _robot(stage: Stage, plan: RobotPlan, sent: Any, start: float) -> dict[str, Any]:
     numbers = measure(stage, plan, sent, start)
-    told = [status for status in stage.recorder.told(plan.robot, start) if status.arrival > start + 2.0]
+    # while it is being sent to: a robot that has ended does not starve
+    told = stage.recorder.told(plan.robot, start + 2.0, start + plan.seconds)
     stale = scores.staleness(sent.puts[plan.robot], scores.processed(told))
     corrections = scores.corrected(stage.recorder.poses(plan.robot, start + 2.0, start + plan.seconds))
     aged = scores.staleness(sent.puts[plan.robot], corrections)

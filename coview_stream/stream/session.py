@@ -74,6 +74,7 @@ class Session:
         self._processed_at: float | None = None
         self._fix_state = State.SEARCHING
         self._lost: str | None = None
+        self._begun = ""  # why the search began anew
         self._forget_frame()
         self._first_epoch = self._epoch  # what was under way before is nobody's
 
@@ -152,6 +153,7 @@ class Session:
         with self._lock:
             if self._correction is not None or self._fix_state is State.TRACKING:
                 self._lose(reason)
+            self._begun = f"searching anew: {reason}"
             self._forget_frame()
 
     def reset(self) -> None:
@@ -306,9 +308,10 @@ class Session:
                 return State.LOST, self._lost
             if self._fix_state is State.TRACKING:
                 return State.AMBIGUOUS, "verifying the place after a pause of odometry"
-            return self._fix_state, evidence if self.last_frame_ns is not None else why_nothing(
-                self.keys, self.counters, self.odometry.newest is not None
-            )
+            if self.last_frame_ns is None:
+                has_odometry = self.odometry.newest is not None
+                return self._fix_state, why_nothing(self.keys, self.counters, has_odometry)
+            return self._fix_state, evidence or self._begun or "too little has been seen"
 
     def age(self) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""

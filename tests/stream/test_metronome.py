@@ -46,7 +46,12 @@ def test_with_slack_a_late_beat_does_not_shift_the_later_ones():
     clock = Metronome(100.0, 0.0, slack=0.05)
     assert clock.beat(0.0)
     assert clock.beat(0.045)  # due at 0.01; the next ones are caught up
-    assert [clock.beat(0.045), clock.beat(0.0451), clock.beat(0.0452), clock.beat(0.0453)] == [True, True, True, False]
+    assert [clock.beat(0.045), clock.beat(0.0451), clock.beat(0.0452), clock.beat(0.0453)] == [
+        True,
+        True,
+        True,
+        False,
+    ]
     assert clock.remaining(0.0453) == pytest.approx(0.0047)
     assert clock.beat(0.2)  # later than the slack: go on from here
     assert not clock.beat(0.2)
