@@ -20,6 +20,7 @@ class NodeConfig:
         horizon: odometry is remembered for this long (sensor time); an older frame is late.
         max_gap: odometry is interpolated between samples no farther apart than this.
         max_outage: a longer pause of odometry (sensor time) is a new beginning: the robot may have been carried.
+        max_network_outage: the same where nobody was connected to the node meanwhile, which explains the pause.
         max_speed: faster motion between two odometry samples is a jump; see :mod:`coview_stream.stream.odometry`.
         max_turn_rate: likewise for headings, radians per second, and 20 degrees.
         max_payload: a larger message is counted as oversized and not looked at.
@@ -36,6 +37,7 @@ class NodeConfig:
     horizon: float = 5.0
     max_gap: float = 0.5
     max_outage: float = 2.0
+    max_network_outage: float = 10.0
     max_speed: float = 50.0
     max_turn_rate: float = 20.0
     max_payload: int = 16 << 20

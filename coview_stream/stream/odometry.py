@@ -81,9 +81,13 @@ class OdometryBuffer:
         self._strange: deque[tuple[float, int]] = deque(maxlen=_STEADY)  # local time, stamp
         self._strange_since = float("inf")
 
-    def add(self, sample: OdometryMessage, now: float) -> Intake:
-        """Take in a sample that came at local time ``now``; only duplicates and strays leave no trace."""
-        verdict = self._classify(sample, now)
+    def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> Intake:
+        """Take in a sample that came at local time ``now``; only duplicates and strays leave no trace.
+
+        ``unreachable``: none could have come since the last one, for nobody was connected.
+        """
+        longest = self.config.max_network_outage if unreachable else self.config.max_outage
+        verdict = self._classify(sample, now, longest)
         if verdict in (Intake.DUPLICATE, Intake.OUT_OF_ORDER):
             return verdict
         if verdict in (Intake.JUMP, Intake.RESTART, Intake.OUTAGE):
@@ -101,7 +105,7 @@ class OdometryBuffer:
             self._samples.popleft()
         return verdict
 
-    def _classify(self, sample: OdometryMessage, now: float) -> Intake:
+    def _classify(self, sample: OdometryMessage, now: float, longest: float) -> Intake:
         last = self.newest
         if last is None:
             return Intake.CONTINUES
@@ -114,7 +118,7 @@ class OdometryBuffer:
             if not self._runs_on(sample.stamp_ns, now):
                 return Intake.OUT_OF_ORDER
             return Intake.RESTART if seconds < 0 else Intake.OUTAGE
-        if seconds > self.config.max_outage:
+        if seconds > longest:
             return Intake.OUTAGE
         step = inverse(last.T_odom_body) @ sample.T_odom_body
         if self._impossible(step, seconds):

@@ -71,9 +71,15 @@ class Reporter:
     def publish(self, now: float, everyone: bool = True) -> None:
         """Publish the status of every robot, or of those whose state has changed."""
         if everyone:
-            self._guard.run("connection", lambda: self._link.look(self._transport.connection()))
+            self._guard.run("connection", partial(self._look, now))
         for session in self._sessions:
             self._guard.run(f"{session.keys.robot}: status", partial(self._report, session, now, everyone))
+
+    def _look(self, now: float) -> None:
+        self._link.look(self._transport.connection())
+        if not (self._link.connection.routers or self._link.connection.peers):
+            for session in self._sessions:
+                session.unreachable(now)
 
     def say_goodbye(self, now: float) -> None:
         """Publish that nobody tracks the robots any more."""

@@ -74,6 +74,7 @@ class Session:
         self._processed_at: float | None = None
         self._fix_state = State.SEARCHING
         self._lost: str | None = None
+        self._unreachable = float("-inf")  # local time at which nobody was connected
         self._begun = ""  # why the search began anew
         self._forget_frame()
         self._first_epoch = self._epoch  # what was under way before is nobody's
@@ -116,7 +117,8 @@ class Session:
             if message is None:
                 note(self.counters, self.complaints, "odometry_", name, sample.key, reason)
                 return
-            self._continue(self.odometry.add(message, now), message)
+            unreachable = self._unreachable > self.odometry.arrived
+            self._continue(self.odometry.add(message, now, unreachable), message)
             self._pair(now)
 
     def _continue(self, intake: Intake, message: OdometryMessage) -> None:
@@ -134,13 +136,18 @@ class Session:
                 self._doubt(message.stamp_ns)
         elif intake is Intake.OUTAGE:
             self.counters.odometry_gaps += 1
-            self.begin_anew(f"odometry was away for more than {self.config.max_outage:g} s")
+            self.begin_anew("odometry was away for too long")
         elif intake is Intake.JUMP:
             self.counters.odometry_jumps += 1
             self.begin_anew("odometry jumped")
         elif intake is Intake.RESTART:
             self.counters.clock_restarts += 1
             self.begin_anew("the sender's clock started anew")
+
+    def unreachable(self, now: float) -> None:
+        """Take note that nobody is connected to the node: that odometry pauses says nothing of the robot then."""
+        with self._lock:
+            self._unreachable = now
 
     def _doubt(self, from_ns: int) -> None:
         """No pose until a frame stamped ``from_ns`` or later has verified the place."""

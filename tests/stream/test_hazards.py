@@ -89,7 +89,23 @@ def test_a_long_outage_of_odometry_is_a_new_beginning():
     assert robot.session.pose() is not None
     robot.moved(2.7, x=0.6, now=robot.now + 2.4)
     assert robot.session.pose() is None
-    assert robot.session.state() == (State.LOST, "odometry was away for more than 2 s")
+    assert robot.session.state() == (State.LOST, "odometry was away for too long")
+
+
+@pytest.mark.parametrize(("seconds", "state"), [(6.0, State.AMBIGUOUS), (12.0, State.LOST)])
+def test_an_outage_of_the_network_keeps_the_place_for_a_while(seconds, state):
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.session.unreachable(robot.now + 1.0)
+    robot.moved(0.3 + seconds, x=0.6, now=robot.now + seconds)
+    assert robot.session.pose() is None
+    assert robot.session.state()[0] is state
+    robot.moved(0.4 + seconds, x=0.6, now=robot.now + 0.1)
+    robot.saw(0.35 + seconds)
+    job = robot.session.take_frame()
+    assert job.suspect or state is State.LOST
+    robot.session.frame_done(job, tracking(job), robot.now + 0.01)
+    assert robot.session.pose() is not None
 
 
 def test_a_stamp_is_not_given_two_poses():

@@ -214,3 +214,16 @@ def test_the_end_waits_for_no_reader_of_a_last_status():
     stuck.set()
     until(lambda: site.node.close(patience=0.0))
     assert site.net.closed
+
+
+@pytest.mark.parametrize(("away", "losses"), [(True, 0), (False, 1)])
+def test_a_pause_that_the_network_explains_keeps_the_place(away, losses):
+    site = Site("r1")
+    site.node.declare()
+    site.frame("r1", 0.0)
+    if away:
+        site.net.go_away()
+        site.node.publish_statuses(time.monotonic())
+        site.net.come_back()
+    site.frame("r1", 4.0)
+    assert site.status("r1")["counters"]["losses"] == losses
