@@ -7,6 +7,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 from coview_stream.checkup.channel import cloud_findings, odometry_findings
 from coview_stream.checkup.finding import Finding
@@ -118,9 +119,9 @@ def listen(
     for one in heard:
         k = one.keys
         one.began = clock()
-        odometry = keep(one.odometry, lambda s, t, k=k: see_odometry(s, t, codecs[1], k.odometry_hint))  # type: ignore[misc]
+        odometry = keep(one.odometry, partial(see_odometry, option=codecs[1], hint=k.odometry_hint))
         transport.subscribe(k.odometry, odometry, "all")
-        clouds = keep(one.clouds, lambda s, t, k=k: see_cloud(s, t, codecs[0], k.cloud_hint))  # type: ignore[misc]
+        clouds = keep(one.clouds, partial(see_cloud, option=codecs[0], hint=k.cloud_hint))
         transport.subscribe(k.cloud, clouds, "all")
         transport.subscribe(k.status, status_of(one), "all")
     wait(seconds)

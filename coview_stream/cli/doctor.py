@@ -98,7 +98,7 @@ def _checkup(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findin
 def _zenoh_takes(args: argparse.Namespace, connect: list[str]) -> bool:
     """Report wrong endpoints and files before anything slow; False if there is no zenoh, which is a finding."""
     try:
-        import zenoh  # noqa: F401
+        import zenoh  # noqa: F401 - only whether it is there
     except ImportError:
         return False
     from coview_stream.stream.zenoh_config import compose

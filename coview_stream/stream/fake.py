@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from coview_stream.errors import TransportError
@@ -110,7 +111,7 @@ class FakeTransport:
         self.published.append(sample)
         for key, handler, _ in list(self._subscriptions):
             if matches(key, sample.key):
-                error = self._guard.run(key, lambda handler=handler: handler(sample))  # type: ignore[misc]
+                error = self._guard.run(key, partial(handler, sample))
                 if error is not None:
                     self.raised.append(error)
 

@@ -56,7 +56,7 @@ def open_transport(
     import zenoh
 
     # RUST_LOG=zenoh=warn says why a router refuses us; without it this is silent
-    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
     return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload)
 
 
@@ -207,7 +207,7 @@ class ZenohTransport:
             if not self._closing.is_set():
                 self._session = session
                 for declare in self._pending:
-                    self._guard.run("declaring", lambda declare=declare: declare(session))  # type: ignore[misc]
+                    self._guard.run("declaring", partial(declare, session))
                 self._pending.clear()
                 return
         session.close()

@@ -100,7 +100,7 @@ def test_bad_bases_name_the_option(base: str) -> None:
 )
 def test_bad_overrides_name_the_option(options: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        robot_keys("native", "coview", "rover1", **options)  # type: ignore[arg-type]
+        robot_keys("native", "coview", "rover1", **options)
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:

@@ -68,12 +68,12 @@ def cdr_cloud(
 
 def cdr_pose(order: str = "<", covariance: object = (0.0,) * 36, quaternion: object = TURN) -> Cdr:
     out = header(order, "map").put("d", 1, 2, 3)
-    return out.put("d", *quaternion).put("d", *covariance)  # type: ignore[misc]
+    return out.put("d", *quaternion).put("d", *covariance)
 
 
 def cdr_odometry(order: str = "<", quaternion: object = TURN, position: object = (1, 2, 3)) -> bytes:
-    out = header(order, "odom").text("base_link").put("d", *position)  # type: ignore[misc]
-    return out.put("d", *quaternion).put("d", *(0.0,) * 36).put("d", *(0.0,) * 42).done()  # type: ignore[misc]
+    out = header(order, "odom").text("base_link").put("d", *position)
+    return out.put("d", *quaternion).put("d", *(0.0,) * 36).put("d", *(0.0,) * 42).done()
 
 
 XYZ = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
