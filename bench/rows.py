@@ -97,7 +97,8 @@ def compared(
     repeat: int = REPEAT,
 ) -> Row:
     """Median milliseconds of both sides, in turns; ours has to be ``least`` times faster (None: informs)."""
-    return against(name, *medians(ours, baseline, repeat=repeat), "ms", least)
+    first, second = medians(ours, baseline, repeat=repeat)
+    return against(name, first, second, "ms", least)
 
 
 def against(name: str, ours: float, baseline: float, unit: str, least: float | None) -> Row:

@@ -6,6 +6,8 @@ and takes its work from a queue; callers, on any thread, wait for their result.
 
 * ``COVIEW_KERNELS`` = ``taichi``, ``quadrants`` or ``numpy`` forces a backend; unset, the first usable one
   serves.
+* ``COVIEW_THREADS`` = 1, 2, ... bounds the threads that a kernel spreads over; unset, every core that the
+  process may use serves, up to 16.
 * A host program that has initialised Taichi itself keeps it: a second ``init`` would destroy its fields, and
   its program accepts no other thread. We then take quadrants, if that is installed, or NumPy. The same if the
   host initialises Taichi after us; it must not do so while one of our kernels runs.
@@ -104,9 +106,18 @@ def _init(library: Any) -> None:
 
 
 def workers() -> int:
-    """Threads that a kernel spreads over."""
+    """Threads that a kernel spreads over: the cores of this process, at most ``COVIEW_THREADS`` of them.
+
+    Raises:
+        ValueError: ``COVIEW_THREADS`` is no whole number from 1 up.
+    """
     own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(_MAX_WORKERS, own)
+    asked = os.environ.get("COVIEW_THREADS", "")
+    if not asked:
+        return min(_MAX_WORKERS, own)
+    if not asked.isdecimal() or int(asked) < 1:
+        raise ValueError(f"COVIEW_THREADS is {asked!r}; set it to a whole number from 1 up, or unset it")
+    return min(_MAX_WORKERS, own, int(asked))
 
 
 def library() -> Any:

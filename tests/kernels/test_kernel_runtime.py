@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 import threading
@@ -192,5 +193,20 @@ def test_kernel_modules_insist_on_the_owner():
     assert "runtime.kernels" in done.stderr
 
 
-def test_workers_are_at_least_one():
+def test_workers_are_at_least_one(monkeypatch):
+    monkeypatch.delenv("COVIEW_THREADS", raising=False)
     assert 1 <= runtime.workers() <= 16
+
+
+def test_workers_are_bounded_by_the_environment(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
+    for asked, given in (("", 8), ("1", 1), ("3", 3), ("64", 8)):
+        monkeypatch.setenv("COVIEW_THREADS", asked)
+        assert runtime.workers() == given
+
+
+@pytest.mark.parametrize("asked", ["0", "-1", "two", "1.5", " "])
+def test_a_bound_that_is_no_number_of_threads_is_refused(monkeypatch, asked):
+    monkeypatch.setenv("COVIEW_THREADS", asked)
+    with pytest.raises(ValueError, match=r"COVIEW_THREADS is .+ whole number"):
+        runtime.workers()
