@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from coview_kernels.runtime import workers
+from coview_kernels.runtime import cores
 from coview_stream.checkup.finding import Finding
 from coview_stream.checkup.probes import probe
 
@@ -23,7 +23,7 @@ _OLDEST_ZENOH = (1, 10)
 def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterator[Finding]:
     """Look at the machine; takes some seconds, for the kernels are compiled."""
     yield python_finding(sys.version_info[:3])
-    yield processor_finding(_model(), workers(), _quota())
+    yield processor_finding(_model(), cores(), _quota())
     total, available = memory()
     yield memory_finding(total, available)
     yield blas_finding(os.environ.get("OPENBLAS_NUM_THREADS", ""))

@@ -105,19 +105,23 @@ def _init(library: Any) -> None:
         del misc.print
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def workers() -> int:
     """Threads that a kernel spreads over: the cores of this process, at most ``COVIEW_THREADS`` of them.
 
     Raises:
         ValueError: ``COVIEW_THREADS`` is no whole number from 1 up.
     """
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     asked = os.environ.get("COVIEW_THREADS", "")
     if not asked:
-        return min(_MAX_WORKERS, own)
+        return min(_MAX_WORKERS, cores())
     if not asked.isdecimal() or int(asked) < 1:
         raise ValueError(f"COVIEW_THREADS is {asked!r}; set it to a whole number from 1 up, or unset it")
-    return min(_MAX_WORKERS, own, int(asked))
+    return min(_MAX_WORKERS, cores(), int(asked))
 
 
 def library() -> Any:
