@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +26,7 @@ from coview_stream.place.consensus import Consensus, Hypothesis
 from coview_stream.place.descriptor import Descriptor, describe, ground_below
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.place.retrieval import Retrieval
+from coview_stream.pose.rays import RangeImage
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, Source, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
@@ -67,6 +69,11 @@ class Query:
     def position(self) -> npt.NDArray[np.float64]:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
+
+    @cached_property
+    def seen(self) -> RangeImage:
+        """The newest frame by direction."""
+        return RangeImage.of(self.cloud)
 
     @classmethod
     def of(
@@ -206,7 +213,7 @@ class GlobalSearch:
             return None
         T = found.T_map_source
         surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
-        evidence = verify(source, T, query.cloud, T @ query.T_odom_body, target, surveyed)
+        evidence = verify(source, T, query.seen, T @ query.T_odom_body, target, surveyed)
         return Candidate(hypothesis, found, evidence)
 
     def _judge(self, candidates: list[Candidate], query: Query) -> Verdict:

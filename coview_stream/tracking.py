@@ -12,6 +12,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
 from coview_stream.place.keyframes import thinned
+from coview_stream.pose.rays import RangeImage
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
@@ -117,7 +118,7 @@ class Tracker:
         )  # fmt: skip
         T = self.T_map_odom if found is None else found.T_map_source
         surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
-        evidence = verify(source, T, cloud, T @ T_odom_body, target, surveyed)
+        evidence = verify(source, T, RangeImage.of(cloud), T @ T_odom_body, target, surveyed)
         rule = self.config.acceptance
         if tilt_of(T) > rule.most_tilt:
             return None

@@ -21,22 +21,14 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.geometry import Points, Pose, inverse, lengths, transform
+from coview_stream.geometry import Pose, transform
+from coview_stream.pose.rays import RangeImage, rays_against_map
 from coview_stream.pose.registration import LocalMap, Source
 
 _STRUCTURE_HEIGHT = 1.0  # metres above the ground
 _STRUCTURE_REACH = 0.5  # metres: two voxels of the map
 _GROUND_SEARCH = 1.0  # metres to the next map point of the ground, which a sparse map shows every half metre
 _GROUND_REACH = 0.15  # metres off its plane
-_FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
-_FREE_EVERY = 3  # of the map's points: a share needs no more
-_FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
-_BEAM = np.radians(2.0)  # cell of the range image
-_COLUMNS = int(np.ceil(2 * np.pi / _BEAM)) + 1
-_CELLS = _COLUMNS * (int(np.ceil(np.pi / _BEAM)) + 1)
-_BEAM_HITS = 2
-_SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
-_SLACK_SLOPE = 0.03
 _LEAST_STRUCTURE = 60  # fewer points cannot tell places apart
 _PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points proves little
 
@@ -68,7 +60,7 @@ class Evidence:
 def verify(
     source: Source,
     T_map_source: Pose,
-    cloud: Points,
+    seen: RangeImage,
     T_map_body: Pose,
     target: LocalMap,
     surveyed: npt.NDArray[np.bool_],
@@ -78,7 +70,7 @@ def verify(
     Args:
         source: local scan that was registered; points that the map does not cover are left out.
         T_map_source: (4, 4) its pose.
-        cloud: (N, 3) float32 the newest frame, body frame: the rays whose way was free.
+        seen: the newest frame: the rays whose way was free.
         T_map_body: (4, 4) pose of that frame.
         target: the map around it.
         surveyed: (M,) which points of ``source`` lie where the map has been surveyed.
@@ -93,7 +85,7 @@ def verify(
     covered = 0.0 if few else float((found | target.edges.above(moved[high])).mean())
     grounded = float(_on_surface(moved[low], partner[low], target).sum())
     ground = (grounded + 0.5 * _PSEUDO) / (float(low.sum()) + _PSEUDO)
-    met, passed = rays_against_map(cloud, T_map_body, target.points)
+    met, passed = rays_against_map(seen, T_map_body, target.points)
     free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
     return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)
 
@@ -108,56 +100,3 @@ def _on_surface(
     on = np.zeros(len(points), dtype=bool)
     on[has] = off < _GROUND_REACH
     return on
-
-
-def rays_against_map(cloud: Points, T_map_body: Pose, points: Points) -> tuple[int, int]:
-    """How many map points the frame's rays met, and how many they passed through.
-
-    A map point is passed through where every return in its 2-degree cell of the frame's range image lies clearly
-    behind it; points behind the returns are hidden and do not count.
-
-    Args:
-        cloud: (N, 3) one frame, body frame, metres.
-        T_map_body: (4, 4).
-        points: (K, 3) map points, map frame.
-    """
-    ranges = lengths(cloud)
-    usable = ranges > 1.0
-    ranges = ranges[usable]
-    cell = _beam_cells(cloud.compress(usable, axis=0), ranges)
-    nearest = np.full(_CELLS, np.inf, dtype=np.float32)
-    farthest = np.zeros(_CELLS, dtype=np.float32)
-    np.minimum.at(nearest, cell, ranges)
-    np.maximum.at(farthest, cell, ranges)
-    hits = np.bincount(cell, minlength=_CELLS)
-
-    position = T_map_body[:3, 3]
-    points = points[::_FREE_EVERY]
-    dx, dy = points[:, 0] - position[0], points[:, 1] - position[1]
-    wanted = (dx * dx + dy * dy < _FREE_RANGE**2) & (
-        points[:, 2] > position[2] + _floor_below(cloud) + _FREE_HEIGHT
-    )
-    body = transform(inverse(T_map_body), points.compress(wanted, axis=0).astype(np.float64))
-    distance = lengths(body)
-    off = distance > 1.0
-    body, distance = body.compress(off, axis=0), distance[off]
-    seen = _beam_cells(body, distance)
-    looked = hits[seen] >= _BEAM_HITS
-    slack = _SLACK + _SLACK_SLOPE * distance
-    passed = looked & (distance < nearest[seen] - slack)
-    met = looked & ~passed & (distance <= farthest[seen] + slack)
-    return int(met.sum()), int(passed.sum())
-
-
-def _beam_cells(points: npt.NDArray[np.floating], ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:
-    azimuth = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
-    elevation = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / _BEAM).astype(
-        np.int64
-    )
-    return np.asarray(elevation * _COLUMNS + azimuth)
-
-
-def _floor_below(cloud: Points) -> float:
-    """Height of the ground relative to the sensor: a low percentile of the points within 10 m, never above it."""
-    near = cloud[:, 2][np.hypot(cloud[:, 0], cloud[:, 1]) < 10.0]
-    return min(0.0, float(np.percentile(near, 5))) if len(near) >= 20 else 0.0

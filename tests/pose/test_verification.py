@@ -9,10 +9,11 @@ from courtyard import local_map, parts, plane
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry import pose_from, rot_z, transform
-from coview_stream.pose import verification
+from coview_stream.pose import rays
+from coview_stream.pose.rays import RangeImage, rays_against_map
 from coview_stream.pose.registration import LocalMaps, Source
 from coview_stream.pose.source import local_source
-from coview_stream.pose.verification import rays_against_map, verify
+from coview_stream.pose.verification import verify
 
 CONFIG = RegistrationConfig()
 
@@ -20,7 +21,7 @@ CONFIG = RegistrationConfig()
 @pytest.fixture(autouse=True)
 def every_map_point(monkeypatch):
     """Count every map point, not every third."""
-    monkeypatch.setattr(verification, "_FREE_EVERY", 1)
+    monkeypatch.setattr(rays, "_FREE_EVERY", 1)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def seen(world_map, world_drive):
         T_body = wrong @ T
         target = maps.around(T_body[:3, 3])
         surveyed = world_map.surveyed(transform(wrong, source.points)[:, :2])
-        return verify(source, wrong, cloud, T_body, target, surveyed)
+        return verify(source, wrong, RangeImage.of(cloud), T_body, target, surveyed)
 
     return evidence
 
@@ -88,33 +89,36 @@ BODY = pose_from(np.eye(3), [0, 0, 1.5])
 
 
 def test_rays_that_end_at_the_wall_met_it():
-    met, passed = rays_against_map(fan(10.2), BODY, WALL)
+    met, passed = rays_against_map(RangeImage.of(fan(10.2)), BODY, WALL)
     assert passed == 0
     assert met > 0.9 * len(WALL)
 
 
 def test_rays_that_end_behind_the_wall_passed_through_it():
-    met, passed = rays_against_map(fan(25.0), BODY, WALL)
+    met, passed = rays_against_map(RangeImage.of(fan(25.0)), BODY, WALL)
     assert met == 0
     assert passed > 0.5 * len(WALL)
 
 
 def test_a_wall_behind_the_returns_is_hidden():
-    assert rays_against_map(fan(4.0), BODY, WALL) == (0, 0)
+    assert rays_against_map(RangeImage.of(fan(4.0)), BODY, WALL) == (0, 0)
 
 
 def test_where_no_ray_went_nothing_is_said():
-    assert rays_against_map(fan(25.0), pose_from(rot_z(np.pi), [0, 0, 1.5]), WALL) == (0, 0)
-    assert rays_against_map(fan(25.0), pose_from(np.eye(3), [-40, 0, 1.5]), WALL) == (0, 0)
+    assert rays_against_map(RangeImage.of(fan(25.0)), pose_from(rot_z(np.pi), [0, 0, 1.5]), WALL) == (0, 0)
+    assert rays_against_map(RangeImage.of(fan(25.0)), pose_from(np.eye(3), [-40, 0, 1.5]), WALL) == (0, 0)
 
 
 def test_the_heading_of_the_robot_counts():
     """Body x ahead: a robot that looks along +y meets a wall that stands at +y."""
     turned = transform(pose_from(rot_z(np.pi / 2), [0, 0, 0]), WALL)
-    met, passed = rays_against_map(fan(10.2), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
+    met, passed = rays_against_map(RangeImage.of(fan(10.2)), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
     assert met > 0
     assert passed == 0
-    assert rays_against_map(fan(10.2), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (0, 0)
+    assert rays_against_map(RangeImage.of(fan(10.2)), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (
+        0,
+        0,
+    )
 
 
 def test_little_structure_proves_nothing():
@@ -125,7 +129,7 @@ def test_little_structure_proves_nothing():
     height = field[0][:, 2].copy()
     source = Source(field[0], height > 0.5, height)
     everywhere = np.ones(len(height), bool)
-    sparse = verify(source, np.eye(4), fan(25.0), BODY, target, everywhere)
+    sparse = verify(source, np.eye(4), RangeImage.of(fan(25.0)), BODY, target, everywhere)
     assert sparse.ground > 0.99
     assert sparse.near == 0.0
     assert sparse.score == 0.0
@@ -140,7 +144,7 @@ def test_points_off_the_survey_do_not_count(seen):
     height = np.tile(target.points[:, 2], 2)
     source = Source(points, height > 0.5, height)
     surveyed = np.arange(len(points)) < len(target.points)
-    found = verify(source, np.eye(4), fan(25.0, 5.0), BODY, target, surveyed)
+    found = verify(source, np.eye(4), RangeImage.of(fan(25.0, 5.0)), BODY, target, surveyed)
     assert found.near == 1.0
     assert found.ground > 0.99
     assert found.inside == 0.5
