@@ -91,7 +91,8 @@ def exp_se3(xi: npt.NDArray[np.float64]) -> Pose:
 
 def orthonormal(T: Pose) -> Pose:
     """``T`` with its rotation projected back onto SO(3) (drift from repeated products)."""
-    return pose_from(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    return pose_from(U @ Vt, T[:3, 3])
 
 
 def is_pose(T: npt.NDArray[np.floating]) -> bool:

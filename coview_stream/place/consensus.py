@@ -17,10 +17,10 @@ import numpy.typing as npt
 from coview_stream.config import Channel, ConsensusConfig
 from coview_stream.geometry import Pose, pose_from, rot_z
 from coview_stream.place.retrieval import Volume
+from coview_stream.place.station_grid import StationGrid, Values
 
+_SAMPLE = 100_000  # numbers are enough for a median
 _SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
-_MARGIN = 100  # cells around the stations; farther apart than this keyframes do not vote together
-_LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys
 
 
 @dataclass(frozen=True)
@@ -36,50 +36,9 @@ class Hypothesis:
 @dataclass(frozen=True)
 class _Ballot:
     centre: npt.NDArray[np.float64]  # (3,) odometry frame, z on the ground
-    votes: npt.NDArray[
-        np.float32
-    ]  # (S, M + 1) standardised distances; the last station is nowhere: no opinion
+    votes: Values  # standardised distances (S, ...), spread over the grid
     smallest: float  # smallest raw distance of any channel, for the paper's single-minimum rule
     where: tuple[int, int]  # its station and shift
-
-
-class StationGrid:
-    """Finds the station at a position: stations stand at the centres of a square grid, one per level.
-
-    The grid has a margin, so that a step from any station to a place off the map is one addition and finds nothing.
-    """
-
-    def __init__(self, stations: npt.NDArray[np.float32], block: float) -> None:
-        self.stations = stations
-        self.block = block
-        cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
-        cells += _MARGIN - cells.min(axis=0)
-        self._width = int(cells[:, 1].max()) + 1 + _MARGIN
-        self._flat = cells[:, 0] * self._width + cells[:, 1]
-        order = np.lexsort((stations[:, 2], self._flat))
-        unique, first, count = np.unique(self._flat[order], return_index=True, return_counts=True)
-        size = (int(cells[:, 0].max()) + 1 + _MARGIN) * self._width
-        self._grid = np.full((int(count.max()), size), -1, dtype=np.int32)
-        for level in range(len(self._grid)):
-            has = count > level
-            self._grid[level, unique[has]] = order[first[has] + level]
-
-    def moved(self, shift_cells: npt.NDArray[np.int64], rise: float) -> npt.NDArray[np.int32]:
-        """Index (M,) of the station that lies ``shift_cells`` (2,) from each station, -1 where there is none.
-
-        ``rise`` (metres) is the height gained on the way; it picks the storey.
-        """
-        if np.abs(shift_cells).max() >= _MARGIN:
-            return np.full(len(self.stations), -1, dtype=np.int32)
-        there = self._flat + (shift_cells[0] * self._width + shift_cells[1])
-        if len(self._grid) == 1:
-            return np.asarray(self._grid[0][there])
-        levels = self._grid[:, there]
-        gap = np.abs(self.stations[levels, 2] - (self.stations[:, 2] + rise))
-        gap[levels < 0] = np.inf
-        best = gap.argmin(axis=0)
-        columns = np.arange(len(self.stations))
-        return np.where(gap[best, columns] < _LEVEL_GAP, levels[best, columns], -1).astype(np.int32)
 
 
 class Consensus:
@@ -105,12 +64,15 @@ class Consensus:
         Channels are standardised (median and MAD over all hypotheses) before they are averaged: how far a
         hypothesis stands out is comparable between channels and places, the distance itself is not.
         """
-        votes = sum(standardised(volume) for volume in distances.values()) / np.float32(len(distances))
         best = min(distances.values(), key=lambda volume: float(volume.min()))
         station, shift = np.unravel_index(int(best.argmin()), best.shape)
-        by_shift = np.zeros((np.shape(votes)[1], len(self.stations) + 1), dtype=np.float32)
-        by_shift[:, :-1] = np.transpose(votes)
-        self._ballots.append(_Ballot(centre, by_shift, float(best.min()), (int(station), int(shift))))
+        votes = np.zeros_like(best)
+        for volume in distances.values():
+            votes += standardised(volume)
+        votes *= np.float32(1.0 / len(distances))
+        spread = self.grid.spread(np.ascontiguousarray(votes.T))
+        ballot = _Ballot(centre, spread, float(best.min()), (int(station), int(shift)))
+        self._ballots.append(ballot)
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
@@ -124,25 +86,23 @@ class Consensus:
     def scores(self) -> Volume:
         """Sum the votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
         newest = self._ballots[-1]
-        total = newest.votes[:, :-1].copy()
-        sectors = len(total)
+        total = newest.votes.copy()
+        yaw = yaw_of_shift(np.arange(len(total)), len(total))
+        turned = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
         for ballot in list(self._ballots)[:-1]:
             step = ballot.centre - newest.centre
-            for n in range(sectors):
-                xy = rot_z(float(yaw_of_shift(n, sectors)))[:2, :2] @ step[:2]
-                moved = self.grid.moved(np.rint(xy / self.grid.block).astype(np.int64), float(step[2]))
-                total[n] += ballot.votes[n][
-                    moved
-                ]  # -1, no station there (map edge, building), finds the zero
-        return np.asarray(total.T / np.float32(np.sqrt(len(self._ballots))))
+            cells = np.rint(np.tensordot(step[:2], turned, (0, 1)).T / self.grid.block).astype(np.int64)
+            for n, cell in enumerate(cells):
+                self.grid.add(total[n], ballot.votes[n], cell, float(step[2]))
+        total *= np.float32(1.0 / np.sqrt(len(self._ballots)))
+        scores: Volume = self.grid.gathered(total).T
+        return scores
 
     def _peaks(self, scores: Volume, centre: npt.NDArray[np.float64]) -> list[Hypothesis]:
-        sectors = scores.shape[1]
-        flat = np.ascontiguousarray(scores).ravel()
-        some = min(_SHORTLIST, flat.size - 1)
-        shortlist = np.argpartition(flat, some)[: some + 1]
-        shortlist = shortlist[np.argsort(flat[shortlist], kind="stable")]
-        station, shift = np.divmod(shortlist, sectors)
+        stations, sectors = scores.shape
+        flat = np.ascontiguousarray(scores.T).ravel()
+        shortlist = smallest(flat, _SHORTLIST)
+        shift, station = np.divmod(shortlist, stations)
         xyz = self.stations[station].astype(np.float64)
         yaw = yaw_of_shift(shift, sectors)
         free = np.ones(len(shortlist), dtype=bool)
@@ -171,14 +131,39 @@ def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> npt.NDArray[np.float64]:
 
 def standardised(volume: Volume) -> Volume:
     """How many robust standard deviations each distance lies from the median of all, negative is better."""
-    scored = volume[(volume != 1.0).any(axis=1)]  # ring-key mode leaves most stations at 1, unscored
-    if not len(scored):
+    sample = _sample(volume)
+    if not len(sample):
         return np.zeros_like(volume)
-    step = max(1, scored.size // 100_000)
-    while np.gcd(step, scored.shape[1]) > 1:  # or the sample would hold few of the shifts
-        step += 1
-    sample = scored.ravel()[::step]
-    median = np.float32(np.median(sample))
+    median = np.median(sample)
     spread = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
-    votes: Volume = (volume - median) / spread
-    return np.where(volume == 1.0, np.maximum(votes, np.float32(0.0)), votes)
+    votes: Volume = (volume - median) * np.float32(1.0 / spread)
+    if median > 1.0:  # then what nothing is known of would count in favour
+        np.maximum(votes, np.float32(0.0), out=votes, where=volume == 1.0)
+    return votes
+
+
+def _sample(volume: Volume) -> npt.NDArray[np.float32]:
+    """Distances (K,) at every shift of stations spread over the map, those left out that were not scored."""
+    every = max(1, volume.size // _SAMPLE)
+    for rows in (volume[::every], volume):  # the paper's mode leaves most stations at 1, unscored
+        scored = rows[(rows != 1.0).any(axis=1)]
+        if scored.size >= min(_SAMPLE // 2, volume.size // 2):
+            break
+    return np.asarray(scored.ravel())
+
+
+def smallest(values: npt.NDArray[np.float32], count: int) -> npt.NDArray[np.int64]:
+    """Return the indices of the ``count`` smallest of (N,) values, smallest first; equal ones by index."""
+    if count >= len(values):
+        return np.asarray(np.argsort(values, kind="stable"))
+    # most are ruled out by a bound from a sample, which is too small now and then: then all are looked at
+    every = max(1, len(values) // _SAMPLE)
+    sample = values[::every]
+    rank = min(2 * count // every, len(sample) - 1)
+    found = np.flatnonzero(values <= np.partition(sample, rank)[rank])
+    if len(found) < count:
+        found = np.arange(len(values))
+    near = values[found]
+    bound = np.partition(near, count - 1)[count - 1]
+    found = found[near <= bound]
+    return np.asarray(found[np.argsort(values[found], kind="stable")[:count]])

@@ -7,7 +7,8 @@ import pytest
 
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry import inverse, pose_from, rot_z, transform
-from coview_stream.place.consensus import Consensus, StationGrid, standardised, yaw_of_shift
+from coview_stream.place.consensus import Consensus, smallest, standardised, yaw_of_shift
+from coview_stream.place.station_grid import StationGrid
 
 BLOCK, S, SIDE = 2.0, 12, 12
 SHIFT = 2  # yaw of odometry in the map: -60 degrees
@@ -115,6 +116,50 @@ def test_the_map_does_not_wrap_around_its_edges():
         for m in range(len(stations)):
             there = np.flatnonzero(np.abs(stations[:, :2] - goal[m]).max(axis=1) < 0.1)
             assert found[m] == (there[0] if len(there) else -1)
+
+
+def test_values_are_added_a_step_farther_on_in_either_layout():
+    """Stations of a ragged site; a layout on cells and a look-up each are the same sum."""
+    rng = np.random.default_rng(5)
+    stations = grid_stations(9)[rng.permutation(81)[:60]]
+    cells, each = StationGrid(stations, BLOCK), StationGrid(stations, BLOCK)
+    assert cells.laid_out
+    each.laid_out = False
+    values = rng.normal(size=(3, 60)).astype(np.float32)
+    np.testing.assert_array_equal(cells.gathered(cells.spread(values)), values)
+    for step in ([0, 0], [2, -3], [-8, 1], [8, 8], [9, 0], [0, -9], [500, 0], [-150, 150]):
+        sums = []
+        for grid in (cells, each):
+            total = grid.spread(values[:1])
+            grid.add(total[0], grid.spread(values[1:2])[0], np.array(step), 0.0)
+            sums.append(grid.gathered(total)[0])
+        there = cells.moved(np.array(step), 0.0)
+        np.testing.assert_array_equal(sums[0], values[0] + np.where(there < 0, 0, values[1][there]))
+        np.testing.assert_array_equal(sums[0], sums[1])
+
+
+@pytest.mark.parametrize("kind", ["one road", "two storeys"])
+def test_few_stations_on_a_wide_grid_are_not_laid_out(kind):
+    road = (
+        grid_stations(40)[::41]
+        if kind == "one road"
+        else np.concatenate([grid_stations(4), grid_stations(4, z=4.0)])
+    )
+    assert not StationGrid(road, BLOCK).laid_out
+
+
+@pytest.mark.parametrize("count", [1, 7, 4000, 9999, 10_000, 20_000])
+@pytest.mark.parametrize("kind", ["normal", "ties", "few", "rising"])
+def test_smallest_is_a_stable_sort(kind, count, monkeypatch):
+    monkeypatch.setattr("coview_stream.place.consensus._SAMPLE", 100)
+    rng = np.random.default_rng(6)
+    values = {
+        "normal": rng.normal(size=10_000),
+        "ties": rng.integers(0, 5, 10_000),
+        "few": np.where(np.arange(10_000) % 100, 1.0, 2.0),  # the sample sees only what is large
+        "rising": np.arange(10_000),
+    }[kind].astype(np.float32)
+    np.testing.assert_array_equal(smallest(values, count), np.argsort(values, kind="stable")[:count])
 
 
 def test_storeys_are_told_apart_by_the_height_gained():
