@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry import Points, Pose, exp_se3, pose_from, transform
+from coview_stream.geometry import Points, Pose
 from coview_stream.pose.edges import EdgeRaster, edge_raster
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ _CROP_STEP = 16.0  # metres between the centres of cached crops
 _STOP_SHIFT = 1e-3  # metres; below the map's own noise
 _STOP_TURN = 5e-5  # radians
 _LEAST_PAIRS = 50
-_MOST_SHARE = 5.0  # weight of a point of the rarer kind
 _WIDTH_SHARE = (
     0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
 )
@@ -143,92 +142,23 @@ def register(
     Returns:
         The result, or None where fewer than 50 points find a partner.
     """
-    # two kernels an iteration: handing each to their thread and back would take as long as they do
-    return kernels.submit(
-        _register,
-        source,
-        T_map_source,
-        target,
-        config,
-        scales,
-        prior,
-        centre,
-        iterations or config.iterations,
-    )
-
-
-def _register(
-    source: Source,
-    T: Pose,
-    target: LocalMap,
-    config: RegistrationConfig,
-    scales: tuple[float, ...],
-    prior: Prior | None,
-    centre: npt.NDArray[np.float64] | None,
-    iterations: int,
-) -> Registration | None:
     pivot = source.points.mean(axis=0, dtype=np.float64) if centre is None else centre
-    total, converged, result = 0, False, None
-    for scale in scales:
-        for _ in range(iterations):
-            step = _step(source, T, target, config, scale, prior, pivot)
-            if step is None:
-                return None
-            increment, information, rmse, pairs = step
-            about = transform(T, pivot[None])[0]
-            T = pose_from(np.eye(3), about) @ exp_se3(increment) @ pose_from(np.eye(3), -about) @ T
-            total += 1
-            converged = bool(
-                np.linalg.norm(increment[3:]) < _STOP_SHIFT and np.linalg.norm(increment[:3]) < _STOP_TURN
-            )
-            result = Registration(T, information, rmse, pairs, total, converged)
-            if converged:
-                break
-    return result
-
-
-def _step(
-    source: Source,
-    T: Pose,
-    target: LocalMap,
-    config: RegistrationConfig,
-    scale: float,
-    prior: Prior | None,
-    pivot: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], Matrix6, float, int] | None:
-    """One Gauss-Newton step: increment (6,), information (6, 6), rmse and number of pairs."""
-    moved = transform(T, source.points)
-    distance, partner = kernels.nearest(target.grid, moved, scale)
-    # above the ground and on it apart, with equal weight: the ground fits anywhere and would crowd out the rest
-    share = np.zeros(len(moved), dtype=np.float32)
-    for group in (source.above, ~source.above):
-        index = np.flatnonzero(group & np.isfinite(distance))
-        if len(index):
-            kept = kernels.trim(distance[index], config.keep)
-            # capped, or a handful of points would outweigh thousands
-            share[index] = kept * min(0.5 * len(moved) / kept.sum(), _MOST_SHARE)
-    chosen = np.flatnonzero(share)
-    if len(chosen) < _LEAST_PAIRS:
-        return None
-    # take: indexing rows takes five times as long
-    pairs = partner[chosen]
-    q, n = target.points.take(pairs, axis=0), target.normals.take(pairs, axis=0)
-    residual = np.einsum("ij,ij->i", moved.take(chosen, axis=0) - q, n)
-    # Cauchy weights: what remains of foliage and changes after trimming must not pull
-    width = max(config.residual_scale, _WIDTH_SHARE * scale)
-    weight = share[chosen] / (1.0 + (residual / width) ** 2)
-    about = transform(T, pivot[None])[0]
-    H, b, _ = kernels.normal_equations(source.points.take(chosen, axis=0), q, n, weight, T, about)
-    variance = float((weight * residual**2).sum() / weight.sum()) + 1e-6
-    information, gradient = H / variance, b / variance
+    # the pairs count correlated points; weigh the prior alike
+    belief = None
     if prior is not None:
-        # the deviation from the prior's mean, in the same tangent
-        R = T[:3, :3] @ prior.T_map_source[:3, :3].T
-        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        shift = about - transform(prior.T_map_source, pivot[None])[0]
-        scaled = prior.information * config.inflation**2  # H counts correlated points; weigh the prior alike
-        information = information + scaled
-        gradient = gradient + scaled @ np.concatenate([turn, shift])
-    increment = np.asarray(-np.linalg.solve(information + 1e-6 * np.eye(6), gradient))
-    rmse = float(np.sqrt((weight * residual**2).sum() / weight.sum()))
-    return increment, information, rmse, len(chosen)
+        belief = kernels.Belief(prior.T_map_source, prior.information * config.inflation**2)
+    found = kernels.align_planes(
+        target.grid,
+        target.normals,
+        source.points,
+        source.above,
+        T_map_source,
+        pivot,
+        [(scale, max(config.residual_scale, _WIDTH_SHARE * scale)) for scale in scales],
+        keep=config.keep,
+        iterations=iterations or config.iterations,
+        stop=(_STOP_SHIFT, _STOP_TURN),
+        least=_LEAST_PAIRS,
+        prior=belief,
+    )
+    return None if found is None else Registration(*found)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview, visible
+from coview_kernels.icp import Alignment, Belief, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit, warm_up
@@ -17,8 +18,11 @@ from coview_kernels.trimmed_icp import normal_equations, trim
 from coview_kernels.voxel import transform_unique
 
 __all__ = [
+    "Alignment",
+    "Belief",
     "PointGrid",
     "PolarGrid",
+    "align_planes",
     "all_shift_distance",
     "backend",
     "column_spectra",

@@ -5,6 +5,8 @@ from coview_kernels import runtime
 
 ti = runtime.library()
 
+ROWS = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
+
 SLACK = 1e-9  # metres, and of the distance: more than rounding moves a face between two cells
 FAR = 1e18  # metres, stands for no face
 
@@ -32,11 +34,83 @@ def cell_of(cells, count) -> ti.i32:
     return ti.cast(ti.min(ti.max(cells, ti.cast(0, ti.f64)), ti.cast(count - 1, ti.f64)), ti.i32)
 
 
+@ti.func
+def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y, z, limit, margin):
+    """Find the nearest point of those nearer than the square root of ``limit``.
+
+    Returns the square of its distance, its row (-1 if there is none), and a square that the distance of every other
+    point reaches: that of the second nearest, the limit, or the nearest's distance and ``margin`` together.
+    """
+    size, per_metre = frame[3], frame[4]
+    nx, ny, nz = ti.cast(frame[5], ti.i32), ti.cast(frame[6], ti.i32), ti.cast(frame[7], ti.i32)
+    best = limit
+    beyond = limit
+    found = -1
+    ring = 0
+    # by its bits: a host program may have told the compiler that there are no NaNs
+    if ((ti.bit_cast(x + y + z, ti.i64) >> 52) & 0x7FF) == 0x7FF:
+        ring = -1
+    # offsets from the corner only find cells; distances must round as the twin's
+    u = x - frame[0]
+    v = y - frame[1]
+    w = z - frame[2]
+    ix = cell_of(u * per_metre, nx)
+    iy = cell_of(v * per_metre, ny)
+    while ring >= 0:
+        for i in range(ti.max(ix - ring, 0), ti.min(ix + ring, nx - 1) + 1):
+            dx = gap(ix, i, u, size)
+            j = iy - ring
+            if dx * dx >= beyond:
+                j = iy + ring + 1
+            while j <= iy + ring:
+                dy = gap(iy, j, v, size)
+                left = beyond - dx * dx - dy * dy
+                if j >= 0 and j < ny and left > 0:
+                    dz = ti.sqrt(left) + SLACK
+                    column = (i * ny + j) * nz
+                    begin = starts[column + cell_of((w - dz) * per_metre, nz)]
+                    end = starts[column + cell_of((w + dz) * per_metre, nz) + 1]
+                    for p in range(begin, end):
+                        row = rows[p]
+                        ex = x - ti.cast(ti.bit_cast(row[0], ti.f32), ti.f64)
+                        ey = y - ti.cast(ti.bit_cast(row[1], ti.f32), ti.f64)
+                        ez = z - ti.cast(ti.bit_cast(row[2], ti.f32), ti.f64)
+                        d2 = ex * ex + ey * ey + ez * ez
+                        if d2 < best:
+                            # without a margin the nearest bounds the search, to the bit
+                            if margin > 0:
+                                far = ti.sqrt(d2) + margin
+                                beyond = ti.min(beyond, ti.min(best, far * far))
+                            else:
+                                beyond = d2
+                            best = d2
+                            found = p
+                        elif d2 < beyond:
+                            beyond = d2
+                # the ring has every column of its first and last row, but only the ends of the others
+                j += 1 if ti.abs(i - ix) == ring else 2 * ring
+        # the nearest face of the columns outside the ring, on the sides where there are any
+        reach = ti.cast(FAR, ti.f64)
+        if ix > ring:
+            reach = ti.min(reach, u - (ix - ring) * size)
+        if ix + ring < nx - 1:
+            reach = ti.min(reach, (ix + ring + 1) * size - u)
+        if iy > ring:
+            reach = ti.min(reach, v - (iy - ring) * size)
+        if iy + ring < ny - 1:
+            reach = ti.min(reach, (iy + ring + 1) * size - v)
+        reach = short_of(reach)
+        ring += 1
+        if reach * reach >= beyond:
+            ring = -1
+    return best, found, beyond
+
+
 @ti.kernel
 def nearest(
     frame: ti.types.ndarray(ti.f64, 1),
     starts: ti.types.ndarray(ti.i32, 1),
-    rows: ti.types.ndarray(ti.i32, 2),
+    rows: ROWS,
     queries: ti.types.ndarray(ti.f32, 2),
     T: ti.types.ndarray(ti.f64, 2),
     radius: ti.f64,
@@ -48,67 +122,16 @@ def nearest(
     what lies beyond them.
     """
     for n in range(queries.shape[0]):
-        size, per_metre = frame[3], frame[4]
-        nx, ny, nz = ti.cast(frame[5], ti.i32), ti.cast(frame[6], ti.i32), ti.cast(frame[7], ti.i32)
         a = ti.cast(queries[n, 0], ti.f64)
         b = ti.cast(queries[n, 1], ti.f64)
         c = ti.cast(queries[n, 2], ti.f64)
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
         z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-        best = radius * radius
-        found = -1
-        ring = 0
-        # by its bits: a host program may have told the compiler that there are no NaNs
-        if ((ti.bit_cast(x + y + z, ti.i64) >> 52) & 0x7FF) == 0x7FF:
-            ring = -1
-        # offsets from the corner only find cells; distances must round as the twin's
-        u = x - frame[0]
-        v = y - frame[1]
-        w = z - frame[2]
-        ix = cell_of(u * per_metre, nx)
-        iy = cell_of(v * per_metre, ny)
-        while ring >= 0:
-            for i in range(ti.max(ix - ring, 0), ti.min(ix + ring, nx - 1) + 1):
-                dx = gap(ix, i, u, size)
-                j = iy - ring
-                if dx * dx >= best:
-                    j = iy + ring + 1
-                while j <= iy + ring:
-                    dy = gap(iy, j, v, size)
-                    left = best - dx * dx - dy * dy
-                    if j >= 0 and j < ny and left > 0:
-                        dz = ti.sqrt(left) + SLACK
-                        column = (i * ny + j) * nz
-                        begin = starts[column + cell_of((w - dz) * per_metre, nz)]
-                        end = starts[column + cell_of((w + dz) * per_metre, nz) + 1]
-                        for p in range(begin, end):
-                            ex = x - ti.cast(ti.bit_cast(rows[p, 0], ti.f32), ti.f64)
-                            ey = y - ti.cast(ti.bit_cast(rows[p, 1], ti.f32), ti.f64)
-                            ez = z - ti.cast(ti.bit_cast(rows[p, 2], ti.f32), ti.f64)
-                            d2 = ex * ex + ey * ey + ez * ez
-                            if d2 < best:
-                                best = d2
-                                found = p
-                    # the ring has every column of its first and last row, but only the ends of the others
-                    j += 1 if ti.abs(i - ix) == ring else 2 * ring
-            # the nearest face of the columns outside the ring, on the sides where there are any
-            reach = ti.cast(FAR, ti.f64)
-            if ix > ring:
-                reach = ti.min(reach, u - (ix - ring) * size)
-            if ix + ring < nx - 1:
-                reach = ti.min(reach, (ix + ring + 1) * size - u)
-            if iy > ring:
-                reach = ti.min(reach, v - (iy - ring) * size)
-            if iy + ring < ny - 1:
-                reach = ti.min(reach, (iy + ring + 1) * size - v)
-            reach = short_of(reach)
-            ring += 1
-            if reach * reach >= best:
-                ring = -1
+        best, found, _ = walk(frame, starts, rows, x, y, z, radius * radius, 0.0)
         if found >= 0:
             answer[0, n] = ti.sqrt(best)
-            answer[1, n] = rows[found, 3]
+            answer[1, n] = rows[found][3]
 
 
 @ti.kernel
@@ -117,7 +140,7 @@ def sort(
     frame: ti.types.ndarray(ti.f64, 1),
     cell: ti.types.ndarray(ti.i32, 1),
     starts: ti.types.ndarray(ti.i32, 1),
-    rows: ti.types.ndarray(ti.i32, 2),
+    rows: ROWS,
 ):
     """Sort the points by cell into ``rows``, by counting; ``starts`` comes as zeros, one more than cells."""
     for n in range(points.shape[0]):
@@ -141,5 +164,5 @@ def sort(
             place = starts[cell[n]] - 1
             starts[cell[n]] = place
             for d in ti.static(range(3)):
-                rows[place, d] = ti.bit_cast(points[n, d], ti.i32)
-            rows[place, 3] = n
+                rows[place][d] = ti.bit_cast(points[n, d], ti.i32)
+            rows[place][3] = n

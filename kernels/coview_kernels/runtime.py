@@ -235,6 +235,18 @@ def warm_up() -> None:
     eye, origin = np.eye(4), np.zeros(3)
     api.transform_unique(cloud, eye, 1.0)
     api.nearest(api.PointGrid(cloud), cloud, 1.0)
+    api.align_planes(
+        api.PointGrid(cloud),
+        cloud,
+        cloud,
+        np.ones(2),
+        eye,
+        origin,
+        [(1.0, 1.0)],
+        keep=1.0,
+        iterations=1,
+        least=1,
+    )
     grid, _ = api.polar_bin(cloud, origin, 2, 4, 8.0)
     one = np.zeros(1, dtype=np.int32)
     api.station_bins(np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, one, one, one, 2, 4, 2.0)

@@ -35,6 +35,7 @@ def succeeds(code: str, **environment: str) -> str:
 def test_public_names():
     assert coview_kernels.__all__ == sorted(coview_kernels.__all__)
     assert set(coview_kernels.__all__) == {
+        *("Alignment", "Belief", "align_planes"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         "normal_equations",
         *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "trim", "unit_columns"),

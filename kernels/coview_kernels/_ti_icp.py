@@ -1,0 +1,283 @@
+# mypy: ignore-errors
+"""Taichi source of icp.py: all iterations in one launch, and partners that are searched for only when they may change.
+
+A launch costs as much as an iteration over 5,000 points, and waking a second thread too. So the first search, which is
+half of the work, is spread over the threads, and the iterations follow on one; they return early where the pose still
+moves so far that most partners have to be searched for again, and the next launch spreads that.
+"""
+
+from coview_kernels import runtime
+from coview_kernels._ti_nearest import walk
+
+ti = runtime.library()
+
+POINTS = ti.types.ndarray(dtype=ti.types.vector(4, ti.f32), ndim=1)
+ROWS = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
+NORMALS = ti.types.ndarray(dtype=ti.types.vector(3, ti.f32), ndim=1)
+MEMORY = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
+
+NONE = 1e300  # square metres: no partner within the radius
+SLACK = 1e-9  # metres: more than rounding adds to a bound
+MOST_SHARE = 5.0  # weight of a point of the rarer kind
+MARGIN = 0.15  # metres that a search looks further than it must, so that it serves later poses; 0.05-0.3 are as fast
+
+# memory of a point: where it was searched for (3), how far all map points but its partner were then at least,
+# the partner's row, and the square of its distance now
+SAFE, ROW, NEAR = 3, 4, 5
+# ranks, a row for either kind of point: how many are kept, how many of them are still to be found, the bits of the
+# largest squared distance among them (as float32, which sort as it does), then a histogram
+KEPT, LEFT, LAST, BINS = 0, 1, 2, 3
+# settings; see icp.py
+KEEP, ITERATIONS, SCALES, STOP_SHIFT, STOP_TURN, LEAST, PRIOR, BULK = 8, 9, 10, 11, 12, 13, 14, 15
+PIVOT, MEAN, BELIEF, RADII = 16, 19, 31, 67
+# state: pose by rows (12), then these, the information (36) and the sums of a step (30)
+SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS = 12, 13, 14, 15, 16, 17, 53
+RUNNING, DONE, LOST = 0, 1, 2
+
+
+@ti.func
+def placed(T: ti.template(), p):
+    x, y, z = ti.cast(p[0], ti.f64), ti.cast(p[1], ti.f64), ti.cast(p[2], ti.f64)
+    return ti.Vector(
+        [T[4 * d] * x + T[4 * d + 1] * y + T[4 * d + 2] * z + T[4 * d + 3] for d in ti.static(range(3))]
+    )
+
+
+@ti.func
+def point_of(row):
+    return ti.Vector([ti.cast(ti.bit_cast(row[d], ti.f32), ti.f64) for d in ti.static(range(3))])
+
+
+@ti.func
+def pair(frame, starts: ti.template(), rows: ti.template(), at, i, radius, memory: ti.template()) -> ti.i32:
+    """Bring the partner of point ``i``, now ``at``, up to date; return whether it had to be searched for."""
+    row = ti.cast(memory[i][ROW], ti.i32)
+    drift = (at - ti.Vector([memory[i][0], memory[i][1], memory[i][2]])).norm()
+    safe = ti.max(memory[i][SAFE] - drift - SLACK, 0.0)
+    near = ti.cast(NONE, ti.f64)
+    if row >= 0:
+        near = (at - point_of(rows[row])).norm_sqr()
+    # by the triangle inequality no other point is nearer than safe: the partner stays, or there still is none
+    searched = safe * safe < ti.min(near, radius * radius)
+    if searched:
+        limit = radius + MARGIN
+        best, found, beyond = walk(frame, starts, rows, at[0], at[1], at[2], limit * limit, MARGIN)
+        near = best if found >= 0 else NONE
+        memory[i][0], memory[i][1], memory[i][2] = at[0], at[1], at[2]
+        memory[i][SAFE] = ti.sqrt(beyond)
+        memory[i][ROW] = found
+    memory[i][NEAR] = near if near < radius * radius else NONE
+    return searched
+
+
+@ti.func
+def rank(keep, source: ti.template(), memory: ti.template(), ranks: ti.template()):
+    """Find how far the farthest kept pair of either kind is, by radix: exact, and no slower where all are equal."""
+    for kind in range(2):
+        ranks[kind, LAST] = 0
+    for level in ti.static(range(3)):
+        shift = ti.static(20 - 10 * level)
+        bins = ti.static(2048 if level == 0 else 1024)
+        for kind in range(2):
+            for b in range(bins):
+                ranks[kind, BINS + b] = 0
+        for i in range(source.shape[0]):
+            if memory[i][NEAR] < NONE:
+                key = ti.bit_cast(ti.cast(memory[i][NEAR], ti.f32), ti.i32)
+                kind = ti.cast(source[i][3], ti.i32)
+                if ti.static(level == 0):
+                    ranks[kind, BINS + (key >> shift)] += 1
+                elif (key >> (shift + 10)) == ranks[kind, LAST]:
+                    ranks[kind, BINS + ((key >> shift) & 1023)] += 1
+        for kind in range(2):
+            if ti.static(level == 0):
+                found = 0
+                for b in range(bins):
+                    found += ranks[kind, BINS + b]
+                ranks[kind, KEPT] = ti.min(found, ti.max(1, ti.cast(keep * found, ti.i32)))
+                ranks[kind, LEFT] = ranks[kind, KEPT]
+            left = ranks[kind, LEFT]
+            b = BINS
+            while ranks[kind, b] < left:
+                left -= ranks[kind, b]
+                b += 1
+            ranks[kind, LEFT] = left
+            ranks[kind, LAST] = ranks[kind, LAST] * 1024 + b - BINS
+            if ti.static(level == 2):
+                # all that are as far as the last one that is kept are kept too
+                ranks[kind, KEPT] += ranks[kind, b] - left
+
+
+@ti.func
+def add_up(
+    T, about, width, rows: ti.template(), normals: ti.template(), source: ti.template(), memory: ti.template(),
+    ranks: ti.template(), state: ti.template(),
+):  # fmt: skip
+    """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs."""
+    acc = ti.Vector.zero(ti.f64, 30)
+    n = source.shape[0]
+    last = ti.Vector([ranks[0, LAST], ranks[1, LAST]])
+    share = ti.Vector(
+        [ti.min(0.5 * n / ti.max(1, ranks[kind, KEPT]), MOST_SHARE) for kind in ti.static(range(2))]
+    )
+    for i in range(n):
+        near = memory[i][NEAR]
+        point = source[i]
+        above = point[3] > 0
+        most = last[1] if above else last[0]
+        if near < NONE and ti.bit_cast(ti.cast(near, ti.f32), ti.i32) <= most:
+            row = rows[ti.cast(memory[i][ROW], ti.i32)]
+            at = placed(T, point)
+            normal = ti.cast(normals[row[3]], ti.f64)
+            r = normal.dot(at - point_of(row))
+            ratio = r / width
+            w = (share[1] if above else share[0]) / (1.0 + ratio * ratio)
+            turn = (at - about).cross(normal)
+            J = ti.Vector([turn[0], turn[1], turn[2], normal[0], normal[1], normal[2]])
+            for a in ti.static(range(6)):
+                wa = w * J[a]
+                for b in ti.static(range(a, 6)):
+                    acc[ti.static(6 * a - a * (a - 1) // 2 + b - a)] += wa * J[b]
+                acc[21 + a] += wa * r
+            acc[27] += w * r * r
+            acc[28] += w
+            acc[29] += 1.0
+    for k in ti.static(range(30)):
+        state[SUMS + k] = acc[k]
+
+
+@ti.func
+def solve(T, about, settings: ti.template(), state: ti.template(), system: ti.template()):
+    """Fuse the sums with the prior into ``state``'s information; leave the increment in the system's last column."""
+    variance = state[SUMS + 27] / state[SUMS + 28] + 1e-6
+    k = 0
+    for a in range(6):
+        for b in range(a, 6):
+            state[INFORMATION + 6 * a + b] = state[SUMS + k] / variance
+            state[INFORMATION + 6 * b + a] = state[SUMS + k] / variance
+            k += 1
+        system[a, 6] = -state[SUMS + 21 + a] / variance
+    if settings[PRIOR] > 0:
+        off = ti.Vector.zero(ti.f64, 6)
+        pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
+        M = ti.Vector([settings[MEAN + d] for d in ti.static(range(12))])
+        # half the sum of the columns' cross products: the sine part of T M^-1
+        turn = ti.Vector.zero(ti.f64, 3)
+        for d in ti.static(range(3)):
+            turn += 0.5 * ti.Vector([M[d], M[4 + d], M[8 + d]]).cross(ti.Vector([T[d], T[4 + d], T[8 + d]]))
+        mean = placed(M, pivot)
+        for d in ti.static(range(3)):
+            off[d] = turn[d]
+            off[3 + d] = about[d] - mean[d]
+        for a in ti.static(range(6)):
+            for b in ti.static(range(6)):
+                belief = settings[BELIEF + 6 * a + b]
+                state[INFORMATION + 6 * a + b] += belief
+                system[a, 6] -= belief * off[b]
+    for a in range(6):
+        for b in range(6):
+            system[a, b] = state[INFORMATION + 6 * a + b]
+        system[a, a] += 1e-6
+    eliminate(system)
+
+
+@ti.func
+def eliminate(system: ti.template()):
+    """Gauss-Jordan with pivots, as the matrix may be all but singular."""
+    for c in range(6):
+        top = c
+        for a in range(c + 1, 6):
+            if ti.abs(system[a, c]) > ti.abs(system[top, c]):
+                top = a
+        for b in range(c, 7):
+            swap = system[c, b]
+            system[c, b] = system[top, b]
+            system[top, b] = swap
+        for a in range(6):
+            if a != c:
+                share = system[a, c] / system[c, c]
+                for b in range(c, 7):
+                    system[a, b] -= share * system[c, b]
+    for c in range(6):
+        system[c, 6] /= system[c, c]
+
+
+@ti.func
+def advance(T, about, settings: ti.template(), state: ti.template(), system: ti.template()):
+    """Apply the increment to the pose, about ``about``, and see what follows."""
+    turn = ti.Vector([system[d, 6] for d in ti.static(range(3))])
+    shift = ti.Vector([system[d, 6] for d in ti.static(range(3, 6))])
+    angle = turn.norm()
+    sine, rest = ti.cast(1.0, ti.f64), ti.cast(0.5, ti.f64)
+    if angle > 1e-5:
+        half = ti.sin(0.5 * angle) / angle
+        sine, rest = ti.sin(angle) / angle, 2.0 * half * half
+    arm = ti.Vector([T[3], T[7], T[11]]) - about
+    for column in ti.static(range(4)):
+        v = arm
+        if ti.static(column < 3):
+            v = ti.Vector([T[column], T[4 + column], T[8 + column]])
+        side = turn.cross(v)
+        v += sine * side + rest * turn.cross(side)
+        if ti.static(column == 3):
+            v += about + shift
+        for d in ti.static(range(3)):
+            state[4 * d + column] = v[d]
+    state[TOTAL] += 1
+    state[ROUND] += 1
+    state[CONVERGED] = 0.0
+    if shift.norm() < settings[STOP_SHIFT] and angle < settings[STOP_TURN]:
+        state[CONVERGED] = 1.0
+    if state[CONVERGED] > 0 or state[ROUND] >= settings[ITERATIONS]:
+        state[ROUND] = 0
+        state[SCALE] += 1
+        if state[SCALE] >= settings[SCALES]:
+            state[STATUS] = DONE
+
+
+@ti.kernel
+def align(
+    settings: ti.types.ndarray(ti.f64, 1),
+    starts: ti.types.ndarray(ti.i32, 1),
+    rows: ROWS,
+    normals: NORMALS,
+    source: POINTS,
+    memory: MEMORY,
+    ranks: ti.types.ndarray(ti.i32, 2),
+    system: ti.types.ndarray(ti.f64, 2),
+    state: ti.types.ndarray(ti.f64, 1),
+    chunks: ti.i32,
+):
+    """Iterate from the state's pose until the status says why it ended, or until searches should be spread again."""
+    n = source.shape[0]
+    each = (n + chunks - 1) // chunks
+    ti.loop_config(block_dim=1)
+    for c in range(chunks):
+        frame = ti.Vector([settings[k] for k in ti.static(range(8))])
+        T = ti.Vector([state[k] for k in ti.static(range(12))])
+        radius = settings[RADII + 2 * ti.cast(state[SCALE], ti.i32)]
+        for i in range(ti.min(n, c * each), ti.min(n, (c + 1) * each)):
+            pair(frame, starts, rows, placed(T, source[i]), i, radius, memory)
+
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        frame = ti.Vector([settings[k] for k in ti.static(range(8))])
+        pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
+        searched = 0
+        first = 1
+        while state[STATUS] == RUNNING and (first == 1 or searched < settings[BULK]):
+            T = ti.Vector([state[k] for k in ti.static(range(12))])
+            scale = RADII + 2 * ti.cast(state[SCALE], ti.i32)
+            if first == 0:
+                searched = 0
+                for i in range(n):
+                    searched += pair(frame, starts, rows, placed(T, source[i]), i, settings[scale], memory)
+            first = 0
+            about = placed(T, pivot)
+            rank(settings[KEEP], source, memory, ranks)
+            add_up(T, about, settings[scale + 1], rows, normals, source, memory, ranks, state)
+            if state[SUMS + 29] < settings[LEAST]:
+                state[STATUS] = LOST
+            else:
+                solve(T, about, settings, state, system)
+                advance(T, about, settings, state, system)

@@ -1,0 +1,120 @@
+"""Trimmed point-to-plane ICP in plain NumPy, on SciPy's k-d tree."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from coview_kernels.arrays import F32, F64, Mask
+from coview_kernels.reference.nearest import nearest
+from coview_kernels.reference.trimmed_icp import normal_equations
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+_MOST_SHARE = 5.0  # a handful of points must not outweigh thousands
+
+
+class Plan(NamedTuple):
+    """Arguments of :func:`coview_kernels.align_planes`, checked."""
+
+    T: F64
+    pivot: F64
+    scales: tuple[tuple[float, float], ...]
+    keep: float
+    iterations: int
+    stop: tuple[float, float]
+    least: int
+    prior: tuple[F64, F64] | None
+
+
+class Alignment(NamedTuple):
+    """What a registration found, with its evidence."""
+
+    T: F64
+    """(4, 4) ``T_target_source``."""
+    information: F64
+    """(6, 6) over (rx, ry, rz, x, y, z) about the moved pivot before the last step, the prior included."""
+    rmse: float
+    """Weighted root mean square of the kept residuals before the last step, metres."""
+    pairs: int
+    """How many pairs were kept at the last step."""
+    iterations: int
+    """Over all scales."""
+    converged: bool
+    """Whether the last step was small enough to stop."""
+
+
+def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
+    """See :func:`coview_kernels.align_planes`; ``tree`` holds the map."""
+    T, total, answer = plan.T, 0, None
+    for radius, width in plan.scales:
+        for _ in range(plan.iterations):
+            step = _step(tree, normals, source, kind, plan, T, radius, width)
+            if step is None:
+                return None
+            increment, information, rmse, pairs = step
+            T = _moved(T, increment, T[:3, :3] @ plan.pivot + T[:3, 3])
+            total += 1
+            turn, shift = np.linalg.norm(increment[:3]), np.linalg.norm(increment[3:])
+            converged = bool(shift < plan.stop[0] and turn < plan.stop[1])
+            answer = Alignment(T, information, rmse, pairs, total, converged)
+            if converged:
+                break
+    return answer
+
+
+def _step(
+    tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan, T: F64, radius: float, width: float
+) -> tuple[F64, F64, float, int] | None:
+    """One Gauss-Newton step: increment (6,), information (6, 6), rmse and number of pairs."""
+    distance, partner = nearest(tree, source, radius, T)
+    found = np.flatnonzero(np.isfinite(distance))
+    pairs = partner[found]
+    gap = source[found].astype(np.float64) @ T[:3, :3].T + T[:3, 3] - tree.data[pairs]
+    share = _shares(np.einsum("ij,ij->i", gap, gap).astype(np.float32), kind[found], plan.keep, len(source))
+    chosen = np.flatnonzero(share)
+    if len(chosen) < plan.least:
+        return None
+    share, gap, pairs = share[chosen], gap[chosen], pairs[chosen]
+    n = normals[pairs]
+    residual = np.einsum("ij,ij->i", gap, n)
+    weight = share / (1.0 + (residual / width) ** 2)
+    about = T[:3, :3] @ plan.pivot + T[:3, 3]
+    q = tree.data[pairs].astype(np.float32)
+    H, b, squares = normal_equations(source[found[chosen]], q, n, weight, T, about)
+    mean_square = squares / weight.sum()
+    information, gradient = H / (mean_square + 1e-6), b / (mean_square + 1e-6)
+    if plan.prior is not None:
+        mean, belief = plan.prior
+        R = T[:3, :3] @ mean[:3, :3].T
+        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        shift = about - (mean[:3, :3] @ plan.pivot + mean[:3, 3])
+        information = information + belief
+        gradient = gradient + belief @ np.concatenate([turn, shift])
+    increment: F64 = -np.linalg.solve(information + 1e-6 * np.eye(6), gradient)
+    return increment, information, float(np.sqrt(mean_square)), len(chosen)
+
+
+def _shares(squares: F32, kind: Mask, keep: float, points: int) -> F64:
+    """Weights (M,) of pairs by their squared distances: 0 for those trimmed, and equal sums for both kinds."""
+    share = np.zeros(len(squares))
+    for group in (kind, ~kind):
+        index = np.flatnonzero(group)
+        if len(index):
+            number = max(1, int(keep * len(index)))
+            kept = index[squares[index] <= np.partition(squares[index], number - 1)[number - 1]]
+            share[kept] = min(0.5 * points / len(kept), _MOST_SHARE)
+    return share
+
+
+def _moved(T: F64, increment: F64, about: F64) -> F64:
+    """``Trans(about) exp(increment) Trans(-about) T``."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(increment[:3]).as_matrix()
+    moved = np.eye(4)
+    moved[:3, :3] = turn @ T[:3, :3]
+    moved[:3, 3] = turn @ (T[:3, 3] - about) + about + increment[3:]
+    return moved

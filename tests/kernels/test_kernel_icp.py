@@ -1,0 +1,176 @@
+"""The registration kernel against its plain twin: same pose, evidence and end, whatever the scene, start and prior."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import coview_kernels.icp
+from coview_kernels import Belief, PointGrid, align_planes, reference
+from coview_kernels.reference.icp import Plan
+
+SCALES = ((1.5, 0.5), (0.8, 0.26), (0.4, 0.13))
+FIXED = {"keep": 0.7, "iterations": 15}
+
+
+def pose(rotation_vector, translation):
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
+    T[:3, 3] = translation
+    return T
+
+
+def room(rng, noise):
+    """Points (K, 3) and normals of a floor, two walls and a pillar, 0.3 m apart, somewhere on the map."""
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(0, 12, 0.3), np.arange(0, 4, 0.3)))
+    zero = np.zeros_like(u)
+    parts = [
+        (np.stack([u, 3 * v, zero], 1), [0, 0, 1]),
+        (np.stack([u, zero, v], 1), [0, 1, 0]),
+        (np.stack([zero, u, v], 1), [1, 0, 0]),
+        (np.stack([zero + 7, 5 + 0.2 * u, v], 1), [1, 0, 0]),
+        (np.stack([7 + 0.2 * u, zero + 5, v], 1), [0, 1, 0]),
+    ]
+    points = np.concatenate([p for p, _ in parts]) + rng.uniform(-200, 200, 3)
+    normals = np.concatenate([np.tile(np.array(n, np.float32), (len(p), 1)) for p, n in parts])
+    return (points + noise * rng.normal(size=points.shape)).astype(np.float32), normals
+
+
+def scan_of(points, rng, truth, outliers, noise):
+    """A scan (N, 3) of some of the points from ``truth``, which of it is above the floor, and its middle."""
+    some = rng.permutation(len(points))[:900]
+    seen = points[some] + noise * rng.normal(size=(len(some), 3))
+    stray = seen[: int(outliers * len(seen))]
+    stray += rng.uniform(-2, 2, stray.shape)
+    above = seen[:, 2] > points[:, 2].min() + 0.5
+    back = np.linalg.inv(truth)
+    local = (seen @ back[:3, :3].T + back[:3, 3]).astype(np.float32)
+    return local, above, local.mean(axis=0, dtype=np.float64)
+
+
+def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, least=50, **changes):
+    """Answers of the kernel and of its twin."""
+    options = FIXED | changes
+    ours = align_planes(grid, normals, local, above, T, pivot, scales, prior=prior, least=least, **options)
+    belief = None if prior is None else (np.asarray(prior.mean), np.asarray(prior.information))
+    stop = options.pop("stop", (1e-3, 5e-5))
+    plan = Plan(T, pivot, scales, options["keep"], options["iterations"], stop, least, belief)
+    return ours, reference.align_planes(grid.tree, normals, local, above, plan)
+
+
+def assert_same(ours, plain, pivot):
+    """1e-6 m at the pivot and 1e-7 rad: sums are rounded in another order."""
+    assert (ours is None) == (plain is None)
+    if ours is None:
+        return
+    assert (ours.pairs, ours.iterations, ours.converged) == (plain.pairs, plain.iterations, plain.converged)
+    middle = np.append(pivot, 1.0)
+    np.testing.assert_allclose(ours.T @ middle, plain.T @ middle, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(ours.T[:3, :3], plain.T[:3, :3], rtol=0, atol=1e-7)
+    scale = np.abs(plain.information).max()
+    np.testing.assert_allclose(ours.information, plain.information, rtol=1e-6, atol=1e-7 * scale)
+    assert ours.rmse == pytest.approx(plain.rmse, rel=1e-6, abs=1e-9)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 10**9]))
+def test_agrees_with_the_twin(seed, outliers, believed, bulk):
+    rng = np.random.default_rng(seed)
+    points, normals = room(rng, 0.01)
+    truth = pose([0, 0, rng.uniform(-3, 3)], rng.uniform(-9, 9, 3))
+    local, above, pivot = scan_of(points, rng, truth, outliers, 0.02)
+    start = truth @ pose(rng.normal(0, 0.02, 3), np.zeros(3))
+    start[:3, 3] += truth[:3, :3] @ pivot - start[:3, :3] @ pivot + rng.uniform(-0.4, 0.4, 3)
+    local[::97] = np.nan
+    prior = Belief(start, np.diag([1e4, 1e4, 1e3, 50.0, 40.0, 90.0])) if believed else None
+    # one launch, or one for each iteration
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(coview_kernels.icp, "_BULK", bulk)
+        ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior)
+    assert_same(ours, plain, pivot)
+    assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < 0.1
+
+
+def test_equal_distances_are_kept_together():
+    """Lattices seen exactly, a sixteenth of a metre off: all of a kind are equally far, and stay or go together."""
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(0, 8, 0.25), np.arange(0, 8, 0.25)))
+    parts = np.stack([u, v, 0 * u], 1), np.stack([0 * u + 16, u, v + 1], 1)
+    points = np.concatenate(parts).astype(np.float32)
+    normals = np.repeat(np.float32([[0, 0, 1], [1, 0, 0]]), len(u), axis=0)
+    local, above = points[::3], points[::3, 2] > 0.5
+    for start in (np.eye(4), pose([0, 0, 0], [0.0625, 0, 0.0625])):
+        ours, plain = both(
+            PointGrid(points), normals, local, above, start, np.zeros(3), scales=SCALES[:1], iterations=1
+        )
+        assert_same(ours, plain, np.zeros(3))
+        assert ours.pairs == len(local)
+        np.testing.assert_allclose(ours.T, np.eye(4), atol=1e-6)
+
+
+def test_a_far_start_of_large_turns():
+    """The increment's rotation is exact, not linear: half a radian in one step."""
+    rng = np.random.default_rng(2)
+    points, normals = room(rng, 0.01)
+    middle = points.mean(axis=0, dtype=np.float64)
+    local, above, pivot = scan_of(points, rng, pose([0, 0, 0], middle), 0.0, 0.0)
+    start = pose([0.05, -0.1, 0.5], np.add(middle, [0.5, -0.4, 0.3]))
+    ours, plain = both(PointGrid(points), normals, local, above, start, pivot, scales=((9.0, 3.0), *SCALES))
+    assert_same(ours, plain, pivot)
+
+
+def test_one_kind_of_point_or_few_pairs():
+    rng = np.random.default_rng(3)
+    points, normals = room(rng, 0.01)
+    middle = points.mean(axis=0, dtype=np.float64)
+    truth = pose([0, 0, 1.0], middle)
+    local, above, pivot = scan_of(points, rng, truth, 0.1, 0.01)
+    grid = PointGrid(points)
+    for kind in (np.zeros_like(above), np.ones_like(above), np.arange(len(above)) == 7):
+        assert_same(*both(grid, normals, local, kind, truth, pivot), pivot)
+    far = truth + 0.0
+    far[2, 3] += 50.0
+    for start, least in ((far, 50), (truth, 650)):
+        ours, plain = both(grid, normals, local, above, start, pivot, least=least)
+        assert ours is None
+        assert plain is None
+
+
+def test_a_belief_decides_where_nothing_else_does():
+    """A bare floor leaves heading and place free; the mean of a sure belief is where they end."""
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(0, 12, 0.3), np.arange(0, 12, 0.3)))
+    floor = np.stack([u, v, 0 * u], 1).astype(np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (len(floor), 1))
+    local = floor[::3]
+    pivot = local.mean(axis=0, dtype=np.float64)
+    mean = pose([0, 0, 0.05], [0.3, -0.2, 0.0])
+    belief = Belief(mean, np.diag([1.0, 1.0, 1e6, 1e6, 1e6, 1.0]))
+    ours, plain = both(PointGrid(floor), up, local, np.zeros(len(local), bool), np.eye(4), pivot, belief)
+    assert_same(ours, plain, pivot)
+    np.testing.assert_allclose(ours.T, mean, atol=2e-3)
+
+
+def test_empty_sides_find_nothing():
+    none = np.empty((0, 3))
+    cloud, up = np.random.default_rng(4).normal(size=(99, 3)), np.tile([0.0, 0, 1], (99, 1))
+    options = {"T": np.eye(4), "pivot": np.zeros(3), "scales": SCALES, **FIXED}
+    assert align_planes(PointGrid(none), none, cloud, np.ones(99), **options) is None
+    assert align_planes(PointGrid(cloud), up, none, np.ones(0), **options) is None
+
+
+def test_bad_arguments_are_named():
+    cloud = np.zeros((2, 3))
+    good = {
+        "normals": cloud, "source": cloud, "kind": np.ones(2), "T": np.eye(4), "pivot": np.zeros(3),
+        "scales": SCALES, **FIXED,
+    }  # fmt: skip
+    bad = {
+        "normals": cloud[:1], "source": np.zeros(3), "kind": np.ones(3), "T": np.full((4, 4), np.nan),
+        "pivot": [0, 0, np.inf], "scales": [(0.0, 1.0)], "keep": 1.1, "iterations": 0,
+        "prior": Belief(np.eye(4), np.full((6, 6), np.inf)),
+    }  # fmt: skip
+    for name, value in bad.items():
+        with pytest.raises(ValueError, match=name.rstrip("s")):
+            align_planes(PointGrid(cloud), **(good | {name: value}))
