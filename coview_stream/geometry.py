@@ -10,7 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
+
+from coview_stream.rotation import exp_so3, matrices, nearest_rotation, quaternions
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -86,13 +87,12 @@ def tilt_of(T: Pose) -> float:
 
 def exp_se3(xi: npt.NDArray[np.float64]) -> Pose:
     """Left-multiplied pose increment from (rx, ry, rz, x, y, z): rotate, then shift."""
-    return pose_from(Rotation.from_rotvec(xi[:3]).as_matrix(), xi[3:])
+    return pose_from(exp_so3(xi[:3]), xi[3:])
 
 
 def orthonormal(T: Pose) -> Pose:
     """``T`` with its rotation projected back onto SO(3) (drift from repeated products)."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    return pose_from(U @ Vt, T[:3, 3])
+    return pose_from(nearest_rotation(T[:3, :3]), T[:3, 3])
 
 
 def is_pose(T: npt.NDArray[np.floating]) -> bool:
@@ -105,10 +105,10 @@ def is_pose(T: npt.NDArray[np.floating]) -> bool:
 
 def pose_to_tum(T: Pose) -> npt.NDArray[np.float64]:
     """(7,) x y z qx qy qz qw of a pose."""
-    return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat()])
+    return np.concatenate([T[:3, 3], quaternions(T[:3, :3])])
 
 
 def pose_from_tum(row: npt.ArrayLike) -> Pose:
     """Pose from (7,) x y z qx qy qz qw; the quaternion need not be normalised."""
     values = np.asarray(row, dtype=np.float64)
-    return pose_from(Rotation.from_quat(values[3:]).as_matrix(), values[:3])
+    return pose_from(matrices(values[3:]), values[:3])

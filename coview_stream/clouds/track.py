@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from coview_stream.clouds.trajectory import Poses
+from coview_stream.rotation import between
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.odometry import Segment
 
@@ -67,8 +67,6 @@ class Track:
 
 def _between(a: Poses, b: Poses, share: npt.NDArray[np.float64]) -> Poses:
     poses = np.array(a)
-    start = Rotation.from_matrix(a[:, :3, :3])
-    turn = (start.inv() * Rotation.from_matrix(b[:, :3, :3])).as_rotvec()
-    poses[:, :3, :3] = (start * Rotation.from_rotvec(share[:, None] * turn)).as_matrix()
+    poses[:, :3, :3] = between(a[:, :3, :3], b[:, :3, :3], share)
     poses[:, :3, 3] += share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
     return poses

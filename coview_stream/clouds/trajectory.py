@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from coview_stream.clouds.writers import atomic
 from coview_stream.errors import InputError, RunError
 from coview_stream.geometry import Pose, pose_to_tum
+from coview_stream.rotation import matrices, nearest_rotation
 
 Stamps = npt.NDArray[np.float64]
 Poses = npt.NDArray[np.float64]
@@ -40,7 +40,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Stamps, Poses]:
     short = np.linalg.norm(quaternions, axis=1) < _SHORTEST_QUATERNION
     if short.any():
         raise RunError(f"{path}:{lines[int(np.argmax(short))]}: quaternion is zero; write qx qy qz qw")
-    return stamps, _poses(rows[:, 1:4], Rotation.from_quat(quaternions).as_matrix() if len(rows) else None)
+    return stamps, _poses(rows[:, 1:4], matrices(quaternions) if len(rows) else None)
 
 
 def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
@@ -53,15 +53,15 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
     rows, lines = _read_rows(path, 12, "the 3x4 pose, row by row")
     if not len(rows):
         return np.zeros((0, 4, 4))
-    matrices = rows.reshape(-1, 3, 4)
-    R = matrices[:, :, :3]
+    parts = rows.reshape(-1, 3, 4)
+    R = parts[:, :, :3]
     wrong = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
     wrong |= np.linalg.det(R) <= 0
     if wrong.any():
         raise RunError(
             f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is no rotation; check the columns"
         )
-    return _poses(matrices[:, :, 3], Rotation.from_matrix(R).as_matrix())
+    return _poses(parts[:, :, 3], nearest_rotation(R))
 
 
 def read_times(path: str | os.PathLike[str]) -> Stamps:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from coview_stream.geometry import Points
+from coview_stream.sliding import highest_around, lowest_around
 
 _CELL = 0.5  # metres
 _DROP = 2.0  # metres: what falls less is no wall
@@ -47,5 +47,5 @@ def edge_raster(points: Points) -> EdgeRaster:
     flat = np.full(rows * columns, _NOTHING, dtype=np.float32)
     np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
     top = flat.reshape(rows, columns)
-    edge = np.where(top - ndimage.minimum_filter(top, size=_REACH) > _DROP, top, np.float32(_NOTHING))
-    return EdgeRaster(ndimage.maximum_filter(edge, size=_OVERHANG), corner)
+    edge = np.where(top - lowest_around(top, _REACH) > _DROP, top, np.float32(_NOTHING))
+    return EdgeRaster(highest_around(edge, _OVERHANG), corner)

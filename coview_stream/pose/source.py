@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry import Points, lengths
 from coview_stream.pose.registration import Source
+from coview_stream.sliding import lowest_around
 
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
 _CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, not part of it
@@ -52,6 +52,6 @@ def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
     cell = i * columns + j
     lowest = np.full(rows * columns, np.inf, dtype=np.float32)
     np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
-    around = ndimage.minimum_filter(lowest.reshape(rows, columns), size=3, mode="constant", cval=np.inf)
+    around = lowest_around(lowest.reshape(rows, columns), 3)
     height: npt.NDArray[np.float32] = points[:, 2] - around.ravel()[cell]
     return height

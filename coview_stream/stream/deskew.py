@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation, Slerp
 
 from coview_stream.geometry import Points, Pose, inverse
+from coview_stream.rotation import between
 from coview_stream.stream.odometry import Segment
 
 _STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s
@@ -36,7 +36,9 @@ def deskew(
     grid = np.linspace(low, high, _STEPS)
     T_body_odom = inverse(T_odom_body)
     relative = T_body_odom @ segment.poses
-    turns = Slerp(at, Rotation.from_matrix(relative[:, :3, :3]))(grid).as_matrix().astype(np.float32)
+    k = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, len(at) - 2)
+    share = (grid - at[k]) / (at[k + 1] - at[k])
+    turns = between(relative[k, :3, :3], relative[k + 1, :3, :3], share).astype(np.float32)
     shifts = np.column_stack([np.interp(grid, at, relative[:, k, 3]) for k in range(3)]).astype(np.float32)
     step = np.rint((known - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
     return np.asarray(np.einsum("nij,nj->ni", turns[step], points) + shifts[step], dtype=np.float32)

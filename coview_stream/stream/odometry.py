@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from coview_stream.geometry import Pose, inverse, pose_from, rotation_angle
+from coview_stream.rotation import between
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.messages import OdometryMessage
 
@@ -185,6 +185,5 @@ class OdometryBuffer:
 
 def _between(a: OdometryMessage, b: OdometryMessage, stamp_ns: int) -> Pose:
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-    rotations = Rotation.from_matrix(np.stack([a.T_odom_body[:3, :3], b.T_odom_body[:3, :3]]))
-    turn = Slerp([0.0, 1.0], rotations)(share).as_matrix()
+    turn = between(a.T_odom_body[:3, :3], b.T_odom_body[:3, :3], share)
     return pose_from(turn, (1 - share) * a.T_odom_body[:3, 3] + share * b.T_odom_body[:3, 3])

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation, Slerp
 
 from coview_stream.clouds.runs import Run
 from coview_stream.errors import ConfigError
 from coview_stream.geometry import Pose, pose_from
+from coview_stream.rotation import between
 
 _LONE_PERIOD = 0.1  # seconds between repetitions of a run of one frame, which has no rate of its own
 
@@ -114,9 +114,9 @@ def _between(run: Run, dues: Times, k: int, rate: float) -> Iterator[Beat]:
     count = round((dues[k + 1] - dues[k]) * rate)
     if count < 2:
         return
-    turn = Slerp([0.0, 1.0], Rotation.from_matrix(run.poses[k : k + 2, :3, :3]))
+    start, end = run.poses[k : k + 2, :3, :3]
     for share in np.arange(1, count) / count:
         due, stamp, position = (
             a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps, run.poses[:, :3, 3])
         )
-        yield Beat(float(due), float(stamp), pose_from(turn(share).as_matrix(), position), None)
+        yield Beat(float(due), float(stamp), pose_from(between(start, end, share), position), None)
