@@ -31,7 +31,7 @@ KEPT, LEFT, LAST, BINS = 0, 1, 2, 3
 KEEP, ITERATIONS, SCALES, STOP_SHIFT, STOP_TURN, LEAST, PRIOR, BULK = 8, 9, 10, 11, 12, 13, 14, 15
 PIVOT, MEAN, BELIEF, RADII = 16, 19, 31, 67
 # state: pose by rows (12), then these, the information (36) and the sums of a step (30)
-SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS = 12, 13, 14, 15, 16, 17, 53
+SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, PAIRED, OFF = 12, 13, 14, 15, 16, 17, 53, 83, 84
 RUNNING, DONE, LOST = 0, 1, 2
 
 
@@ -147,7 +147,7 @@ def add_up(
 
 
 @ti.func
-def solve(T, about, settings: ti.template(), state: ti.template(), system: ti.template()):
+def solve(pivot, about, settings: ti.template(), state: ti.template(), system: ti.template()):
     """Fuse the sums with the prior into ``state``'s information; leave the increment in the system's last column."""
     variance = state[SUMS + 27] / state[SUMS + 28] + 1e-6
     k = 0
@@ -158,22 +158,20 @@ def solve(T, about, settings: ti.template(), state: ti.template(), system: ti.te
             k += 1
         system[a, 6] = -state[SUMS + 21 + a] / variance
     if settings[PRIOR] > 0:
-        off = ti.Vector.zero(ti.f64, 6)
-        pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
-        M = ti.Vector([settings[MEAN + d] for d in ti.static(range(12))])
-        # half the sum of the columns' cross products: the sine part of T M^-1
+        mean = placed(ti.Vector([settings[MEAN + k] for k in ti.static(range(12))]), pivot)
+        # half the sum of the columns' cross products is the sine part of T mean^-1
         turn = ti.Vector.zero(ti.f64, 3)
+        for d in range(3):
+            m = ti.Vector([settings[MEAN + d], settings[MEAN + 4 + d], settings[MEAN + 8 + d]])
+            turn += 0.5 * m.cross(ti.Vector([state[d], state[4 + d], state[8 + d]]))
         for d in ti.static(range(3)):
-            turn += 0.5 * ti.Vector([M[d], M[4 + d], M[8 + d]]).cross(ti.Vector([T[d], T[4 + d], T[8 + d]]))
-        mean = placed(M, pivot)
-        for d in ti.static(range(3)):
-            off[d] = turn[d]
-            off[3 + d] = about[d] - mean[d]
-        for a in ti.static(range(6)):
-            for b in ti.static(range(6)):
+            state[OFF + d] = turn[d]
+            state[OFF + 3 + d] = about[d] - mean[d]
+        for a in range(6):
+            for b in range(6):
                 belief = settings[BELIEF + 6 * a + b]
                 state[INFORMATION + 6 * a + b] += belief
-                system[a, 6] -= belief * off[b]
+                system[a, 6] -= belief * state[OFF + b]
     for a in range(6):
         for b in range(6):
             system[a, b] = state[INFORMATION + 6 * a + b]
@@ -203,7 +201,7 @@ def eliminate(system: ti.template()):
 
 
 @ti.func
-def advance(T, about, settings: ti.template(), state: ti.template(), system: ti.template()):
+def advance(about, settings: ti.template(), state: ti.template(), system: ti.template()):
     """Apply the increment to the pose, about ``about``, and see what follows."""
     turn = ti.Vector([system[d, 6] for d in ti.static(range(3))])
     shift = ti.Vector([system[d, 6] for d in ti.static(range(3, 6))])
@@ -212,14 +210,13 @@ def advance(T, about, settings: ti.template(), state: ti.template(), system: ti.
     if angle > 1e-5:
         half = ti.sin(0.5 * angle) / angle
         sine, rest = ti.sin(angle) / angle, 2.0 * half * half
-    arm = ti.Vector([T[3], T[7], T[11]]) - about
-    for column in ti.static(range(4)):
-        v = arm
-        if ti.static(column < 3):
-            v = ti.Vector([T[column], T[4 + column], T[8 + column]])
+    for column in range(4):
+        v = ti.Vector([state[column], state[4 + column], state[8 + column]])
+        if column == 3:
+            v -= about
         side = turn.cross(v)
         v += sine * side + rest * turn.cross(side)
-        if ti.static(column == 3):
+        if column == 3:
             v += about + shift
         for d in ti.static(range(3)):
             state[4 * d + column] = v[d]
@@ -248,36 +245,33 @@ def align(
     state: ti.types.ndarray(ti.f64, 1),
     chunks: ti.i32,
 ):
-    """Iterate from the state's pose until the status says why it ended, or until searches should be spread again."""
+    """Iterate from the state's pose until the status says why it ended, or until searches should be spread again.
+
+    With more than one chunk: only bring the partners up to date, which the iterations then begin with.
+    """
     n = source.shape[0]
     each = (n + chunks - 1) // chunks
     ti.loop_config(block_dim=1)
     for c in range(chunks):
         frame = ti.Vector([settings[k] for k in ti.static(range(8))])
-        T = ti.Vector([state[k] for k in ti.static(range(12))])
-        radius = settings[RADII + 2 * ti.cast(state[SCALE], ti.i32)]
-        for i in range(ti.min(n, c * each), ti.min(n, (c + 1) * each)):
-            pair(frame, starts, rows, placed(T, source[i]), i, radius, memory)
-
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        frame = ti.Vector([settings[k] for k in ti.static(range(8))])
-        pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
-        searched = 0
-        first = 1
-        while state[STATUS] == RUNNING and (first == 1 or searched < settings[BULK]):
+        again = state[STATUS] == RUNNING
+        while again:
             T = ti.Vector([state[k] for k in ti.static(range(12))])
             scale = RADII + 2 * ti.cast(state[SCALE], ti.i32)
-            if first == 0:
-                searched = 0
-                for i in range(n):
+            searched = 0
+            if state[PAIRED] == 0:
+                for i in range(ti.min(n, c * each), ti.min(n, (c + 1) * each)):
                     searched += pair(frame, starts, rows, placed(T, source[i]), i, settings[scale], memory)
-            first = 0
-            about = placed(T, pivot)
-            rank(settings[KEEP], source, memory, ranks)
-            add_up(T, about, settings[scale + 1], rows, normals, source, memory, ranks, state)
-            if state[SUMS + 29] < settings[LEAST]:
-                state[STATUS] = LOST
-            else:
-                solve(T, about, settings, state, system)
-                advance(T, about, settings, state, system)
+            again = False
+            if chunks == 1:
+                state[PAIRED] = 0
+                pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
+                about = placed(T, pivot)
+                rank(settings[KEEP], source, memory, ranks)
+                add_up(T, about, settings[scale + 1], rows, normals, source, memory, ranks, state)
+                if state[SUMS + 29] < settings[LEAST]:
+                    state[STATUS] = LOST
+                else:
+                    solve(pivot, about, settings, state, system)
+                    advance(about, settings, state, system)
+                again = state[STATUS] == RUNNING and searched < settings[BULK]

@@ -24,7 +24,7 @@ __all__ = ["Alignment", "Belief", "align_planes"]
 
 _BULK = 1500  # searches in one iteration that are worth another launch, to be spread over the threads
 _CHUNKS = 4  # for each thread: points that must search far come in clusters
-_TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS, _STATE = 14, 15, 16, 17, 53, 83
+_TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS, _PAIRED = 14, 15, 16, 17, 53, 83
 _LOST = 2
 _BINS = 2048
 _UNKNOWN = (0.0, 0.0, 0.0, -1.0, -1.0, 0.0)
@@ -115,29 +115,22 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     memory = np.empty((n, 6))
     memory[:] = _UNKNOWN
     ranks = np.empty((2, 3 + _BINS), dtype=np.int32)
-    system, state = np.empty((6, 7)), np.zeros(_STATE)
+    system, state = np.empty((6, 7)), np.zeros(_PAIRED + 7)
     state[:12] = plan.T[:3].ravel()
     settings = _settings(cells.frame, plan, _BULK if workers > 1 else n + 1)
     launch = runtime.kernels("icp").align
+    arrays = settings, cells.starts, cells.rows, normals, points, memory, ranks, system, state
     while not state[_STATUS]:
-        launch(
-            settings,
-            cells.starts,
-            cells.rows,
-            normals,
-            points,
-            memory,
-            ranks,
-            system,
-            state,
-            _CHUNKS * workers,
-        )
+        if workers > 1:
+            launch(*arrays, _CHUNKS * workers)
+            state[_PAIRED] = 1
+        launch(*arrays, 1)
     if state[_STATUS] == _LOST or not np.isfinite(state[:12]).all():
         return None
     pose = np.eye(4)
     pose[:3] = state[:12].reshape(3, 4)
     information = state[_INFORMATION:_SUMS].reshape(6, 6).copy()
-    squares, weights, pairs = state[_SUMS + 27 :]
+    squares, weights, pairs = state[_SUMS + 27 : _PAIRED]
     return Alignment(
         pose,
         information,
