@@ -42,7 +42,13 @@ SUITE = (
     Entry("registration", "trimmed ICP beside small_gicp"),
     Entry("engine", "Localizer.step on a large map: times, CPU share, memory", threads=(None,)),
     Entry("start", "import, first run, ready to serve", threads=(None,)),
-    Entry("peers", "other libraries on the same queries", threads=(None,), limit_s=420.0),
+    Entry(
+        "peers",
+        "other libraries on the same queries",
+        threads=(None,),
+        limit_s=420.0,
+        module="bench.peers.summary",
+    ),
 )
 
 OWN = {
@@ -51,6 +57,7 @@ OWN = {
     "build_map": "seconds and memory of building a map",
     "ground": "the ground filter on labelled LAS files",
     "stream": "robots over zenoh: rates, delays, attacks",
+    "peers": "each peer in each world, every answer as JSON",
     "plots": "the plots of docs/performance.md",
 }
 """Benchmarks with a command and tables of their own: ``python -m bench.NAME``."""
