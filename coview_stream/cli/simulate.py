@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; names and ranges are checked by SimulationConfig."""
     parser.add_argument("out", type=Path, metavar="OUT", help="directory to write; new or empty")
     parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
-    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64 or mid360 (vlp16)")
+    parser.add_argument("--sensor", default="vlp16", help="vlp16, os64, os64-2048 or mid360 (vlp16)")
     parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
     parser.add_argument("--size", type=float, default=240.0, help="side of the map, metres (240)")
     parser.add_argument("--length", type=float, default=80.0, help="distance driven, metres (80)")

@@ -27,7 +27,7 @@ class SimulationConfig:
 
     Attributes:
         scene: town, campus, village, industrial or forest.
-        sensor: vlp16, os64 or mid360.
+        sensor: vlp16, os64, os64-2048 or mid360.
         seed: everything else follows from it; equal configurations give equal files.
         size: side of the square map, metres.
         length: distance driven, metres.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -80,10 +81,10 @@ def _vlp16() -> Sensor:
     return Sensor("vlp16", _spinning(elevation, firing, 1800), 0.5, 100.0)
 
 
-def _os64() -> Sensor:
+def _os64(name: str = "os64", columns: int = 512) -> Sensor:
     elevation = np.radians(np.linspace(22.5, -22.5, 64))
     staggered: Floats = np.radians(np.tile([3.16, 1.05, -1.05, -3.16], 16))
-    return Sensor("os64", _spinning(elevation, staggered, 512), 0.5, 120.0)
+    return Sensor(name, _spinning(elevation, staggered, columns), 0.5, 120.0)
 
 
 def _mid360() -> Sensor:
@@ -102,4 +103,9 @@ def _mid360() -> Sensor:
     return Sensor("mid360", beams, 0.1, 70.0)
 
 
-SENSORS: dict[str, Callable[[], Sensor]] = {"vlp16": _vlp16, "os64": _os64, "mid360": _mid360}
+SENSORS: dict[str, Callable[[], Sensor]] = {
+    "vlp16": _vlp16,
+    "os64": _os64,
+    "os64-2048": partial(_os64, "os64-2048", 2048),  # its densest mode, 131,072 beams
+    "mid360": _mid360,
+}

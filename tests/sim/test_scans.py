@@ -77,10 +77,10 @@ def test_beams_are_unit_vectors_and_repeat_only_where_they_should(name):
     assert np.linalg.norm(first, axis=1) == pytest.approx(1.0)
     assert np.array_equal(first, second) is (name != "mid360")
     elevation = np.degrees(np.arcsin(first[:, 2]))
-    low, high = {"vlp16": (-15, 15), "os64": (-22.5, 22.5), "mid360": (-7, 52)}[name]
+    low, high = {"vlp16": (-15, 15), "mid360": (-7, 52)}.get(name, (-22.5, 22.5))
     assert elevation.min() == pytest.approx(low, abs=0.1)
     assert elevation.max() == pytest.approx(high, abs=0.1)
-    rows = {"vlp16": 16, "os64": 64}.get(name)
+    rows = {"vlp16": 16, "os64": 64, "os64-2048": 64}.get(name)
     assert rows is None or len(np.unique(elevation.round(6))) == rows
 
 
