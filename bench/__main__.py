@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.rows import Row
-from bench.running import run
+from bench.running import counted, run
 from bench.suite import OWN, SUITE, Entry
 from bench.tables import line, rule
 
@@ -63,7 +63,7 @@ def _measure(entries: Sequence[Entry], threads: int | None, quick: bool) -> list
     rows: list[Row] = []
     for entry in entries:
         for count in _thread_counts(entry, threads):
-            progress = _Progress(entry.name if count is None else f"{entry.name}, {count} threads")
+            progress = _Progress(entry.name if count is None else f"{entry.name}, {counted(count)}")
             for row in run(entry, count, quick, progress):
                 progress.clear()
                 rows.append(row)

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from bench.engine import folder
 from bench.peers.contest import contest
 from bench.peers.places import WORLDS
 from bench.peers.roster import PEERS
@@ -51,9 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.peers", description=__doc__)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every answer of every peer")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} places a world instead of {PLACES}")
-    parser.add_argument(
-        "--worlds", type=Path, default=Path("out/worlds"), help="keeps the worlds (out/worlds)"
-    )
+    parser.add_argument("--worlds", type=Path, default=folder(), help=f"keeps the worlds ({folder()})")
     parser.add_argument("--only", nargs="+", metavar="PEER", help="these peers only, as the table names them")
     parser.add_argument(
         "--limit", type=float, default=LIMIT_S, metavar="S", help=f"per world and peer ({LIMIT_S:g} s)"

@@ -3,7 +3,7 @@
 * As in the product: the search gets the keyframes of the drive one after the other and gives a pose once three of
   them have confirmed it (``LocalizerConfig()``); the time is that of all keyframes until then.
 * One scan: the same search with ``stationary=True``, from one submap, which has to stand alone.
-* Tracking: registration at the scales that the tracker uses.
+* Tracking: registration at the scales that the tracker uses, then its verification, which is in the time, too.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from bench.peers.places import Place
 from bench.peers.start import started
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry import transform
+from coview_stream.geometry import inverse, transform
 from coview_stream.pose.registration import LocalMaps, register
 from coview_stream.pose.source import local_source
+from coview_stream.pose.verification import verify
 from coview_stream.search import GlobalSearch, Query
+from coview_stream.tracking import kept
 
 
 class Keyframes:
@@ -62,12 +64,13 @@ class OneScan(Keyframes):
 
 
 class Tracking:
-    """Registration from a pose nearby."""
+    """Registration from a pose nearby, believed if it passes the check that every registration must pass."""
 
     def __init__(self, site: BaseMap) -> None:
         import coview_kernels
 
         coview_kernels.warm_up()
+        self._site = site
         self._config = LocalizerConfig().registration
         self._maps = LocalMaps(site, self._config.source_range)
 
@@ -79,4 +82,10 @@ class Tracking:
         if target is None:
             return Answer(None, False)
         found = register(source, start, target, self._config, self._config.track, centre=np.zeros(3))
-        return Answer(None, False) if found is None else Answer(found.T_map_source, found.converged)
+        if found is None:
+            return Answer(None, False)
+        T, newest = found.T_map_source, place.queries[-1]
+        surveyed = self._site.surveyed(transform(T, source.points)[:, :2])
+        T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
+        evidence = verify(source, T, newest.seen, T_map_body, target, surveyed)
+        return Answer(T, kept(evidence, LocalizerConfig().acceptance), evidence.score)

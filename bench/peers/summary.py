@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.engine import folder as worlds_folder
 from bench.peers.contest import contest
 from bench.peers.roster import OUR_TRACKING, OURS, PEERS
 from bench.peers.trial import Trial
@@ -21,9 +22,9 @@ _PLACES, _QUICK = 10, 3
 _LIMIT_S = 30.0
 
 
-def rows(quick: bool = False, folder: Path = Path("out/worlds")) -> Iterator[Row]:
+def rows(quick: bool = False, folder: Path | None = None) -> Iterator[Row]:
     """Compare ours with every peer: share of right poses, time of a query, false accepts."""
-    trials = list(contest(folder, _QUICK if quick else _PLACES, _LIMIT_S))
+    trials = list(contest(folder or worlds_folder(), _QUICK if quick else _PLACES, _LIMIT_S))
     by_name = {peer.name: [t for t in trials if t.peer == peer.name] for peer in PEERS}
     for peer in PEERS:
         reference = by_name[OUR_TRACKING if peer.tracking else OURS]

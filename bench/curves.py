@@ -1,0 +1,86 @@
+"""What the plots of the performance page show: milliseconds over candidates, points and robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bench.engine import folder, frames_of
+from bench.peers.places import base_map, world
+from bench.rows import medians
+
+PERIOD_MS = 100.0
+"""Between the frames of a robot, at 10 Hz."""
+
+_SEARCH_FRAMES = 400  # at most, until a robot is tracked
+_ROUNDS = 61
+
+
+@dataclass
+class Curves:
+    """Milliseconds by name, at each ``x``; ``limit`` is a line that says how much is allowed."""
+
+    title: str
+    axis: str
+    x: Sequence[int]
+    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+    limit: tuple[float, str] | None = None
+
+
+def robots(quick: bool = False) -> Curves:
+    """One round of frames, one of each robot in turn, of robots that share a map and its crops in one process."""
+    counts = (1, 2) if quick else (1, 2, 4, 8, 16)
+    out = Curves("Tracking several robots on one map", "robots in one process", counts)
+    out.limit = (PERIOD_MS, "period of 10 Hz")
+    scene = "town"
+    there = world(folder(), scene)
+    fleet = _fleet(there, scene, max(counts))
+    median, worst = [], []
+    for count in counts:
+        rounds = np.array([_round(fleet[:count]) for _ in range(11 if quick else _ROUNDS)])
+        median.append(float(np.median(rounds)))
+        worst.append(float(np.percentile(rounds, 95)))
+    out.milliseconds = {"a round of frames, median": median, "95th percentile": worst}
+    return out
+
+
+class _Robot:
+    """A tracked robot, which drives a run to and fro."""
+
+    def __init__(self, localizer: Any, frames: list[Any], start: int) -> None:
+        self._localizer = localizer
+        self._frames = frames
+        self._order = [index for index, _ in frames_of(frames, 2 * len(frames) - 2)]
+        self._tick = start
+
+    def step(self) -> bool:
+        """Take in the next frame; tell whether the robot is tracked."""
+        index = self._order[self._tick % len(self._order)]
+        self._tick += 1
+        frame = self._frames[index]
+        fix = self._localizer.step(frame.points, frame.T_odom_body, self._tick * PERIOD_MS / 1e3)
+        return fix.T_map_body is not None
+
+
+def _fleet(there: Any, scene: str, count: int) -> list[_Robot]:
+    """Robots that have found their places along one run, far from each other."""
+    from coview_stream import Localizer, LocalizerConfig
+    from coview_stream.clouds import open_run
+    from coview_stream.pose.registration import LocalMaps
+
+    site, run = base_map(folder(), scene), open_run(there / "run")
+    frames = [run.read(index) for index in range(len(run))]
+    config = LocalizerConfig()
+    crops = LocalMaps(site, config.registration.source_range)
+    fleet = [_Robot(Localizer(site, config, crops), frames, k * len(frames) // count) for k in range(count)]
+    for robot in fleet:
+        if not any(robot.step() for _ in range(_SEARCH_FRAMES)):
+            raise RuntimeError("a robot has not found its place; the plot would show searches")
+    return fleet
+
+
+def _round(fleet: list[_Robot]) -> float:
+    return medians(lambda: [robot.step() for robot in fleet], repeat=1, warm_up=0)[0]
