@@ -117,6 +117,8 @@ class Localizer:
             due = self._tracker.due(patience) or self._doubts > 0
             if due or stamp - self._registered >= patience * self.config.tracking.seconds:
                 self._track(cloud, T_odom_body, stamp, idle=not due)
+            else:
+                self._tracker.look_around(T_odom_body)
         elif keyframe is not None:
             scan = self.base_map.descriptor_config
             return Query.of(self._buffer, keyframe, cloud, scan, self._tracker.travelled, self._generation)

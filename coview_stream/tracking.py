@@ -91,6 +91,12 @@ class Tracker:
         settings = self.config.tracking
         return driven >= patience * settings.distance or turned >= patience * settings.turn
 
+    def look_around(self, T_odom_body: Pose) -> None:
+        """Crop the map here already, on a frame that registers nothing: a new crop takes as long as a registration."""
+        position = transform(self.T_map_odom, T_odom_body[None, :3, 3])[0]
+        if (target := self.local_maps.around(position)) is not None:
+            target.prepare()
+
     def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False) -> Evidence | None:
         """Register the recent points from the predicted pose; None where the map offers nothing to register to.
 

@@ -124,6 +124,17 @@ def test_a_doubtful_registration_is_not_believed(world_map, world_drive, rule):
     assert not tracker.due()
 
 
+def test_the_map_is_cropped_before_it_is_needed(world_map, world_drive, monkeypatch):
+    """On a frame that registers nothing: both together would take too long."""
+    tracker, cloud = tracker_of(world_map), world_drive.clouds[4]
+    T = inverse(T_MAP_ODOM) @ world_drive.T_map_body[4]
+    tracker.look_around(T)
+    monkeypatch.setattr(type(world_map), "crop", None)
+    monkeypatch.setattr("coview_stream.pose.registration.edge_raster", None)
+    tracker.observe(cloud, T)
+    assert tracker.update(cloud, T).score > 0.8
+
+
 def test_garbage_does_not_move_the_pose(world_map, world_drive):
     tracker, T_start, evidence, _ = updated(world_map, world_drive, cloud=garbage())
     assert evidence.score < AcceptanceConfig().keep_score

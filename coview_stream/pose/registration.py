@@ -42,6 +42,11 @@ class LocalMap:
         """The points, to be searched by :func:`coview_kernels.nearest`."""
         return kernels.PointGrid(self.points)
 
+    def prepare(self) -> None:
+        """Make now what is made when asked for."""
+        kernels.nearest(self.grid, self.points[:1], 1.0)  # which sorts them
+        _ = self.edges
+
     @cached_property
     def edges(self) -> EdgeRaster:
         """Where the map must have walls that it does not show."""
