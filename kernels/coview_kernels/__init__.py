@@ -10,8 +10,9 @@ from __future__ import annotations
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview, visible
 from coview_kernels.icp import Alignment, Belief, align_planes
+from coview_kernels.intake import FrameIntake, Intake
 from coview_kernels.nearest import PointGrid, nearest
-from coview_kernels.polar import polar_bin, station_bins
+from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit, warm_up
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
 from coview_kernels.trimmed_icp import normal_equations, trim
@@ -20,6 +21,8 @@ from coview_kernels.voxel import transform_unique
 __all__ = [
     "Alignment",
     "Belief",
+    "FrameIntake",
+    "Intake",
     "PointGrid",
     "PolarGrid",
     "align_planes",
@@ -27,6 +30,7 @@ __all__ = [
     "backend",
     "column_spectra",
     "coview",
+    "describe_points",
     "nearest",
     "normal_equations",
     "polar_bin",

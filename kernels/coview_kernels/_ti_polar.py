@@ -1,82 +1,153 @@
 # mypy: ignore-errors
 """Taichi source of polar.py. Every chunk of points has bins of its own: atomics on shared ones are slower."""
 
-from coview_kernels import runtime
+from coview_kernels import launch, runtime
 
 ti = runtime.library()
+
+Floats = ti.types.ndarray(ti.f32, 1)
+Doubles = ti.types.ndarray(ti.f64, 1)
+Integers = ti.types.ndarray(ti.i32, 1)
+SPAN = launch.SPAN
+covisible = runtime.kernels("covisibility").covisible
 
 LOWEST = -3.4028235e38
 
 
-@ti.kernel
-def polar_bin(
-    points: ti.types.ndarray(ti.f32, 2),
-    cx: ti.f64,
-    cy: ti.f64,
-    cz: ti.f64,
+@ti.func
+def add_point(
+    px: ti.f64,
+    py: ti.f64,
+    pz: ti.f64,
+    first: ti.i32,
     rings: ti.i32,
     sectors: ti.i32,
-    per_metre: ti.f32,
-    edges: ti.types.ndarray(ti.f64, 1),
-    guesses: ti.types.ndarray(ti.i32, 2),
-    bins: ti.types.ndarray(ti.f64, 3),
+    params: ti.template(),
+    edges: ti.template(),
+    guesses: ti.template(),
+    bins: ti.template(),
 ):
-    """Leave in bins, by chunk and bin: greatest height, sum of heights, count; in its last row the dropped.
+    """Add a point to the chunk's bins, which begin at ``first``: greatest height, sum of heights, count.
 
-    ``edges``: the R + 1 squared ring edges, then the S + 1 rays as x, y. Few and packed arrays: passing one
-    costs 10 us, as much as 600 points.
+    ``params``: centre x, y, z, rings per metre, steps of the guesses. ``edges``: the R + 1 squared ring edges,
+    then the S + 1 rays as x, y.
     """
-    chunks = bins.shape[0]
-    steps = guesses.shape[1] - 1
-    r2_max = edges[rings]
-    n = points.shape[0]
-    step = (n + chunks - 1) // chunks
-    ti.loop_config(block_dim=1)
-    for c in range(chunks):
-        for b in range(rings * sectors):
-            bins[c, b, 0] = LOWEST
-        bad = 0
-        for i in range(ti.min(n, c * step), ti.min(n, (c + 1) * step)):
-            px = ti.cast(points[i, 0], ti.f64)
-            py = ti.cast(points[i, 1], ti.f64)
-            pz = ti.cast(points[i, 2], ti.f64)
-            # NaN and inf stay in the sum, whose bits show them; three float32 do not overflow a float64
-            if ((ti.bit_cast(px + py + pz, ti.i64) >> 52) & 0x7FF) == 0x7FF:
-                bad += 1
-                continue
-            dx = ti.cast(px - cx, ti.f32)
-            dy = ti.cast(py - cy, ti.f32)
-            x = ti.cast(dx, ti.f64)
-            y = ti.cast(dy, ti.f64)
-            r2 = x * x + y * y
-            if r2 >= r2_max:
-                continue
-            # both guesses are off by one at most; comparing with the edges, as in sectors.py, sets them right
-            ring = ti.min(ti.cast(ti.sqrt(ti.cast(r2, ti.f32)) * per_metre, ti.i32), rings - 1)
-            if r2 < edges[ring]:
-                ring -= 1
-            elif r2 >= edges[ring + 1]:
-                ring += 1
-            ax = ti.abs(dx)
-            ay = ti.abs(dy)
-            octant = ti.cast(ay > ax, ti.i32) + 2 * ti.cast(dx < 0, ti.i32) + 4 * ti.cast(dy < 0, ti.i32)
-            ratio = ti.min(ax, ay) / ti.max(ti.max(ax, ay), 1e-30)
-            s = guesses[octant, ti.cast(ratio * steps, ti.i32)]
-            ray = rings + 1 + 2 * s
-            lx = edges[ray]
-            ly = edges[ray + 1]
-            ux = edges[ray + 2]
-            uy = edges[ray + 3]
-            if lx * y < ly * x and lx * x + ly * y > 0:
-                s = ti.select(s == 0, sectors - 1, s - 1)
-            elif ux * y >= uy * x and ux * x + uy * y > 0:
-                s = ti.select(s == sectors - 1, 0, s + 1)
-            b = ring * sectors + s
-            h = ti.cast(ti.cast(pz - cz, ti.f32), ti.f64)
-            bins[c, b, 0] = ti.max(bins[c, b, 0], h)
-            bins[c, b, 1] += h
-            bins[c, b, 2] += 1.0
-        bins[c, rings * sectors, 0] = ti.cast(bad, ti.f64)
+    dx = ti.cast(px - params[0], ti.f32)
+    dy = ti.cast(py - params[1], ti.f32)
+    x = ti.cast(dx, ti.f64)
+    y = ti.cast(dy, ti.f64)
+    r2 = x * x + y * y
+    if r2 < edges[rings]:
+        # both guesses are off by one at most; comparing with the edges, as in sectors.py, sets them right
+        ring = ti.cast(ti.sqrt(ti.cast(r2, ti.f32)) * ti.cast(params[3], ti.f32), ti.i32)
+        ring = ti.min(ring, rings - 1)
+        if r2 < edges[ring]:
+            ring -= 1
+        elif r2 >= edges[ring + 1]:
+            ring += 1
+        ax = ti.abs(dx)
+        ay = ti.abs(dy)
+        octant = ti.cast(ay > ax, ti.i32) + 2 * ti.cast(dx < 0, ti.i32) + 4 * ti.cast(dy < 0, ti.i32)
+        ratio = ti.min(ax, ay) / ti.max(ti.max(ax, ay), 1e-30)
+        steps = ti.cast(params[4], ti.i32)
+        s = guesses[octant * (steps + 1) + ti.cast(ratio * steps, ti.i32)]
+        ray = rings + 1 + 2 * s
+        lx = edges[ray]
+        ly = edges[ray + 1]
+        ux = edges[ray + 2]
+        uy = edges[ray + 3]
+        if lx * y < ly * x and lx * x + ly * y > 0:
+            s = ti.select(s == 0, sectors - 1, s - 1)
+        elif ux * y >= uy * x and ux * x + uy * y > 0:
+            s = ti.select(s == sectors - 1, 0, s + 1)
+        b = first + 3 * (ring * sectors + s)
+        h = ti.cast(ti.cast(pz - params[2], ti.f32), ti.f64)
+        bins[b] = ti.max(bins[b], h)
+        bins[b + 1] += h
+        bins[b + 2] += 1.0
+
+
+@ti.func
+def clear_bins(first: ti.i32, size: ti.i32, bins: ti.template()):
+    """Empty a chunk's bins."""
+    for b in range(size):
+        bins[first + 3 * b] = LOWEST
+        bins[first + 3 * b + 1] = 0.0
+        bins[first + 3 * b + 2] = 0.0
+
+
+@ti.func
+def merge_bins(
+    chunks: ti.i32,
+    size: ti.i32,
+    bins: ti.template(),
+    highest: ti.template(),
+    total: ti.template(),
+    count: ti.template(),
+):
+    """Join the chunks' bins."""
+    for b in range(size):
+        top = bins[3 * b]
+        height = bins[3 * b + 1]
+        number = bins[3 * b + 2]
+        for c in range(1, chunks):
+            other = 3 * (c * size + b)
+            top = ti.max(top, bins[other])
+            height += bins[other + 1]
+            number += bins[other + 2]
+        highest[b] = ti.select(number > 0, ti.cast(top, ti.f32), ti.cast(0.0, ti.f32))
+        total[b] = ti.cast(height, ti.f32)
+        count[b] = ti.cast(number, ti.i32)
+
+
+@ti.kernel
+def describe(
+    points: Floats,
+    rows: ti.i32,
+    chunks: ti.i32,
+    rings: ti.i32,
+    sectors: ti.i32,
+    params: Doubles,
+    edges: Doubles,
+    guesses: Integers,
+    bins: Doubles,
+    dropped: Integers,
+    highest: Floats,
+    total: Floats,
+    count: Integers,
+    value: Floats,
+):
+    """Polar bins of ``rows`` points and what is co-visible.
+
+    ``params`` goes on with vertical, hide, scale and eye of :func:`covisible`; hide < 0: leave ``value`` alone.
+    All arrays are flat: an index into more axes costs a read of the shape and a product each time.
+    """
+    size = rings * sectors
+    for q in range(chunks * SPAN):
+        if q % SPAN == 0:
+            c = q // SPAN
+            step = (rows + chunks - 1) // chunks
+            clear_bins(3 * c * size, size, bins)
+            bad = 0
+            for i in range(ti.min(rows, c * step), ti.min(rows, (c + 1) * step)):
+                x = ti.cast(points[3 * i], ti.f64)
+                y = ti.cast(points[3 * i + 1], ti.f64)
+                z = ti.cast(points[3 * i + 2], ti.f64)
+                # NaN and inf stay in the sum, whose bits show them; three float32 do not overflow a float64
+                if ((ti.bit_cast(x + y + z, ti.i64) >> 52) & 0x7FF) == 0x7FF:
+                    bad += 1
+                else:
+                    add_point(x, y, z, 3 * c * size, rings, sectors, params, edges, guesses, bins)
+            dropped[c] = bad
+
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        merge_bins(chunks, size, bins, highest, total, count)
+        vertical = ti.cast(params[5], ti.i32)
+        hide = ti.cast(params[6], ti.i32)
+        scale = ti.cast(params[7], ti.i32)
+        if hide >= 0:
+            covisible(0, rings, sectors, vertical, hide, scale, params[8], highest, total, count, value)
 
 
 @ti.kernel

@@ -58,3 +58,11 @@ def same_shape(name: str, array: npt.NDArray[Any], other: str, shape: tuple[int,
     """Raise ValueError unless ``array`` has ``shape``, which is that of ``other``."""
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, but {other} has {shape}")
+
+
+def visibility(vertical: str, mode: str, eye: float) -> None:
+    """Raise ValueError unless the options of co-visibility are known and ``eye`` is finite."""
+    one_of("vertical", vertical, ("max", "mean", "off"))
+    one_of("mode", mode, ("paper", "eye", "off"))
+    if not math.isfinite(eye):
+        raise ValueError(f"eye must be finite, got {eye}")

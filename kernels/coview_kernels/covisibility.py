@@ -13,9 +13,7 @@ import numpy.typing as npt
 
 from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, I32, Mask, Mode, Vertical
-
-_MODES = ("paper", "eye", "off")
-_VERTICALS = ("max", "mean", "off")
+from coview_kernels.launch import Launch
 
 
 def visible(max_height: npt.ArrayLike, count: npt.ArrayLike, mode: Mode, eye: float = 1.5) -> Mask:
@@ -42,7 +40,7 @@ def visible(max_height: npt.ArrayLike, count: npt.ArrayLike, mode: Mode, eye: fl
             finite.
     """
     height, points = _grids(max_height, count)
-    _check_mode(mode, eye)
+    check.visibility("max", mode, eye)
     return reference.visible(height, points, mode, eye)
 
 
@@ -80,28 +78,27 @@ def coview(
     height, points = _grids(max_height, count)
     total = np.ascontiguousarray(sum_height, dtype=np.float32)
     check.same_shape("sum_height", total, "max_height", height.shape)
-    check.one_of("vertical", vertical, _VERTICALS)
-    _check_mode(mode, eye)
+    check.visibility(vertical, mode, eye)
     return runtime.dispatch(_coview, reference.coview, height, total, points, vertical, mode, eye)
 
 
 def _coview(max_height: F32, sum_height: F32, count: I32, vertical: Vertical, mode: Mode, eye: float) -> F32:
     value = np.empty_like(max_height)
-    runtime.kernels("covisibility").coview(
-        *(_flat(max_height), _flat(sum_height), _flat(count)),
-        *(("off", "max", "mean").index(vertical), int(mode != "off"), *_slope(mode, eye), _flat(value)),
-    )
+    rings, sectors = max_height.shape[-2:]
+    grids = math.prod(max_height.shape[:-2])
+    # most launches are of one grid: threads cost more than its 10 us
+    Launch(
+        *("covisibility", "coview", grids, min(runtime.workers(), max(1, grids // 8)), rings, sectors),
+        *encoded(vertical, mode, eye),
+        *(a.reshape(-1) for a in (max_height, sum_height, count, value)),
+    )()
     return value
 
 
-def _flat(grids: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """View of the grids as (M, R, S)."""
-    return grids.reshape(math.prod(grids.shape[:-2]), *grids.shape[-2:])
-
-
-def _slope(mode: Mode, eye: float) -> tuple[int, float]:
-    """Factor of the ring number and height of the eye; see the comment in the reference."""
-    return (2, float(np.float32(eye))) if mode == "eye" else (1, 0.0)
+def encoded(vertical: Vertical, mode: Mode, eye: float) -> tuple[int, int, int, float]:
+    """How the kernels are told: vertical, hide, and the scale and eye of the slopes, see the reference."""
+    scale, zero = (2, float(np.float32(eye))) if mode == "eye" else (1, 0.0)
+    return ("off", "max", "mean").index(vertical), int(mode != "off"), scale, zero
 
 
 def _grids(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
@@ -111,9 +108,3 @@ def _grids(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
         raise ValueError(f"max_height has shape {np.shape(max_height)}, expected (..., rings, sectors)")
     check.same_shape("count", points, "max_height", height.shape)
     return height, points
-
-
-def _check_mode(mode: str, eye: float) -> None:
-    check.one_of("mode", mode, _MODES)
-    if not math.isfinite(eye):
-        raise ValueError(f"eye must be finite, got {eye}")

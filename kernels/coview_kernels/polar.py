@@ -9,11 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import check, reference, runtime
-from coview_kernels.arrays import F32, F64, I32, PolarGrid
+from coview_kernels.arrays import F32, F64, I32, Mode, PolarGrid, Vertical
+from coview_kernels.covisibility import encoded
+from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table
 from coview_kernels.sectors import ring_edges2, sector_edges, sector_guesses
 
-_MAX_SECTORS = 3000  # beyond, a guess from the table may be off by more than one sector
+MAX_SECTORS = 3000  # beyond, a guess from the table may be off by more than one sector
+_POINTS_PER_CHUNK = 4096  # fewer are done before another thread is awake
+_NOTHING: F32 = np.empty(0, dtype=np.float32)
 
 
 def polar_bin(
@@ -43,30 +47,106 @@ def polar_bin(
     cloud = check.float32("points", points, None, 3)
     origin = check.finite64("centre", centre, 3)
     check.grid_size(rings, sectors, r_max)
-    native = _polar_bin if sectors <= _MAX_SECTORS else reference.polar_bin
+    native = _polar_bin if sectors <= MAX_SECTORS else reference.polar_bin
     return runtime.dispatch(native, reference.polar_bin, cloud, origin, rings, sectors, float(r_max))
 
 
 def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
-    bins = np.zeros((runtime.workers(), rings * sectors + 1, 3))
-    runtime.kernels("polar").polar_bin(
-        *(points, *centre.tolist(), rings, sectors, rings / r_max),
-        *(_packed_edges(rings, sectors, r_max), sector_guesses(sectors), bins),
-    )
-    highest, (_, total, number) = bins[:, :-1, 0].max(axis=0), bins[:, :-1].sum(axis=0).T
-    shape = (rings, sectors)
-    with np.errstate(over="ignore"):  # a sum of absurd heights may be infinite
-        grid = PolarGrid(
-            np.where(number > 0, highest, 0.0).astype(np.float32).reshape(shape),
-            total.astype(np.float32).reshape(shape),
-            number.astype(np.int32).reshape(shape),
+    grid, _, dropped = _bins(rings, sectors, r_max)(points, centre, None)
+    return grid, dropped
+
+
+def describe_points(
+    points: npt.ArrayLike,
+    centre: npt.ArrayLike,
+    rings: int,
+    sectors: int,
+    r_max: float,
+    vertical: Vertical = "max",
+    mode: Mode = "paper",
+    eye: float = 1.5,
+) -> tuple[PolarGrid, F32, int]:
+    """:func:`polar_bin` and :func:`coview` of its grid in one go, to the bit.
+
+    Returns:
+        The grid, (R, S) each; the co-view context (R, S) float32, metres; the number of rows dropped because
+        they hold NaN or inf.
+
+    Raises:
+        ValueError: a shape, a number or an option is out of its range.
+    """
+    cloud = check.float32("points", points, None, 3)
+    origin = check.finite64("centre", centre, 3)
+    check.grid_size(rings, sectors, r_max)
+    check.visibility(vertical, mode, eye)
+    native = _describe_points if sectors <= MAX_SECTORS else reference.describe_points
+    plain, radius = reference.describe_points, float(r_max)
+    return runtime.dispatch(native, plain, cloud, origin, rings, sectors, radius, vertical, mode, eye)
+
+
+def _describe_points(
+    points: F32,
+    centre: F64,
+    rings: int,
+    sectors: int,
+    r_max: float,
+    vertical: Vertical,
+    mode: Mode,
+    eye: float,
+) -> tuple[PolarGrid, F32, int]:
+    return _bins(rings, sectors, r_max)(points, centre, encoded(vertical, mode, eye))
+
+
+class PolarBins:
+    """Bins, edges and results that stay from call to call; for the owner thread only."""
+
+    def __init__(self, rings: int, sectors: int, r_max: float, chunks: int) -> None:
+        size = rings * sectors
+        self.sizes = rings, sectors
+        self.edges = np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
+        steps = min(1024, max(256, 1 << sectors.bit_length()))  # few, to stay in the nearest cache
+        self.guesses = sector_guesses(sectors, steps).ravel()
+        self.params = np.zeros(9)
+        self.params[3:5] = rings / r_max, steps
+        self.bins = np.empty(3 * size * chunks)
+        self.dropped = np.zeros(chunks, dtype=np.int32)
+        self.highest, self.total, self.value = (np.empty(size, dtype=np.float32) for _ in range(3))
+        self.count = np.empty(size, dtype=np.int32)
+        self.grid = PolarGrid(
+            self.highest.reshape(self.sizes), self.total.reshape(self.sizes), self.count.reshape(self.sizes)
         )
-    return grid, int(bins[:, -1, 0].sum())
 
 
-@lru_cache(maxsize=64)
-def _packed_edges(rings: int, sectors: int, r_max: float) -> F64:
-    return np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
+class _Describer(PolarBins):
+    """Describes points in one launch."""
+
+    def __init__(self, rings: int, sectors: int, r_max: float) -> None:
+        self._chunks = runtime.workers()
+        super().__init__(rings, sectors, r_max, self._chunks)
+        self._launch = Launch(
+            *("polar", "describe", _NOTHING, 0, 1, rings, sectors),
+            *(self.params, self.edges, self.guesses, self.bins, self.dropped),
+            *(self.highest, self.total, self.count, self.value),
+        )
+
+    def __call__(
+        self, points: F32, centre: F64, visibility: tuple[int, int, int, float] | None
+    ) -> tuple[PolarGrid, F32, int]:
+        chunks = min(self._chunks, 1 + len(points) // _POINTS_PER_CHUNK)
+        self.params[:3] = centre
+        self.params[5:] = visibility or (0, -1, 0, 0.0)
+        for index, value in enumerate((points.reshape(-1), len(points), chunks)):
+            self._launch.put(index, value)
+        self._launch()
+        self._launch.put(0, _NOTHING)  # keeps no cloud alive
+        top, total, count = self.grid
+        grid = PolarGrid(top.copy(), total.copy(), count.copy())
+        return grid, self.value.reshape(self.sizes).copy(), int(self.dropped[:chunks].sum())
+
+
+@lru_cache(maxsize=8)
+def _bins(rings: int, sectors: int, r_max: float) -> _Describer:
+    return _Describer(rings, sectors, r_max)
 
 
 def station_bins(

@@ -131,6 +131,11 @@ def library() -> Any:
     return _owner.library
 
 
+def program() -> Any:
+    """Return the initialised program of :func:`library`; whatever was compiled for another one is void."""
+    return _program(library())
+
+
 def kernels(name: str) -> Any:
     """Return the module ``_ti_<name>``, imported at first use; call on the owner thread."""
     return importlib.import_module(f"coview_kernels._ti_{name}")
@@ -234,6 +239,7 @@ def warm_up() -> None:
     cloud = np.ones((2, 3), dtype=np.float32)
     eye, origin = np.eye(4), np.zeros(3)
     api.transform_unique(cloud, eye, 1.0)
+    api.FrameIntake(1.0)(cloud, eye)
     api.nearest(api.PointGrid(cloud), cloud, 1.0)
     api.align_planes(
         api.PointGrid(cloud),

@@ -9,13 +9,14 @@ from __future__ import annotations
 from coview_kernels.reference.covisibility import coview, visible
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
-from coview_kernels.reference.polar import polar_bin, station_bins
+from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
 from coview_kernels.reference.trimmed_icp import normal_equations
 from coview_kernels.reference.voxel import transform_unique
 
 __all__ = [
     "align_planes",
     "coview",
+    "describe_points",
     "nearest",
     "normal_equations",
     "polar_bin",

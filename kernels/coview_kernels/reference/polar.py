@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, I32, I64, PolarGrid
+from coview_kernels.arrays import F32, F64, I32, I64, Mode, PolarGrid, Vertical
+from coview_kernels.reference.covisibility import coview
 from coview_kernels.sectors import polar_index
 
 
@@ -29,6 +30,21 @@ def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) 
     shape = (rings, sectors)
     grid = PolarGrid(highest.reshape(shape), total.reshape(shape), count.reshape(shape))
     return grid, int(np.count_nonzero(~finite))
+
+
+def describe_points(
+    points: F32,
+    centre: F64,
+    rings: int,
+    sectors: int,
+    r_max: float,
+    vertical: Vertical = "max",
+    mode: Mode = "paper",
+    eye: float = 1.5,
+) -> tuple[PolarGrid, F32, int]:
+    """See :func:`coview_kernels.describe_points`."""
+    grid, dropped = polar_bin(points, centre, rings, sectors, r_max)
+    return grid, coview(*grid, vertical=vertical, mode=mode, eye=eye), dropped
 
 
 def cell_table(cell: float, rings: int, sectors: int, r_max: float) -> tuple[I64, I64, I64]:
