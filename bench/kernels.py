@@ -64,7 +64,7 @@ def _stations(rng: np.random.Generator) -> Iterator[Case]:
 
 
 def _neighbours(rng: np.random.Generator) -> Iterator[Case]:
-    """A street: ground and two walls, a point every quarter metre; the twin is SciPy's k-d tree, its queries alone."""
+    """Walk a street: ground, two walls, a point every quarter metre; the twin is SciPy's k-d tree, queries alone."""
     along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))
     flat = np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])
     walls = [
