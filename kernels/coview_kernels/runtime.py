@@ -103,6 +103,31 @@ def _init(library: Any) -> None:
         )
     finally:
         del misc.print
+    _hasten(library)
+
+
+def _hasten(library: Any) -> None:
+    """Have the compiler's front end write its notes on the source unwrapped.
+
+    Taichi makes one for every node of a kernel, for error messages, and breaks its lines at 80 columns: a third of the
+    time that a kernel takes to load from the cache, where nothing can be wrong any more.
+    """
+    try:
+        notes = importlib.import_module(f"{library.__name__}.lang.ast.ast_transformer_utils")
+    except ImportError:
+        return
+    if hasattr(notes, "TextWrapper"):
+        notes.TextWrapper = _Unwrapped
+
+
+class _Unwrapped:
+    """Stands for ``textwrap.TextWrapper`` where lines may be long."""
+
+    def __init__(self, **_: Any) -> None: ...
+
+    def wrap(self, text: str) -> list[str]:
+        """Return the line, or nothing for a blank one."""
+        return [text] if text.strip() else []
 
 
 def cores() -> int:
