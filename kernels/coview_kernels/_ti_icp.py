@@ -8,13 +8,13 @@ moves so far that most partners have to be searched for again, and the next laun
 
 from coview_kernels import runtime
 from coview_kernels._ti_nearest import walk
+from coview_kernels.launch import SPAN
 
 ti = runtime.library()
 
-POINTS = ti.types.ndarray(dtype=ti.types.vector(4, ti.f32), ndim=1)
-ROWS = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
-NORMALS = ti.types.ndarray(dtype=ti.types.vector(3, ti.f32), ndim=1)
-MEMORY = ti.types.ndarray(dtype=ti.types.vector(6, ti.f64), ndim=1)
+FLOATS = ti.types.ndarray(ti.f32, 1)
+DOUBLES = ti.types.ndarray(ti.f64, 1)
+WHOLES = ti.types.ndarray(ti.i32, 1)
 
 NONE = 1e300  # square metres: no partner within the radius
 SLACK = 1e-9  # metres: more than rounding adds to a bound
@@ -37,36 +37,41 @@ RUNNING, DONE, LOST = 0, 1, 2
 
 @ti.func
 def placed(T: ti.template(), p):
-    x, y, z = ti.cast(p[0], ti.f64), ti.cast(p[1], ti.f64), ti.cast(p[2], ti.f64)
+    x, y, z = p[0], p[1], p[2]
     return ti.Vector(
         [T[4 * d] * x + T[4 * d + 1] * y + T[4 * d + 2] * z + T[4 * d + 3] for d in ti.static(range(3))]
     )
 
 
 @ti.func
-def point_of(row):
-    return ti.Vector([ti.cast(ti.bit_cast(row[d], ti.f32), ti.f64) for d in ti.static(range(3))])
+def floats(array: ti.template(), at):
+    return ti.Vector([ti.cast(array[at + d], ti.f64) for d in ti.static(range(3))])
+
+
+@ti.func
+def point_of(rows: ti.template(), p):
+    return ti.Vector([ti.cast(ti.bit_cast(rows[4 * p + d], ti.f32), ti.f64) for d in ti.static(range(3))])
 
 
 @ti.func
 def pair(frame, starts: ti.template(), rows: ti.template(), at, i, radius, memory: ti.template()) -> ti.i32:
     """Bring the partner of point ``i``, now ``at``, up to date; return whether it had to be searched for."""
-    row = ti.cast(memory[i][ROW], ti.i32)
-    drift = (at - ti.Vector([memory[i][0], memory[i][1], memory[i][2]])).norm()
-    safe = ti.max(memory[i][SAFE] - drift - SLACK, 0.0)
+    row = ti.cast(memory[6 * i + ROW], ti.i32)
+    drift = (at - ti.Vector([memory[6 * i + 0], memory[6 * i + 1], memory[6 * i + 2]])).norm()
+    safe = ti.max(memory[6 * i + SAFE] - drift - SLACK, 0.0)
     near = ti.cast(NONE, ti.f64)
     if row >= 0:
-        near = (at - point_of(rows[row])).norm_sqr()
+        near = (at - point_of(rows, row)).norm_sqr()
     # by the triangle inequality no other point is nearer than safe: the partner stays, or there still is none
     searched = safe * safe < ti.min(near, radius * radius)
     if searched:
         limit = radius + MARGIN
         best, found, beyond = walk(frame, starts, rows, at[0], at[1], at[2], limit * limit, MARGIN)
         near = best if found >= 0 else NONE
-        memory[i][0], memory[i][1], memory[i][2] = at[0], at[1], at[2]
-        memory[i][SAFE] = ti.sqrt(beyond)
-        memory[i][ROW] = found
-    memory[i][NEAR] = near if near < radius * radius else NONE
+        memory[6 * i + 0], memory[6 * i + 1], memory[6 * i + 2] = at[0], at[1], at[2]
+        memory[6 * i + SAFE] = ti.sqrt(beyond)
+        memory[6 * i + ROW] = found
+    memory[6 * i + NEAR] = near if near < radius * radius else NONE
     return searched
 
 
@@ -81,10 +86,10 @@ def rank(keep, source: ti.template(), memory: ti.template(), ranks: ti.template(
         for kind in range(2):
             for b in range(bins):
                 ranks[kind, BINS + b] = 0
-        for i in range(source.shape[0]):
-            if memory[i][NEAR] < NONE:
-                key = ti.bit_cast(ti.cast(memory[i][NEAR], ti.f32), ti.i32)
-                kind = ti.cast(source[i][3], ti.i32)
+        for i in range(source.shape[0] // 4):
+            if memory[6 * i + NEAR] < NONE:
+                key = ti.bit_cast(ti.cast(memory[6 * i + NEAR], ti.f32), ti.i32)
+                kind = ti.cast(source[4 * i + 3], ti.i32)
                 if ti.static(level == 0):
                     ranks[kind, BINS + (key >> shift)] += 1
                 elif (key >> (shift + 10)) == ranks[kind, LAST]:
@@ -115,21 +120,20 @@ def add_up(
 ):  # fmt: skip
     """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs."""
     acc = ti.Vector.zero(ti.f64, 30)
-    n = source.shape[0]
+    n = source.shape[0] // 4
     last = ti.Vector([ranks[0, LAST], ranks[1, LAST]])
     share = ti.Vector(
         [ti.min(0.5 * n / ti.max(1, ranks[kind, KEPT]), MOST_SHARE) for kind in ti.static(range(2))]
     )
     for i in range(n):
-        near = memory[i][NEAR]
-        point = source[i]
-        above = point[3] > 0
+        near = memory[6 * i + NEAR]
+        above = source[4 * i + 3] > 0
         most = last[1] if above else last[0]
         if near < NONE and ti.bit_cast(ti.cast(near, ti.f32), ti.i32) <= most:
-            row = rows[ti.cast(memory[i][ROW], ti.i32)]
-            at = placed(T, point)
-            normal = ti.cast(normals[row[3]], ti.f64)
-            r = normal.dot(at - point_of(row))
+            row = ti.cast(memory[6 * i + ROW], ti.i32)
+            at = placed(T, floats(source, 4 * i))
+            normal = floats(normals, 3 * rows[4 * row + 3])
+            r = normal.dot(at - point_of(rows, row))
             ratio = r / width
             w = (share[1] if above else share[0]) / (1.0 + ratio * ratio)
             turn = (at - about).cross(normal)
@@ -234,34 +238,36 @@ def advance(about, settings: ti.template(), state: ti.template(), system: ti.tem
 
 @ti.kernel
 def align(
-    settings: ti.types.ndarray(ti.f64, 1),
-    starts: ti.types.ndarray(ti.i32, 1),
-    rows: ROWS,
-    normals: NORMALS,
-    source: POINTS,
-    memory: MEMORY,
+    settings: DOUBLES,
+    starts: WHOLES,
+    rows: WHOLES,
+    normals: FLOATS,
+    source: FLOATS,
+    memory: DOUBLES,
     ranks: ti.types.ndarray(ti.i32, 2),
     system: ti.types.ndarray(ti.f64, 2),
-    state: ti.types.ndarray(ti.f64, 1),
+    state: DOUBLES,
     chunks: ti.i32,
 ):
     """Iterate from the state's pose until the status says why it ended, or until searches should be spread again.
 
     With more than one chunk: only bring the partners up to date, which the iterations then begin with.
     """
-    n = source.shape[0]
+    n = source.shape[0] // 4
     each = (n + chunks - 1) // chunks
-    ti.loop_config(block_dim=1)
-    for c in range(chunks):
+    for q in range(chunks * SPAN):
+        c = q // SPAN
         frame = ti.Vector([settings[k] for k in ti.static(range(8))])
-        again = state[STATUS] == RUNNING
+        again = q % SPAN == 0 and state[STATUS] == RUNNING
         while again:
             T = ti.Vector([state[k] for k in ti.static(range(12))])
             scale = RADII + 2 * ti.cast(state[SCALE], ti.i32)
             searched = 0
             if state[PAIRED] == 0:
                 for i in range(ti.min(n, c * each), ti.min(n, (c + 1) * each)):
-                    searched += pair(frame, starts, rows, placed(T, source[i]), i, settings[scale], memory)
+                    searched += pair(
+                        frame, starts, rows, placed(T, floats(source, 4 * i)), i, settings[scale], memory
+                    )
             again = False
             if chunks == 1:
                 state[PAIRED] = 0

@@ -5,7 +5,9 @@ from coview_kernels import runtime
 
 ti = runtime.library()
 
-ROWS = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
+ROWS = ti.types.ndarray(
+    ti.i32, 1
+)  # flat: with four to a row, known here, an index costs no look at the shape
 
 SLACK = 1e-9  # metres, and of the distance: more than rounding moves a face between two cells
 FAR = 1e18  # metres, stands for no face
@@ -71,10 +73,9 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
                     begin = starts[column + cell_of((w - dz) * per_metre, nz)]
                     end = starts[column + cell_of((w + dz) * per_metre, nz) + 1]
                     for p in range(begin, end):
-                        row = rows[p]
-                        ex = x - ti.cast(ti.bit_cast(row[0], ti.f32), ti.f64)
-                        ey = y - ti.cast(ti.bit_cast(row[1], ti.f32), ti.f64)
-                        ez = z - ti.cast(ti.bit_cast(row[2], ti.f32), ti.f64)
+                        ex = x - ti.cast(ti.bit_cast(rows[4 * p], ti.f32), ti.f64)
+                        ey = y - ti.cast(ti.bit_cast(rows[4 * p + 1], ti.f32), ti.f64)
+                        ez = z - ti.cast(ti.bit_cast(rows[4 * p + 2], ti.f32), ti.f64)
                         d2 = ex * ex + ey * ey + ez * ez
                         if d2 < best:
                             # without a margin the nearest bounds the search, to the bit
@@ -131,7 +132,7 @@ def nearest(
         best, found, _ = walk(frame, starts, rows, x, y, z, radius * radius, 0.0)
         if found >= 0:
             answer[0, n] = ti.sqrt(best)
-            answer[1, n] = rows[found][3]
+            answer[1, n] = rows[4 * found + 3]
 
 
 @ti.kernel
@@ -164,5 +165,5 @@ def sort(
             place = starts[cell[n]] - 1
             starts[cell[n]] = place
             for d in ti.static(range(3)):
-                rows[place][d] = ti.bit_cast(points[n, d], ti.i32)
-            rows[place][3] = n
+                rows[4 * place + d] = ti.bit_cast(points[n, d], ti.i32)
+            rows[4 * place + 3] = n

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, F64, Mask
+from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
 from coview_kernels.reference.icp import Alignment, Plan
 
@@ -26,6 +27,7 @@ _BULK = 1500  # searches in one iteration that are worth another launch, to be s
 _CHUNKS = 4  # for each thread: points that must search far come in clusters
 _TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS, _PAIRED = 14, 15, 16, 17, 53, 83
 _LOST = 2
+_CHUNK_COUNT = 9  # which argument it is
 _BINS = 2048
 _UNKNOWN = (0.0, 0.0, 0.0, -1.0, -1.0, 0.0)
 
@@ -112,19 +114,24 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     cells, workers, n = grid.cells, runtime.workers(), len(source)
     points = np.empty((n, 4), dtype=np.float32)
     points[:, :3], points[:, 3] = source, kind
-    memory = np.empty((n, 6))
+    memory = np.empty((n, len(_UNKNOWN)))
     memory[:] = _UNKNOWN
     ranks = np.empty((2, 3 + _BINS), dtype=np.int32)
     system, state = np.empty((6, 7)), np.zeros(_PAIRED + 7)
     state[:12] = plan.T[:3].ravel()
     settings = _settings(cells.frame, plan, _BULK if workers > 1 else n + 1)
-    launch = runtime.kernels("icp").align
-    arrays = settings, cells.starts, cells.rows, normals, points, memory, ranks, system, state
+    launch = Launch(
+        "icp", "align",
+        settings, cells.starts, cells.rows, normals.reshape(-1), points.reshape(-1), memory.reshape(-1),
+        ranks, system, state, 1,
+    )  # fmt: skip
     while not state[_STATUS]:
         if workers > 1:
-            launch(*arrays, _CHUNKS * workers)
+            launch.put(_CHUNK_COUNT, _CHUNKS * workers)
+            launch()
+            launch.put(_CHUNK_COUNT, 1)
             state[_PAIRED] = 1
-        launch(*arrays, 1)
+        launch()
     if state[_STATUS] == _LOST or not np.isfinite(state[:12]).all():
         return None
     pose = np.eye(4)

@@ -35,7 +35,7 @@ class Cells(NamedTuple):
     starts: I32
     """(cells + 1,) first row in ``rows`` of each cell."""
     rows: I32
-    """(K, 4) the bits of x, y, z as float32 and the point's index in the cloud: one cache line for all."""
+    """(4 K,) row by row, the bits of x, y, z as float32 and the point's index in the cloud: one cache line for all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def _sorted(points: F32, edge: float) -> Cells:
     """Sort the points into cells, of a larger ``edge`` if there would be too many."""
     if not len(points):
         return Cells(
-            np.array([0.0, 0, 0, edge, 1 / edge, 1, 1, 1]), np.zeros(2, np.int32), np.empty((0, 4), np.int32)
+            np.array([0.0, 0, 0, edge, 1 / edge, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32)
         )
     # by columns: twenty times as fast as along the first axis
     low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
@@ -130,6 +130,6 @@ def _sorted(points: F32, edge: float) -> Cells:
     frame = np.array([*low, edge, 1.0 / edge, *shape])
     starts = np.zeros(int(shape.prod()) + 1, dtype=np.int32)
     cell = np.empty(len(points), dtype=np.int32)
-    rows = np.empty((len(points), 4), dtype=np.int32)
+    rows = np.empty(4 * len(points), dtype=np.int32)
     runtime.kernels("nearest").sort(points, frame, cell, starts, rows)
     return Cells(frame, starts, rows)
