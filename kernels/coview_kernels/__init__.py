@@ -11,6 +11,7 @@ from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview, visible
 from coview_kernels.icp import Alignment, Belief, align_planes
 from coview_kernels.intake import FrameIntake, Intake
+from coview_kernels.matching import MatchIndex, Nearest
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit, warm_up
@@ -23,6 +24,8 @@ __all__ = [
     "Belief",
     "FrameIntake",
     "Intake",
+    "MatchIndex",
+    "Nearest",
     "PointGrid",
     "PolarGrid",
     "align_planes",

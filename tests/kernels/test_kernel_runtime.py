@@ -37,6 +37,7 @@ def test_public_names():
     assert coview_kernels.__all__ == sorted(coview_kernels.__all__)
     assert set(coview_kernels.__all__) == {
         *("Alignment", "Belief", "align_planes"),
+        *("MatchIndex", "Nearest"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         "normal_equations",
         *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "trim", "unit_columns"),

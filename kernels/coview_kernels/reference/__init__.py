@@ -10,6 +10,7 @@ from coview_kernels.reference.covisibility import coview, visible
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
+from coview_kernels.reference.screen import screen
 from coview_kernels.reference.trimmed_icp import normal_equations
 from coview_kernels.reference.voxel import transform_unique
 
@@ -20,6 +21,7 @@ __all__ = [
     "nearest",
     "normal_equations",
     "polar_bin",
+    "screen",
     "station_bins",
     "transform_unique",
     "visible",

@@ -1,0 +1,148 @@
+"""The K stations nearest to a query (eqs 7-9), exactly, without computing every distance.
+
+Bounds from one byte per number (:mod:`coview_kernels.screen`) leave a few stations; those are scored in
+float64 from their descriptors. The answer is that of the exhaustive search:
+
+* the distances are those of :func:`coview_kernels.all_shift_distance` within 1e-6 (that is float32);
+* distances are compared after rounding to 1e-9; of equal ones the lower station comes first, and of equal
+  shifts the lower one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import check
+from coview_kernels.arrays import C64, F32, F64, I64
+from coview_kernels.screen import MAX_SECTORS, Screen
+from coview_kernels.similarity import all_shift_distance, unit_columns
+
+_PORTION = 256  # stations scored at a time, best bounds first: what follows may drop out meanwhile
+_MANY = 16  # more than 1 / 16 of the stations left: all distances at once are cheaper, if there are spectra
+_ROUNDED = 2e-9
+_FLOAT = 2e-5  # all_shift_distance is float32
+
+
+class Nearest(NamedTuple):
+    """The nearest stations, nearest first.
+
+    Attributes:
+        station: (k,) int64 index.
+        shift: (k,) int64, the station's best shift n: yaw -2 pi n / S.
+        distance: (k,) float32 in [0, 2].
+    """
+
+    station: I64
+    shift: I64
+    distance: F32
+
+
+class MatchIndex:
+    """What the search keeps of M stations: about 1.3 kB each at 20 x 60, beside the descriptors themselves.
+
+    Args:
+        descriptors: (M, R, S) of a floating type, finite; kept, not copied: a memory map stays one. S is at
+            most 63.
+
+    Raises:
+        ValueError: another shape, too many sectors, NaN or inf.
+    """
+
+    def __init__(self, descriptors: npt.NDArray[Any]) -> None:
+        if descriptors.ndim != 3 or not 1 <= descriptors.shape[2] <= MAX_SECTORS or not descriptors.shape[1]:
+            raise ValueError(
+                f"descriptors have shape {descriptors.shape}, expected (M, rings, 1 to {MAX_SECTORS} sectors)"
+            )
+        if not np.isfinite(descriptors.max(initial=0.0) - descriptors.min(initial=0.0)):
+            raise ValueError("descriptors hold NaN or inf")
+        self.descriptors = descriptors
+        self._screen = Screen(descriptors)
+
+    def __len__(self) -> int:
+        """Return the number of stations M."""
+        return len(self.descriptors)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the index adds to the descriptors."""
+        return self._screen.nbytes
+
+    def top_k(self, query: npt.ArrayLike, k: int, spectra: C64 | None = None) -> Nearest:
+        """Find the ``k`` nearest stations (all M, if there are fewer), each at its best shift.
+
+        Args:
+            query: (R, S) descriptor, finite.
+            k: at least 1.
+            spectra: of all stations, from :func:`coview_kernels.column_spectra`, if the caller has them:
+                the way out where bounds do not tell the stations apart (all alike, or noise).
+
+        Raises:
+            ValueError: shapes that do not fit, NaN or inf, or ``k`` below 1.
+        """
+        rings, sectors = self.descriptors.shape[1:]
+        values = check.float32("query", query, rings, sectors)
+        if not np.isfinite(values).all():
+            raise ValueError("query holds NaN or inf")
+        if k < 1:
+            raise ValueError(f"k must be at least 1, got {k}")
+        k = min(k, len(self))
+        unit = unit_columns(values)
+        if not unit.any():  # every distance is 1
+            return Nearest(np.arange(k), np.zeros(k, dtype=np.int64), np.ones(k, dtype=np.float32))
+        if k == 0:
+            return Nearest(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
+        bounds = self._screen.bounds(unit)
+        return self._nearest(
+            values, bounds.estimate - bounds.error, bounds.estimate + bounds.error, k, spectra
+        )
+
+    def _nearest(self, query: F32, low: F64, high: F64, k: int, spectra: C64 | None) -> Nearest:
+        """Score exactly whatever may be among the best; ``low`` and ``high`` (M,) bound the correlations."""
+        turned = _turned(query)
+        seeds = np.argpartition(low, -k)[-k:]
+        found, shift = self._scores(seeds, turned)
+        rest = np.flatnonzero(high >= found.min() - _ROUNDED)
+        rest = np.setdiff1d(rest, seeds, assume_unique=True)
+        if spectra is not None and len(rest) > len(self) // _MANY:
+            alike = 1.0 - all_shift_distance(query, spectra, query.shape[1]).min(axis=1)
+            rest = rest[alike[rest] >= found.min() - _FLOAT]
+            high = np.minimum(high, alike + _FLOAT)
+        rest = rest[np.argsort(-high[rest], kind="stable")]
+        station = seeds
+        for start in range(0, len(rest), _PORTION):
+            part = rest[start : start + _PORTION]
+            least = np.partition(found, -k)[-k]
+            part = part[high[part] >= least - _ROUNDED]
+            if not len(part):
+                break
+            scores, shifts = self._scores(part, turned)
+            station, found, shift = (
+                np.concatenate(pair) for pair in ((station, part), (found, scores), (shift, shifts))
+            )
+        order = np.lexsort((station, -found))[:k]
+        return Nearest(station[order], shift[order], (1.0 - found[order]).astype(np.float32))
+
+    def _scores(self, station: I64, turned: F64) -> tuple[F64, I64]:
+        """Best correlations (n,), rounded to 1e-9, and their shifts, from the descriptors, in float64."""
+        rows = _unit64(self.descriptors[station]).reshape(len(station), -1)
+        correlation = np.round(rows @ turned, 9)
+        shift = correlation.argmax(axis=1)
+        return correlation[np.arange(len(shift)), shift], shift
+
+
+def _unit64(descriptors: npt.NDArray[Any]) -> F64:
+    columns = descriptors.astype(np.float64)
+    norm = np.sqrt((columns * columns).sum(axis=-2))[..., None, :]
+    return columns / np.where(norm > 0, norm, 1.0)
+
+
+def _turned(query: F32) -> F64:
+    """(R S, S): the query's unit columns, column n turned by n sectors, over S."""
+    unit = _unit64(query) / query.shape[1]
+    twice = np.concatenate([unit, unit], axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(twice, query.shape[1], axis=1)  # (R, S + 1, S)
+    rings, sectors = query.shape
+    return np.ascontiguousarray(windows[:, :sectors].transpose(0, 2, 1)).reshape(rings * sectors, sectors)

@@ -1,0 +1,175 @@
+"""The pruned answer is the exhaustive one, on random and adversarial cases; bounds hold against float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import coview_kernels as ck
+from coview_kernels import reference, screen
+from coview_kernels.screen import Screen
+
+TOLERANCE = 1e-6
+SHAPES = ((4, 12), (3, 7), (20, 60), (5, 2), (2, 1), (7, 33))
+
+
+def correlations(query, descriptors):
+    """Eqs 7-9 in float64, (M, S): an oracle of its own, by Fourier transforms of whole columns."""
+
+    def unit(columns):
+        columns = np.asarray(columns, dtype=np.float64)
+        norm = np.sqrt((columns**2).sum(axis=-2, keepdims=True))
+        return np.divide(columns, norm, out=np.zeros_like(columns), where=norm > 0)
+
+    sectors = query.shape[1]
+    a, b = (np.fft.rfft(unit(x), axis=-1) for x in (query, descriptors))
+    return np.fft.irfft((a * b.conj()).sum(axis=-2), n=sectors, axis=-1) / sectors
+
+
+def agrees(found, query, descriptors, k):
+    """Distances rank by rank, each station's own distance at its shift, nobody better left out, ties by index."""
+    distance = 1.0 - correlations(query, descriptors)
+    best = distance.min(axis=1)
+    k = min(k, len(best))
+    assert found.station.shape == found.shift.shape == found.distance.shape == (k,)
+    assert len(set(found.station.tolist())) == k
+    np.testing.assert_allclose(found.distance, np.sort(best)[:k], atol=TOLERANCE)
+    np.testing.assert_allclose(distance[found.station, found.shift], found.distance, atol=TOLERANCE)
+    missing = np.setdiff1d(np.arange(len(best)), found.station)
+    assert not len(missing) or not k or best[missing].min() >= best[found.station].max() - 3e-9
+    same = np.diff(found.distance) == 0
+    exact = np.abs(np.diff(best[found.station])) < 1e-12
+    assert (np.diff(found.station)[same & exact] > 0).all()
+
+
+def scene(rng, kind, m, shape):
+    """Descriptors and a query of one kind of difficulty."""
+    rings, sectors = shape
+    desc = rng.uniform(0.2, 12, (m, rings, sectors)) * (rng.random((m, rings, sectors)) < 0.6)
+    query = rng.uniform(0.2, 12, (rings, sectors)) * (rng.random((rings, sectors)) < 0.6)
+    if kind == "zero columns":
+        desc *= rng.random((m, 1, sectors)) < 0.3
+        query *= rng.random((1, sectors)) < 0.5
+    elif kind == "empty":
+        desc[rng.random(m) < 0.5] = 0.0
+        query *= rng.random() < 0.7
+    elif kind == "duplicates":
+        desc = desc[rng.integers(0, max(1, m // 6), m)]
+        query = desc[0] if rng.random() < 0.5 else query
+    elif kind == "turned duplicates":
+        desc = np.stack([np.roll(desc[0], int(n), axis=1) for n in rng.integers(0, sectors, m)])
+    elif kind == "near ties":
+        desc = desc[:1] * (1 + 1e-3 * rng.standard_normal(desc.shape))
+        query = desc[0] if rng.random() < 0.5 else query
+    elif kind == "negative":
+        desc, query = rng.standard_normal(desc.shape), rng.standard_normal(query.shape)
+    elif kind == "tiny and huge":
+        desc *= 10.0 ** rng.integers(-6, 4, (m, 1, 1))
+        query *= 1e-30
+    elif kind == "one bin":
+        desc *= rng.random(desc.shape) < 1.5 / desc[0].size
+        query *= rng.random(query.shape) < 3.0 / query.size
+    elif kind == "outlier":
+        desc = np.abs(np.roll(query, 1, axis=1) + 0.1 * rng.standard_normal(desc.shape))
+        desc[-1] = rng.standard_normal(shape)
+    elif kind == "constant":
+        desc, query = np.ones_like(desc), np.ones_like(query)
+    return desc.astype(np.float16), query.astype(np.float32)
+
+
+KINDS = (
+    *("random", "zero columns", "empty", "duplicates", "turned duplicates", "near ties", "negative"),
+    *("tiny and huge", "one bin", "outlier", "constant"),
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_equals_the_exhaustive_answer(kind):
+    # 11 kinds x 6 shapes x (2 to 24 maps x 32 queries): more than 10,000 cases
+    rng = np.random.default_rng(KINDS.index(kind))
+    for shape in SHAPES:
+        for _ in range(4 if shape == (20, 60) else 8):
+            m = int(rng.integers(1, 60))
+            desc, query = scene(rng, kind, m, shape)
+            index = ck.MatchIndex(desc)
+            for turn in range(24):
+                asked = np.roll(query, turn, axis=1) * (rng.random(query.shape) < 0.97)
+                k = int(rng.choice([1, 2, 10, m, m + 3]))
+                agrees(index.top_k(asked, k), asked, desc, k)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bounds_hold(kind):
+    rng = np.random.default_rng(100 + KINDS.index(kind))
+    for shape in SHAPES:
+        desc, query = scene(rng, kind, 40, shape)
+        best = correlations(query, desc).max(axis=1)
+        bounds = Screen(desc).bounds(ck.unit_columns(query))
+        assert (np.abs(bounds.estimate - best) <= bounds.error).all()
+
+
+def test_bounds_are_tight_enough_to_prune():
+    rng = np.random.default_rng(5)
+    desc, _ = scene(rng, "random", 3000, (20, 60))
+    query = np.roll(desc[700], 9, axis=1) + rng.normal(0, 2, (20, 60)).astype(np.float32)
+    bounds = Screen(desc).bounds(ck.unit_columns(query))
+    assert bounds.error.max() < 0.03
+    assert (bounds.estimate + bounds.error > (bounds.estimate - bounds.error).max()).sum() == 1
+    found = ck.MatchIndex(desc).top_k(query, 3)
+    assert (found.station[0], found.shift[0]) == (700, 9)
+
+
+@pytest.mark.parametrize("shape", [(20, 60), (3, 7), (1, 63), (40, 34)])
+def test_the_kernel_is_its_twin_to_the_bit(shape):
+    rng = np.random.default_rng(6)
+    stations = Screen(rng.normal(size=(50, *shape)))
+    numbers = rng.integers(-128, 128, stations.stations.shape).astype(np.int8)
+    query = rng.integers(-2000, 2001, (2, *numbers.shape[1:])).astype(np.int16)
+    lanes = stations._lanes
+    turn = rng.integers(-600, 601, (3 + 2 * numbers.shape[2], lanes)).astype(np.int16)
+    np.testing.assert_array_equal(screen.screen(numbers, query, turn), reference.screen(numbers, query, turn))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.0])
+def test_many_alike_are_told_apart_with_spectra_too(scale):
+    rng = np.random.default_rng(7)
+    desc = (rng.uniform(1, 9, (1, 6, 20)) + scale * 1e-2 * rng.standard_normal((900, 6, 20))).astype(
+        np.float16
+    )
+    index, spectra = ck.MatchIndex(desc), ck.column_spectra(desc)
+    query = rng.uniform(1, 9, (6, 20)).astype(np.float32)
+    for k in (1, 7, 400):
+        agrees(index.top_k(query, k), query, desc, k)
+        agrees(index.top_k(query, k, spectra=spectra), query, desc, k)
+
+
+def test_an_index_takes_less_than_600_bytes_beyond_a_kilobyte_and_keeps_a_memory_map(tmp_path):
+    file = np.lib.format.open_memmap(tmp_path / "d.npy", "w+", np.float16, (300, 20, 60))
+    file[:] = np.random.default_rng(8).uniform(0, 9, file.shape)
+    index = ck.MatchIndex(file)
+    assert index.nbytes / len(index) < 1300
+    assert index.descriptors is file
+
+
+def test_no_stations_and_no_query():
+    none = ck.MatchIndex(np.empty((0, 4, 8), dtype=np.float16)).top_k(np.ones((4, 8)), 5)
+    assert none.station.shape == none.shift.shape == none.distance.shape == (0,)
+    found = ck.MatchIndex(np.ones((6, 4, 8), dtype=np.float16)).top_k(np.zeros((4, 8)), 3)
+    np.testing.assert_array_equal(found.station, [0, 1, 2])
+    np.testing.assert_array_equal(found.distance, 1.0)
+
+
+def test_bad_arguments_are_named():
+    index = ck.MatchIndex(np.ones((3, 4, 6)))
+    with pytest.raises(ValueError, match="query has shape"):
+        index.top_k(np.ones((4, 7)), 1)
+    with pytest.raises(ValueError, match="query holds"):
+        index.top_k(np.full((4, 6), np.nan), 1)
+    with pytest.raises(ValueError, match="k must"):
+        index.top_k(np.ones((4, 6)), 0)
+    with pytest.raises(ValueError, match="descriptors have"):
+        ck.MatchIndex(np.ones((4, 6)))
+    with pytest.raises(ValueError, match="descriptors have"):
+        ck.MatchIndex(np.ones((3, 4, 64)))
+    with pytest.raises(ValueError, match="descriptors hold"):
+        ck.MatchIndex(np.full((3, 4, 6), np.inf))
