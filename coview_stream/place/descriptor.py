@@ -15,6 +15,7 @@ from coview_stream.geometry import Points
 Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
+_VERTICAL: dict[Channel, Literal["max", "off"]] = {"coview": "max", "coview_strict": "off"}
 _GROUND_RADIUS = 6.0  # metres around a keyframe in which its own VLS shows the ground (notes: sd 3 cm)
 
 
@@ -29,12 +30,11 @@ def channel(name: Channel, grid: PolarGrid, config: DescriptorConfig) -> Descrip
     if name == "density":
         density: Descriptor = np.log1p(grid.count).astype(np.float32)
         return density
-    vertical: Literal["max", "off"] = "max" if name == "coview" else "off"
     return kernels.coview(
         grid.max_height,
         grid.sum_height,
         grid.count,
-        vertical=vertical,
+        vertical=_VERTICAL[name],
         mode=config.visibility,
         eye=config.eye,
     )
@@ -50,8 +50,18 @@ def describe(
         centre: (3,) the zero of the descriptor: the keyframe's x and y and the ground below it.
         config: bins, channels and visibility.
     """
-    grid, _ = kernels.polar_bin(points, centre, config.rings, config.sectors, config.radius)
-    return {name: channel(name, grid, config) for name in config.channels}
+    first: Channel = "coview" if "coview" in config.channels else "coview_strict"
+    grid, context, _ = kernels.describe_points(
+        points,
+        centre,
+        config.rings,
+        config.sectors,
+        config.radius,
+        vertical=_VERTICAL[first],
+        mode=config.visibility,
+        eye=config.eye,
+    )
+    return {name: context if name == first else channel(name, grid, config) for name in config.channels}
 
 
 def ring_key(descriptor: Descriptor) -> npt.NDArray[np.float32]:

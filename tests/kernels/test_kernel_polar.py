@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_cases import clouds
 
-from coview_kernels import polar_bin, reference, station_bins
+from coview_kernels import coview, describe_points, polar, polar_bin, reference, station_bins
 from coview_kernels.sectors import polar_index
 
 SIZES = st.sampled_from([(1, 1), (1, 2), (3, 4), (20, 60), (20, 61), (7, 360)])
@@ -34,6 +34,39 @@ def test_agrees_with_numpy(points, size, r_max, centre):
     expected, expected_dropped = reference.polar_bin(points, np.array(centre, dtype=float), *size, r_max)
     assert_same(grid, expected)
     assert dropped == expected_dropped == np.count_nonzero(~np.isfinite(points).all(axis=1))
+
+
+@given(
+    clouds(),
+    SIZES,
+    st.sampled_from(["max", "mean", "off"]),
+    st.sampled_from(["paper", "eye", "off"]),
+    st.sampled_from([0.0, 1.5]),
+)
+def test_describing_at_once_is_binning_and_co_visibility(points, size, vertical, mode, eye):
+    centre = np.array([2.5, -7.5, 1.0])
+    grid, context, dropped = describe_points(points, centre, *size, 50.0, vertical, mode, eye)
+    expected, expected_dropped = polar_bin(points, centre, *size, 50.0)
+    assert_same(grid, expected)
+    assert dropped == expected_dropped
+    np.testing.assert_array_equal(context, coview(*expected, vertical=vertical, mode=mode, eye=eye))
+    plain = reference.describe_points(points, centre, *size, 50.0, vertical, mode, eye)
+    np.testing.assert_array_equal(context, plain[1])
+    assert context.dtype == plain[1].dtype
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_chunks_add_up(monkeypatch, threads):
+    polar._bins.cache_clear()
+    monkeypatch.setattr(polar.runtime, "workers", lambda: threads)
+    points = np.random.default_rng(9).normal(0, 20, (30_000, 3)).astype(np.float32)
+    points[::100, 2] = np.nan
+    for n in (30_000, 5_000, 30_000):
+        found, dropped = polar_bin(points[:n], np.ones(3), 20, 60, 50.0)
+        expected, expected_dropped = reference.polar_bin(points[:n], np.ones(3), 20, 60, 50.0)
+        assert_same(found, expected)
+        assert dropped == expected_dropped
+    polar._bins.cache_clear()
 
 
 @given(clouds(max_points=120), st.sampled_from([(3, 4), (20, 60)]))
@@ -171,6 +204,8 @@ def test_bad_arguments_are_named():
     cloud, raster = np.zeros((1, 3)), np.zeros((4, 5))
     with pytest.raises(ValueError, match="centre"):
         polar_bin(cloud, (0, np.nan, 0), 20, 60, 50.0)
+    with pytest.raises(ValueError, match="mode"):
+        describe_points(cloud, (0, 0, 0), 20, 60, 50.0, mode="ear")
     with pytest.raises(ValueError, match="r_max"):
         polar_bin(cloud, (0, 0, 0), 20, 60, 0.0)
     with pytest.raises(ValueError, match="rings"):
