@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,26 @@ class Curves:
     x: Sequence[int]
     milliseconds: dict[str, list[float]] = field(default_factory=dict)
     limit: tuple[float, str] | None = None
+
+
+def points(quick: bool = False) -> Curves:
+    """Frames of 4,096 to 131,072 points: transform, range filter, voxels, polar bins (:mod:`bench.intake`)."""
+    from bench.intake import _BINS as BINS
+    from bench.intake import _LIMITS as LIMITS
+    from bench.intake import best_numpy, frame, pose
+    from coview_kernels import FrameIntake
+
+    sizes = [4_096, 16_384] if quick else [4_096, 8_192, 16_384, 32_768, 65_536, 131_072]
+    out = Curves("Taking in a frame", "points of the frame", sizes)
+    both, T, order = np.concatenate([frame(0), frame(1)]), pose(), np.random.default_rng(0)
+    found = []
+    for size in sizes:
+        part = both[np.sort(order.choice(len(both), size, replace=False))]
+        take = FrameIntake(*LIMITS, BINS)
+        found.append(medians(partial(take, part, T), partial(best_numpy, part, T)))
+    ours, numpy = zip(*found, strict=True)
+    out.milliseconds = {"coview_stream": list(ours), "NumPy, one sort": list(numpy)}
+    return out
 
 
 def robots(quick: bool = False) -> Curves:
