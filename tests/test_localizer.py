@@ -318,16 +318,17 @@ def test_what_was_found_before_a_suspicion_waits_for_a_frame_after_it(world_map,
 
 def test_a_frame_is_thinned_once_and_kept_apart_from_the_callers_array(world_map, world_drive, monkeypatch):
     """A driver may reuse its array for the next frame; adopting a verdict later still looks at the newest one."""
-    thinned, made = keyframes.thinned, []
-    monkeypatch.setattr(keyframes, "thinned", lambda *a: made.append(thinned(*a)) or made[-1])
     monkeypatch.setattr(tracking, "thinned", None)
     localizer = Localizer(world_map)
     array = world_drive.clouds[0].copy()
     localizer.take(array, world_drive.T_odom_body[0], 0.0)
     array[:] = 0.0
     np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
-    assert len(made) == 1
-    np.testing.assert_array_equal(localizer._tracker._window(), made[0])
+    T = pose_from(world_drive.T_odom_body[0][:3, :3], np.zeros(3))
+    made = keyframes.thinned(world_drive.clouds[0], T, localizer.config.keyframe)
+    np.testing.assert_allclose(localizer._tracker._window(), made, atol=1e-6)
+    localizer.take(world_drive.clouds[1], world_drive.T_odom_body[1], 0.1)
+    np.testing.assert_allclose(localizer._tracker._window()[-len(made) :], made, atol=1e-6)  # newest first
 
 
 def standing(localizer, cloud, T_odom_body, seconds, start):

@@ -57,10 +57,11 @@ class KeyframeBuffer:
         self.travelled = 0.0
         self.newest: Points = np.empty((0, 3), dtype=np.float32)
         self._pending: list[Points] = []
+        self._intake = kernels.FrameIntake(config.voxel, config.range_min)
 
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
         """Take in one frame (N, 3) in the body frame; return the keyframe it completes, if it does."""
-        self.newest = thinned(cloud, T_odom_body, self.config)
+        self.newest = self._intake(cloud, T_odom_body).points.copy()  # which the next frame overwrites
         self._pending.append(self.newest)
         if sum(map(len, self._pending)) > _PENDING_POINTS:
             self._pending = [self._unique(np.concatenate(self._pending))]

@@ -98,3 +98,12 @@ def test_the_newest_frame_is_at_hand_as_it_was_thinned():
     for k in range(3):
         buffer.add(np.repeat(cloud(k), 2, axis=0), at(0.5 * k), float(k))
         np.testing.assert_array_equal(buffer.newest, keyframes.thinned(cloud(k), at(0.5 * k), CONFIG))
+
+
+def test_what_was_taken_in_stays_as_it_was():
+    """Frames go through buffers that are used again."""
+    buffer = KeyframeBuffer(CONFIG)
+    buffer.add(cloud(0), at(0.0), 0.0)
+    first, before = buffer.newest, buffer.newest.copy()
+    buffer.add(cloud(1), at(0.1), 0.1)
+    np.testing.assert_array_equal(first, before)
