@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from bench.engine import folder, frames_of
-from bench.peers.places import base_map, world
+from bench.peers.places import base_map, places, world
 from bench.rows import medians
 
 PERIOD_MS = 100.0
 """Between the frames of a robot, at 10 Hz."""
+
+BEST = 20
+"""Stations that matching has to name."""
+
+SCENE = "town"
 
 _SEARCH_FRAMES = 400  # at most, until a robot is tracked
 _ROUNDS = 61
@@ -29,6 +36,36 @@ class Curves:
     x: Sequence[int]
     milliseconds: dict[str, list[float]] = field(default_factory=dict)
     limit: tuple[float, str] | None = None
+
+
+def candidates(quick: bool = False) -> Curves:
+    """One keyframe with 1,000 to 100,000 stations at all 60 shifts; the best 20 are asked for.
+
+    Stations are those of the town's map; beyond their number, halves of two of them, turned. The query is a keyframe
+    of its run. Index, spectra and transposed descriptors are made beforehand.
+    """
+    import coview_kernels as kernels
+
+    sizes = [1_000, 3_000] if quick else [1_000, 3_000, 10_000, 30_000, 100_000]
+    out = Curves("Matching one query at all shifts", "stations", sizes)
+    stations, query = _stations(max(sizes))
+    found = []
+    for size in sizes:
+        some = stations[:size]
+        index, spectra = kernels.MatchIndex(some), kernels.column_spectra(some)
+        columns = np.ascontiguousarray(kernels.unit_columns(some).reshape(size, -1).T)
+        turned = np.stack([np.roll(kernels.unit_columns(query), n, axis=1) for n in range(query.shape[1])])
+        turned = turned.reshape(len(turned), -1) / query.shape[1]
+        found.append(
+            medians(
+                partial(index.top_k, query, BEST),
+                partial(_best_of_spectra, query, spectra),
+                partial(_best_of_product, turned, columns),
+            )
+        )
+    names = ("coview_stream, pruned", "spectra, BLAS", "one product of turned queries, BLAS")
+    out.milliseconds = dict(zip(names, map(list, zip(*found, strict=True)), strict=True))
+    return out
 
 
 def points(quick: bool = False) -> Curves:
@@ -56,9 +93,7 @@ def robots(quick: bool = False) -> Curves:
     counts = (1, 2) if quick else (1, 2, 4, 8, 16)
     out = Curves("Tracking several robots on one map", "robots in one process", counts)
     out.limit = (PERIOD_MS, "period of 10 Hz")
-    scene = "town"
-    there = world(folder(), scene)
-    fleet = _fleet(there, scene, max(counts))
+    fleet = _fleet(world(folder(), SCENE), max(counts))
     median, worst = [], []
     for count in counts:
         rounds = np.array([_round(fleet[:count]) for _ in range(11 if quick else _ROUNDS)])
@@ -66,6 +101,45 @@ def robots(quick: bool = False) -> Curves:
         worst.append(float(np.percentile(rounds, 95)))
     out.milliseconds = {"a round of frames, median": median, "95th percentile": worst}
     return out
+
+
+def _stations(count: int) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.float32]]:
+    """Descriptors (count, R, S) and a query (R, S)."""
+    from coview_stream.place.descriptor import describe, ground_below
+
+    world(folder(), SCENE)
+    site, rng = base_map(folder(), SCENE), np.random.default_rng(0)
+    channel = site.descriptor_config.channels[0]
+    known = np.array(site.descriptors(channel))[rng.permutation(len(site))]
+    newest = places(folder(), SCENE, 1)[0].queries[-1]
+    centre = newest.position.copy()
+    centre[2] = ground_below(newest.scan, newest.position)
+    query = describe(newest.scan, centre, site.descriptor_config)[channel]
+    parts, half = [known[:count]], known.shape[2] // 2
+    while sum(map(len, parts)) < count:
+        turns = rng.integers(0, known.shape[2], len(known))
+        sectors = (np.arange(half) + turns[:, None]) % known.shape[2]
+        made = known[rng.permutation(len(known))]
+        other = known[rng.permutation(len(known))]
+        np.put_along_axis(made, sectors[:, None], np.take_along_axis(other, sectors[:, None], axis=2), axis=2)
+        parts.append(made)
+    return np.concatenate(parts)[:count], query
+
+
+def _best_of_spectra(
+    query: npt.NDArray[np.float32], spectra: npt.NDArray[np.complex64]
+) -> npt.NDArray[np.intp]:
+    import coview_kernels as kernels
+
+    distance = kernels.all_shift_distance(query, spectra, query.shape[1]).min(axis=1)
+    return np.argpartition(distance, BEST)[:BEST]
+
+
+def _best_of_product(
+    turned: npt.NDArray[np.float32], columns: npt.NDArray[np.float32]
+) -> npt.NDArray[np.intp]:
+    score = (turned @ columns).max(axis=0)
+    return np.argpartition(-score, BEST)[:BEST]
 
 
 class _Robot:
@@ -86,13 +160,13 @@ class _Robot:
         return fix.T_map_body is not None
 
 
-def _fleet(there: Any, scene: str, count: int) -> list[_Robot]:
+def _fleet(there: Path, count: int) -> list[_Robot]:
     """Robots that have found their places along one run, far from each other."""
     from coview_stream import Localizer, LocalizerConfig
     from coview_stream.clouds import open_run
     from coview_stream.pose.registration import LocalMaps
 
-    site, run = base_map(folder(), scene), open_run(there / "run")
+    site, run = base_map(folder(), SCENE), open_run(there / "run")
     frames = [run.read(index) for index in range(len(run))]
     config = LocalizerConfig()
     crops = LocalMaps(site, config.registration.source_range)

@@ -24,7 +24,11 @@ from bench.curves import Curves
 OUT = Path("docs/images")
 _COLOURS = ("#0072B2", "#D55E00", "#999999", "#009E73")
 
-PLOTS: dict[str, Callable[[bool], Curves]] = {"points": curves.points, "robots": curves.robots}
+PLOTS: dict[str, Callable[[bool], Curves]] = {
+    "candidates": curves.candidates,
+    "points": curves.points,
+    "robots": curves.robots,
+}
 
 
 def draw(shown: Curves, command: str, path: Path) -> None:
