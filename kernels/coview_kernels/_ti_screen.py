@@ -20,9 +20,10 @@ def high(a, b):
 
 
 @lru_cache
-def screen(rows: int, blocks: int, lanes: int):
-    """Kernel for stations of (rows, blocks) and shifts 0 .. lanes - 1 and their negatives."""
+def _screen(rows: int, blocks: int, lanes: int):
+    """Kernel for stations of (rows, blocks); shifts 0 .. lanes - 1, their negatives, and half a turn from both."""
     size = rows * blocks
+    half = blocks // 2
     step = 4 if rows % 4 == 0 else 2
 
     @ti.kernel
@@ -47,30 +48,56 @@ def screen(rows: int, blocks: int, lanes: int):
                         sy += high(v, query[size + at])
                     x[b] += sx
                     y[b] += sy
-            cosine = ti.Vector.zero(i16, lanes)
-            sine = ti.Vector.zero(i16, lanes)
+            # sums over the even blocks, and over the odd ones, which change their sign half a turn on
+            even = ti.Vector.zero(i16, lanes)
+            odd = ti.Vector.zero(i16, lanes)
+            even_sine = ti.Vector.zero(i16, lanes)
+            odd_sine = ti.Vector.zero(i16, lanes)
             first = y[0]
             for n in range(lanes):
-                cosine[n] = turn[n] + high(first, turn[2 * lanes + n])
-                sine[n] = turn[lanes + n]
-            for g in range(blocks // 4):
-                xs = ti.Vector.zero(i16, 4)
-                ys = ti.Vector.zero(i16, 4)
+                even[n] = turn[n] + high(first, turn[4 * lanes + n])
+                odd[n] = turn[lanes + n]
+                even_sine[n] = turn[2 * lanes + n]
+                odd_sine[n] = turn[3 * lanes + n]
+            for g in range(half // 4):
+                xs = ti.Vector.zero(i16, 8)
+                ys = ti.Vector.zero(i16, 8)
                 for u in ti.static(range(4)):
                     xs[u] = x[g * 4 + u]
                     ys[u] = y[g * 4 + u]
+                    xs[4 + u] = x[half + g * 4 + u]
+                    ys[4 + u] = y[half + g * 4 + u]
                 for n in range(lanes):
-                    sx = ti.cast(0, i16)
-                    sy = ti.cast(0, i16)
+                    a = ti.cast(0, i16)
+                    b = ti.cast(0, i16)
+                    c = ti.cast(0, i16)
+                    d = ti.cast(0, i16)
                     for u in ti.static(range(4)):
-                        sx += high(xs[u], turn[(3 + g * 4 + u) * lanes + n])
-                        sy += high(ys[u], turn[(3 + blocks + g * 4 + u) * lanes + n])
-                    cosine[n] += sx
-                    sine[n] += sy
+                        at = (5 + g * 4 + u) * lanes + n
+                        a += high(xs[u], turn[at])
+                        b += high(ys[u], turn[at + blocks * lanes])
+                        c += high(xs[4 + u], turn[at + half * lanes])
+                        d += high(ys[4 + u], turn[at + (blocks + half) * lanes])
+                    even[n] += a
+                    even_sine[n] += b
+                    odd[n] += c
+                    odd_sine[n] += d
             top = ti.cast(-32768, i16)
             # a length that the compiler does not know: it unrolls a known one into scalars
             for n in range(length):
-                top = ti.max(top, cosine[n] + ti.max(sine[n], -sine[n]))
+                p = even_sine[n] + odd_sine[n]
+                q = even_sine[n] - odd_sine[n]
+                near = even[n] + odd[n] + ti.max(p, -p)
+                far = even[n] - odd[n] + ti.max(q, -q)
+                top = ti.max(top, ti.max(near, far))
             out[m] = ti.cast(top, i32)
 
     return best
+
+
+def __getattr__(name):
+    """Return the kernel ``screen_<rows>_<blocks>_<lanes>``: a kernel's local vectors have fixed lengths."""
+    kind, _, sizes = name.partition("_")
+    if kind != "screen":
+        raise AttributeError(name)
+    return _screen(*map(int, sizes.split("_")))

@@ -104,8 +104,9 @@ class MatchIndex:
         turned = _turned(query)
         seeds = np.argpartition(low, -k)[-k:]
         found, shift = self._scores(seeds, turned)
-        rest = np.flatnonzero(high >= found.min() - _ROUNDED)
-        rest = np.setdiff1d(rest, seeds, assume_unique=True)
+        left = high >= found.min() - _ROUNDED
+        left[seeds] = False
+        rest = np.flatnonzero(left)
         if spectra is not None and len(rest) > len(self) // _MANY:
             alike = 1.0 - all_shift_distance(query, spectra, query.shape[1]).min(axis=1)
             rest = rest[alike[rest] >= found.min() - _FLOAT]
@@ -128,7 +129,7 @@ class MatchIndex:
     def _scores(self, station: I64, turned: F64) -> tuple[F64, I64]:
         """Best correlations (n,), rounded to 1e-9, and their shifts, from the descriptors, in float64."""
         rows = _unit64(self.descriptors[station]).reshape(len(station), -1)
-        correlation = np.round(rows @ turned, 9)
+        correlation = np.round(rows @ turned.T, 9)
         shift = correlation.argmax(axis=1)
         return correlation[np.arange(len(shift)), shift], shift
 
@@ -140,9 +141,8 @@ def _unit64(descriptors: npt.NDArray[Any]) -> F64:
 
 
 def _turned(query: F32) -> F64:
-    """(R S, S): the query's unit columns, column n turned by n sectors, over S."""
-    unit = _unit64(query) / query.shape[1]
-    twice = np.concatenate([unit, unit], axis=1)
-    windows = np.lib.stride_tricks.sliding_window_view(twice, query.shape[1], axis=1)  # (R, S + 1, S)
-    rings, sectors = query.shape
-    return np.ascontiguousarray(windows[:, :sectors].transpose(0, 2, 1)).reshape(rings * sectors, sectors)
+    """(S, R S): in row n the query's unit columns, turned by n sectors, over S."""
+    sectors = query.shape[1]
+    unit = _unit64(query) / sectors
+    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([unit, unit], axis=1), sectors, axis=1)
+    return np.ascontiguousarray(windows[:, :sectors].transpose(1, 0, 2)).reshape(sectors, -1)

@@ -31,6 +31,7 @@ import numpy.typing as npt
 
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I32
+from coview_kernels.launch import Launch
 from coview_kernels.similarity import unit_columns
 
 MAX_SECTORS = 63
@@ -60,8 +61,10 @@ class Screen:
 
     def __init__(self, descriptors: npt.NDArray[Any]) -> None:
         m, self.rings, self.sectors = descriptors.shape
-        self._blocks = -(-((self.sectors + 1) // 2) // 16) * 16
-        self._lanes = -(-(self.sectors // 2 + 1) // 16) * 16
+        self._frequency = _frequencies(self.sectors)
+        self._blocks = len(self._frequency)
+        # a sum for shift n serves -n too and, if odd frequencies are summed apart, half a turn on from both
+        self._shifts = self.sectors // (4 if self.sectors % 4 == 0 else 2) + 1
         self._step = self._steps(descriptors[:: -(-m // _SAMPLE) or 1])  # evenly, at most _SAMPLE
         self.stations = np.empty((m, 2 * self.rings, self._blocks), dtype=np.int8)
         self.missed = np.empty(m, dtype=np.float32)
@@ -77,6 +80,7 @@ class Screen:
         self._norm = np.sqrt(norm)
         self._reach = 1.0 + float(self.missed.max(initial=0.0))  # of a station's dequantised norm
         self._cosine, self._sine, self._nyquist = self._turns()
+        self._kernel = _Kernel(self.stations, self._cosine.shape[1])
 
     @property
     def nbytes(self) -> int:
@@ -89,7 +93,7 @@ class Screen:
         size = float(np.sqrt((numbers * numbers).sum()))
         whole, gain, rounding = self._whole_query(numbers)
         turn, unit, twist = self._table(gain, size + rounding)
-        best = screen(self.stations, whole, turn)
+        best = self._kernel(whole, turn)
         error: F64 = self.missed.astype(np.float64) * size + (rounding + twist + _FLOAT)
         return Bounds(best.astype(np.float64) * unit, error)
 
@@ -99,14 +103,13 @@ class Screen:
 
         spectra = fft.rfft(unit_columns(descriptors), axis=-1)
         m, rings, sectors = descriptors.shape
-        complexes = (sectors + 1) // 2
+        has = self._frequency >= 0
+        chosen = spectra[:, :, self._frequency[has]] * np.float32(np.sqrt(2.0) / sectors)
         out = np.zeros((m, 2 * rings, self._blocks), dtype=np.float32)
-        spectra *= np.float32(np.sqrt(2.0) / sectors)
-        out[:, :rings, :complexes] = spectra.real[:, :, :complexes]
-        out[:, rings:, 1:complexes] = spectra.imag[:, :, 1:complexes]
+        out[:, :rings, has] = chosen.real
+        out[:, rings:, has] = chosen.imag
         out[:, :rings, 0] *= np.float32(np.sqrt(0.5))
-        if sectors % 2 == 0:
-            out[:, rings:, 0] = spectra.real[:, :, -1] * np.float32(np.sqrt(0.5))
+        out[:, rings:, 0] = spectra.real[:, :, -1] * np.float32(1.0 / sectors) if sectors % 2 == 0 else 0.0
         return out
 
     def _steps(self, sample: npt.NDArray[Any]) -> F32:
@@ -132,44 +135,72 @@ class Screen:
         return whole.astype(np.int16), gain, float(np.sqrt(2.0) * (self._norm * missed / gain).sum())
 
     def _turns(self) -> tuple[F64, F64, F64]:
-        """Cosines and sines (L, N) of every block at every shift up to S / 2, and of the frequency S / 2 (N,)."""
-        block, shift = np.arange(self._blocks)[:, None], np.arange(self._lanes)[None]
-        angle = 2.0 * np.pi * block * shift / self.sectors
-        used = (block < (self.sectors + 1) // 2) & (shift <= self.sectors // 2)
-        even = (-1.0) ** shift[0] * (shift[0] <= self.sectors // 2) * (self.sectors % 2 == 0)
-        return np.cos(angle) * used, -np.sin(angle) * used, even
+        """Cosines and sines (L, N) of every block at every shift, and of the frequency S / 2 (N,)."""
+        lanes = -(-self._shifts // 16) * 16
+        shift = np.arange(lanes)
+        angle = 2.0 * np.pi / self.sectors * np.outer(self._frequency, shift)
+        used = np.outer(self._frequency >= 0, shift < self._shifts)
+        nyquist = (-1.0) ** shift * (shift < self._shifts) * (self.sectors % 2 == 0)
+        return np.cos(angle) * used, -np.sin(angle) * used, nyquist
 
     def _table(self, gain: F64, size: float) -> tuple[npt.NDArray[np.int16], float, float]:
-        """Rows of the turn: mean of the upper halves (2), frequency S / 2, cosines (L), sines (L); unit; error."""
-        rows, used = 2 * self.rings, (self.sectors + 1) // 2
-        scale = 256.0 / gain[:used]  # of one unit of a product
+        """Rows of the turn: mean of the upper halves, frequency S / 2, cosines (L), sines (L); unit; error."""
+        rows = 2 * self.rings
+        scale = np.where(self._frequency >= 0, 256.0 / gain, 0.0)  # of one unit of a product
         # either side of the mean, in a pair whose turn has a norm of 1, or is (1, 1) in block 0
         error = rows / 2.0 * (np.sqrt(2.0) * float(scale.sum()) + float(scale[0]))
         unit = max(2.01 * float(scale.max()), (self._reach * size + error) / 31_000.0)
-        factor = np.zeros(self._blocks)
-        factor[:used] = 65_536.0 * scale / unit
-        terms = 2 * self._blocks + 1
-        turn = np.zeros((3 + 2 * self._blocks, self._lanes))
-        turn[2] = self._nyquist * factor[0]
-        turn[3 : 3 + self._blocks] = self._cosine * factor[:, None]
-        turn[3 + self._blocks :] = self._sine * factor[:, None]
-        mean = rows / 2.0 / 65_536.0
-        turn[0] = mean * (turn[2] + turn[3 : 3 + self._blocks].sum(axis=0)) + (self._blocks + 1) / 2.0
-        turn[1] = mean * turn[3 + self._blocks :].sum(axis=0) + self._blocks / 2.0
-        turn[0, self.sectors // 2 + 1 :] = -30_000.0
-        return np.rint(turn).astype(np.int16), unit, error + (0.75 * terms + 1.0) * unit
+        factor = (65_536.0 / unit * scale)[:, None]
+        blocks, half = self._blocks, self._blocks // 2
+        turn = np.empty((5 + 2 * blocks, self._cosine.shape[1]))
+        turn[4] = self._nyquist * factor[0]
+        turn[5 : 5 + blocks] = self._cosine * factor
+        turn[5 + blocks :] = self._sine * factor
+        turn[:4] = turn[5:].reshape(4, half, -1).sum(axis=1)
+        turn[0] += turn[4]
+        turn[:4] = turn[:4] * (rows / 2.0 / 65_536.0) + half / 2.0
+        turn[0, self._shifts :] = -30_000.0
+        return np.rint(turn).astype(np.int16), unit, error + (0.75 * (2 * blocks + 1) + 4.0) * unit
 
 
-def screen(stations: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
-    """Greatest sum of a cosine part and a sine part's size over the shifts, (M,), in units of the turn."""
-    return runtime.dispatch(_native, reference.screen, stations, query, turn)
+def _frequencies(sectors: int) -> npt.NDArray[np.int64]:
+    """Frequency of each block (L,), -1 for none: even ones in the first half, odd ones in the second.
+
+    Half a turn changes the sign of the odd ones, so that one sum serves two shifts. If S is no multiple of 4,
+    all are in the first half.
+    """
+    every = np.arange((sectors + 1) // 2)
+    parts = (every[::2], every[1::2]) if sectors % 4 == 0 else (every, every[:0])
+    half = -(-len(parts[0]) // 8) * 8
+    out = np.full((2, half), -1, dtype=np.int64)
+    for row, part in zip(out, parts, strict=True):
+        row[: len(part)] = part
+    return out.reshape(-1)
 
 
-def _native(stations: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
-    rows, blocks = stations.shape[1:]
-    lanes = turn.shape[1]
-    out = np.empty(len(stations), dtype=np.int32)
-    if len(out):
-        kernel = runtime.kernels("screen").screen(rows, blocks, lanes)
-        kernel(stations.reshape(-1), query.reshape(-1), turn.reshape(-1), lanes, out)
-    return out
+class _Kernel:
+    """The kernel on its stations, (M, K, L) int8, or its twin."""
+
+    def __init__(self, stations: npt.NDArray[np.int8], lanes: int) -> None:
+        self._stations = stations
+        rows, blocks = stations.shape[1:]
+        self._query = np.zeros((2, rows, blocks), dtype=np.int16)
+        self._turn = np.zeros((5 + 2 * blocks, lanes), dtype=np.int16)
+        self._out = np.empty(len(stations), dtype=np.int32)
+        flat = (a.reshape(-1) for a in (stations, self._query, self._turn))
+        self._launch = Launch("screen", f"screen_{rows}_{blocks}_{lanes}", *flat, lanes, self._out)
+
+    def __call__(self, query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
+        """Greatest correlation over the shifts, (M,), in units of the turn."""
+        best: I32 = runtime.dispatch(self._native, reference.screen, self._stations, query, turn)
+        return best
+
+    def _native(
+        self, _: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]
+    ) -> I32:
+        # on the owner thread, and so one query at a time
+        if len(self._out):
+            self._query[:] = query
+            self._turn[:] = turn
+            self._launch()
+        return self._out.copy()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import coview_kernels as ck
-from coview_kernels import reference, screen
+from coview_kernels import reference
 from coview_kernels.screen import Screen
 
 TOLERANCE = 1e-6
@@ -123,11 +123,10 @@ def test_bounds_are_tight_enough_to_prune():
 def test_the_kernel_is_its_twin_to_the_bit(shape):
     rng = np.random.default_rng(6)
     stations = Screen(rng.normal(size=(50, *shape)))
-    numbers = rng.integers(-128, 128, stations.stations.shape).astype(np.int8)
-    query = rng.integers(-2000, 2001, (2, *numbers.shape[1:])).astype(np.int16)
-    lanes = stations._lanes
-    turn = rng.integers(-600, 601, (3 + 2 * numbers.shape[2], lanes)).astype(np.int16)
-    np.testing.assert_array_equal(screen.screen(numbers, query, turn), reference.screen(numbers, query, turn))
+    kernel = stations._kernel
+    query = rng.integers(-2000, 2001, kernel._query.shape).astype(np.int16)
+    turn = rng.integers(-600, 601, kernel._turn.shape).astype(np.int16)
+    np.testing.assert_array_equal(kernel(query, turn), reference.screen(stations.stations, query, turn))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.0])

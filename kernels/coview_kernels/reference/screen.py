@@ -13,16 +13,20 @@ _PORTION = 256
 
 
 def screen(stations: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
-    """Greatest C + |S| over the shifts, (M,) int32, for stations (M, K, L), query (2, K, L), turn (3 + 2L, N)."""
+    """Greatest correlation over the shifts, (M,) int32; stations (M, K, L), query (2, K, L), turn (5 + 2L, N)."""
     wide, t = query.astype(np.int32), turn.astype(np.int32)
     blocks = stations.shape[2]
+    even, odd = slice(0, blocks // 2), slice(blocks // 2, blocks)
+    cosine, sine = t[5 : 5 + blocks], t[5 + blocks :]
     out = np.empty(len(stations), dtype=np.int32)
     for start in range(0, len(stations), _PORTION):
         part = stations[start : start + _PORTION].astype(np.int32) << 8
         x, y = (((part * w) >> 16).sum(axis=1) for w in wide)
-        cosine = t[0] + _high(y[:, 0, None], t[2]) + _high(x[:, :, None], t[3 : 3 + blocks]).sum(axis=1)
-        sine = t[1] + _high(y[:, :, None], t[3 + blocks :]).sum(axis=1)
-        out[start : start + len(part)] = (cosine + np.abs(sine)).max(axis=1)
+        a, c = (_high(x[:, s, None], cosine[s]).sum(axis=1) + t[i] for i, s in enumerate((even, odd)))
+        b, d = (_high(y[:, s, None], sine[s]).sum(axis=1) + t[2 + i] for i, s in enumerate((even, odd)))
+        a += _high(y[:, 0, None], t[4])
+        best = np.maximum(a + c + np.abs(b + d), a - c + np.abs(b - d))
+        out[start : start + len(part)] = best.max(axis=1)
     return out
 
 
