@@ -1,9 +1,9 @@
 """KISS-Matcher 1.0 (MIT): FasterPFH, ROBIN pruning, GNC; the submap against the whole map.
 
-Settings in its favour: voxels of 1 m (its authors advise a voxel that grows with the map; at 0.5 m the whole map
-takes minutes), Quatro's solver for rotation, made for gravity-aligned clouds, and the radii, noise bounds and 5,000
-correspondences of its defaults. Both clouds are its own to thin. It vouches by its own example's rule: a valid
-solution with five final inliers or more.
+Settings in its favour: of voxels of 0.7, 1, 1.5 and 2 m (its authors advise one that grows with the map; at 0.5 m the
+whole map takes minutes), each with its default solver and with Quatro, made for level clouds, the pair that was right
+most often on six places of either world; radii, noise bounds and 5,000 correspondences of its defaults. Both clouds
+are its own to thin. It vouches by its own example's rule: a valid solution with five final inliers or more.
 """
 
 from __future__ import annotations
