@@ -56,6 +56,7 @@ def intake(
     params: Doubles,
     edges: Doubles,
     guesses: Integers,
+    cells: polar.Shorts,
     bins: Doubles,
     highest: Floats,
     total: Floats,
@@ -134,7 +135,8 @@ def intake(
             step = (rows + chunks - 1) // chunks
             begin = ti.min(rows, c * step)
             out = begin
-            clear_bins(3 * c * size, size, bins)
+            first = 3 * c * (size + 1)
+            clear_bins(first, size + 1, bins)
             for j in range(begin, begin + totals[5 * c]):
                 seen = 0
                 if move[12] != 0:
@@ -153,7 +155,7 @@ def intake(
                         x = ti.cast(a, ti.f64)
                         y = ti.cast(b, ti.f64)
                         z = ti.cast(d, ti.f64)
-                        add_point(x, y, z, 3 * c * size, rings, sectors, params, edges, guesses, bins)
+                        add_point(x, y, z, first, rings, sectors, params, edges, guesses, cells, bins)
             totals[5 * c + 1] = out - begin
 
     ti.loop_config(serialize=True)

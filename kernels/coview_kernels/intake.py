@@ -139,7 +139,14 @@ class _Buffers:
         arguments: tuple[Any, ...] = (
             *(np.empty(0, dtype=np.float32), 0, 1, 0, bits, self._move, self._table),
             *(np.empty(rows, dtype=np.int64), self.moved.reshape(-1), self._totals),
-            *(*(bins[:2] if bins else (0, 0)), polar.params, polar.edges, polar.guesses, polar.bins),
+            *(
+                *(bins[:2] if bins else (0, 0)),
+                polar.params,
+                polar.edges,
+                polar.guesses,
+                polar.cells,
+                polar.bins,
+            ),
             *(polar.highest, polar.total, polar.count),
         )
         self._launch = Launch("intake", "intake", *arguments)

@@ -13,7 +13,7 @@ from coview_kernels.arrays import F32, F64, I32, Mode, PolarGrid, Vertical
 from coview_kernels.covisibility import encoded
 from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table
-from coview_kernels.sectors import ring_edges2, sector_edges, sector_guesses
+from coview_kernels.sectors import HALF, cell_bins, ring_edges2, sector_edges, sector_guesses
 
 MAX_SECTORS = 3000  # beyond, a guess from the table may be off by more than one sector
 _POINTS_PER_CHUNK = 4096  # fewer are done before another thread is awake
@@ -106,9 +106,10 @@ class PolarBins:
         self.edges = np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
         steps = min(1024, max(256, 1 << sectors.bit_length()))  # few, to stay in the nearest cache
         self.guesses = sector_guesses(sectors, steps).ravel()
-        self.params = np.zeros(9)
-        self.params[3:5] = rings / r_max, steps
-        self.bins = np.empty(3 * size * chunks)
+        self.cells = cell_bins(rings, sectors, r_max)
+        self.params = np.zeros(11)
+        self.params[3:7] = rings / r_max, steps, HALF / r_max, r_max
+        self.bins = np.empty(3 * (size + 1) * chunks)
         self.dropped = np.zeros(chunks, dtype=np.int32)
         self.highest, self.total, self.value = (np.empty(size, dtype=np.float32) for _ in range(3))
         self.count = np.empty(size, dtype=np.int32)
@@ -125,7 +126,7 @@ class _Describer(PolarBins):
         super().__init__(rings, sectors, r_max, self._chunks)
         self._launch = Launch(
             *("polar", "describe", _NOTHING, 0, 1, rings, sectors),
-            *(self.params, self.edges, self.guesses, self.bins, self.dropped),
+            *(self.params, self.edges, self.guesses, self.cells, self.bins, self.dropped),
             *(self.highest, self.total, self.count, self.value),
         )
 
@@ -134,7 +135,7 @@ class _Describer(PolarBins):
     ) -> tuple[PolarGrid, F32, int]:
         chunks = min(self._chunks, 1 + len(points) // _POINTS_PER_CHUNK)
         self.params[:3] = centre
-        self.params[5:] = visibility or (0, -1, 0, 0.0)
+        self.params[7:] = visibility or (0, -1, 0, 0.0)
         for index, value in enumerate((points.reshape(-1), len(points), chunks)):
             self._launch.put(index, value)
         self._launch()
