@@ -46,6 +46,7 @@ class Retrieval:
         self.config = config
         self._spectra: dict[Channel, Spectra] = {}
         self._keys: dict[Channel, npt.NDArray[np.float32]] = {}
+        self._indices: dict[Channel, kernels.MatchIndex] = {}
 
     def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, Volume]:
         """Eqs 7-9 for each channel: (M, S) distances in [0, 2]; shift n means yaw -2 pi n / S.
@@ -53,6 +54,14 @@ class Retrieval:
         In ``ring_key`` mode stations that are not among the candidates have distance 1 at every shift.
         """
         return {name: self._channel(name, descriptor) for name, descriptor in query.items()}
+
+    def best(self, query: dict[Channel, Descriptor], k: int) -> dict[Channel, kernels.Nearest]:
+        """Eqs 7-9 for each channel: the ``k`` nearest stations, each at its best shift, nearest first.
+
+        The same stations as :meth:`distances` would give, at a fraction of its time and memory: most of the
+        stations are ruled out by bounds. An index of 1.3 kB per station is made at the first query.
+        """
+        return {name: self._nearest(name, descriptor, k) for name, descriptor in query.items()}
 
     def prepare(self) -> None:
         """Make now the spectra that are kept, rather than at the first query."""
@@ -71,6 +80,17 @@ class Retrieval:
         sectors = query.shape[-1]
         parts = [kernels.all_shift_distance(query, spectra, sectors) for spectra in self._blocks(name)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _nearest(self, name: Channel, query: Descriptor, k: int) -> kernels.Nearest:
+        bounded = self.config.mode == "exhaustive" and query.shape[-1] <= kernels.MatchIndex.MAX_SECTORS
+        if not bounded or kernels.backend() == "numpy":  # bounds are for the kernel's integers
+            volume = self._channel(name, query)
+            nearest = volume.min(axis=1)
+            station = np.argsort(nearest, kind="stable")[:k]
+            return kernels.Nearest(station, volume[station].argmin(axis=1), nearest[station])
+        if name not in self._indices:
+            self._indices[name] = kernels.MatchIndex(self.stations.descriptors(name))
+        return self._indices[name].top_k(query, k, spectra=self._spectra.get(name))
 
     def _blocks(self, name: Channel) -> Iterator[Spectra]:
         descriptors = self.stations.descriptors(name)

@@ -51,6 +51,8 @@ class MatchIndex:
         ValueError: another shape, too many sectors, NaN or inf.
     """
 
+    MAX_SECTORS = MAX_SECTORS
+
     def __init__(self, descriptors: npt.NDArray[Any]) -> None:
         if descriptors.ndim != 3 or not 1 <= descriptors.shape[2] <= MAX_SECTORS or not descriptors.shape[1]:
             raise ValueError(

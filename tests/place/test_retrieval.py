@@ -142,3 +142,25 @@ def test_a_robot_turned_left_is_found_at_its_heading(turn):
     station, shift = np.unravel_index(volume["scan_context"].argmin(), volume["scan_context"].shape)
     assert station == 8
     assert np.cos(yaw_of_shift(int(shift), S) - yaw) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("mode", ["exhaustive", "ring_key"])
+@pytest.mark.parametrize("k", [1, 5, M + 1])
+def test_the_best_are_those_of_all_distances(stations, query, mode, k):
+    one = Retrieval(stations, RetrievalConfig(mode=mode, candidates=9))
+    found, volumes = one.best(query, k), one.distances(query)
+    for name, volume in volumes.items():
+        nearest = volume.min(axis=1)
+        expected = np.sort(nearest)[: min(k, M)]
+        np.testing.assert_allclose(found[name].distance, expected, atol=1e-6)
+        np.testing.assert_allclose(nearest[found[name].station], expected, atol=1e-6)
+        np.testing.assert_allclose(volume[found[name].station, found[name].shift], expected, atol=1e-6)
+
+
+def test_the_best_without_kernels_are_the_same(stations, query, monkeypatch):
+    expected = Retrieval(stations, RetrievalConfig()).best(query, 4)
+    monkeypatch.setattr(retrieval.kernels, "backend", lambda: "numpy")
+    for name, found in Retrieval(stations, RetrievalConfig()).best(query, 4).items():
+        np.testing.assert_array_equal(found.station, expected[name].station)
+        np.testing.assert_array_equal(found.shift, expected[name].shift)
+        np.testing.assert_allclose(found.distance, expected[name].distance, atol=1e-6)
