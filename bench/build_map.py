@@ -37,12 +37,12 @@ def synthetic(points: int, stations: int, block: float, seed: int = 1) -> Cloud:
     side = float(np.sqrt(stations / (1 - _COVERED))) * block
     walls = points // 8
     xy = rng.uniform(0, side, (points - walls, 2))
-    z = _terrain(xy)
+    z = terrain(xy)
     wall_parts = []
     boxes = _boxes(rng, side)
     for x, y, width, depth, height in boxes:
         inside = (np.abs(xy[:, 0] - x) < width / 2) & (np.abs(xy[:, 1] - y) < depth / 2)
-        base = float(_terrain(np.array([[x, y]]))[0])
+        base = float(terrain(np.array([[x, y]]))[0])
         z[inside] = base + height
         wall_parts.append(_wall(rng, walls // len(boxes), (x, y, width, depth, height), base))
     _grow(rng, xy, z, side)
@@ -50,7 +50,8 @@ def synthetic(points: int, stations: int, block: float, seed: int = 1) -> Cloud:
     return np.concatenate([seen, *wall_parts])
 
 
-def _terrain(xy: Cloud) -> Cloud:
+def terrain(xy: Cloud) -> Cloud:
+    """Height of the ground at (N, 2), metres."""
     return np.asarray(2.0 * np.sin(xy[:, 0] / 37.0) + 1.5 * np.cos(xy[:, 1] / 51.0))
 
 

@@ -183,33 +183,41 @@ def describe(
 
 @ti.kernel
 def station_bins(
-    top: ti.types.ndarray(ti.f32, 1),
-    points: ti.types.ndarray(ti.i32, 1),
-    heights: ti.types.ndarray(ti.f32, 1),
-    base: ti.types.ndarray(ti.i32, 1),
-    ground: ti.types.ndarray(ti.f32, 1),
-    starts: ti.types.ndarray(ti.i32, 1),
-    offsets: ti.types.ndarray(ti.i32, 1),
-    highest: ti.types.ndarray(ti.f32, 2),
-    total: ti.types.ndarray(ti.f32, 2),
-    count: ti.types.ndarray(ti.i32, 2),
+    stations: ti.i32,
+    chunks: ti.i32,
+    size: ti.i32,
+    top: Floats,
+    points: Integers,
+    heights: Floats,
+    base: Integers,
+    ground: Floats,
+    starts: Integers,
+    offsets: Integers,
+    highest: Floats,
+    total: Floats,
+    count: Integers,
 ):
     """Bin b of a station gathers the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
 
     The cells are sorted by bin, so a bin is summed in registers and stored once.
     """
-    for m in range(base.shape[0]):
-        floor = ti.cast(ground[m], ti.f64)
-        for b in range(highest.shape[1]):
-            best = ti.cast(LOWEST, ti.f32)
-            number = 0
-            height = ti.cast(0.0, ti.f64)
-            for k in range(starts[b], starts[b + 1]):
-                at = base[m] + offsets[k]
-                best = ti.max(best, top[at])
-                number += points[at]
-                height += ti.cast(heights[at], ti.f64)
-            if number > 0:
-                highest[m, b] = ti.cast(ti.cast(best, ti.f64) - floor, ti.f32)
-                total[m, b] = ti.cast(height - number * floor, ti.f32)
-                count[m, b] = number
+    for q in range(chunks * SPAN):
+        if q % SPAN == 0:
+            c = q // SPAN
+            step = (stations + chunks - 1) // chunks
+            for m in range(ti.min(stations, c * step), ti.min(stations, (c + 1) * step)):
+                floor = ti.cast(ground[m], ti.f64)
+                at_station = base[m]
+                for b in range(size):
+                    best = ti.cast(LOWEST, ti.f32)
+                    number = 0
+                    height = ti.cast(0.0, ti.f64)
+                    for k in range(starts[b], starts[b + 1]):
+                        at = at_station + offsets[k]
+                        best = ti.max(best, top[at])
+                        number += points[at]
+                        height += ti.cast(heights[at], ti.f64)
+                    if number > 0:
+                        highest[m * size + b] = ti.cast(ti.cast(best, ti.f64) - floor, ti.f32)
+                        total[m * size + b] = ti.cast(height - number * floor, ti.f32)
+                        count[m * size + b] = number

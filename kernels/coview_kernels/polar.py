@@ -228,11 +228,13 @@ def _station_bins(
     heights = np.pad(np.where(empty, 0, raster_sum).astype(np.float32), reach)
     width = top.shape[1]
     base = (rows.astype(np.int64) + reach) * width + cols + reach
-    size = (len(rows), rings * sectors)
-    grid = PolarGrid(np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.int32))
-    runtime.kernels("polar").station_bins(
-        *(top.ravel(), points.ravel(), heights.ravel(), base.astype(np.int32), ground),
-        *(starts, (d_row * width + d_col).astype(np.int32), *grid),
-    )
+    size = rings * sectors
     shape = (len(rows), rings, sectors)
-    return PolarGrid(grid[0].reshape(shape), grid[1].reshape(shape), grid[2].reshape(shape))
+    grid = PolarGrid(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.int32))
+    Launch(
+        *("polar", "station_bins", len(rows), min(runtime.workers(), max(1, len(rows))), size),
+        *(top.ravel(), points.ravel(), heights.ravel(), base.astype(np.int32), ground),
+        *(starts, (d_row * width + d_col).astype(np.int32)),
+        *(grid.max_height.reshape(-1), grid.sum_height.reshape(-1), grid.count.reshape(-1)),
+    )()
+    return grid
