@@ -24,6 +24,8 @@ _CACHED_CROPS = 12
 _CROP_STEP = 16.0  # metres between the centres of cached crops
 _STOP_SHIFT = 1e-3  # metres; below the map's own noise
 _STOP_TURN = 5e-5  # radians
+_COARSE_SHIFT = 0.03  # of a scale that another one follows; a finer stop there changes no error
+_COARSE_TURN = 1.5e-3  # radians per metre of such a scale
 _LEAST_PAIRS = 50
 _WIDTH_SHARE = (
     0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
@@ -159,11 +161,24 @@ def register(
         source.above,
         T_map_source,
         pivot,
-        [(scale, max(config.residual_scale, _WIDTH_SHARE * scale)) for scale in scales],
+        _stages(scales, config),
         keep=config.keep,
         iterations=iterations or config.iterations,
-        stop=(_STOP_SHIFT, _STOP_TURN),
         least=_LEAST_PAIRS,
         prior=belief,
     )
     return None if found is None else Registration(*found)
+
+
+def _stages(scales: tuple[float, ...], config: RegistrationConfig) -> list[kernels.Scale]:
+    """Return the scales as the kernel takes them; all but the last end early, as the next one goes on from there."""
+    last = len(scales) - 1
+    return [
+        kernels.Scale(
+            scale,
+            max(config.residual_scale, _WIDTH_SHARE * scale),
+            _STOP_SHIFT if k == last else max(_STOP_SHIFT, _COARSE_SHIFT * scale),
+            _STOP_TURN if k == last else max(_STOP_TURN, _COARSE_TURN * scale),
+        )
+        for k, scale in enumerate(scales)
+    ]

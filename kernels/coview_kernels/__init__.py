@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview, visible
-from coview_kernels.icp import Alignment, Belief, align_planes
+from coview_kernels.icp import Alignment, Belief, Scale, align_planes
 from coview_kernels.intake import FrameIntake, Intake
 from coview_kernels.matching import MatchIndex, Nearest
 from coview_kernels.nearest import PointGrid, nearest
@@ -28,6 +28,7 @@ __all__ = [
     "Nearest",
     "PointGrid",
     "PolarGrid",
+    "Scale",
     "align_planes",
     "all_shift_distance",
     "backend",

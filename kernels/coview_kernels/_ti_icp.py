@@ -28,8 +28,10 @@ SAFE, ROW, NEAR = 3, 4, 5
 # largest squared distance among them (as float32, which sort as it does), then a histogram
 KEPT, LEFT, LAST, BINS = 0, 1, 2, 3
 # settings; see icp.py
-KEEP, ITERATIONS, SCALES, STOP_SHIFT, STOP_TURN, LEAST, PRIOR, BULK = 8, 9, 10, 11, 12, 13, 14, 15
-PIVOT, MEAN, BELIEF, RADII = 16, 19, 31, 67
+KEEP, ITERATIONS, SCALES, LEAST, PRIOR, BULK = 8, 9, 10, 11, 12, 13
+PIVOT, MEAN, BELIEF, FIRST = 14, 17, 29, 65
+# and of each scale radius, width of the weights, and the shift and turn that end it
+RADIUS, WIDTH, SHIFT, TURN, EACH = 0, 1, 2, 3, 4
 # state: pose by rows (12), then these, the information (36) and the sums of a step (30)
 SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, PAIRED, OFF = 12, 13, 14, 15, 16, 17, 53, 83, 84
 RUNNING, DONE, LOST = 0, 1, 2
@@ -227,7 +229,8 @@ def advance(about, settings: ti.template(), state: ti.template(), system: ti.tem
     state[TOTAL] += 1
     state[ROUND] += 1
     state[CONVERGED] = 0.0
-    if shift.norm() < settings[STOP_SHIFT] and angle < settings[STOP_TURN]:
+    scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
+    if shift.norm() < settings[scale + SHIFT] and angle < settings[scale + TURN]:
         state[CONVERGED] = 1.0
     if state[CONVERGED] > 0 or state[ROUND] >= settings[ITERATIONS]:
         state[ROUND] = 0
@@ -261,12 +264,18 @@ def align(
         again = q % SPAN == 0 and state[STATUS] == RUNNING
         while again:
             T = ti.Vector([state[k] for k in ti.static(range(12))])
-            scale = RADII + 2 * ti.cast(state[SCALE], ti.i32)
+            scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
             searched = 0
             if state[PAIRED] == 0:
                 for i in range(ti.min(n, c * each), ti.min(n, (c + 1) * each)):
                     searched += pair(
-                        frame, starts, rows, placed(T, floats(source, 4 * i)), i, settings[scale], memory
+                        frame,
+                        starts,
+                        rows,
+                        placed(T, floats(source, 4 * i)),
+                        i,
+                        settings[scale + RADIUS],
+                        memory,
                     )
             again = False
             if chunks == 1:
@@ -274,7 +283,7 @@ def align(
                 pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
                 about = placed(T, pivot)
                 rank(settings[KEEP], source, memory, ranks)
-                add_up(T, about, settings[scale + 1], rows, normals, source, memory, ranks, state)
+                add_up(T, about, settings[scale + WIDTH], rows, normals, source, memory, ranks, state)
                 if state[SUMS + 29] < settings[LEAST]:
                     state[STATUS] = LOST
                 else:

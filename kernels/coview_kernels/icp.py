@@ -19,9 +19,9 @@ from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, F64, Mask
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
-from coview_kernels.reference.icp import Alignment, Plan
+from coview_kernels.reference.icp import Alignment, Plan, Scale
 
-__all__ = ["Alignment", "Belief", "align_planes"]
+__all__ = ["Alignment", "Belief", "Scale", "align_planes"]
 
 _BULK = 1500  # searches in one iteration that are worth another launch, to be spread over the threads
 _CHUNKS = 4  # for each thread: points that must search far come in clusters
@@ -48,11 +48,10 @@ def align_planes(
     kind: npt.ArrayLike,
     T: npt.ArrayLike,
     pivot: npt.ArrayLike,
-    scales: Sequence[tuple[float, float]],
+    scales: Sequence[Scale],
     *,
     keep: float,
     iterations: int,
-    stop: tuple[float, float] = (1e-3, 5e-5),
     least: int = 50,
     prior: Belief | None = None,
 ) -> Alignment | None:
@@ -70,10 +69,9 @@ def align_planes(
         kind: (N,) bool.
         T: (4, 4) ``T_target_source`` to begin with.
         pivot: (3,) source-frame point that rotations are about.
-        scales: radius (exclusive) and width of the Cauchy weights of each, metres, coarse to fine.
+        scales: coarse to fine.
         keep: share of the pairs in (0, 1].
         iterations: at most, on each scale.
-        stop: a step below these, metres and radians, ends a scale.
         least: pairs without which there is no answer.
         prior: belief to fuse.
 
@@ -92,13 +90,13 @@ def align_planes(
     if iterations < 1 or not len(scales):
         raise ValueError(f"at least one iteration and scale are needed, got {iterations} and {len(scales)}")
     if not all(math.isfinite(v) and v > 0 for pair in scales for v in pair):
-        raise ValueError(f"scales must be pairs of positive metres, got {scales}")
+        raise ValueError(f"scales must hold positive metres and radians, got {scales}")
     belief = None
     if prior is not None:
         mean = check.finite64("the prior's mean", prior.mean, 4, 4)
         belief = mean, check.finite64("the prior's information", prior.information, 6, 6)
     plan = Plan(
-        check.finite64("T", T, 4, 4), check.finite64("pivot", pivot, 3), tuple(scales), keep, iterations, stop, least,
+        check.finite64("T", T, 4, 4), check.finite64("pivot", pivot, 3), tuple(scales), keep, iterations, least,
         belief,
     )  # fmt: skip
     if not len(grid.points) or len(points) < least:
@@ -150,13 +148,13 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
 
 def _settings(frame: F64, plan: Plan, bulk: int) -> F64:
     """All numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
-    values = np.zeros(67 + 2 * len(plan.scales))
+    values = np.zeros(65 + 4 * len(plan.scales))
     values[:8] = frame
-    values[8:16] = (
-        plan.keep, plan.iterations, len(plan.scales), *plan.stop, plan.least, plan.prior is not None, bulk,
+    values[8:14] = (
+        plan.keep, plan.iterations, len(plan.scales), plan.least, plan.prior is not None, bulk,
     )  # fmt: skip
-    values[16:19] = plan.pivot
+    values[14:17] = plan.pivot
     if plan.prior is not None:
-        values[19:31], values[31:67] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
-    values[67:] = np.ravel(plan.scales)
+        values[17:29], values[29:65] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
+    values[65:] = np.ravel(plan.scales)
     return values

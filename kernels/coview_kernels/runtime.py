@@ -273,7 +273,7 @@ def warm_up() -> None:
         np.ones(2),
         eye,
         origin,
-        [(1.0, 1.0)],
+        [api.Scale(1.0, 1.0)],
         keep=1.0,
         iterations=1,
         least=1,

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import coview_kernels.icp
-from coview_kernels import Belief, PointGrid, align_planes, reference
+from coview_kernels import Belief, PointGrid, Scale, align_planes, reference
 from coview_kernels.reference.icp import Plan
 
-SCALES = ((1.5, 0.5), (0.8, 0.26), (0.4, 0.13))
+SCALES = (Scale(1.5, 0.5, 0.02, 1e-3), Scale(0.8, 0.26), Scale(0.4, 0.13))
 FIXED = {"keep": 0.7, "iterations": 15}
 
 
@@ -56,8 +56,7 @@ def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, least
     options = FIXED | changes
     ours = align_planes(grid, normals, local, above, T, pivot, scales, prior=prior, least=least, **options)
     belief = None if prior is None else (np.asarray(prior.mean), np.asarray(prior.information))
-    stop = options.pop("stop", (1e-3, 5e-5))
-    plan = Plan(T, pivot, scales, options["keep"], options["iterations"], stop, least, belief)
+    plan = Plan(T, pivot, scales, options["keep"], options["iterations"], least, belief)
     return ours, reference.align_planes(grid.tree, normals, local, above, plan)
 
 
@@ -117,7 +116,9 @@ def test_a_far_start_of_large_turns():
     middle = points.mean(axis=0, dtype=np.float64)
     local, above, pivot = scan_of(points, rng, pose([0, 0, 0], middle), 0.0, 0.0)
     start = pose([0.05, -0.1, 0.5], np.add(middle, [0.5, -0.4, 0.3]))
-    ours, plain = both(PointGrid(points), normals, local, above, start, pivot, scales=((9.0, 3.0), *SCALES))
+    ours, plain = both(
+        PointGrid(points), normals, local, above, start, pivot, scales=(Scale(9.0, 3.0), *SCALES)
+    )
     assert_same(ours, plain, pivot)
 
 
@@ -168,7 +169,7 @@ def test_bad_arguments_are_named():
     }  # fmt: skip
     bad = {
         "normals": cloud[:1], "source": np.zeros(3), "kind": np.ones(3), "T": np.full((4, 4), np.nan),
-        "pivot": [0, 0, np.inf], "scales": [(0.0, 1.0)], "keep": 1.1, "iterations": 0,
+        "pivot": [0, 0, np.inf], "scales": [Scale(0.0, 1.0)], "keep": 1.1, "iterations": 0,
         "prior": Belief(np.eye(4), np.full((6, 6), np.inf)),
     }  # fmt: skip
     for name, value in bad.items():

@@ -36,7 +36,7 @@ def succeeds(code: str, **environment: str) -> str:
 def test_public_names():
     assert coview_kernels.__all__ == sorted(coview_kernels.__all__)
     assert set(coview_kernels.__all__) == {
-        *("Alignment", "Belief", "align_planes"),
+        *("Alignment", "Belief", "Scale", "align_planes"),
         *("MatchIndex", "Nearest"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         "normal_equations",

@@ -16,15 +16,27 @@ if TYPE_CHECKING:
 _MOST_SHARE = 5.0  # a handful of points must not outweigh thousands
 
 
+class Scale(NamedTuple):
+    """One of the stages of a registration."""
+
+    radius: float
+    """Farthest partner (exclusive), metres."""
+    width: float
+    """Of the Cauchy weights, metres."""
+    shift: float = 1e-3
+    """A step shorter than this, metres,"""
+    turn: float = 5e-5
+    """and than this, radians, ends it."""
+
+
 class Plan(NamedTuple):
     """Arguments of :func:`coview_kernels.align_planes`, checked."""
 
     T: F64
     pivot: F64
-    scales: tuple[tuple[float, float], ...]
+    scales: tuple[Scale, ...]
     keep: float
     iterations: int
-    stop: tuple[float, float]
     least: int
     prior: tuple[F64, F64] | None
 
@@ -49,16 +61,16 @@ class Alignment(NamedTuple):
 def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
     """See :func:`coview_kernels.align_planes`; ``tree`` holds the map."""
     T, total, answer = plan.T, 0, None
-    for radius, width in plan.scales:
+    for scale in plan.scales:
         for _ in range(plan.iterations):
-            step = _step(tree, normals, source, kind, plan, T, radius, width)
+            step = _step(tree, normals, source, kind, plan, T, scale)
             if step is None:
                 return None
             increment, information, rmse, pairs = step
             T = _moved(T, increment, T[:3, :3] @ plan.pivot + T[:3, 3])
             total += 1
             turn, shift = np.linalg.norm(increment[:3]), np.linalg.norm(increment[3:])
-            converged = bool(shift < plan.stop[0] and turn < plan.stop[1])
+            converged = bool(shift < scale.shift and turn < scale.turn)
             answer = Alignment(T, information, rmse, pairs, total, converged)
             if converged:
                 break
@@ -66,10 +78,10 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
 
 
 def _step(
-    tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan, T: F64, radius: float, width: float
+    tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan, T: F64, scale: Scale
 ) -> tuple[F64, F64, float, int] | None:
     """One Gauss-Newton step: increment (6,), information (6, 6), rmse and number of pairs."""
-    distance, partner = nearest(tree, source, radius, T)
+    distance, partner = nearest(tree, source, scale.radius, T)
     found = np.flatnonzero(np.isfinite(distance))
     pairs = partner[found]
     gap = source[found].astype(np.float64) @ T[:3, :3].T + T[:3, 3] - tree.data[pairs]
@@ -80,7 +92,7 @@ def _step(
     share, gap, pairs = share[chosen], gap[chosen], pairs[chosen]
     n = normals[pairs]
     residual = np.einsum("ij,ij->i", gap, n)
-    weight = share / (1.0 + (residual / width) ** 2)
+    weight = share / (1.0 + (residual / scale.width) ** 2)
     about = T[:3, :3] @ plan.pivot + T[:3, 3]
     q = tree.data[pairs].astype(np.float32)
     H, b, squares = normal_equations(source[found[chosen]], q, n, weight, T, about)
