@@ -124,6 +124,9 @@ def test_rows_put_every_peer_beside_ours():
     assert (false.ours, false.holds) == (1, None)
     right, *_ = summary.judged(ours, theirs, ours=False)
     assert right.holds is False
+    late = [tried(OURS, answer(50.0), answer(0.1))]
+    right, *_ = summary.judged([tried("X", answer(0.1))], late, ours=False)
+    assert right.ours == 0.0
     accepts, *_ = summary.judged(ours, ours, ours=True)
     assert accepts.holds is True
     accepts, *_ = summary.judged([tried(OURS, answer(30.0))], ours, ours=True)

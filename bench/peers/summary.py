@@ -1,6 +1,6 @@
 """The peers as rows of the suite: ten places in each of two worlds, a line per peer and figure.
 
-A trial ends after 30 s, so that a slow peer answers some of the queries only; its shares are of those. The whole
+A trial ends after 30 s, so that a slow peer answers the first queries only; both sides' shares are of those. The whole
 table, with all answers, is that of ``python -m bench.peers``.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +45,18 @@ def judged(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) -> I
         yield informs(f"{name}, right", _share(theirs), "%")
         yield informs(f"{name}, time of a query", _milliseconds(theirs), "ms")
         return
-    same = [t for t in reference if t.scene in {trial.scene for trial in answered}]
+    same = [_cut(mine, trial) for trial in answered for mine in reference if mine.scene == trial.scene]
     share, their_share = _share(same), _share(answered)
     ratio = share / their_share if their_share else None
     yield Row(f"{name}, right", share, their_share, "%", ratio, "as often", share >= their_share)
     time, their_time = _milliseconds(same), _milliseconds(answered)
     yield Row(f"{name}, time of a query", time, their_time, "ms", their_time / time, "", None)
     yield informs(f"{name}, its false accepts", sum(t.false_accepts() for t in answered), "")
+
+
+def _cut(mine: Trial, theirs: Trial) -> Trial:
+    """Return our trial as far as theirs came."""
+    return replace(mine, answers=mine.answers[: len(theirs.answers)])
 
 
 def _share(trials: Sequence[Trial]) -> float:
