@@ -68,16 +68,18 @@ def _screen(rows: int, blocks: int, lanes: int):
                     xs[4 + u] = x[half + g * 4 + u]
                     ys[4 + u] = y[half + g * 4 + u]
                 for n in range(lanes):
+                    # adds nothing, but keeps a number that all lanes share from being spread as 32 bits and narrowed
+                    zero = turn[5 * lanes + n]
                     a = ti.cast(0, i16)
                     b = ti.cast(0, i16)
                     c = ti.cast(0, i16)
                     d = ti.cast(0, i16)
                     for u in ti.static(range(4)):
-                        at = (5 + g * 4 + u) * lanes + n
-                        a += high(xs[u], turn[at])
-                        b += high(ys[u], turn[at + blocks * lanes])
-                        c += high(xs[4 + u], turn[at + half * lanes])
-                        d += high(ys[4 + u], turn[at + (blocks + half) * lanes])
+                        at = (6 + g * 4 + u) * lanes + n
+                        a += high(xs[u] + zero, turn[at])
+                        b += high(ys[u] + zero, turn[at + blocks * lanes])
+                        c += high(xs[4 + u] + zero, turn[at + half * lanes])
+                        d += high(ys[4 + u] + zero, turn[at + (blocks + half) * lanes])
                     even[n] += a
                     even_sine[n] += b
                     odd[n] += c

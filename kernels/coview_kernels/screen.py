@@ -144,7 +144,7 @@ class Screen:
         return np.cos(angle) * used, -np.sin(angle) * used, nyquist
 
     def _table(self, gain: F64, size: float) -> tuple[npt.NDArray[np.int16], float, float]:
-        """Rows of the turn: mean of the upper halves, frequency S / 2, cosines (L), sines (L); unit; error."""
+        """Rows of the turn: means of upper halves (4), frequency S / 2, zeros, cosines (L), sines (L); unit; error."""
         rows = 2 * self.rings
         scale = np.where(self._frequency >= 0, 256.0 / gain, 0.0)  # of one unit of a product
         # either side of the mean, in a pair whose turn has a norm of 1, or is (1, 1) in block 0
@@ -152,11 +152,12 @@ class Screen:
         unit = max(2.01 * float(scale.max()), (self._reach * size + error) / 31_000.0)
         factor = (65_536.0 / unit * scale)[:, None]
         blocks, half = self._blocks, self._blocks // 2
-        turn = np.empty((5 + 2 * blocks, self._cosine.shape[1]))
+        turn = np.empty((6 + 2 * blocks, self._cosine.shape[1]))
+        turn[5] = 0.0
         turn[4] = self._nyquist * factor[0]
-        turn[5 : 5 + blocks] = self._cosine * factor
-        turn[5 + blocks :] = self._sine * factor
-        turn[:4] = turn[5:].reshape(4, half, -1).sum(axis=1)
+        turn[6 : 6 + blocks] = self._cosine * factor
+        turn[6 + blocks :] = self._sine * factor
+        turn[:4] = turn[6:].reshape(4, half, -1).sum(axis=1)
         turn[0] += turn[4]
         turn[:4] = turn[:4] * (rows / 2.0 / 65_536.0) + half / 2.0
         turn[0, self._shifts :] = -30_000.0
@@ -185,7 +186,7 @@ class _Kernel:
         self._stations = stations
         rows, blocks = stations.shape[1:]
         self._query = np.zeros((2, rows, blocks), dtype=np.int16)
-        self._turn = np.zeros((5 + 2 * blocks, lanes), dtype=np.int16)
+        self._turn = np.zeros((6 + 2 * blocks, lanes), dtype=np.int16)
         self._out = np.empty(len(stations), dtype=np.int32)
         flat = (a.reshape(-1) for a in (stations, self._query, self._turn))
         self._launch = Launch("screen", f"screen_{rows}_{blocks}_{lanes}", *flat, lanes, self._out)

@@ -13,11 +13,11 @@ _PORTION = 256
 
 
 def screen(stations: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
-    """Greatest correlation over the shifts, (M,) int32; stations (M, K, L), query (2, K, L), turn (5 + 2L, N)."""
+    """Greatest correlation over the shifts, (M,) int32; stations (M, K, L), query (2, K, L), turn (6 + 2L, N)."""
     wide, t = query.astype(np.int32), turn.astype(np.int32)
     blocks = stations.shape[2]
     even, odd = slice(0, blocks // 2), slice(blocks // 2, blocks)
-    cosine, sine = t[5 : 5 + blocks], t[5 + blocks :]
+    cosine, sine = t[6 : 6 + blocks], t[6 + blocks :]
     out = np.empty(len(stations), dtype=np.int32)
     for start in range(0, len(stations), _PORTION):
         part = stations[start : start + _PORTION].astype(np.int32) << 8
