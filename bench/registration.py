@@ -5,7 +5,8 @@ Every way gets the same 10,000 points of the last five metres' frames (thinned t
 of the map and the same starts: up to 0.5 m off in each direction and 3 degrees of heading ("search"), or a tenth of
 that ("tracking").
 
-* ours: the engine's settings, two scales while tracking and three from the far starts (1.5, 0.8, 0.4 m).
+* ours: the engine's settings and, as its search does it, every fifth point for the coarse scales (0.8 m while
+  tracking, 1.5 and 0.8 m from the far starts), then all for the last one (0.4 m).
 * small_gicp: GICP and VGICP with correspondences within 2 m (the better of 1 and 2 m, tried), covariances of 10
   neighbours and voxels of 1 m. Its tile is prepared before, as ours is; its source's covariances, without which it
   cannot begin and which ours does not need, are part of the time. "align only" leaves them out.
@@ -38,7 +39,8 @@ from coview_stream.pose.source import height_above_lowest
 POINTS, VOXEL, REACH, WINDOW = 10_000, 0.25, 50.0, 5.0
 LEAST = 1.5
 STARTS = {"tracking": (0.05, np.radians(0.3)), "search": (0.5, np.radians(3.0))}
-SCALES = {"tracking": RegistrationConfig().track, "search": (1.5, 0.8, 0.4)}
+COARSE = {"tracking": (0.8,), "search": (1.5, 0.8)}
+FINE, NTH = (0.4,), 5
 WAYS = ("GICP", "VGICP")
 _CLEAR = 0.5  # metres above the ground, as in coview_stream.pose.source
 
@@ -179,9 +181,10 @@ Way = Callable[[Place, Pose], tuple[float, Pose | None]]
 def _sides(kind: str, peers: dict[int, SmallGicp]) -> dict[str, Way]:
     def ours(place: Place, begin: Pose) -> tuple[float, Pose | None]:
         clock = time.perf_counter()
-        answer = register(
-            place.source, begin, place.target, RegistrationConfig(), SCALES[kind], centre=place.position
-        )
+        config, about = RegistrationConfig(), place.position
+        rough = register(place.source.every(NTH), begin, place.target, config, COARSE[kind], centre=about)
+        middle = begin if rough is None else rough.T_map_source
+        answer = register(place.source, middle, place.target, config, FINE, centre=about)
         return time.perf_counter() - clock, None if answer is None else answer.T_map_source
 
     def theirs(way: str, whole: bool) -> Way:
