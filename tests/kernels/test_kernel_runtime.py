@@ -37,6 +37,7 @@ def test_public_names():
     assert coview_kernels.__all__ == sorted(coview_kernels.__all__)
     assert set(coview_kernels.__all__) == {
         *("Alignment", "Belief", "Scale", "align_planes"),
+        *("FrameIntake", "Intake", "describe_points"),
         *("MatchIndex", "Nearest"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         "normal_equations",
