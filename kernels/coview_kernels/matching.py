@@ -20,6 +20,7 @@ from coview_kernels.arrays import C64, F32, F64, I64
 from coview_kernels.screen import MAX_SECTORS, Screen
 from coview_kernels.similarity import all_shift_distance, unit_columns
 
+_CHECKED = 1024
 _PORTION = 256  # stations scored at a time, best bounds first: what follows may drop out meanwhile
 _MANY = 16  # more than 1 / 16 of the stations left: all distances at once are cheaper, if there are spectra
 _ROUNDED = 2e-9
@@ -58,7 +59,9 @@ class MatchIndex:
             raise ValueError(
                 f"descriptors have shape {descriptors.shape}, expected (M, rings, 1 to {MAX_SECTORS} sectors)"
             )
-        if not np.isfinite(descriptors.max(initial=0.0) - descriptors.min(initial=0.0)):
+        if not all(
+            np.isfinite(descriptors[i : i + _CHECKED]).all() for i in range(0, len(descriptors), _CHECKED)
+        ):
             raise ValueError("descriptors hold NaN or inf")
         self.descriptors = descriptors
         self._screen = Screen(descriptors)
