@@ -33,6 +33,11 @@ class Engine(Protocol):
         """Drop what is known of a robot."""
         ...
 
+    @property
+    def kernels(self) -> tuple[str, ...]:
+        """Those that its jobs launch, to be compiled before the first."""
+        ...
+
     def prepare(self) -> None:
         """Do what would make the first job slow; called when there may be time."""
         ...
@@ -40,6 +45,8 @@ class Engine(Protocol):
 
 class TrackEngine:
     """Takes in frames: keyframes, deskewing, registration around a known place."""
+
+    kernels = ("FrameIntake", "transform_unique", "nearest", "align_planes")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
@@ -86,6 +93,8 @@ class TrackEngine:
 
 class SearchEngine:
     """Searches the whole map for keyframes; all robots share the map's spectra."""
+
+    kernels = ("transform_unique", "describe_points", "nearest", "align_planes")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map

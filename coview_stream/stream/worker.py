@@ -14,14 +14,14 @@ def main(argv: list[str]) -> int:
     pipe = Connection(descriptor)
     with contextlib.suppress(OSError):
         os.nice(nice)
-    from coview_kernels import runtime
+    from coview_kernels import warm_up
     from coview_stream.errors import CoViewError
     from coview_stream.stream.engine import open_engine
     from coview_stream.stream.lane import attempt
 
     try:
         engine = open_engine(kind, map_path, sha256)
-        runtime.warm_up()
+        warm_up(*engine.kernels)
     except CoViewError as error:
         pipe.send(("error", str(error)))
         return 1

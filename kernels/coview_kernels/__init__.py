@@ -14,10 +14,11 @@ from coview_kernels.intake import FrameIntake, Intake
 from coview_kernels.matching import MatchIndex, Nearest
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
-from coview_kernels.runtime import backend, shutdown, submit, warm_up
+from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
 from coview_kernels.trimmed_icp import normal_equations, trim
 from coview_kernels.voxel import transform_unique
+from coview_kernels.warming import warm_up
 
 __all__ = [
     "Alignment",

@@ -28,8 +28,6 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
-import numpy as np
-
 from coview_kernels.owner import OwnerThread, StoppedError
 
 P = ParamSpec("P")
@@ -113,7 +111,7 @@ def _hasten(library: Any) -> None:
     time that a kernel takes to load from the cache, where nothing can be wrong any more.
     """
     try:
-        notes = importlib.import_module(f"{library.__name__}.lang.ast.ast_transformer_utils")
+        notes: Any = importlib.import_module(f"{library.__name__}.lang.ast.ast_transformer_utils")
     except ImportError:
         return
     if hasattr(notes, "TextWrapper"):
@@ -253,37 +251,6 @@ def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwa
                 _owner.stop()
                 _owner, _backend = None, "numpy"
         return plain(*args, **kwargs)
-
-
-def warm_up() -> None:
-    """Start the backend and compile every kernel now rather than at first use."""
-    if backend() == "numpy":
-        return
-    import coview_kernels as api
-
-    cloud = np.ones((2, 3), dtype=np.float32)
-    eye, origin = np.eye(4), np.zeros(3)
-    api.transform_unique(cloud, eye, 1.0)
-    api.FrameIntake(1.0)(cloud, eye)
-    api.nearest(api.PointGrid(cloud), cloud, 1.0)
-    api.align_planes(
-        api.PointGrid(cloud),
-        cloud,
-        cloud,
-        np.ones(2),
-        eye,
-        origin,
-        [api.Scale(1.0, 1.0)],
-        keep=1.0,
-        iterations=1,
-        least=1,
-    )
-    grid, _ = api.polar_bin(cloud, origin, 2, 4, 8.0)
-    one = np.zeros(1, dtype=np.int32)
-    api.station_bins(np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, one, one, one, 2, 4, 2.0)
-    api.coview(*grid)
-    for normals in (None, cloud):
-        api.normal_equations(cloud, cloud, normals, np.ones(2), eye, origin)
 
 
 def shutdown() -> None:

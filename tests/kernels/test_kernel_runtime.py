@@ -207,6 +207,11 @@ def test_the_compilers_notes_on_the_source_are_not_wrapped():
     assert wrapper.wrap("  ") == textwrap.TextWrapper(width=80).wrap("  ")
 
 
+def test_unknown_kernels_cannot_be_warmed():
+    with pytest.raises(ValueError, match=r"no kernel nearset; there are .*nearest"):
+        warm_up("nearset", "nearest")
+
+
 def test_workers_are_at_least_one(monkeypatch):
     monkeypatch.delenv("COVIEW_THREADS", raising=False)
     assert 1 <= runtime.workers() <= 16

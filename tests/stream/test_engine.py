@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from small_world import pose_error
 
+import coview_kernels
+from coview_kernels import runtime
+from coview_kernels.launch import Launch
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, MapError, RunError
 from coview_stream.fix import State
@@ -64,6 +67,40 @@ def reference(engines, world_drive):
 def alone(reference):
     """Its fixes."""
     return reference.fixes
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Names of the kernel modules that were launched since it was last cleared."""
+    coview_kernels.warm_up()  # modules that import one another do so now
+    names = set()
+    kernels, launch = runtime.kernels, Launch.__call__
+    monkeypatch.setattr(runtime, "kernels", lambda name: names.add(name) or kernels(name))
+    monkeypatch.setattr(Launch, "__call__", lambda self: names.add(self._name[0]) or launch(self))
+    return names
+
+
+@pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
+def test_engines_name_the_kernels_that_they_launch(world_map, world_drive, launched, monkeypatch):
+    """What is not named is compiled when the first job needs it, which takes a second."""
+    track, search = TrackEngine(world_map), SearchEngine(world_map)
+    asked = {}
+    for engine in (track, search):
+
+        def run(job, engine=engine, run=engine.run):
+            launched.clear()
+            result = run(job)
+            asked.setdefault(engine, set()).update(launched)
+            return result
+
+        monkeypatch.setattr(engine, "run", run)
+    follower = Follower(track, search, "fresh")
+    follower.follow(world_drive, range(FRAMES))
+    assert follower.fixes[-1].state is State.TRACKING
+    for engine in (track, search):
+        launched.clear()
+        coview_kernels.warm_up(*engine.kernels)
+        assert asked[engine] == launched
 
 
 def same(fix, other):

@@ -1,0 +1,63 @@
+"""Kernels compiled before they are needed: from the cache, too, each takes a tenth of a second or more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from coview_kernels import runtime
+from coview_kernels.covisibility import coview
+from coview_kernels.icp import Scale, align_planes
+from coview_kernels.intake import FrameIntake
+from coview_kernels.nearest import PointGrid, nearest
+from coview_kernels.polar import describe_points, polar_bin, station_bins
+from coview_kernels.trimmed_icp import normal_equations
+from coview_kernels.voxel import transform_unique
+
+_CLOUD = np.ones((2, 3), dtype=np.float32)
+_EYE, _ORIGIN, _ONE = np.eye(4), np.zeros(3), np.zeros(1, dtype=np.int32)
+
+
+def _align() -> None:
+    scales = [Scale(1.0, 1.0)]
+    align_planes(
+        PointGrid(_CLOUD), _CLOUD, _CLOUD, np.ones(2), _EYE, _ORIGIN, scales, keep=1.0, iterations=1, least=1
+    )
+
+
+def _normal_equations() -> None:
+    for normals in (None, _CLOUD):
+        normal_equations(_CLOUD, _CLOUD, normals, np.ones(2), _EYE, _ORIGIN)
+
+
+_CALLS: dict[str, Callable[[], object]] = {
+    "FrameIntake": lambda: FrameIntake(1.0)(_CLOUD, _EYE),
+    "align_planes": _align,
+    "coview": lambda: coview(*polar_bin(_CLOUD, _ORIGIN, 2, 4, 8.0)[0]),
+    "describe_points": lambda: describe_points(_CLOUD, _ORIGIN, 2, 4, 8.0),
+    "nearest": lambda: nearest(PointGrid(_CLOUD), _CLOUD, 1.0),
+    "normal_equations": _normal_equations,
+    "polar_bin": lambda: polar_bin(_CLOUD, _ORIGIN, 2, 4, 8.0),
+    "station_bins": lambda: station_bins(
+        np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, _ONE, _ONE, _ONE, 2, 4, 2.0
+    ),
+    "transform_unique": lambda: transform_unique(_CLOUD, _EYE, 1.0),
+}
+
+
+def warm_up(*names: str) -> None:
+    """Start the backend and compile kernels now rather than at first use.
+
+    Args:
+        names: of the public functions that will be called; none stands for all.
+
+    Raises:
+        ValueError: a name is unknown.
+    """
+    if unknown := sorted(set(names) - set(_CALLS)):
+        raise ValueError(f"no kernel {', '.join(unknown)}; there are {', '.join(_CALLS)}")
+    if runtime.backend() == "numpy":
+        return
+    for name in names or _CALLS:
+        _CALLS[name]()
