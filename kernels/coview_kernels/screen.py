@@ -204,4 +204,5 @@ class _Kernel:
             self._query[:] = query
             self._turn[:] = turn
             self._launch()
-        return self._out.copy()
+        copied: I32 = self._out.copy()
+        return copied
