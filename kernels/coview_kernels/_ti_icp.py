@@ -82,9 +82,9 @@ def rank(keep, source: ti.template(), memory: ti.template(), ranks: ti.template(
     """Find how far the farthest kept pair of either kind is, by radix: exact, and no slower where all are equal."""
     for kind in range(2):
         ranks[kind, LAST] = 0
-    for level in ti.static(range(3)):
-        shift = ti.static(20 - 10 * level)
-        bins = ti.static(2048 if level == 0 else 1024)
+    for level in range(3):
+        shift = 20 - 10 * level
+        bins = 2048 if level == 0 else 1024
         for kind in range(2):
             for b in range(bins):
                 ranks[kind, BINS + b] = 0
@@ -92,12 +92,15 @@ def rank(keep, source: ti.template(), memory: ti.template(), ranks: ti.template(
             if memory[6 * i + NEAR] < NONE:
                 key = ti.bit_cast(ti.cast(memory[6 * i + NEAR], ti.f32), ti.i32)
                 kind = ti.cast(source[4 * i + 3], ti.i32)
-                if ti.static(level == 0):
-                    ranks[kind, BINS + (key >> shift)] += 1
+                b = -1
+                if level == 0:
+                    b = BINS + (key >> shift)
                 elif (key >> (shift + 10)) == ranks[kind, LAST]:
-                    ranks[kind, BINS + ((key >> shift) & 1023)] += 1
+                    b = BINS + ((key >> shift) & 1023)
+                if b >= 0:
+                    ranks[kind, b] = ranks[kind, b] + 1  # += would be atomic
         for kind in range(2):
-            if ti.static(level == 0):
+            if level == 0:
                 found = 0
                 for b in range(bins):
                     found += ranks[kind, BINS + b]
@@ -110,9 +113,9 @@ def rank(keep, source: ti.template(), memory: ti.template(), ranks: ti.template(
                 b += 1
             ranks[kind, LEFT] = left
             ranks[kind, LAST] = ranks[kind, LAST] * 1024 + b - BINS
-            if ti.static(level == 2):
+            if level == 2:
                 # all that are as far as the last one that is kept are kept too
-                ranks[kind, KEPT] += ranks[kind, b] - left
+                ranks[kind, KEPT] = ranks[kind, KEPT] + ranks[kind, b] - left
 
 
 @ti.func
@@ -176,12 +179,12 @@ def solve(pivot, about, settings: ti.template(), state: ti.template(), system: t
         for a in range(6):
             for b in range(6):
                 belief = settings[BELIEF + 6 * a + b]
-                state[INFORMATION + 6 * a + b] += belief
-                system[a, 6] -= belief * state[OFF + b]
+                state[INFORMATION + 6 * a + b] = state[INFORMATION + 6 * a + b] + belief
+                system[a, 6] = system[a, 6] - belief * state[OFF + b]
     for a in range(6):
         for b in range(6):
             system[a, b] = state[INFORMATION + 6 * a + b]
-        system[a, a] += 1e-6
+        system[a, a] = system[a, a] + 1e-6
     eliminate(system)
 
 
@@ -201,7 +204,7 @@ def eliminate(system: ti.template()):
             if a != c:
                 share = system[a, c] / system[c, c]
                 for b in range(c, 7):
-                    system[a, b] -= share * system[c, b]
+                    system[a, b] = system[a, b] - share * system[c, b]
     for c in range(6):
         system[c, 6] /= system[c, c]
 
@@ -226,15 +229,15 @@ def advance(about, settings: ti.template(), state: ti.template(), system: ti.tem
             v += about + shift
         for d in ti.static(range(3)):
             state[4 * d + column] = v[d]
-    state[TOTAL] += 1
-    state[ROUND] += 1
+    state[TOTAL] = state[TOTAL] + 1
+    state[ROUND] = state[ROUND] + 1
     state[CONVERGED] = 0.0
     scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
     if shift.norm() < settings[scale + SHIFT] and angle < settings[scale + TURN]:
         state[CONVERGED] = 1.0
     if state[CONVERGED] > 0 or state[ROUND] >= settings[ITERATIONS]:
         state[ROUND] = 0
-        state[SCALE] += 1
+        state[SCALE] = state[SCALE] + 1
         if state[SCALE] >= settings[SCALES]:
             state[STATUS] = DONE
 

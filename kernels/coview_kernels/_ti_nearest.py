@@ -154,7 +154,7 @@ def sort(
     ti.loop_config(serialize=True)
     for _ in range(1):
         for n in range(points.shape[0]):
-            starts[cell[n]] += 1
+            starts[cell[n]] = starts[cell[n]] + 1
         end = 0
         for c in range(starts.shape[0]):
             end += starts[c]
