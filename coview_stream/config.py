@@ -254,7 +254,8 @@ class TrackingConfig:
 
     Register after ``distance`` metres of driving or ``turn`` radians of turning, or ``seconds`` (sensor time) whatever
     odometry says, for wheels slip, drivers hang and robots are carried; with the points of the last ``window``
-    metres (older ones are smeared by the drift) but at least ``min_points``. Drifts are random-walk sigmas per square
+    metres (older ones are smeared by the drift) but at least ``min_points``, and of the newest frames that have
+    ``max_points`` only: a dense lidar needs no more. Drifts are random-walk sigmas per square
     root of a metre driven; ``turn_drift`` is yaw error per radian turned.
     """
 
@@ -262,6 +263,7 @@ class TrackingConfig:
     seconds: float = 1.0
     window: float = 2.0
     min_points: int = 2500
+    max_points: int = 50_000
     turn: float = math.radians(10)
     yaw_drift: float = math.radians(0.3)
     turn_drift: float = 0.02
@@ -280,7 +282,7 @@ class TrackingConfig:
             "tilt_drift",
             "position_drift",
         )
-        _counts(self, "min_points")
+        _counts(self, "min_points", "max_points")
 
 
 @dataclass(frozen=True)

@@ -110,19 +110,21 @@ class Localizer:
         """
         cloud, T_odom_body = self._checked(cloud, T_odom_body, stamp)
         self._newest = _Frame(cloud, T_odom_body, stamp)
-        keyframe = self._buffer.add(cloud, T_odom_body, stamp)
-        self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
-        if self.state is State.TRACKING:
+        if self.state is State.TRACKING:  # keyframes are for searching: a loss starts from nothing
+            self._tracker.observe(cloud, T_odom_body, self._buffer.thin(cloud, T_odom_body))
             patience = _HURRIED if hurry else 1.0
             due = self._tracker.due(patience) or self._doubts > 0
             if due or stamp - self._registered >= patience * self.config.tracking.seconds:
                 self._track(cloud, T_odom_body, stamp, idle=not due)
             else:
                 self._tracker.look_around(T_odom_body)
-        elif keyframe is not None:
-            scan = self.base_map.descriptor_config
-            return Query.of(self._buffer, keyframe, cloud, scan, self._tracker.travelled, self._generation)
-        return None
+            return None
+        keyframe = self._buffer.add(cloud, T_odom_body, stamp)
+        self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
+        if keyframe is None:
+            return None
+        scan = self.base_map.descriptor_config
+        return Query.of(self._buffer, keyframe, cloud, scan, self._tracker.travelled, self._generation)
 
     def adopt(self, verdict: Verdict) -> None:
         """Second half of :meth:`step`: take note of a search, and start tracking when one place stands alone.
@@ -136,6 +138,7 @@ class Localizer:
         if verdict.accepted is not None:
             self._tracker.start(verdict.accepted.registration, verdict.travelled)
             self.state, self._doubts = State.TRACKING, 0
+            self._buffer.clear()
             self._registered = newest.stamp
             if not self._speaks_for(self._tracker.update(newest.cloud, newest.T_odom_body)):
                 self.suspect()  # what it sees now does not fit: it may have driven on or been carried since

@@ -157,7 +157,8 @@ class Tracker:
         parts: list[Points] = []
         count = 0
         for frame in reversed(self._recent):
-            if count >= settings.min_points and self.travelled - frame.travelled > settings.window:
+            old = self.travelled - frame.travelled > settings.window
+            if count >= settings.max_points or (old and count >= settings.min_points):
                 break
             parts.append(frame.points)
             count += len(frame.points)

@@ -90,6 +90,19 @@ def test_what_odometry_does_is_believed_less_and_less(still):
     assert (driven > turned).all()
 
 
+def test_the_window_is_the_last_metres_more_for_few_points_less_for_many(world_map):
+    def window(points, frames=8, **settings):
+        config = LocalizerConfig(tracking=TrackingConfig(**settings))
+        tracker = Tracker(world_map, config, LocalMaps(world_map, 50.0))
+        for k in range(frames):
+            tracker.observe(None, pose_from(np.eye(3), [0.5 * k, 0, 0]), np.full((points, 3), k, np.float32))
+        return sorted({int(k) for k in tracker._window()[:, 0]})
+
+    assert window(1000) == [3, 4, 5, 6, 7]  # 2 m
+    assert window(300) == list(range(8))[-9:]  # 2,500 points need more
+    assert window(20_000) == [5, 6, 7]  # 50,000 are plenty
+
+
 # ---- which registrations are believed
 
 

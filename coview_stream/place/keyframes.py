@@ -59,9 +59,14 @@ class KeyframeBuffer:
         self._pending: list[Points] = []
         self._intake = kernels.FrameIntake(config.voxel, config.range_min)
 
+    def thin(self, cloud: Points, T_odom_body: Pose) -> Points:
+        """Thin one frame (N, 3) in the body frame to :attr:`newest`, for who needs no keyframes."""
+        self.newest = self._intake(cloud, T_odom_body).points.copy()  # which the next frame overwrites
+        return self.newest
+
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
         """Take in one frame (N, 3) in the body frame; return the keyframe it completes, if it does."""
-        self.newest = self._intake(cloud, T_odom_body).points.copy()  # which the next frame overwrites
+        self.thin(cloud, T_odom_body)
         self._pending.append(self.newest)
         if sum(map(len, self._pending)) > _PENDING_POINTS:
             self._pending = [self._unique(np.concatenate(self._pending))]

@@ -16,6 +16,7 @@ _BEAM = np.radians(2.0)  # cell of the range image
 _COLUMNS = int(np.ceil(2 * np.pi / _BEAM)) + 1
 _CELLS = _COLUMNS * (int(np.ceil(np.pi / _BEAM)) + 1)
 _BEAM_HITS = 2
+_MOST_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
 _SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
 _SLACK_SLOPE = 0.03
 
@@ -39,6 +40,7 @@ class RangeImage:
     @classmethod
     def of(cls, cloud: Points) -> RangeImage:
         """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
+        cloud = cloud[:: max(1, -(-len(cloud) // _MOST_RAYS))]
         ranges = lengths(cloud)
         usable = ranges > 1.0
         ranges = ranges[usable]

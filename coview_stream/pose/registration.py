@@ -46,8 +46,12 @@ class LocalMap:
 
     def prepare(self) -> None:
         """Make now what is made when asked for."""
-        kernels.nearest(self.grid, self.points[:1], 1.0)  # which sorts them
-        _ = self.edges
+        _ = self.edges, self._sorted
+
+    @cached_property
+    def _sorted(self) -> bool:
+        kernels.nearest(self.grid, self.points[:1], 1.0)
+        return True
 
     @cached_property
     def edges(self) -> EdgeRaster:

@@ -107,3 +107,13 @@ def test_what_was_taken_in_stays_as_it_was():
     first, before = buffer.newest, buffer.newest.copy()
     buffer.add(cloud(1), at(0.1), 0.1)
     np.testing.assert_array_equal(first, before)
+
+
+def test_a_frame_can_be_thinned_without_becoming_part_of_a_keyframe():
+    buffer = KeyframeBuffer(CONFIG)
+    np.testing.assert_array_equal(
+        buffer.thin(cloud(0), at(0.0)), keyframes.thinned(cloud(0), at(0.0), CONFIG)
+    )
+    assert buffer.newest is not None
+    assert len(buffer.recent(1)) == 0
+    assert len(buffer.keyframes) == 0

@@ -148,3 +148,16 @@ def test_points_off_the_survey_do_not_count(seen):
     assert found.near == 1.0
     assert found.ground > 0.99
     assert found.inside == 0.5
+
+
+def test_a_dense_frame_is_judged_by_a_part_of_it(monkeypatch):
+    cloud = np.repeat(fan(10.2), 9, axis=0)
+    whole = rays_against_map(RangeImage.of(cloud), BODY, WALL)
+    monkeypatch.setattr(rays, "_MOST_RAYS", len(fan(10.2)) * 3)
+    part = RangeImage.of(cloud)
+    assert 0.2 * len(cloud) < part.hits.sum() < 0.4 * len(cloud)
+    assert rays_against_map(part, BODY, WALL) == whole
+
+
+def test_a_frame_without_points_has_no_rays():
+    assert rays_against_map(RangeImage.of(np.empty((0, 3), np.float32)), BODY, WALL) == (0, 0)
