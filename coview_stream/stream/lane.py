@@ -16,16 +16,18 @@ import threading
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from coview_stream.errors import CoViewError
-from coview_stream.search import Verdict
-from coview_stream.stream.engine import Engine
-from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.watchdog import Watchdog
 
-Job = FrameJob | SearchJob
-Result = FrameResult | Verdict
+if TYPE_CHECKING:  # the child imports them; that a node opens should not wait for it here too
+    from coview_stream.search import Verdict
+    from coview_stream.stream.engine import Engine
+    from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
+
+Job: TypeAlias = "FrameJob | SearchJob"
+Result: TypeAlias = "FrameResult | Verdict"
 
 _GLANCE = 0.1  # seconds between two looks at whether the opening has been cancelled
 

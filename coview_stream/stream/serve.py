@@ -7,18 +7,18 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import MapError, TransportError
 from coview_stream.stream.apart import check_apart
-from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.lane import CancelledError, DiedError, ProcessLane
-from coview_stream.stream.node import Node
-from coview_stream.stream.session import Session
 from coview_stream.stream.transport import Transport
-from coview_stream.stream.zenoh_transport import open_transport
+
+if TYPE_CHECKING:
+    from coview_stream.stream.node import Node
 
 log = logging.getLogger("coview_stream.node")
 
@@ -77,6 +77,12 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     try:
         for lane in lanes:
             lane.start()
+        # imported while the engines start, which takes longer
+        from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
+        from coview_stream.stream.node import Node
+        from coview_stream.stream.session import Session
+        from coview_stream.stream.zenoh_transport import open_transport
+
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload
         )
@@ -84,8 +90,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         codecs = (options.cloud_codec, options.odometry_codec)
         sessions = [Session(k, base_map.sha256, options.node, options=codecs) for k in options.keys]
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
-        for lane in lanes:
-            lane.wait_ready(cancelled)
+        track.wait_ready(cancelled)  # the other one has until the first keyframe
         if cancelled():
             raise CancelledError("the node is no longer wanted")
         node = Node(sessions, transport, track, search, options.node, options.pose_codec)

@@ -16,7 +16,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 from coview_stream.cli import serve as command
 from coview_stream.errors import ConfigError
-from coview_stream.stream import serve
+from coview_stream.stream import serve, zenoh_transport
 from coview_stream.stream.fake import FakeTransport
 from coview_stream.stream.keys import robot_keys
 from coview_stream.stream.lane import CancelledError
@@ -168,7 +168,7 @@ def test_the_largest_payload_reaches_the_transport(monkeypatch, world_file):
     def open_transport(*args):
         raise ConfigError(f"asked with {args}")
 
-    monkeypatch.setattr(serve, "open_transport", open_transport)
+    monkeypatch.setattr(zenoh_transport, "open_transport", open_transport)
     keys = [robot_keys("native", "coview", "r1")]
     options = serve.ServeOptions(world_file, keys, node=serve.NodeConfig(max_payload=1234))
     assert BaseMap.load(world_file).sha256
