@@ -22,7 +22,7 @@ from bench.running import counted, run
 from bench.suite import OWN, SUITE, Entry
 from bench.tables import line, rule
 
-_HEAD = ("benchmark", "ours", "baseline", "unit", "ratio", "target", "verdict")
+HEAD = ("benchmark", "ours", "baseline", "unit", "ratio", "target", "verdict")
 _WIDTHS = (60, 9, 9, 7, 7, 12, 13)
 _VERDICTS = {True: "holds", False: "DOES NOT HOLD", None: "informs"}
 
@@ -127,7 +127,7 @@ def main(arguments: Sequence[str] | None = None, suite: Sequence[Entry] = SUITE)
         return 0
     chosen = [entry for entry in suite if not options.names or entry.name in options.names]
     begin = time.monotonic()
-    print(line(_HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
+    print(line(HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
     try:
         rows = _measure(chosen, options.threads, options.quick)
     except KeyboardInterrupt:

@@ -26,7 +26,7 @@ from bench.tables import line, number, rule
 PLACES, QUICK = 20, 4
 LIMIT_S = 180.0
 
-_HEAD = (
+HEAD = (
     "peer", "world", "right < 3 m", "< 1 m", "false accepts", "found", "e_t m", "e_r deg", "query ms", "map s"
 )  # fmt: skip
 _WIDTHS = (24, 7, 11, 8, 13, 8, 6, 7, 8, 6)
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     chosen = [peer for peer in PEERS if not options.only or peer.name in options.only]
     count, trials = QUICK if options.quick else PLACES, []
-    print(line(_HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
+    print(line(HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
     for trial in contest(options.worlds, count, options.limit, chosen, tuple(WORLDS)):
         trials.append(trial)
         if trial.prepare_s == trial.prepare_s:  # it came that far
