@@ -165,7 +165,10 @@ class GlobalSearch:
         if descriptor.ground_zero:
             centre[2] = ground_below(query.scan, query.position)
         self.last_query = describe(query.scan, centre, descriptor)
-        self.consensus.vote(centre, self.retrieval.distances(self.last_query))
+        if self.config.consensus.mode == "single":
+            self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
+        else:
+            self.consensus.vote(centre, self.retrieval.distances(self.last_query))
 
     def _refine(self, hypotheses: list[Hypothesis], source: Source, query: Query) -> list[Candidate]:
         """Return verified candidates, best first. All go through the coarse scales, the promising ones through all."""

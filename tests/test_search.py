@@ -10,7 +10,13 @@ import small_world
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.writers import write_cloud
-from coview_stream.config import AcceptanceConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
+from coview_stream.config import (
+    AcceptanceConfig,
+    ConsensusConfig,
+    DescriptorConfig,
+    LocalizerConfig,
+    RegistrationConfig,
+)
 from coview_stream.fix import State
 from coview_stream.geometry import exp_se3, inverse, pose_from, rot_z, tilt_of
 from coview_stream.localizer import Localizer
@@ -244,6 +250,13 @@ def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive
     assert "confirmed by 2 keyframes" in again.evidence.reason
     search.clear()
     assert search.update(next(frames)).evidence.score == 0.0
+
+
+def test_the_papers_rule_asks_for_the_nearest_stations_only(search, world_drive, monkeypatch):
+    single = replace(search.config, consensus=ConsensusConfig(mode="single"))
+    paper = GlobalSearch(search.base_map, single, search.local_maps)
+    monkeypatch.setattr(paper.retrieval, "distances", None)
+    assert paper.update(next(run_of(world_drive, 1))).evidence.score > 0.8
 
 
 def test_what_was_bad_is_not_tried_again(search, world_drive, monkeypatch):

@@ -14,12 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from coview_kernels import Nearest
 from coview_stream.config import Channel, ConsensusConfig
 from coview_stream.geometry import Pose, pose_from, rot_z
 from coview_stream.place.retrieval import Volume
 from coview_stream.place.station_grid import StationGrid, Values
 
 _SAMPLE = 100_000  # numbers are enough for a median
+_NO_VOTES = np.empty(0, dtype=np.float32)
 _SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
 
 
@@ -39,6 +41,7 @@ class _Ballot:
     votes: Values  # standardised distances (S, ...), spread over the grid
     smallest: float  # smallest raw distance of any channel, for the paper's single-minimum rule
     where: tuple[int, int]  # its station and shift
+    sectors: int
 
 
 class Consensus:
@@ -71,8 +74,16 @@ class Consensus:
             votes += standardised(volume)
         votes *= np.float32(1.0 / len(distances))
         spread = self.grid.spread(np.ascontiguousarray(votes.T))
-        ballot = _Ballot(centre, spread, float(best.min()), (int(station), int(shift)))
+        ballot = _Ballot(centre, spread, float(best.min()), (int(station), int(shift)), best.shape[1])
         self._ballots.append(ballot)
+
+    def vote_nearest(
+        self, centre: npt.NDArray[np.float64], nearest: dict[Channel, Nearest], sectors: int
+    ) -> None:
+        """Add what ``single`` makes of one keyframe: the nearest station of each channel, out of ``sectors`` shifts."""
+        best = min(nearest.values(), key=lambda found: float(found.distance[0]))
+        where = int(best.station[0]), int(best.shift[0])
+        self._ballots.append(_Ballot(centre, _NO_VOTES, float(best.distance[0]), where, sectors))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
@@ -119,7 +130,7 @@ class Consensus:
         self, station: int, shift: int, score: float, centre: npt.NDArray[np.float64]
     ) -> Hypothesis:
         """Eq. 12, mended: the turn is about the keyframe's centre, not about the odometry frame's origin."""
-        turn = rot_z(float(yaw_of_shift(shift, self._ballots[-1].votes.shape[0])))
+        turn = rot_z(float(yaw_of_shift(shift, self._ballots[-1].sectors)))
         T = pose_from(turn, self.stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
         return Hypothesis(T, station, shift, score)
 

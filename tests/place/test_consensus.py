@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from coview_kernels import Nearest
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry import inverse, pose_from, rot_z, transform
 from coview_stream.place.consensus import Consensus, smallest, standardised, yaw_of_shift
@@ -39,6 +40,11 @@ def volume(seed, station, wrong=None, M=SIDE * SIDE):
     return {"scan_context": noise.astype(np.float32)}
 
 
+def nearest_of(distances):
+    station = distances.min(axis=1).argmin(keepdims=True)
+    return Nearest(station, distances[station].argmin(axis=1), distances[station].min(axis=1))
+
+
 @pytest.fixture
 def voted():
     """Five keyframes along x whose own minima are all wrong, each elsewhere."""
@@ -64,6 +70,21 @@ def test_the_single_minimum_is_wrong_there(voted):
         single.vote(centre, volume(k, station, wrong=(11 + 17 * k, 5 + k)))
     (only,) = single.hypotheses()
     assert (only.station, only.shift) in [(11 + 17 * k, 5 + k) for k in range(5)]
+
+
+def test_the_single_minimum_needs_no_more_than_the_nearest_stations(voted):
+    consensus, visited = voted
+    config = ConsensusConfig(mode="single")
+    by_volume, by_nearest = (Consensus(consensus.stations, BLOCK, config) for _ in range(2))
+    for k, (station, centre) in enumerate(zip(visited, centres(consensus.stations, visited), strict=True)):
+        asked = volume(k, station, wrong=(11 + 17 * k, 5 + k))["scan_context"] + np.float32(0.01 * (k != 3))
+        channels = {"coview": asked + np.float32(0.1), "scan_context": asked}
+        by_volume.vote(centre, channels)
+        by_nearest.vote_nearest(centre, {name: nearest_of(v) for name, v in channels.items()}, S)
+    (expected,), (found,) = by_volume.hypotheses(), by_nearest.hypotheses()
+    assert (found.station, found.shift) == (expected.station, expected.shift) == (11 + 17 * 3, 5 + 3)
+    assert found.score == expected.score
+    np.testing.assert_array_equal(found.T_map_odom, expected.T_map_odom)
 
 
 def test_the_hypothesis_is_T_map_odom_however_far_the_odometry_is(voted):
