@@ -59,6 +59,7 @@ OWN = {
     "stream": "robots over zenoh: rates, delays, attacks",
     "peers": "each peer in each world, every answer as JSON",
     "plots": "the plots of docs/performance.md",
+    "where": "where the time of a step goes, stage by stage",
     "publish": "puts measured tables into docs/performance.md",
 }
 """Benchmarks with a command and tables of their own: ``python -m bench.NAME``."""
