@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check
+from coview_kernels import check, runtime
 from coview_kernels.arrays import C64, F32, F64, I64
-from coview_kernels.screen import MAX_SECTORS, Screen
-from coview_kernels.similarity import all_shift_distance, unit_columns
+from coview_kernels.screen import MAX_SECTORS, Bounds, Screen
+from coview_kernels.search import Search
+from coview_kernels.similarity import all_shift_distance
 
 _CHECKED = 1024
 _PORTION = 256  # stations scored at a time, best bounds first: what follows may drop out meanwhile
-_MANY = 16  # more than 1 / 16 of the stations left: all distances at once are cheaper, if there are spectra
 _ROUNDED = 2e-9
 _FLOAT = 2e-5  # all_shift_distance is float32
 
@@ -65,6 +65,7 @@ class MatchIndex:
             raise ValueError("descriptors hold NaN or inf")
         self.descriptors = descriptors
         self._screen = Screen(descriptors)
+        self._search: Search | None = None
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -94,49 +95,58 @@ class MatchIndex:
         if k < 1:
             raise ValueError(f"k must be at least 1, got {k}")
         k = min(k, len(self))
-        unit = unit_columns(values)
-        if not unit.any():  # every distance is 1
+        if not values.any():  # every distance is 1
             return Nearest(np.arange(k), np.zeros(k, dtype=np.int64), np.ones(k, dtype=np.float32))
         if k == 0:
             return Nearest(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
-        bounds = self._screen.bounds(unit)
-        return self._nearest(
-            values, bounds.estimate - bounds.error, bounds.estimate + bounds.error, k, spectra
-        )
+        return runtime.dispatch(self._native, self._plain, values, k, spectra)
 
-    def _nearest(self, query: F32, low: F64, high: F64, k: int, spectra: C64 | None) -> Nearest:
-        """Score exactly whatever may be among the best; ``low`` and ``high`` (M,) bound the correlations."""
+    def _native(self, query: F32, k: int, spectra: C64 | None) -> Nearest:
+        """On the owner thread as a whole: one hand-over, and one launch, per query."""
+        if self._search is None:
+            self._search = Search(self._screen, self.descriptors)
+        few = self._search.scored(query, k)
+        return self._nearest(query, self._search.bounds(), k, spectra) if few is None else _first(k, *few)
+
+    def _plain(self, query: F32, k: int, spectra: C64 | None) -> Nearest:
+        return self._nearest(query, self._screen.bounds(query), k, spectra)
+
+    def _nearest(self, query: F32, bounds: Bounds, k: int, spectra: C64 | None) -> Nearest:
+        """Score exactly whatever may be among the best."""
         turned = _turned(query)
-        seeds = np.argpartition(low, -k)[-k:]
-        found, shift = self._scores(seeds, turned)
-        left = high >= found.min() - _ROUNDED
-        left[seeds] = False
+        low, high = bounds.estimate - bounds.error, bounds.estimate + bounds.error
+        station = np.argpartition(low, -k)[-k:]
+        shift, found = self._scores(station, turned)
+        least = float(found.min()) - _ROUNDED
+        left = high >= least
+        left[station] = False
         rest = np.flatnonzero(left)
-        if spectra is not None and len(rest) > len(self) // _MANY:
+        if spectra is not None and len(rest) > _PORTION:
             alike = 1.0 - all_shift_distance(query, spectra, query.shape[1]).min(axis=1)
-            rest = rest[alike[rest] >= found.min() - _FLOAT]
+            rest = rest[alike[rest] >= least - _FLOAT]
             high = np.minimum(high, alike + _FLOAT)
         rest = rest[np.argsort(-high[rest], kind="stable")]
-        station = seeds
         for start in range(0, len(rest), _PORTION):
             part = rest[start : start + _PORTION]
-            least = np.partition(found, -k)[-k]
-            part = part[high[part] >= least - _ROUNDED]
+            part = part[high[part] >= float(np.partition(found, -k)[-k]) - _ROUNDED]
             if not len(part):
                 break
-            scores, shifts = self._scores(part, turned)
-            station, found, shift = (
-                np.concatenate(pair) for pair in ((station, part), (found, scores), (shift, shifts))
-            )
-        order = np.lexsort((station, -found))[:k]
-        return Nearest(station[order], shift[order], (1.0 - found[order]).astype(np.float32))
+            turns, more = self._scores(part, turned)
+            station, shift = np.concatenate([station, part]), np.concatenate([shift, turns])
+            found = np.concatenate([found, more])
+        return _first(k, station, shift, found)
 
-    def _scores(self, station: I64, turned: F64) -> tuple[F64, I64]:
-        """Best correlations (n,), rounded to 1e-9, and their shifts, from the descriptors, in float64."""
+    def _scores(self, station: I64, turned: F64) -> tuple[I64, F64]:
+        """Best shifts (n,) and their correlations, rounded to 1e-9, from the descriptors, in float64."""
         rows = _unit64(self.descriptors[station]).reshape(len(station), -1)
         correlation = np.round(rows @ turned.T, 9)
         shift = correlation.argmax(axis=1)
-        return correlation[np.arange(len(shift)), shift], shift
+        return shift, correlation[np.arange(len(shift)), shift]
+
+
+def _first(k: int, station: I64, shift: I64, correlation: F64) -> Nearest:
+    order = np.lexsort((station, -correlation))[:k]
+    return Nearest(station[order], shift[order], (1.0 - correlation[order]).astype(np.float32))
 
 
 def _unit64(descriptors: npt.NDArray[Any]) -> F64:

@@ -29,9 +29,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, F64, I32
-from coview_kernels.launch import Launch
+from coview_kernels import reference
+from coview_kernels.arrays import F32, F64
 from coview_kernels.similarity import unit_columns
 
 MAX_SECTORS = 63
@@ -64,23 +63,22 @@ class Screen:
         self._frequency = _frequencies(self.sectors)
         self._blocks = len(self._frequency)
         # a sum for shift n serves -n too and, if odd frequencies are summed apart, half a turn on from both
-        self._shifts = self.sectors // (4 if self.sectors % 4 == 0 else 2) + 1
-        self._step = self._steps(descriptors[:: -(-m // _SAMPLE) or 1])  # evenly, at most _SAMPLE
+        self.shifts = self.sectors // (4 if self.sectors % 4 == 0 else 2) + 1
+        self.step = self._steps(descriptors[:: -(-m // _SAMPLE) or 1])  # evenly, at most _SAMPLE
         self.stations = np.empty((m, 2 * self.rings, self._blocks), dtype=np.int8)
         self.missed = np.empty(m, dtype=np.float32)
         norm = np.zeros(self._blocks)
         for start in range(0, m, _PORTION):
             part = slice(start, start + _PORTION)
             numbers = self._numbers(descriptors[part])
-            whole = np.clip(np.rint(numbers / self._step), -127, 127)
+            whole = np.clip(np.rint(numbers / self.step), -127, 127)
             self.stations[part] = whole
-            numbers -= whole * self._step
+            numbers -= whole * self.step
             self.missed[part] = np.sqrt(np.einsum("mkl,mkl->m", numbers, numbers)) * np.float32(1.0001)
             norm = np.maximum(norm, np.einsum("mkl,mkl->ml", whole, whole).max(axis=0))
-        self._norm = np.sqrt(norm)
-        self._reach = 1.0 + float(self.missed.max(initial=0.0))  # of a station's dequantised norm
-        self._cosine, self._sine, self._nyquist = self._turns()
-        self._kernel = _Kernel(self.stations, self._cosine.shape[1])
+        self.norm = np.sqrt(norm)
+        self.reach = 1.0 + float(self.missed.max(initial=0.0))  # of a station's dequantised norm
+        self._cosine, self._sine, self._nyquist = self.turns()
 
     @property
     def nbytes(self) -> int:
@@ -88,12 +86,12 @@ class Screen:
         return self.stations.nbytes + self.missed.nbytes
 
     def bounds(self, query: F32) -> Bounds:
-        """Bounds for a query of (R, S) unit columns."""
+        """Bounds for a query (R, S), finite: the twin of :meth:`coview_kernels.search.Search.bounds`."""
         numbers = self._numbers(query[None])[0].astype(np.float64)
         size = float(np.sqrt((numbers * numbers).sum()))
         whole, gain, rounding = self._whole_query(numbers)
         turn, unit, twist = self._table(gain, size + rounding)
-        best = self._kernel(whole, turn)
+        best = reference.screen(self.stations, whole, turn)
         error: F64 = self.missed.astype(np.float64) * size + (rounding + twist + _FLOAT)
         return Bounds(best.astype(np.float64) * unit, error)
 
@@ -119,29 +117,45 @@ class Screen:
         least = 1e-3 * square.max(initial=0.0) + 1e-12  # rows that the sample lacks
         return np.asarray(np.sqrt(np.maximum(square, least)) * (_RANGE / 127.0), dtype=np.float32)
 
+    def room(self) -> F64:
+        """(L,) the greatest norm of a query's int16 with which no sum of upper halves leaves int16.
+
+        |sum| <= |int8| |int16| / 256 + K, by Cauchy-Schwarz.
+        """
+        room: F64 = (_FULL - 8.0 * self.rings) * 256.0 / np.maximum(self.norm, 1.0)
+        return np.minimum(room, 32_000.0)
+
     def _whole_query(self, numbers: F64) -> tuple[npt.NDArray[np.int16], F64, float]:
         """Return the query as (2, K, L) int16, for real and imaginary products; its gain (L,); what rounding costs."""
         rings = self.rings
         pair = np.stack([numbers, np.concatenate([numbers[rings:], -numbers[:rings]])])
         pair[0, rings:, 0] = pair[1, :rings, 0] = 0.0
         pair[1, rings:, 0] = numbers[rings:, 0]
-        pair *= self._step
-        # no sum of upper halves leaves int16: |sum| <= |int8| |int16| / 256 + K, by Cauchy-Schwarz
+        pair *= self.step
         size = np.sqrt((pair * pair).sum(axis=1)).max(axis=0)
-        room = (_FULL - 4.0 * len(numbers)) * 256.0 / np.maximum(self._norm, 1.0)
-        gain = np.minimum(room, 32_000.0) / np.maximum(size, 1e-30)
+        gain = self.room() / np.maximum(size, 1e-30)
         whole = np.rint(pair * gain)
         missed = np.sqrt(((whole - pair * gain) ** 2).sum(axis=(0, 1)))
-        return whole.astype(np.int16), gain, float(np.sqrt(2.0) * (self._norm * missed / gain).sum())
+        return whole.astype(np.int16), gain, float(np.sqrt(2.0) * (self.norm * missed / gain).sum())
 
-    def _turns(self) -> tuple[F64, F64, F64]:
+    def turns(self) -> tuple[F64, F64, F64]:
         """Cosines and sines (L, N) of every block at every shift, and of the frequency S / 2 (N,)."""
-        lanes = -(-self._shifts // 16) * 16
+        lanes = -(-self.shifts // 16) * 16
         shift = np.arange(lanes)
         angle = 2.0 * np.pi / self.sectors * np.outer(self._frequency, shift)
-        used = np.outer(self._frequency >= 0, shift < self._shifts)
-        nyquist = (-1.0) ** shift * (shift < self._shifts) * (self.sectors % 2 == 0)
+        used = np.outer(self._frequency >= 0, shift < self.shifts)
+        nyquist = (-1.0) ** shift * (shift < self.shifts) * (self.sectors % 2 == 0)
         return np.cos(angle) * used, -np.sin(angle) * used, nyquist
+
+    def waves(self) -> F64:
+        """(S, 2 L) what a ring is multiplied with for its weighted spectrum, real parts and imaginary ones."""
+        sector = np.arange(self.sectors)[:, None]
+        angle = 2.0 * np.pi / self.sectors * sector * self._frequency
+        weight = np.where(self._frequency >= 0, np.sqrt(2.0) / self.sectors, 0.0)
+        real, imaginary = np.cos(angle) * weight, -np.sin(angle) * weight
+        real[:, 0] = 1.0 / self.sectors
+        imaginary[:, :1] = (-1.0) ** sector / self.sectors * (self.sectors % 2 == 0)
+        return np.hstack([real, imaginary])
 
     def _table(self, gain: F64, size: float) -> tuple[npt.NDArray[np.int16], float, float]:
         """Rows of the turn: means of upper halves (4), frequency S / 2, zeros, cosines (L), sines (L); unit; error."""
@@ -149,7 +163,7 @@ class Screen:
         scale = np.where(self._frequency >= 0, 256.0 / gain, 0.0)  # of one unit of a product
         # either side of the mean, in a pair whose turn has a norm of 1, or is (1, 1) in block 0
         error = rows / 2.0 * (np.sqrt(2.0) * float(scale.sum()) + float(scale[0]))
-        unit = max(2.01 * float(scale.max()), (self._reach * size + error) / 31_000.0)
+        unit = max(2.01 * float(scale.max()), (self.reach * size + error) / 31_000.0)
         factor = (65_536.0 / unit * scale)[:, None]
         blocks, half = self._blocks, self._blocks // 2
         turn = np.empty((6 + 2 * blocks, self._cosine.shape[1]))
@@ -160,7 +174,7 @@ class Screen:
         turn[:4] = turn[6:].reshape(4, half, -1).sum(axis=1)
         turn[0] += turn[4]
         turn[:4] = turn[:4] * (rows / 2.0 / 65_536.0) + half / 2.0
-        turn[0, self._shifts :] = -30_000.0
+        turn[0, self.shifts :] = -30_000.0
         return np.rint(turn).astype(np.int16), unit, error + (0.75 * (2 * blocks + 1) + 4.0) * unit
 
 
@@ -177,32 +191,3 @@ def _frequencies(sectors: int) -> npt.NDArray[np.int64]:
     for row, part in zip(out, parts, strict=True):
         row[: len(part)] = part
     return out.reshape(-1)
-
-
-class _Kernel:
-    """The kernel on its stations, (M, K, L) int8, or its twin."""
-
-    def __init__(self, stations: npt.NDArray[np.int8], lanes: int) -> None:
-        self._stations = stations
-        rows, blocks = stations.shape[1:]
-        self._query = np.zeros((2, rows, blocks), dtype=np.int16)
-        self._turn = np.zeros((6 + 2 * blocks, lanes), dtype=np.int16)
-        self._out = np.empty(len(stations), dtype=np.int32)
-        flat = (a.reshape(-1) for a in (stations, self._query, self._turn))
-        self._launch = Launch("screen", f"screen_{rows}_{blocks}_{lanes}", *flat, lanes, self._out)
-
-    def __call__(self, query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
-        """Greatest correlation over the shifts, (M,), in units of the turn."""
-        best: I32 = runtime.dispatch(self._native, reference.screen, self._stations, query, turn)
-        return best
-
-    def _native(
-        self, _: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]
-    ) -> I32:
-        # on the owner thread, and so one query at a time
-        if len(self._out):
-            self._query[:] = query
-            self._turn[:] = turn
-            self._launch()
-        copied: I32 = self._out.copy()
-        return copied

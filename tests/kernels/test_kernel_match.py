@@ -7,10 +7,20 @@ import pytest
 
 import coview_kernels as ck
 from coview_kernels import reference
-from coview_kernels.screen import Screen
+from coview_kernels.screen import Bounds, Screen
+from coview_kernels.search import Search
 
 TOLERANCE = 1e-6
 SHAPES = ((4, 12), (3, 7), (20, 60), (5, 2), (2, 1), (7, 33))
+
+
+def native_bounds(screen: Screen, desc, query) -> Bounds:
+    def run():
+        search = Search(screen, desc)
+        search.scored(query, 0)
+        return search.bounds()
+
+    return ck.submit(run)
 
 
 def correlations(query, descriptors):
@@ -104,15 +114,16 @@ def test_bounds_hold(kind):
     for shape in SHAPES:
         desc, query = scene(rng, kind, 40, shape)
         best = correlations(query, desc).max(axis=1)
-        bounds = Screen(desc).bounds(ck.unit_columns(query))
-        assert (np.abs(bounds.estimate - best) <= bounds.error).all()
+        screen = Screen(desc)
+        for bounds in (screen.bounds(query), native_bounds(screen, desc, query)):
+            assert (np.abs(bounds.estimate - best) <= bounds.error).all()
 
 
 def test_bounds_are_tight_enough_to_prune():
     rng = np.random.default_rng(5)
     desc, _ = scene(rng, "random", 3000, (20, 60))
     query = np.roll(desc[700], 9, axis=1) + rng.normal(0, 2, (20, 60)).astype(np.float32)
-    bounds = Screen(desc).bounds(ck.unit_columns(query))
+    bounds = native_bounds(Screen(desc), desc, query)
     assert bounds.error.max() < 0.03
     assert (bounds.estimate + bounds.error > (bounds.estimate - bounds.error).max()).sum() == 1
     found = ck.MatchIndex(desc).top_k(query, 3)
@@ -122,18 +133,20 @@ def test_bounds_are_tight_enough_to_prune():
 @pytest.mark.parametrize("shape", [(20, 60), (3, 7), (1, 63), (40, 34)])
 def test_the_kernel_is_its_twin_to_the_bit(shape):
     rng = np.random.default_rng(6)
-    stations = Screen(rng.normal(size=(50, *shape)))
-    kernel = stations._kernel
-    query = rng.integers(-2000, 2001, kernel._query.shape).astype(np.int16)
-    turn = rng.integers(-600, 601, kernel._turn.shape).astype(np.int16)
+    desc = rng.normal(size=(50, *shape))
+    screen = Screen(desc)
+    search = ck.submit(Search, screen, desc)
+    query = rng.integers(-2000, 2001, search.query.shape).astype(np.int16)
+    turn = rng.integers(-600, 601, search.turn.shape).astype(np.int16)
     turn[5] = 0
-    np.testing.assert_array_equal(kernel(query, turn), reference.screen(stations.stations, query, turn))
+    best = ck.submit(search.best, query, turn)
+    np.testing.assert_array_equal(best, reference.screen(screen.stations, query, turn))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.0])
 def test_many_alike_are_told_apart_with_spectra_too(scale):
     rng = np.random.default_rng(7)
-    desc = (rng.uniform(1, 9, (1, 6, 20)) + scale * 1e-2 * rng.standard_normal((900, 6, 20))).astype(
+    desc = (rng.uniform(1, 9, (1, 6, 20)) + scale * 1e-2 * rng.standard_normal((2500, 6, 20))).astype(
         np.float16
     )
     index, spectra = ck.MatchIndex(desc), ck.column_spectra(desc)
