@@ -1,7 +1,7 @@
 # mypy: ignore-errors
 """Taichi source of matching.py: from a query to its nearest stations in one launch of three tasks.
 
-prepare: a query's integers and its table of turns (twin: :meth:`coview_kernels.screen.Screen.table`); screen: the
+prepare: a query's integers and its table of turns (twin: :mod:`coview_kernels.screen`); screen: the
 greatest correlation with every station, in integers, on all threads; score: whatever may be among the k best, once
 more in float64. Only the screen is worth waking threads for.
 
@@ -15,7 +15,7 @@ from functools import lru_cache
 from coview_kernels import runtime
 
 ti = runtime.library()
-f32, f64, i8, i16, i32, u16 = ti.f32, ti.f64, ti.i8, ti.i16, ti.i32, ti.u16
+f32, f64, i16, i32, u16 = ti.f32, ti.f64, ti.i16, ti.i32, ti.u16
 _ROUNDED = 2e-9  # as in matching.py
 
 
@@ -26,35 +26,46 @@ def high(a, b):
 
 
 @ti.func
-def whole(x):
-    return ti.cast(ti.cast(ti.round(x), i32), i16)
-
-
-@ti.func
 def half_float(bits):
     # float16 by its bits; the product is exact, for small ones without a leading 1 too
     h = ti.cast(bits, i32)
-    v = ti.bit_cast((h & 0x7FFF) << 13, f32) * ti.cast(2.0**112, f32)
-    return ti.cast(-v if h > 0x7FFF else v, f64)
+    v = ti.bit_cast(((h & 0x8000) << 16) | ((h & 0x7FFF) << 13), f32)
+    return ti.cast(v * ti.cast(2.0**112, f32), f64)
 
 
 @ti.func
 def insert(top: ti.template(), k, value):
     # into k numbers that fall
-    if value > top[k - 1]:
-        j = k - 1
-        while j > 0 and top[j - 1] < value:
-            top[j] = top[j - 1]
-            j -= 1
+    j = k
+    while j > 0 and top[j - 1] < value:
+        j -= 1
+        if j + 1 < k:
+            top[j + 1] = top[j]
+    if j < k:
         top[j] = value
 
 
 @lru_cache
-def _match(rings: int, sectors: int, blocks: int, lanes: int, serial: bool):
-    """Kernel for stations of (rings, sectors); shifts 0 .. lanes - 1, their negatives, and half a turn from both."""
+def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, serial: bool):
+    """Kernel for stations of (rings, sectors); shift n, -n, and half a turn on from both come together."""
     rows, half, bins = 2 * rings, blocks // 2, rings * sectors
-    size = rows * blocks
-    step = 4 if rows % 4 == 0 else 2
+    size, wide = rows * blocks, -(-max(lanes, sectors) // 16) * 16
+    step = 2 - rings % 2
+
+    @ti.func
+    def products(stations: ti.template(), query: ti.template(), m, x: ti.template(), y: ti.template()):
+        for g in range(rings // step):
+            for b in range(blocks):
+                sx = ti.cast(0, i16)
+                sy = ti.cast(0, i16)
+                for u in ti.static(range(step)):
+                    at = ((g * step + u) * 2) * blocks + b
+                    w = stations[(m * rings + g * step + u) * blocks + b]
+                    v = ti.cast(w << ti.cast(8, i16), i16)
+                    sx += high(v, query[at]) + high(w, query[at + blocks])
+                    sy += high(v, query[size + at]) + high(w, query[size + at + blocks])
+                x[b] += sx
+                y[b] += sy
 
     @ti.kernel
     def match(
@@ -71,7 +82,7 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, serial: bool):
         query: ti.types.ndarray(i16, 1),
         turn: ti.types.ndarray(i16, 1),
         found: ti.types.ndarray(f64, 1),
-        stations: ti.types.ndarray(i8, 1),
+        stations: ti.types.ndarray(i16, 1),
         missed: ti.types.ndarray(f32, 1),
         best: ti.types.ndarray(i32, 1),
         length: i32,
@@ -80,7 +91,7 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, serial: bool):
         listed: ti.types.ndarray(i32, 1),
         upper: ti.types.ndarray(f64, 1),
         scores: ti.types.ndarray(f64, 1),
-        shifts: ti.types.ndarray(i32, 1),
+        shifts_out: ti.types.ndarray(i32, 1),
         fresh: i32,
         k: i32,
     ):
@@ -92,89 +103,87 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, serial: bool):
                     v = ti.cast(raw[r * sectors + s], f64)
                     inverse[s] += v * v
             for s in range(sectors):
-                inverse[s] = 1.0 / ti.sqrt(inverse[s]) if inverse[s] > 0.0 else 0.0
+                inverse[s] = ti.select(inverse[s] > 0.0, 1.0 / ti.sqrt(inverse[s]), 0.0)
             square = ti.cast(0.0, f64)
+            first = ti.Vector.zero(f64, blocks)
+            second = ti.Vector.zero(f64, blocks)
             for r in range(rings):
                 sums = ti.Vector.zero(f64, 2 * blocks)
                 for s in range(sectors):
                     u = ti.cast(raw[r * sectors + s], f64) * inverse[s]
                     twice[r * 2 * sectors + s] = u / sectors
                     twice[r * 2 * sectors + sectors + s] = u / sectors
-                    for b in range(2 * blocks):
-                        sums[b] += u * wave[s * 2 * blocks + b]
+                    if u != 0.0:
+                        for b in range(2 * blocks):
+                            sums[b] += u * wave[s * 2 * blocks + b]
+                for b in range(2 * blocks):
+                    numbers[r * 2 * blocks + b] = sums[b]
+                    square += sums[b] * sums[b]
                 for b in range(blocks):
-                    numbers[r * blocks + b] = sums[b]
-                    numbers[(rings + r) * blocks + b] = sums[blocks + b]
-                    square += sums[b] * sums[b] + sums[blocks + b] * sums[blocks + b]
+                    g, h = grain[r * 2 * blocks + b], grain[r * 2 * blocks + blocks + b]
+                    p, q = sums[b] * g, sums[blocks + b] * h
+                    s, t = sums[blocks + b] * g, sums[b] * h
+                    first[b] += p * p + ti.select(b == 0, 0.0, q * q)
+                    second[b] += ti.select(b == 0, q * q, s * s + t * t)
+            for b in range(blocks):
+                second[b] = room[b] / ti.max(ti.sqrt(ti.max(first[b], second[b])), 1e-30)
+                first[b] = 0.0
+            for r in range(rings):
+                for b in range(blocks):
+                    at, under = r * 2 * blocks + b, (r * 2 + 1) * blocks + b
+                    p, q = second[b] * numbers[at] * grain[at], second[b] * numbers[under] * grain[under]
+                    s, t = second[b] * numbers[under] * grain[at], -second[b] * numbers[at] * grain[under]
+                    t = ti.select(b == 0, q, t)
+                    q = ti.select(b == 0, 0.0, q)
+                    s = ti.select(b == 0, 0.0, s)
+                    wp, wq, ws, wt = (
+                        ti.floor(p + 0.5),
+                        ti.floor(q + 0.5),
+                        ti.floor(s + 0.5),
+                        ti.floor(t + 0.5),
+                    )
+                    query[at], query[under] = ti.cast(wp, i16), ti.cast(wq, i16)
+                    query[size + at], query[size + under] = ti.cast(ws, i16), ti.cast(wt, i16)
+                    dp, dq, ds, dt = wp - p, wq - q, ws - s, wt - t
+                    first[b] += dp * dp + dq * dq + ds * ds + dt * dt
             rounding = ti.cast(0.0, f64)
             error = ti.cast(0.0, f64)
             most = ti.cast(0.0, f64)
             for b in range(blocks):
-                first = ti.cast(0.0, f64)
-                second = ti.cast(0.0, f64)
-                for r in range(rings):
-                    at, under = r * blocks + b, (rings + r) * blocks + b
-                    p, q = numbers[at] * grain[at], numbers[under] * grain[under]
-                    s, t = numbers[under] * grain[at], -numbers[at] * grain[under]
-                    if b == 0:
-                        s, t, q = 0.0, q, 0.0
-                    first += p * p + q * q
-                    second += s * s + t * t
-                gain = room[b] / ti.max(ti.sqrt(ti.max(first, second)), 1e-30)
-                lost = ti.cast(0.0, f64)
-                for r in range(rings):
-                    at, under = r * blocks + b, (rings + r) * blocks + b
-                    p, q = gain * numbers[at] * grain[at], gain * numbers[under] * grain[under]
-                    s, t = gain * numbers[under] * grain[at], -gain * numbers[at] * grain[under]
-                    if b == 0:
-                        s, t, q = 0.0, q, 0.0
-                    query[at], query[under] = whole(p), whole(q)
-                    query[size + at], query[size + under] = whole(s), whole(t)
-                    dp, dq = ti.round(p) - p, ti.round(q) - q
-                    ds, dt = ti.round(s) - s, ti.round(t) - t
-                    lost += dp * dp + dq * dq + ds * ds + dt * dt
-                rounding += ti.sqrt(2.0 * lost) * norm[b] / gain
+                rounding += ti.sqrt(2.0 * first[b]) * norm[b] / second[b]
                 # turns are zero where a block stands for no frequency
-                scale[b] = 256.0 / gain if turns[b * lanes] != 0.0 else 0.0
+                scale[b] = ti.select(turns[b * wide] != 0.0, 256.0 / second[b], 0.0)
                 error += ti.sqrt(ti.cast(2.0, f64)) * scale[b]
                 most = ti.max(most, scale[b])
             error = rows / 2.0 * (error + scale[0])
             span = ti.sqrt(square)
             unit = ti.max(2.01 * most, (reach * (span + rounding) + error) / 31000.0)
             for n in range(lanes):
-                nyquist = turns[2 * blocks * lanes + n] * scale[0] * (65536.0 / unit)
-                turn[4 * lanes + n] = whole(nyquist)
+                live = ti.select(n < shifts, 65536.0 / unit, 0.0)
+                nyquist = turns[2 * blocks * wide + n] * scale[0] * live
+                turn[4 * lanes + n] = ti.cast(ti.floor(nyquist + 0.5), i16)
                 turn[5 * lanes + n] = ti.cast(0, i16)
                 for part in range(4):
-                    total = nyquist if part == 0 else ti.cast(0.0, f64)
+                    total = ti.select(part == 0, nyquist, 0.0)
                     for j in range(half):
                         at = part * half + j
-                        value = turns[at * lanes + n] * scale[at % blocks] * (65536.0 / unit)
+                        value = turns[at * wide + n] * scale[at % blocks] * live
                         total += value
-                        turn[(6 + at) * lanes + n] = whole(value)
-                    turn[part * lanes + n] = whole(total * (rows / 2.0 / 65536.0) + half / 2.0)
-                if turns[n] == 0.0:  # block 0 is frequency 0, whose cosine is 1 at every shift there is
-                    turn[n] = ti.cast(-30000, i16)
+                        turn[(6 + at) * lanes + n] = ti.cast(ti.floor(value + 0.5), i16)
+                    total = ti.floor(total * (rows / 2.0 / 65536.0) + half / 2.0 + 0.5)
+                    turn[part * lanes + n] = ti.cast(
+                        ti.select(part == 0 and n >= shifts, -30000.0, total), i16
+                    )
             found[0] = span
             found[1] = unit
-            found[2] = rounding + error + (0.75 * (2 * blocks + 1) + 4.0) * unit + 1e-5
+            found[2] = rounding + error + (0.75 * (2 * blocks + 1) + 4.0) * unit + 3e-5
 
         if ti.static(serial):
             ti.loop_config(serialize=True)
         for m in range(best.shape[0]):
             x = ti.Vector.zero(i16, blocks)
             y = ti.Vector.zero(i16, blocks)
-            for g in range(rows // step):
-                for b in range(blocks):
-                    sx = ti.cast(0, i16)
-                    sy = ti.cast(0, i16)
-                    for u in ti.static(range(step)):
-                        at = (g * step + u) * blocks + b
-                        v = ti.cast(ti.cast(stations[m * size + at], i16) << ti.cast(8, i16), i16)
-                        sx += high(v, query[at])
-                        sy += high(v, query[size + at])
-                    x[b] += sx
-                    y[b] += sy
+            products(stations, query, m, x, y)
             # sums over the even blocks, and over the odd ones, which change their sign half a turn on
             even = ti.Vector.zero(i16, lanes)
             odd = ti.Vector.zero(i16, lanes)
@@ -226,9 +235,13 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, serial: bool):
             span, unit, rest = found[0], found[1], found[2]
             for i in range(k):
                 top[i] = -3.0
+            least = ti.cast(-3.0, f64)
             for m in range(best.shape[0]):
-                insert(top, k, best[m] * unit - (ti.cast(missed[m], f64) * span + rest))
-            least = top[k - 1] - _ROUNDED
+                bound = best[m] * unit - (ti.cast(missed[m], f64) * span + rest)
+                if bound > least:
+                    insert(top, k, bound)
+                    least = top[k - 1]
+            least -= _ROUNDED
             count = 0
             for m in range(best.shape[0]):
                 bound = best[m] * unit + (ti.cast(missed[m], f64) * span + rest)
@@ -249,34 +262,50 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, serial: bool):
                 if upper[i] < least:
                     break
                 upper[i] = -9.0
+                m = listed[i]
+                # the integers once more, for every shift: float64 is for those that may be the best
+                x = ti.Vector.zero(i16, blocks)
+                y = ti.Vector.zero(i16, blocks)
+                products(stations, query, m, x, y)
+                guess = ti.Vector.zero(f64, wide)
+                for b in range(blocks):
+                    p = (x[b] + rings) * scale[b]
+                    q = (y[b] + rings) * scale[b]
+                    row = (2 * blocks if b == 0 else blocks + b) * wide
+                    for n in range(wide):
+                        guess[n] += p * turns[b * wide + n] + q * turns[row + n]
+                error = ti.cast(missed[m], f64) * span + rest
+                floor = least - error
+                for n in range(sectors):
+                    floor = ti.max(floor, guess[n] - 2.0 * error)
                 inverse = ti.Vector.zero(f64, sectors)
-                at = listed[i] * bins
                 for r in range(rings):
                     for s in range(sectors):
-                        v = half_float(descriptors[at + r * sectors + s])
+                        v = half_float(descriptors[m * bins + r * sectors + s])
                         inverse[s] += v * v
                 for s in range(sectors):
-                    inverse[s] = 1.0 / ti.sqrt(inverse[s]) if inverse[s] > 0.0 else 0.0
-                sums = ti.Vector.zero(f64, sectors)
-                for r in range(rings):
-                    for s in range(sectors):
-                        bits = descriptors[at + r * sectors + s]
-                        if bits != 0:
-                            v = half_float(bits) * inverse[s]
-                            for n in range(sectors):
-                                sums[n] += v * twice[r * 2 * sectors + s + n]
+                    inverse[s] = ti.select(inverse[s] > 0.0, 1.0 / ti.sqrt(inverse[s]), 0.0)
                 for n in range(sectors):
-                    score = ti.round(sums[n] * 1e9) * 1e-9
-                    if score > scores[i]:
-                        scores[i] = score
-                        shifts[i] = n
+                    if guess[n] >= floor:
+                        sums = ti.Vector.zero(f64, sectors)
+                        for r in range(rings):
+                            for s in range(sectors):
+                                v = half_float(descriptors[m * bins + r * sectors + s])
+                                sums[s] += v * twice[r * 2 * sectors + n + s]
+                        score = ti.cast(0.0, f64)
+                        for s in range(sectors):
+                            score += sums[s] * inverse[s]
+                        score = ti.round(score * 1e9) * 1e-9
+                        if score > scores[i]:
+                            scores[i] = score
+                            shifts_out[i] = n
                 insert(top, k, scores[i])
 
     return match
 
 
 def __getattr__(name):
-    """Return the kernel ``match_<rings>_<sectors>_<blocks>_<lanes>_<serial>``: local vectors have fixed lengths."""
+    """Return ``match_<rings>_<sectors>_<blocks>_<lanes>_<shifts>_<serial>``: local vectors have fixed lengths."""
     kind, _, sizes = name.partition("_")
     if kind != "match":
         raise AttributeError(name)

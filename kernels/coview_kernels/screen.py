@@ -18,7 +18,9 @@ hold both to float64. On maps of real sites the error is 0.02, and 10 to 20 of 1
 look for the best ten.
 
 Layout: block 0 holds the frequencies 0 and S / 2, whose spectra are real; block f the real and imaginary
-parts of frequency f. A station is (K, L) int8 with K = 2 R rows and L blocks, padded to 16 lanes.
+parts of frequency f. A station is (R, L) int16 of L blocks, padded to 16 lanes, and stands for K = 2 R rows: the
+lower byte is a real part, the whole in units of 256 an imaginary one. To multiply either takes no unpacking but
+one shift.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference
-from coview_kernels.arrays import F32, F64
+from coview_kernels.arrays import F32, F64, I16
 from coview_kernels.similarity import unit_columns
 
 MAX_SECTORS = 63
@@ -39,7 +41,7 @@ MAX_SECTORS = 63
 _PORTION = 512
 _SAMPLE = 1024
 _RANGE = 6.0  # standard deviations that int8 spans: 5 to 8 differ by a tenth in error on simulated sites
-_FLOAT = 1e-5  # float32 spectra, sums and products on the way to the integers
+_FLOAT = 3e-5  # float32 spectra, sums and products on the way to the integers
 _FULL = 32_600.0  # of int16, with room for what rounding adds
 
 
@@ -61,24 +63,29 @@ class Screen:
     def __init__(self, descriptors: npt.NDArray[Any]) -> None:
         m, self.rings, self.sectors = descriptors.shape
         self._frequency = _frequencies(self.sectors)
-        self._blocks = len(self._frequency)
+        self.blocks = len(self._frequency)
         # a sum for shift n serves -n too and, if odd frequencies are summed apart, half a turn on from both
         self.shifts = self.sectors // (4 if self.sectors % 4 == 0 else 2) + 1
+        self.lanes = -(-self.shifts // 16) * 16
+        self.turns = self._turns()
+        self.waves = self._waves()
         self.step = self._steps(descriptors[:: -(-m // _SAMPLE) or 1])  # evenly, at most _SAMPLE
-        self.stations = np.empty((m, 2 * self.rings, self._blocks), dtype=np.int8)
+        self.stations = np.empty((m, self.rings, self.blocks), dtype=np.int16)
         self.missed = np.empty(m, dtype=np.float32)
-        norm = np.zeros(self._blocks)
+        norm = np.zeros(self.blocks)
         for start in range(0, m, _PORTION):
             part = slice(start, start + _PORTION)
             numbers = self._numbers(descriptors[part])
-            whole = np.clip(np.rint(numbers / self.step), -127, 127)
-            self.stations[part] = whole
-            numbers -= whole * self.step
-            self.missed[part] = np.sqrt(np.einsum("mkl,mkl->m", numbers, numbers)) * np.float32(1.0001)
-            norm = np.maximum(norm, np.einsum("mkl,mkl->ml", whole, whole).max(axis=0))
-        self.norm = np.sqrt(norm)
+            numbers /= self.step
+            pair = _packed(numbers)
+            self.stations[part] = pair
+            whole = unpacked(pair)
+            numbers -= whole
+            numbers *= self.step
+            self.missed[part] = np.sqrt(np.einsum("mrpl,mrpl->m", numbers, numbers)) * np.float32(1.0001)
+            norm = np.maximum(norm, np.einsum("mrpl,mrpl->ml", whole, whole).max(axis=0, initial=0.0))
+        self.norm = np.sqrt(norm * 1.0001)
         self.reach = 1.0 + float(self.missed.max(initial=0.0))  # of a station's dequantised norm
-        self._cosine, self._sine, self._nyquist = self.turns()
 
     @property
     def nbytes(self) -> int:
@@ -96,22 +103,13 @@ class Screen:
         return Bounds(best.astype(np.float64) * unit, error)
 
     def _numbers(self, descriptors: npt.NDArray[Any]) -> F32:
-        """(m, K, L) float32: the weighted spectra of the unit columns of (m, R, S)."""
-        from scipy import fft
-
-        spectra = fft.rfft(unit_columns(descriptors), axis=-1)
-        m, rings, sectors = descriptors.shape
-        has = self._frequency >= 0
-        chosen = spectra[:, :, self._frequency[has]] * np.float32(np.sqrt(2.0) / sectors)
-        out = np.zeros((m, 2 * rings, self._blocks), dtype=np.float32)
-        out[:, :rings, has] = chosen.real
-        out[:, rings:, has] = chosen.imag
-        out[:, :rings, 0] *= np.float32(np.sqrt(0.5))
-        out[:, rings:, 0] = spectra.real[:, :, -1] * np.float32(1.0 / sectors) if sectors % 2 == 0 else 0.0
-        return out
+        """(m, R, 2, L) float32: the weighted spectra of the unit columns of (m, R, S), real and imaginary."""
+        flat = unit_columns(descriptors).reshape(-1, self.sectors)
+        product: F32 = flat @ self.waves.astype(np.float32)
+        return product.reshape(len(descriptors), self.rings, 2, self.blocks)
 
     def _steps(self, sample: npt.NDArray[Any]) -> F32:
-        """(K, L) what one unit of int8 stands for; what exceeds the range is clipped, and counted as missed."""
+        """(R, 2, L) what one unit of int8 stands for; what exceeds the range is clipped, and counted as missed."""
         numbers = self._numbers(sample).astype(np.float64)
         square = (numbers * numbers).mean(axis=0) if len(sample) else np.zeros(numbers.shape[1:])
         least = 1e-3 * square.max(initial=0.0) + 1e-12  # rows that the sample lacks
@@ -125,57 +123,67 @@ class Screen:
         room: F64 = (_FULL - 8.0 * self.rings) * 256.0 / np.maximum(self.norm, 1.0)
         return np.minimum(room, 32_000.0)
 
-    def _whole_query(self, numbers: F64) -> tuple[npt.NDArray[np.int16], F64, float]:
-        """Return the query as (2, K, L) int16, for real and imaginary products; its gain (L,); what rounding costs."""
-        rings = self.rings
-        pair = np.stack([numbers, np.concatenate([numbers[rings:], -numbers[:rings]])])
-        pair[0, rings:, 0] = pair[1, :rings, 0] = 0.0
-        pair[1, rings:, 0] = numbers[rings:, 0]
+    def _whole_query(self, numbers: F64) -> tuple[I16, F64, float]:
+        """Return the query (2, R, 2, L), for real and imaginary products; its gain (L,); what rounding costs."""
+        pair = np.stack([numbers, np.stack([numbers[:, 1], -numbers[:, 0]], axis=1)])
+        pair[0, :, 1, 0] = pair[1, :, 0, 0] = 0.0
+        pair[1, :, 1, 0] = numbers[:, 1, 0]
         pair *= self.step
-        size = np.sqrt((pair * pair).sum(axis=1)).max(axis=0)
+        size = np.sqrt((pair * pair).sum(axis=(1, 2))).max(axis=0)
         gain = self.room() / np.maximum(size, 1e-30)
         whole = np.rint(pair * gain)
-        missed = np.sqrt(((whole - pair * gain) ** 2).sum(axis=(0, 1)))
+        missed = np.sqrt(((whole - pair * gain) ** 2).sum(axis=(0, 1, 2)))
         return whole.astype(np.int16), gain, float(np.sqrt(2.0) * (self.norm * missed / gain).sum())
 
-    def turns(self) -> tuple[F64, F64, F64]:
-        """Cosines and sines (L, N) of every block at every shift, and of the frequency S / 2 (N,)."""
-        lanes = -(-self.shifts // 16) * 16
-        shift = np.arange(lanes)
+    def _turns(self) -> F64:
+        """(2 L + 1, W) of every block at the shifts 0 to S - 1: cosines, sines, the cosine of frequency S / 2."""
+        shift = np.arange(-(-max(self.lanes, self.sectors) // 16) * 16)
         angle = 2.0 * np.pi / self.sectors * np.outer(self._frequency, shift)
-        used = np.outer(self._frequency >= 0, shift < self.shifts)
-        nyquist = (-1.0) ** shift * (shift < self.shifts) * (self.sectors % 2 == 0)
-        return np.cos(angle) * used, -np.sin(angle) * used, nyquist
+        used = np.outer(self._frequency >= 0, shift < self.sectors)
+        nyquist = (-1.0) ** shift * (shift < self.sectors) * (self.sectors % 2 == 0)
+        return np.concatenate([np.cos(angle) * used, -np.sin(angle) * used, nyquist[None]])
 
-    def waves(self) -> F64:
+    def _waves(self) -> F64:
         """(S, 2 L) what a ring is multiplied with for its weighted spectrum, real parts and imaginary ones."""
-        sector = np.arange(self.sectors)[:, None]
-        angle = 2.0 * np.pi / self.sectors * sector * self._frequency
-        weight = np.where(self._frequency >= 0, np.sqrt(2.0) / self.sectors, 0.0)
-        real, imaginary = np.cos(angle) * weight, -np.sin(angle) * weight
-        real[:, 0] = 1.0 / self.sectors
-        imaginary[:, :1] = (-1.0) ** sector / self.sectors * (self.sectors % 2 == 0)
-        return np.hstack([real, imaginary])
+        blocks, sectors = self.blocks, self.sectors
+        waves = self.turns[: 2 * blocks, :sectors].T * (np.sqrt(2.0) / sectors)
+        waves[:, 0] = 1.0 / sectors
+        waves[:, blocks] = self.turns[2 * blocks, :sectors] / sectors
+        return np.ascontiguousarray(waves)
 
-    def _table(self, gain: F64, size: float) -> tuple[npt.NDArray[np.int16], float, float]:
+    def _table(self, gain: F64, size: float) -> tuple[I16, float, float]:
         """Rows of the turn: means of upper halves (4), frequency S / 2, zeros, cosines (L), sines (L); unit; error."""
-        rows = 2 * self.rings
+        rows, blocks, half = 2 * self.rings, self.blocks, self.blocks // 2
         scale = np.where(self._frequency >= 0, 256.0 / gain, 0.0)  # of one unit of a product
         # either side of the mean, in a pair whose turn has a norm of 1, or is (1, 1) in block 0
         error = rows / 2.0 * (np.sqrt(2.0) * float(scale.sum()) + float(scale[0]))
         unit = max(2.01 * float(scale.max()), (self.reach * size + error) / 31_000.0)
         factor = (65_536.0 / unit * scale)[:, None]
-        blocks, half = self._blocks, self._blocks // 2
-        turn = np.empty((6 + 2 * blocks, self._cosine.shape[1]))
+        turns = self.turns[:, : self.lanes] * (np.arange(self.lanes) < self.shifts)
+        turn = np.empty((6 + 2 * blocks, self.lanes))
         turn[5] = 0.0
-        turn[4] = self._nyquist * factor[0]
-        turn[6 : 6 + blocks] = self._cosine * factor
-        turn[6 + blocks :] = self._sine * factor
+        turn[4] = turns[2 * blocks] * factor[0]
+        turn[6:] = turns[: 2 * blocks] * np.concatenate([factor, factor])
         turn[:4] = turn[6:].reshape(4, half, -1).sum(axis=1)
         turn[0] += turn[4]
         turn[:4] = turn[:4] * (rows / 2.0 / 65_536.0) + half / 2.0
         turn[0, self.shifts :] = -30_000.0
         return np.rint(turn).astype(np.int16), unit, error + (0.75 * (2 * blocks + 1) + 4.0) * unit
+
+
+def _packed(numbers: F32) -> I16:
+    """(..., L) int16 of (..., 2, L): the second in the upper byte, rounded in view of what lies below."""
+    low = np.clip(np.rint(numbers[..., 0, :]), -127, 127).astype(np.int16) & 255
+    high = np.clip(np.rint(numbers[..., 1, :] - low * np.float32(1.0 / 256.0)), -127, 127).astype(np.int16)
+    return (high << 8) | low
+
+
+def unpacked(pair: I16) -> F32:
+    """(..., 2, L) numbers that (..., L) int16 stand for: the lower byte, and the whole of it in units of 256."""
+    whole = np.empty((*pair.shape[:-1], 2, pair.shape[-1]), dtype=np.float32)
+    whole[..., 0, :] = pair.astype(np.int8)
+    np.multiply(pair, np.float32(1.0 / 256.0), out=whole[..., 1, :])
+    return whole
 
 
 def _frequencies(sectors: int) -> npt.NDArray[np.int64]:

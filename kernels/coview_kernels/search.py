@@ -26,14 +26,12 @@ class Search:
     """
 
     def __init__(self, screen: Screen, descriptors: npt.NDArray[Any]) -> None:
-        rows, blocks = screen.stations.shape[1:]
-        turns = screen.turns()
-        lanes = len(turns[-1])
+        rings, blocks, lanes = screen.rings, screen.blocks, screen.lanes
         self._scores_any = descriptors.dtype == np.float16 and descriptors.flags.c_contiguous
         self._missed = screen.missed
-        self.query = np.zeros((2, rows, blocks), dtype=np.int16)
+        self.query = np.zeros((2, rings, 2, blocks), dtype=np.int16)
         self.turn = np.zeros((6 + 2 * blocks, lanes), dtype=np.int16)
-        self._raw = np.zeros((screen.rings, screen.sectors), dtype=np.float32)
+        self._raw = np.zeros((rings, screen.sectors), dtype=np.float32)
         self._found = np.zeros(
             4
         )  # the query's norm, the turn's unit, the error common to all, stations listed
@@ -41,22 +39,22 @@ class Search:
         self._listed, self._shifts = np.zeros((2, _LISTED), dtype=np.int32)
         self._scores = np.zeros(_LISTED)
         arguments = (
-            *(self._raw, screen.waves(), screen.step.astype(np.float64), screen.norm, screen.room()),
+            *(self._raw, screen.waves, screen.step.astype(np.float64), screen.norm, screen.room()),
             *(
-                np.vstack(turns),
+                screen.turns,
                 screen.reach,
-                np.empty((rows, blocks)),
-                np.empty((screen.rings, 2 * screen.sectors)),
+                np.empty((rings, 2, blocks)),
+                np.empty((rings, 2 * screen.sectors)),
             ),
             *(np.empty(blocks), self.query, self.turn, self._found),
             *(screen.stations, self._missed, self._best, lanes),
-            descriptors.view(np.uint16) if self._scores_any else np.empty(0, dtype=np.uint16),
+            descriptors.view(np.uint16) if self._scores_any else np.empty(1, dtype=np.uint16),
             *(np.empty(MOST_BEST), self._listed, np.empty(_LISTED), self._scores, self._shifts, 1, 0),
         )
         serial = int(runtime.workers() == 1)
         self._launch = Launch(
             "matching",
-            f"match_{screen.rings}_{screen.sectors}_{blocks}_{lanes}_{serial}",
+            f"match_{rings}_{screen.sectors}_{blocks}_{lanes}_{screen.shifts}_{serial}",
             *(np.ascontiguousarray(a).reshape(-1) if isinstance(a, np.ndarray) else a for a in arguments),
         )
         self._k = 0
@@ -80,8 +78,8 @@ class Search:
 
     def bounds(self) -> Bounds:
         """Bounds for the query of the last call."""
-        size, unit, rest, _ = self._found
-        return Bounds(self._best * unit, self._missed * size + rest)
+        size, unit, rest, _ = (float(x) for x in self._found)
+        return Bounds(self._best.astype(np.float64) * unit, self._missed.astype(np.float64) * size + rest)
 
     def best(self, query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
         """Greatest correlation over the shifts, (M,), in units of the turn, for a query's integers."""
@@ -90,4 +88,5 @@ class Search:
         self._launch.put(_FRESH, 0)
         self._launch()
         self._launch.put(_FRESH, 1)
-        return self._best.copy()
+        copied: I32 = self._best.copy()
+        return copied

@@ -7,21 +7,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels.arrays import I32
+from coview_kernels.arrays import I16, I32
 
 _PORTION = 256
 
 
-def screen(stations: npt.NDArray[np.int8], query: npt.NDArray[np.int16], turn: npt.NDArray[np.int16]) -> I32:
-    """Greatest correlation over the shifts, (M,) int32; stations (M, K, L), query (2, K, L), turn (6 + 2L, N)."""
+def screen(stations: I16, query: I16, turn: I16) -> I32:
+    """Greatest correlation over the shifts, (M,) int32; stations (M, R, L), query (2, R, 2, L), turn (6 + 2L, N)."""
     wide, t = query.astype(np.int32), turn.astype(np.int32)
     blocks = stations.shape[2]
     even, odd = slice(0, blocks // 2), slice(blocks // 2, blocks)
     cosine, sine = t[6 : 6 + blocks], t[6 + blocks :]
     out = np.empty(len(stations), dtype=np.int32)
     for start in range(0, len(stations), _PORTION):
-        part = stations[start : start + _PORTION].astype(np.int32) << 8
-        x, y = (((part * w) >> 16).sum(axis=1) for w in wide)
+        pair = stations[start : start + _PORTION]
+        part = np.stack([pair << 8, pair], axis=2).astype(np.int32)
+        x, y = (_high(part, w).sum(axis=(1, 2)) for w in wide)
         a, c = (_high(x[:, s, None], cosine[s]).sum(axis=1) + t[i] for i, s in enumerate((even, odd)))
         b, d = (_high(y[:, s, None], sine[s]).sum(axis=1) + t[2 + i] for i, s in enumerate((even, odd)))
         a += _high(y[:, 0, None], t[4])
