@@ -1,58 +1,67 @@
 # mypy: ignore-errors
-"""Taichi source of polar.py. Every chunk of points has bins of its own: atomics on shared ones are slower."""
+"""Taichi source of polar.py. Every chunk of points has bins of its own: atomics on shared ones are slower.
 
-from coview_kernels import launch, runtime, sectors
+A store to an argument is never vectorised (it might alias the others), a store to a local vector is. So points go by
+blocks: their bins are computed to float32 accuracy, eight points at a time, into a local vector; then they are added
+to the bins one by one; and the few near an edge are compared with it exactly.
+"""
+
+from coview_kernels import launch, runtime
 
 ti = runtime.library()
+f32, f64, i32 = ti.f32, ti.f64, ti.i32
 
-Floats = ti.types.ndarray(ti.f32, 1)
-Doubles = ti.types.ndarray(ti.f64, 1)
-Integers = ti.types.ndarray(ti.i32, 1)
-Shorts = ti.types.ndarray(ti.i16, 1)
+Floats = ti.types.ndarray(f32, 1)
+Doubles = ti.types.ndarray(f64, 1)
+Integers = ti.types.ndarray(i32, 1)
 SPAN = launch.SPAN
-covisible = runtime.kernels("covisibility").covisible
+SERIAL = runtime.workers() == 1  # waking the pool costs 50 us even for one thread
 
-HALF = sectors.HALF
-LOWEST = -3.4028235e38
+BLOCK = 64
+FINITE = 3.4028235e38
+LOWEST = -FINITE
+# of the bins behind the grid's
+OUTSIDE, BROKEN, NEAR, BEHIND = 0, 1, 2, 3
 
 
 @ti.func
-def bin_of(
-    dx: ti.f32,
-    dy: ti.f32,
-    rings: ti.i32,
-    sectors: ti.i32,
-    params: ti.template(),
-    edges: ti.template(),
-    guesses: ti.template(),
-) -> ti.i32:
+def polar(dx: f32, dy: f32, rings: f32, sectors: f32, per_metre: f32):
+    """Range in rings, at most ``rings + 1.5``, to 1e-6 of ``rings``; angle in sectors, to 3e-6 of ``sectors``."""
+    far = ti.sqrt(dx * dx + dy * dy) * per_metre
+    far = ti.select(far < rings + 1.5, far, rings + 1.5)
+    ax, ay = ti.abs(dx), ti.abs(dy)
+    steep = ay > ax
+    longer = ti.select(steep, ay, ax)
+    t = ti.select(steep, ax, ay) / ti.select(longer > 1e-30, longer, 1e-30)
+    s = t * t
+    # minimax polynomial of atan(t), to 1.2e-5 rad, in turns
+    turn = t * (0.15913367 + s * (-0.05256963 + s * (0.02867322 + s * (-0.01355302 + s * 0.00331759))))
+    turn = ti.select(steep, 0.25 - turn, turn)
+    turn = ti.select(dx < 0, 0.5 - turn, turn)
+    turn = ti.select(dy < 0, 1.0 - turn, turn)
+    return far, turn * sectors
+
+
+@ti.func
+def exact_bin(dx: f32, dy: f32, rings: i32, sectors: i32, per_metre: f32, edges: ti.template()) -> i32:
     """Bin of an offset by comparing it with the edges as in sectors.py; R S at and beyond ``r_max``.
 
     ``edges``: the R + 1 squared ring edges, then the S + 1 rays as x, y.
     """
-    x = ti.cast(dx, ti.f64)
-    y = ti.cast(dy, ti.f64)
+    x, y = ti.cast(dx, f64), ti.cast(dy, f64)
     r2 = x * x + y * y
     b = rings * sectors
     if r2 < edges[rings]:
         # both guesses are off by one at most
-        ring = ti.cast(ti.sqrt(ti.cast(r2, ti.f32)) * ti.cast(params[3], ti.f32), ti.i32)
-        ring = ti.min(ring, rings - 1)
+        far, angle = polar(dx, dy, ti.cast(rings, f32), ti.cast(sectors, f32), per_metre)
+        ring = ti.min(ti.cast(far, i32), rings - 1)
         if r2 < edges[ring]:
             ring -= 1
         elif r2 >= edges[ring + 1]:
             ring += 1
-        ax = ti.abs(dx)
-        ay = ti.abs(dy)
-        octant = ti.cast(ay > ax, ti.i32) + 2 * ti.cast(dx < 0, ti.i32) + 4 * ti.cast(dy < 0, ti.i32)
-        ratio = ti.min(ax, ay) / ti.max(ti.max(ax, ay), 1e-30)
-        steps = ti.cast(params[4], ti.i32)
-        s = guesses[octant * (steps + 1) + ti.cast(ratio * steps, ti.i32)]
+        s = ti.min(ti.cast(angle, i32), sectors - 1)
         ray = rings + 1 + 2 * s
-        lx = edges[ray]
-        ly = edges[ray + 1]
-        ux = edges[ray + 2]
-        uy = edges[ray + 3]
+        lx, ly, ux, uy = edges[ray], edges[ray + 1], edges[ray + 2], edges[ray + 3]
         if lx * y < ly * x and lx * x + ly * y > 0:
             s = ti.select(s == 0, sectors - 1, s - 1)
         elif ux * y >= uy * x and ux * x + uy * y > 0:
@@ -62,130 +71,103 @@ def bin_of(
 
 
 @ti.func
-def add_point(
-    px: ti.f64,
-    py: ti.f64,
-    pz: ti.f64,
-    first: ti.i32,
-    rings: ti.i32,
-    sectors: ti.i32,
+def add(
+    start: i32,
+    n: i32,
+    first: i32,
+    points: ti.template(),
+    rings: i32,
+    sectors: i32,
     params: ti.template(),
     edges: ti.template(),
-    guesses: ti.template(),
-    cells: ti.template(),
-    bins: ti.template(),
-):
-    """Add a point to the chunk's bins, which begin at ``first``: greatest height, sum of heights, count.
-
-    ``params``: centre x, y, z, rings per metre, steps of the guesses, cells per metre, r_max. Five points of six
-    lie in a cell that no edge crosses. Bin R S is for what the circle leaves of the square.
-    """
-    dx = ti.cast(px - params[0], ti.f32)
-    dy = ti.cast(py - params[1], ti.f32)
-    if ti.cast(ti.max(ti.abs(dx), ti.abs(dy)), ti.f64) < params[6]:
-        scale = ti.cast(params[5], ti.f32)
-        column = ti.min(ti.cast(dx * scale + float(HALF), ti.i32), 2 * HALF - 1)
-        row = ti.min(ti.cast(dy * scale + float(HALF), ti.i32), 2 * HALF - 1)
-        b = ti.cast(cells[row * (2 * HALF) + column], ti.i32)
-        if b < 0:
-            b = bin_of(dx, dy, rings, sectors, params, edges, guesses)
-        at = first + 3 * b
-        h = ti.cast(ti.cast(pz - params[2], ti.f32), ti.f64)
-        bins[at] = ti.max(bins[at], h)
-        bins[at + 1] = bins[at + 1] + h  # += would be atomic: a locked instruction, 20 times as slow
-        bins[at + 2] = bins[at + 2] + 1.0
-
-
-@ti.func
-def clear_bins(first: ti.i32, size: ti.i32, bins: ti.template()):
-    """Empty a chunk's bins."""
-    for b in range(size):
-        bins[first + 3 * b] = LOWEST
-        bins[first + 3 * b + 1] = 0.0
-        bins[first + 3 * b + 2] = 0.0
-
-
-@ti.func
-def merge_bins(
-    chunks: ti.i32,
-    size: ti.i32,
-    bins: ti.template(),
     highest: ti.template(),
     total: ti.template(),
     count: ti.template(),
 ):
-    """Join the chunks' bins."""
-    for b in range(size):
-        top = bins[3 * b]
-        height = bins[3 * b + 1]
-        number = bins[3 * b + 2]
-        for c in range(1, chunks):
-            other = 3 * (c * (size + 1) + b)
-            top = ti.max(top, bins[other])
-            height += bins[other + 1]
-            number += bins[other + 2]
-        highest[b] = ti.select(number > 0, ti.cast(top, ti.f32), ti.cast(0.0, ti.f32))
-        total[b] = ti.cast(height, ti.f32)
-        count[b] = ti.cast(number, ti.i32)
+    """Add ``n`` points, at most BLOCK, to the bins that begin at ``first``; see ``bins``."""
+    size = rings * sectors
+    cx, cy, cz = params[0], params[1], params[2]
+    per_metre = ti.cast(params[3], f32)
+    all_rings, all_sectors = ti.cast(rings, f32), ti.cast(sectors, f32)
+    # as far as this from the middle of a ring or sector there is no doubt
+    sure_ring, sure_sector = 0.5 - 1e-6 * (all_rings + 2.0), 0.5 - 4e-6 * all_sectors
+    at, height = ti.Vector.zero(i32, BLOCK), ti.Vector.zero(f32, BLOCK)
+    near = 0
+    for j in range(n):
+        i = 3 * (start + j)
+        x, y, z = points[i], points[i + 1], points[i + 2]
+        dx = ti.cast(ti.cast(x, f64) - cx, f32)
+        dy = ti.cast(ti.cast(y, f64) - cy, f32)
+        height[j] = ti.cast(ti.cast(z, f64) - cz, f32)
+        far, angle = polar(dx, dy, all_rings, all_sectors, per_metre)
+        ring, sector = ti.cast(far, i32), ti.cast(angle, i32)
+        off_ring = ti.abs(far - ti.cast(ring, f32) - 0.5)
+        off_sector = ti.abs(angle - ti.cast(sector, f32) - 0.5)
+        b = ti.min(ring * sectors + sector, size)
+        b = ti.select(off_ring > sure_ring, size + NEAR, b)
+        b = ti.select(off_sector > sure_sector, size + NEAR, b)
+        b = ti.select(far > all_rings + 1.0, size + OUTSIDE, b)
+        # false for NaN
+        finite = ti.cast(ti.abs(x) <= FINITE, i32) & ti.cast(ti.abs(y) <= FINITE, i32)
+        finite &= ti.cast(ti.abs(z) <= FINITE, i32)
+        b = ti.select(finite != 0, b, size + BROKEN)
+        near += ti.cast(b == size + NEAR, i32)
+        at[j] = first + b
+    for j in range(n):
+        b, h = at[j], height[j]
+        top = highest[b]
+        highest[b] = ti.select(top > h, top, h)
+        total[b] = total[b] + h  # += would be atomic: a locked instruction, 20 times as slow
+        count[b] = count[b] + 1
+    if near > 0:
+        for j in range(n):
+            if at[j] == first + size + NEAR:
+                i = 3 * (start + j)
+                dx = ti.cast(ti.cast(points[i], f64) - cx, f32)
+                dy = ti.cast(ti.cast(points[i + 1], f64) - cy, f32)
+                b = first + exact_bin(dx, dy, rings, sectors, per_metre, edges)
+                highest[b] = ti.max(highest[b], height[j])
+                total[b] = total[b] + height[j]
+                count[b] = count[b] + 1
 
 
 @ti.kernel
-def describe(
+def bins(
     points: Floats,
-    rows: ti.i32,
-    chunks: ti.i32,
-    rings: ti.i32,
-    sectors: ti.i32,
+    rows: i32,
+    chunks: i32,
+    rings: i32,
+    sectors: i32,
     params: Doubles,
     edges: Doubles,
-    guesses: Integers,
-    cells: Shorts,
-    bins: Doubles,
-    dropped: Integers,
     highest: Floats,
-    total: Floats,
+    total: Doubles,
     count: Integers,
-    value: Floats,
 ):
-    """Polar bins of ``rows`` points and what is co-visible.
+    """Add ``rows`` points to the bins of their chunks.
 
-    ``params`` goes on with vertical, hide, scale and eye of :func:`covisible`; hide < 0: leave ``value`` alone.
-    All arrays are flat: an index into more axes costs a read of the shape and a product each time.
+    A chunk has R S bins and three more: points beyond ``r_max``, points that are not finite, points near an edge.
+    ``params``: centre x, y, z, rings per metre. All arrays are flat: an index into more axes costs a read of the
+    shape and a product each time.
     """
-    size = rings * sectors
+    ti.loop_config(serialize=SERIAL)
     for q in range(chunks * SPAN):
         if q % SPAN == 0:
             c = q // SPAN
             step = (rows + chunks - 1) // chunks
-            first = 3 * c * (size + 1)
-            clear_bins(first, size + 1, bins)
-            bad = 0
-            for i in range(ti.min(rows, c * step), ti.min(rows, (c + 1) * step)):
-                x = ti.cast(points[3 * i], ti.f64)
-                y = ti.cast(points[3 * i + 1], ti.f64)
-                z = ti.cast(points[3 * i + 2], ti.f64)
-                # NaN and inf stay in the sum, whose bits show them; three float32 do not overflow a float64
-                if ((ti.bit_cast(x + y + z, ti.i64) >> 52) & 0x7FF) == 0x7FF:
-                    bad += 1
-                else:
-                    add_point(x, y, z, first, rings, sectors, params, edges, guesses, cells, bins)
-            dropped[c] = bad
-
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        merge_bins(chunks, size, bins, highest, total, count)
-        vertical = ti.cast(params[7], ti.i32)
-        hide = ti.cast(params[8], ti.i32)
-        scale = ti.cast(params[9], ti.i32)
-        if hide >= 0:
-            covisible(0, rings, sectors, vertical, hide, scale, params[10], highest, total, count, value)
+            begin, end = ti.min(rows, c * step), ti.min(rows, (c + 1) * step)
+            first = c * (rings * sectors + BEHIND)
+            for block in range((end - begin + BLOCK - 1) // BLOCK):
+                start = begin + block * BLOCK
+                n = ti.min(BLOCK, end - start)
+                add(start, n, first, points, rings, sectors, params, edges, highest, total, count)
 
 
 @ti.kernel
 def station_bins(
-    stations: ti.i32,
-    chunks: ti.i32,
-    size: ti.i32,
+    stations: i32,
+    chunks: i32,
+    size: i32,
     top: Floats,
     points: Integers,
     heights: Floats,
@@ -206,18 +188,18 @@ def station_bins(
             c = q // SPAN
             step = (stations + chunks - 1) // chunks
             for m in range(ti.min(stations, c * step), ti.min(stations, (c + 1) * step)):
-                floor = ti.cast(ground[m], ti.f64)
+                floor = ti.cast(ground[m], f64)
                 at_station = base[m]
                 for b in range(size):
-                    best = ti.cast(LOWEST, ti.f32)
+                    best = ti.cast(LOWEST, f32)
                     number = 0
-                    height = ti.cast(0.0, ti.f64)
+                    height = ti.cast(0.0, f64)
                     for k in range(starts[b], starts[b + 1]):
                         at = at_station + offsets[k]
                         best = ti.max(best, top[at])
                         number += points[at]
-                        height += ti.cast(heights[at], ti.f64)
+                        height += ti.cast(heights[at], f64)
                     if number > 0:
-                        highest[m * size + b] = ti.cast(ti.cast(best, ti.f64) - floor, ti.f32)
-                        total[m * size + b] = ti.cast(height - number * floor, ti.f32)
+                        highest[m * size + b] = ti.cast(ti.cast(best, f64) - floor, f32)
+                        total[m * size + b] = ti.cast(height - number * floor, f32)
                         count[m * size + b] = number

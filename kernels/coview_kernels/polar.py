@@ -10,13 +10,14 @@ import numpy.typing as npt
 
 from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, F64, I32, Mode, PolarGrid, Vertical
-from coview_kernels.covisibility import encoded
 from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table
-from coview_kernels.sectors import HALF, cell_bins, ring_edges2, sector_edges, sector_guesses
+from coview_kernels.sectors import ring_edges2, sector_edges
 
-MAX_SECTORS = 3000  # beyond, a guess from the table may be off by more than one sector
-_POINTS_PER_CHUNK = 4096  # fewer are done before another thread is awake
+_MOST = 100_000  # rings or sectors that float32 tells apart
+_MOST_BINS = 1 << 20
+_POINTS_PER_CHUNK = 8192  # fewer are done before another thread is awake
+_BEHIND = 3  # bins behind those of the grid: outside, not finite, near an edge
 _NOTHING: F32 = np.empty(0, dtype=np.float32)
 
 
@@ -47,13 +48,18 @@ def polar_bin(
     cloud = check.float32("points", points, None, 3)
     origin = check.finite64("centre", centre, 3)
     check.grid_size(rings, sectors, r_max)
-    native = _polar_bin if sectors <= MAX_SECTORS else reference.polar_bin
+    native = _polar_bin if tells_apart(rings, sectors) else reference.polar_bin
     return runtime.dispatch(native, reference.polar_bin, cloud, origin, rings, sectors, float(r_max))
 
 
+def tells_apart(rings: int, sectors: int) -> bool:
+    """Whether the kernel can tell so many rings and sectors apart."""
+    return max(rings, sectors) <= _MOST and rings * sectors <= _MOST_BINS
+
+
 def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
-    grid, _, dropped = _bins(rings, sectors, r_max)(points, centre, None)
-    return grid, dropped
+    grid, dropped = _bins(rings, sectors, r_max)(points, centre)
+    return PolarGrid(*(a.copy() for a in grid)), dropped
 
 
 def describe_points(
@@ -75,79 +81,72 @@ def describe_points(
     Raises:
         ValueError: a shape, a number or an option is out of its range.
     """
-    cloud = check.float32("points", points, None, 3)
-    origin = check.finite64("centre", centre, 3)
-    check.grid_size(rings, sectors, r_max)
     check.visibility(vertical, mode, eye)
-    native = _describe_points if sectors <= MAX_SECTORS else reference.describe_points
-    plain, radius = reference.describe_points, float(r_max)
-    return runtime.dispatch(native, plain, cloud, origin, rings, sectors, radius, vertical, mode, eye)
-
-
-def _describe_points(
-    points: F32,
-    centre: F64,
-    rings: int,
-    sectors: int,
-    r_max: float,
-    vertical: Vertical,
-    mode: Mode,
-    eye: float,
-) -> tuple[PolarGrid, F32, int]:
-    return _bins(rings, sectors, r_max)(points, centre, encoded(vertical, mode, eye))
+    grid, dropped = polar_bin(points, centre, rings, sectors, r_max)
+    return grid, reference.coview(*grid, vertical=vertical, mode=mode, eye=eye), dropped
 
 
 class PolarBins:
     """Bins, edges and results that stay from call to call; for the owner thread only."""
 
     def __init__(self, rings: int, sectors: int, r_max: float, chunks: int) -> None:
-        size = rings * sectors
-        self.sizes = rings, sectors
-        self.edges = np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
-        steps = min(1024, max(256, 1 << sectors.bit_length()))  # few, to stay in the nearest cache
-        self.guesses = sector_guesses(sectors, steps).ravel()
-        self.cells = cell_bins(rings, sectors, r_max)
-        self.params = np.zeros(11)
-        self.params[3:7] = rings / r_max, steps, HALF / r_max, r_max
-        self.bins = np.empty(3 * (size + 1) * chunks)
-        self.dropped = np.zeros(chunks, dtype=np.int32)
-        self.highest, self.total, self.value = (np.empty(size, dtype=np.float32) for _ in range(3))
-        self.count = np.empty(size, dtype=np.int32)
-        self.grid = PolarGrid(
-            self.highest.reshape(self.sizes), self.total.reshape(self.sizes), self.count.reshape(self.sizes)
+        self._size = rings * sectors
+        shape = chunks, self._size + _BEHIND
+        edges = np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
+        self._params = np.array([0.0, 0.0, 0.0, rings / r_max])
+        self._highest, self._total = np.empty(shape, dtype=np.float32), np.empty(shape)
+        self._count = np.empty(shape, dtype=np.int32)
+        self._sum = np.empty((rings, sectors))
+        top, height = np.empty((2, rings, sectors), dtype=np.float32)
+        self._grid = PolarGrid(top, height, np.empty((rings, sectors), dtype=np.int32))
+        self.arguments = (
+            *(rings, sectors, self._params, edges),
+            *(a.reshape(-1) for a in (self._highest, self._total, self._count)),
         )
+        """Of a kernel that adds points."""
+
+    def clear(self, centre: F64 | None) -> None:
+        """Empty the bins; their centre is (3,), metres, or stays."""
+        if centre is not None:
+            self._params[:3] = centre
+        self._highest.fill(-np.inf)
+        self._total.fill(0.0)
+        self._count.fill(0)
+
+    def grid(self) -> tuple[PolarGrid, int]:
+        """Return what was added since, in buffers that the next call overwrites, and how many were not finite."""
+        top, height, number = self._grid
+        shape, size = number.shape, self._size
+        np.maximum.reduce(self._highest[:, :size].reshape(-1, *shape), axis=0, out=top)
+        np.add.reduce(self._count[:, :size].reshape(-1, *shape), axis=0, out=number)
+        np.copyto(top, 0.0, where=number == 0)
+        with np.errstate(over="ignore", invalid="ignore"):  # of absurd heights
+            np.add.reduce(self._total[:, :size].reshape(-1, *shape), axis=0, out=self._sum)
+            height[:] = self._sum
+        return self._grid, int(self._count[:, size + 1].sum())
 
 
-class _Describer(PolarBins):
-    """Describes points in one launch."""
+class _Binning:
+    """Bins points in one launch."""
 
     def __init__(self, rings: int, sectors: int, r_max: float) -> None:
         self._chunks = runtime.workers()
-        super().__init__(rings, sectors, r_max, self._chunks)
-        self._launch = Launch(
-            *("polar", "describe", _NOTHING, 0, 1, rings, sectors),
-            *(self.params, self.edges, self.guesses, self.cells, self.bins, self.dropped),
-            *(self.highest, self.total, self.count, self.value),
-        )
+        self._bins = PolarBins(rings, sectors, r_max, self._chunks)
+        self._launch = Launch("polar", "bins", _NOTHING, 0, 1, *self._bins.arguments)
 
-    def __call__(
-        self, points: F32, centre: F64, visibility: tuple[int, int, int, float] | None
-    ) -> tuple[PolarGrid, F32, int]:
+    def __call__(self, points: F32, centre: F64) -> tuple[PolarGrid, int]:
         chunks = min(self._chunks, 1 + len(points) // _POINTS_PER_CHUNK)
-        self.params[:3] = centre
-        self.params[7:] = visibility or (0, -1, 0, 0.0)
+        self._bins.clear(centre)
         for index, value in enumerate((points.reshape(-1), len(points), chunks)):
             self._launch.put(index, value)
         self._launch()
         self._launch.put(0, _NOTHING)  # keeps no cloud alive
-        top, total, count = self.grid
-        grid = PolarGrid(top.copy(), total.copy(), count.copy())
-        return grid, self.value.reshape(self.sizes).copy(), int(self.dropped[:chunks].sum())
+        return self._bins.grid()
 
 
 @lru_cache(maxsize=8)
-def _bins(rings: int, sectors: int, r_max: float) -> _Describer:
-    return _Describer(rings, sectors, r_max)
+def _bins(rings: int, sectors: int, r_max: float) -> _Binning:
+    return _Binning(rings, sectors, r_max)
 
 
 def station_bins(

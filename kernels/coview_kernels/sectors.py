@@ -19,9 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, I16, I32, I64
-
-HALF = 256  # cells of cell_bins from the centre to r_max: 512 kB in all
+from coview_kernels.arrays import F32, F64, I64
 
 
 @lru_cache(maxsize=64)
@@ -42,55 +40,6 @@ def sector_edges(sectors: int) -> F64:
     edges = rays.astype(np.float32).astype(np.float64)
     edges.flags.writeable = False
     return edges
-
-
-@lru_cache(maxsize=64)
-def sector_guesses(sectors: int, steps: int = 1024) -> I32:
-    """(8, steps + 1) sector, give or take one, by octant and by the ratio of the smaller offset to the other.
-
-    Octant is ``(|dy| > |dx|) + 2 (dx < 0) + 4 (dy < 0)``. Right while a sector is wider than a step: to some
-    6000 sectors for 1024 steps. A kernel reads this instead of computing an angle; read-only.
-    """
-    ratio = np.minimum((np.arange(steps + 1) + 0.5) / steps, 1.0)
-    one = np.ones_like(ratio)
-    rows = []
-    for octant in range(8):
-        dx, dy = (ratio, one) if octant & 1 else (one, ratio)
-        theta = np.arctan2(-dy if octant & 4 else dy, -dx if octant & 2 else dx) % (2.0 * np.pi)
-        rows.append(np.minimum(theta * (sectors / (2.0 * np.pi)), sectors - 1))
-    guesses = np.array(rows).astype(np.int32)
-    guesses.flags.writeable = False
-    return guesses
-
-
-@lru_cache(maxsize=8)
-def cell_bins(rings: int, sectors: int, r_max: float, half: int = HALF) -> I16:
-    """Bins of the cells of a square grid, flat: what most points need to be told.
-
-    The cells, ``2 * half`` on a side and row by row along y, cover offsets from ``-r_max`` to ``r_max``. A cell
-    within one bin holds its number, a cell beyond ``r_max`` R S, and one that an edge crosses or comes near -1:
-    its points have to be compared with the edges. Read-only; all -1 where the numbers do not fit.
-    """
-    size = 2 * half
-    if rings * sectors >= 1 << 15:
-        return np.full(size * size, -1, dtype=np.int16)
-    line = np.arange(-half, half + 1) * (r_max / half)
-    x, y = line[None, :], line[:, None]
-    r = np.hypot(x, y)
-    near = 1e-3 * r_max / half  # far above the rounding of a point's cell
-    across = r * (rings / r_max)
-    along = (np.arctan2(y, x) % (2.0 * np.pi)) * (sectors / (2.0 * np.pi))
-    ring, sector = np.floor(across), np.floor(along)
-    edge = np.minimum(across - ring, ring + 1 - across) < near * (rings / r_max)
-    edge |= (np.minimum(along - sector, sector + 1 - along) * r < near * sectors) & (sectors > 1)
-    bins = np.where(ring < rings, ring * sectors + sector, rings * sectors).astype(np.int16)
-    bins[edge & (across < rings + 0.5)] = -1
-    # the axes are lines of the grid: the corners of a cell hold its least and greatest range and its outer rays
-    first = bins[:-1, :-1]
-    same = (first == bins[1:, :-1]) & (first == bins[:-1, 1:]) & (first == bins[1:, 1:])
-    cells: I16 = np.where(same, first, np.int16(-1)).ravel()
-    cells.flags.writeable = False
-    return cells
 
 
 def polar_index(dx: F32, dy: F32, rings: int, sectors: int, r_max: float) -> I64:

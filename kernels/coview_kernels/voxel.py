@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, F64
+from coview_kernels.sieve import Sieve
 
-_HUGE = 1e300  # stands for no limit: a compiler may assume that there is no infinity
+_MOST_BYTES = 1 << 23  # of table and results that stay from call to call
+_sieve: Sieve | None = None  # used on the owner thread only
 
 
 def transform_unique(
@@ -49,24 +50,12 @@ def transform_unique(
 
 
 def _transform_unique(points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int]:
-    moved = np.empty_like(points)
-    key = np.empty(len(points), dtype=np.int64)
-    bits = max(4, (2 * len(points)).bit_length())  # a power of two, between a quarter and half full
-    table = np.zeros(1 << bits if voxel > 0 else 1, dtype=np.int64)
-    totals = np.zeros(3, dtype=np.int32)
-    runtime.kernels("voxel").transform_unique(
-        points,
-        T,
-        1.0 / voxel if voxel > 0 else 0.0,
-        min(r_min * r_min, _HUGE),
-        min(r_max * r_max, _HUGE),
-        moved,
-        key,
-        table,
-        64 - bits,
-        totals,
-    )
-    kept, dropped, out_of_reach = (int(n) for n in totals)
-    if out_of_reach:  # more than a million voxels from the origin
+    global _sieve
+    sieve, _sieve = _sieve or Sieve(), None
+    taken = sieve(points, T, voxel, r_min, r_max)
+    if sieve.nbytes <= _MOST_BYTES:
+        _sieve = sieve
+    if taken is None:
         return reference.transform_unique(points, T, voxel, r_min, r_max)
-    return moved[:kept].copy(), dropped
+    moved, dropped = taken
+    return moved.copy(), dropped

@@ -34,7 +34,7 @@ def _normal_equations() -> None:
 _CALLS: dict[str, Callable[[], object]] = {
     "FrameIntake": lambda: FrameIntake(1.0)(_CLOUD, _EYE),
     "align_planes": _align,
-    "coview": lambda: coview(*polar_bin(_CLOUD, _ORIGIN, 2, 4, 8.0)[0]),
+    "coview": lambda: coview(*np.ones((3, 100, 20, 60))),
     "describe_points": lambda: describe_points(_CLOUD, _ORIGIN, 2, 4, 8.0),
     "nearest": lambda: nearest(PointGrid(_CLOUD), _CLOUD, 1.0),
     "normal_equations": _normal_equations,

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coview_kernels import coview, reference, visible
+from coview_kernels import coview, covisibility, reference, visible
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _kernel_for_few_grids_too():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(covisibility, "_LEAST_BINS", 0)
+        yield
+
 
 MODES = st.sampled_from(["paper", "eye", "off"])
 VERTICALS = st.sampled_from(["max", "mean", "off"])

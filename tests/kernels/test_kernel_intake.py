@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_cases import clouds, poses, run_python
 
-from coview_kernels import FrameIntake, backend, intake, reference, shutdown
+from coview_kernels import FrameIntake, backend, reference, shutdown, sieve
 
 BINS = (20, 60, 50.0)
 
@@ -39,10 +39,8 @@ def test_agrees_with_numpy_frame_after_frame(frames, voxel, limits, bins):
         assert_taken(take(points, T), points, T, (voxel, *limits), bins)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3, 9])
-def test_the_first_point_wins_across_chunks(monkeypatch, threads):
-    """Every voxel is hit in every chunk."""
-    monkeypatch.setattr(intake.runtime, "workers", lambda: threads)
+def test_the_first_point_wins():
+    """Every voxel is hit again and again."""
     rng = np.random.default_rng(3)
     points = np.tile(rng.uniform(-10, 10, (5_000, 3)), (8, 1)).astype(np.float32)
     points += rng.uniform(-0.2, 0.2, points.shape).astype(np.float32)
@@ -52,6 +50,31 @@ def test_the_first_point_wins_across_chunks(monkeypatch, threads):
     take = FrameIntake(0.5, 2.0, 12.0, BINS)
     for n in (40_000, 5_000, 0, 39_999):
         assert_taken(take(points[:n], T, (1, 2, 3)), points[:n], T, (0.5, 2.0, 12.0), BINS, (1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize("spread", [0.1, 3.0, 400.0])
+def test_tables_grow_with_the_space_that_a_cloud_fills(spread):
+    """From few cubes of 4 x 4 x 4 voxels to one for each point."""
+    points = np.random.default_rng(9).normal(0, spread, (20_000, 3)).astype(np.float32)
+    take = FrameIntake(0.1, bins=BINS)
+    for n in (1, 20_000, 63, 64, 65):
+        assert_taken(take(points[:n], np.eye(4)), points[:n], np.eye(4), (0.1,), BINS)
+
+
+def test_the_farthest_voxels_within_reach():
+    """16 bits an axis, around the voxel of the sensor."""
+    least, most = -(1 << 15), (1 << 15) - 1
+    corners = np.array(np.meshgrid(*[[least, -1, 0, most]] * 3), dtype=float).reshape(3, -1).T
+    points = np.concatenate([corners + 0.25, corners + 0.75]).astype(np.float32)
+    T = np.eye(4)
+    for sensor in (0.0, 1000.0):
+        T[:3, 3] = sensor
+        take = FrameIntake(1.0)
+        assert_taken(take(points, T), points, T, (1.0,))
+        assert len(take(points, T).points) == 64
+        for step in (least - 1, most + 1):
+            far = np.append(points, np.full((1, 3), step, np.float32), axis=0)
+            assert_taken(take(far, T), far, T, (1.0,))
 
 
 def scan(rng, n=30_000):
@@ -96,7 +119,7 @@ def test_what_is_kept_from_a_frame_is_overwritten_by_the_next():
 
 
 def test_more_frames_than_a_key_can_count(monkeypatch):
-    monkeypatch.setattr(intake, "_GENERATIONS", 4)
+    monkeypatch.setattr(sieve, "_GENERATIONS", 4)
     rng = np.random.default_rng(6)
     take = FrameIntake(0.5)
     for _ in range(10):

@@ -186,7 +186,7 @@ def test_the_interpreter_exits_while_another_thread_still_works():
 
 
 def test_kernel_modules_insist_on_the_owner():
-    code = "import coview_kernels._ti_voxel"
+    code = "import coview_kernels._ti_sieve"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={"PYTHONPATH": str(ROOT / "kernels")},

@@ -1,4 +1,4 @@
-"""Eqs 1-4, co-visibility of polar bins, in plain NumPy: one pass over the rings, all sectors at once."""
+"""Eqs 1-4, co-visibility of polar bins, in plain NumPy, all rings and sectors at once."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import numpy as np
 
 from coview_kernels.arrays import F32, I32, Mask, Mode, Vertical
 
+_LOWEST = -np.finfo(np.float64).max  # of a height of minus infinity: what is occupied is above what is not
+
 
 def visible(max_height: F32, count: I32, mode: Mode, eye: float = 1.5) -> Mask:
     """See :func:`coview_kernels.visible`."""
     occupied: Mask = count > 0
     if mode == "off":
         return occupied
-    # Both modes compare slopes h / a with a = i or i - 1/2. Doubling the half and cross-multiplying leaves
-    # products of a float32 and a small integer, exact in float64: a tie is a tie on every machine.
+    # Slopes are quotients of a float32 and a small integer, rounded once: equal ones stay equal, and distinct ones
+    # distinct. So a tie is a tie on every machine.
     zero = 0.0 if mode == "paper" else float(np.float32(eye))
-    seen = np.zeros_like(occupied)
-    best_h = np.zeros(occupied.shape[:-2] + occupied.shape[-1:])
-    best_a = np.zeros_like(best_h)
-    for i in range(1, occupied.shape[-2] + 1):
-        a = i if mode == "paper" else 2 * i - 1
-        h = max_height[..., i - 1, :].astype(np.float64) - zero
-        with np.errstate(invalid="ignore"):  # an empty bin may hold anything
-            now = occupied[..., i - 1, :] & ((best_a == 0) | (h * best_a > a * best_h))
-        best_h = np.where(now, h, best_h)
-        best_a = np.where(now, a, best_a)
-        seen[..., i - 1, :] = now
+    half = 0.0 if mode == "paper" else 0.5
+    distance = np.arange(1, occupied.shape[-2] + 1)[:, None] - half
+    with np.errstate(invalid="ignore"):  # an empty bin may hold anything
+        slope = np.where(
+            occupied, np.maximum((max_height.astype(np.float64) - zero) / distance, _LOWEST), -np.inf
+        )
+    horizon = np.full_like(slope, -np.inf)
+    np.maximum.accumulate(slope[..., :-1, :], axis=-2, out=horizon[..., 1:, :])
+    seen: Mask = slope > horizon
     return seen
 
 

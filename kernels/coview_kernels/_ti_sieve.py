@@ -1,0 +1,168 @@
+# mypy: ignore-errors
+"""Taichi source of sieve.py: one pass over the points, with a hash table of cubes of 4 x 4 x 4 voxels.
+
+Points go by blocks. They are moved and their voxels numbered into local vectors, which the compiler does several
+points at a time (a store to an argument might alias and is never vectorised). Then they are looked up one by one: a
+cube has 64 bits, one for each voxel, so that the points of a surface, one beside the other, rarely need the table.
+"""
+
+from coview_kernels import runtime
+
+ti = runtime.library()
+f32, f64, i32, i64 = ti.f32, ti.f64, ti.i32, ti.i64
+
+Floats = ti.types.ndarray(f32, 1)
+Doubles = ti.types.ndarray(f64, 1)
+Integers = ti.types.ndarray(i32, 1)
+Longs = ti.types.ndarray(i64, 1)
+
+BLOCK = 64
+FINITE = 3.4028235e38
+FAR = 1 << 15  # voxels around the sensor's are in [-2^15, 2^15): 16 bits an axis, 14 for the cube
+STAMP = 42
+GOLDEN = -7046029254386353131
+
+
+@ti.func
+def voxel_of(p: f32, limit: f32, inverse: f64, middle: i32) -> i32:
+    """``floor(p * inverse)`` above ``middle``; of truncation, since that is vectorised. NaN is far away."""
+    p = ti.select(p < limit, p, limit)
+    p = ti.select(p > -limit, p, -limit)
+    v = ti.cast(p, f64) * inverse
+    whole = ti.cast(v, i32)
+    return whole - ti.cast(ti.cast(whole, f64) > v, i32) - middle
+
+
+@ti.func
+def place(
+    start: i32,
+    n: i32,
+    points: ti.template(),
+    move: ti.template(),
+    a: ti.template(),
+    b: ti.template(),
+    c: ti.template(),
+    plane: ti.template(),
+    rest: ti.template(),
+):
+    """Move ``n`` points to a, b, c and number their voxels; how many are not finite, how many out of reach.
+
+    ``plane`` is the cube's place along x and y, ``rest`` along z, the voxel in the cube (6 bits) and whether the
+    point is in range.
+    """
+    T = ti.Vector([move[k] for k in ti.static(range(12))])
+    inverse, nearest, farthest = move[12], move[13], move[14]
+    limit = ti.cast(move[15], f32)
+    middle = ti.Vector([ti.cast(move[16 + k], i32) - FAR for k in ti.static(range(3))])
+    infinite, far = 0, 0
+    for j in range(n):
+        i = 3 * (start + j)
+        x, y, z = ti.cast(points[i], f64), ti.cast(points[i + 1], f64), ti.cast(points[i + 2], f64)
+        p = ti.cast(T[0] * x + T[1] * y + T[2] * z + T[3], f32)
+        q = ti.cast(T[4] * x + T[5] * y + T[6] * z + T[7], f32)
+        r = ti.cast(T[8] * x + T[9] * y + T[10] * z + T[11], f32)
+        a[j], b[j], c[j] = p, q, r
+        # NaN and inf reach every image, even through a zero (0 * inf is NaN)
+        finite = ti.cast(ti.abs(p) <= FINITE, i32) & ti.cast(ti.abs(q) <= FINITE, i32)
+        finite &= ti.cast(ti.abs(r) <= FINITE, i32)
+        r2 = x * x + y * y + z * z
+        inside = finite & ti.cast(r2 >= nearest, i32) & ti.cast(r2 < farthest, i32)
+        ip = voxel_of(p, limit, inverse, middle[0])
+        iq = voxel_of(q, limit, inverse, middle[1])
+        ir = voxel_of(r, limit, inverse, middle[2])
+        beyond = inside & ti.cast(((ip | iq | ir) >> 16) != 0, i32)
+        infinite += 1 - finite
+        far += beyond
+        plane[j] = ((ip >> 2) << 14) | (iq >> 2)
+        within = ((ip & 3) << 4) | ((iq & 3) << 2) | (ir & 3)
+        rest[j] = ((ir >> 2) << 7) | (within << 1) | (inside - beyond)
+    return infinite, far
+
+
+@ti.func
+def look_up(
+    n: i32,
+    generation: i64,
+    bits: i32,
+    merge: i64,
+    out: i32,
+    at: i32,
+    last: i64,
+    seen: i64,
+    a: ti.template(),
+    b: ti.template(),
+    c: ti.template(),
+    plane: ti.template(),
+    rest: ti.template(),
+    table: ti.template(),
+    moved: ti.template(),
+):
+    """Append the first point of each voxel to ``moved``; its new end, the cubes added, and the last cube.
+
+    ``table`` has a key and 64 bits for each cube. A place is free unless its key is of this ``generation``: nothing
+    is ever cleared. The bits of the last cube, at ``at``, are in ``seen`` until there is another one.
+    """
+    cubes = 0
+    for j in range(n):
+        w = rest[j]
+        k = (generation << STAMP) | (ti.cast(plane[j], i64) << 14) | ti.cast(w >> 7, i64)
+        voxel = ti.cast(w & 1, i64) << ti.cast((w >> 1) & 63, i64)
+        if (k != last) & (voxel != 0):
+            table[2 * at + 1] = seen
+            last = k
+            wrap = (1 << bits) - 1
+            at = ti.cast((k * i64(GOLDEN)) >> (64 - bits), i32) & wrap
+            held = table[2 * at]
+            while (held != k) & ((held >> STAMP) == generation):
+                at = (at + 1) & wrap
+                held = table[2 * at]
+            fresh = ti.cast(held != k, i32)
+            cubes += fresh
+            table[2 * at] = k
+            seen = ti.select(fresh != 0, i64(0), table[2 * at + 1])
+        # written in any case and kept if new: a branch would be guessed wrong too often
+        moved[3 * out] = a[j]
+        moved[3 * out + 1] = b[j]
+        moved[3 * out + 2] = c[j]
+        out += ti.cast((voxel & ~seen) != 0, i32)
+        seen |= voxel & merge
+    return out, cubes, at, last, seen
+
+
+@ti.kernel
+def sieve(
+    points: Floats,
+    rows: i32,
+    generation: i64,
+    bits: i32,
+    merge: i64,
+    move: Doubles,
+    table: Longs,
+    moved: Floats,
+    totals: Integers,
+):
+    """Leave the kept rows at the front of ``moved``.
+
+    ``merge``: -1, or 0 to keep every point. ``move``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
+    and r_max, a coordinate beyond reach, the sensor's voxel. ``totals``: kept, not finite, out of reach, whether
+    the table was too small.
+    """
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        a, b, c = ti.Vector.zero(f32, BLOCK), ti.Vector.zero(f32, BLOCK), ti.Vector.zero(f32, BLOCK)
+        plane, rest = ti.Vector.zero(i32, BLOCK), ti.Vector.zero(i32, BLOCK)
+        infinite, far, cubes, out, at = 0, 0, 0, 0, 0
+        last, seen = i64(0), i64(0)
+        for block in range((rows + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            n = ti.min(BLOCK, rows - start)
+            odd, off = place(start, n, points, move, a, b, c, plane, rest)
+            infinite += odd
+            far += off
+            if cubes + BLOCK <= 1 << (bits - 1):
+                out, more, at, last, seen = look_up(
+                    n, generation, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
+                )
+                cubes += more
+        totals[0], totals[1], totals[2] = out, infinite, far
+        totals[3] = ti.cast(cubes + BLOCK > 1 << (bits - 1), i32)
