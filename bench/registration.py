@@ -182,9 +182,8 @@ def _sides(kind: str, peers: dict[int, SmallGicp]) -> dict[str, Way]:
     def ours(place: Place, begin: Pose) -> tuple[float, Pose | None]:
         clock = time.perf_counter()
         config, about = RegistrationConfig(), place.position
-        rough = register(place.source.every(NTH), begin, place.target, config, COARSE[kind], centre=about)
-        middle = begin if rough is None else rough.T_map_source
-        answer = register(place.source, middle, place.target, config, FINE, centre=about)
+        scales = COARSE[kind] + FINE
+        answer = register(place.source, begin, place.target, config, scales, centre=about, thin=NTH)
         return time.perf_counter() - clock, None if answer is None else answer.T_map_source
 
     def theirs(way: str, whole: bool) -> Way:

@@ -1,9 +1,9 @@
 # mypy: ignore-errors
-"""Taichi source of icp.py: all iterations in one launch, and partners that are searched for only when they may change.
+"""Taichi source of icp.py: an iteration per launch, whose searches are spread over the threads.
 
-A launch costs as much as an iteration over 5,000 points, and waking a second thread too. So the first search, which is
-half of the work, is spread over the threads, and the iterations follow on one; they return early where the pose still
-moves so far that most partners have to be searched for again, and the next launch spreads that.
+Partners are searched for only when they may have changed, and kept beside their point: where few are, an iteration
+reads memory in order. Waking the threads costs as much as an iteration over some hundred points; what follows the
+search is too little to be worth that again, so one thread does it.
 """
 
 from coview_kernels import runtime
@@ -16,24 +16,25 @@ FLOATS = ti.types.ndarray(ti.f32, 1)
 DOUBLES = ti.types.ndarray(ti.f64, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
 
-NONE = 1e300  # square metres: no partner within the radius
 SLACK = 1e-9  # metres: more than rounding adds to a bound
 MOST_SHARE = 5.0  # weight of a point of the rarer kind
 MARGIN = 0.15  # metres that a search looks further than it must, so that it serves later poses; 0.05-0.3 are as fast
+BLOCK = 6  # 2^6 points go to one thread, the next to another: those that must search far come in clusters
 
-# memory of a point: where it was searched for (3), how far all map points but its partner were then at least,
-# the partner's row, and the square of its distance now
-SAFE, ROW, NEAR = 3, 4, 5
-# ranks, a row for either kind of point: how many are kept, how many of them are still to be found, the bits of the
-# largest squared distance among them (as float32, which sort as it does), then a histogram
-KEPT, LEFT, LAST, BINS = 0, 1, 2, 3
+# memory of a point: where it was searched for (3), and how far all map points but its partner were then at least
+SAFE, PLACE = 3, 4
+# partner of a point: position (3) and normal (3); far away where there is none
+PARTNER = 6
+# bins of squared distances, 64 to an octave from 2^-20 square metres up: a row for either kind of point of each chunk,
+# and before them the bin of every point
+FIRST_BIN, BINS = 107 << 6, 2048
 # settings; see icp.py
-KEEP, ITERATIONS, SCALES, LEAST, PRIOR, BULK = 8, 9, 10, 11, 12, 13
+KEEP, ITERATIONS, SCALES, LEAST, PRIOR, ABOVE = 8, 9, 10, 11, 12, 13
 PIVOT, MEAN, BELIEF, FIRST = 14, 17, 29, 65
-# and of each scale radius, width of the weights, and the shift and turn that end it
-RADIUS, WIDTH, SHIFT, TURN, EACH = 0, 1, 2, 3, 4
-# state: pose by rows (12), then these, the information (36) and the sums of a step (30)
-SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, PAIRED, OFF = 12, 13, 14, 15, 16, 17, 53, 83, 84
+# and of each scale radius, width of the weights, the shift and turn that end it, and which points take part
+RADIUS, WIDTH, SHIFT, TURN, EVERY, EACH = 0, 1, 2, 3, 4, 5
+# state: pose by rows (12), then these, the information (36), the sums of a step (30), and six values to work with
+SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, OFF = 12, 13, 14, 15, 16, 17, 53, 83
 RUNNING, DONE, LOST = 0, 1, 2
 
 
@@ -51,103 +52,73 @@ def floats(array: ti.template(), at):
 
 
 @ti.func
-def point_of(rows: ti.template(), p):
-    return ti.Vector([ti.cast(ti.bit_cast(rows[4 * p + d], ti.f32), ti.f64) for d in ti.static(range(3))])
-
-
-@ti.func
-def pair(frame, starts: ti.template(), rows: ti.template(), at, i, radius, memory: ti.template()) -> ti.i32:
-    """Bring the partner of point ``i``, now ``at``, up to date; return whether it had to be searched for."""
-    row = ti.cast(memory[6 * i + ROW], ti.i32)
-    drift = (at - ti.Vector([memory[6 * i + 0], memory[6 * i + 1], memory[6 * i + 2]])).norm()
-    safe = ti.max(memory[6 * i + SAFE] - drift - SLACK, 0.0)
-    near = ti.cast(NONE, ti.f64)
-    if row >= 0:
-        near = (at - point_of(rows, row)).norm_sqr()
+def pair(
+    frame, starts: ti.template(), rows: ti.template(), normals: ti.template(), at, i, radius,
+    memory: ti.template(), partners: ti.template(),
+) -> ti.f64:  # fmt: skip
+    """Bring the partner of point ``i``, now ``at``, up to date; return the square of its distance."""
+    drift = (at - ti.Vector([memory[PLACE * i], memory[PLACE * i + 1], memory[PLACE * i + 2]])).norm()
+    safe = ti.max(memory[PLACE * i + SAFE] - drift - SLACK, 0.0)
+    near = (at - floats(partners, PARTNER * i)).norm_sqr()
     # by the triangle inequality no other point is nearer than safe: the partner stays, or there still is none
-    searched = safe * safe < ti.min(near, radius * radius)
-    if searched:
+    if safe * safe < ti.min(near, radius * radius):
         limit = radius + MARGIN
         best, found, beyond = walk(frame, starts, rows, at[0], at[1], at[2], limit * limit, MARGIN)
-        near = best if found >= 0 else NONE
-        memory[6 * i + 0], memory[6 * i + 1], memory[6 * i + 2] = at[0], at[1], at[2]
-        memory[6 * i + SAFE] = ti.sqrt(beyond)
-        memory[6 * i + ROW] = found
-    memory[6 * i + NEAR] = near if near < radius * radius else NONE
-    return searched
+        for d in ti.static(range(3)):
+            memory[PLACE * i + d] = at[d]
+        memory[PLACE * i + SAFE] = ti.sqrt(beyond)
+        near = best
+        if found >= 0:
+            normal = 3 * rows[4 * found + 3]
+            for d in ti.static(range(3)):
+                partners[PARTNER * i + d] = ti.bit_cast(rows[4 * found + d], ti.f32)
+                partners[PARTNER * i + 3 + d] = normals[normal + d]
+        else:
+            partners[PARTNER * i] = 1e18
+            near = 1e36
+    return near
 
 
 @ti.func
-def rank(keep, source: ti.template(), memory: ti.template(), ranks: ti.template()):
-    """Find how far the farthest kept pair of either kind is, by radix: exact, and no slower where all are equal."""
-    for kind in range(2):
-        ranks[kind, LAST] = 0
-    for level in range(3):
-        shift = 20 - 10 * level
-        bins = 2048 if level == 0 else 1024
-        for kind in range(2):
-            for b in range(bins):
-                ranks[kind, BINS + b] = 0
-        for i in range(source.shape[0] // 4):
-            if memory[6 * i + NEAR] < NONE:
-                key = ti.bit_cast(ti.cast(memory[6 * i + NEAR], ti.f32), ti.i32)
-                kind = ti.cast(source[4 * i + 3], ti.i32)
-                b = -1
-                if level == 0:
-                    b = BINS + (key >> shift)
-                elif (key >> (shift + 10)) == ranks[kind, LAST]:
-                    b = BINS + ((key >> shift) & 1023)
-                if b >= 0:
-                    ranks[kind, b] = ranks[kind, b] + 1  # += would be atomic
-        for kind in range(2):
-            if level == 0:
-                found = 0
-                for b in range(bins):
-                    found += ranks[kind, BINS + b]
-                ranks[kind, KEPT] = ti.min(found, ti.max(1, ti.cast(keep * found, ti.i32)))
-                ranks[kind, LEFT] = ranks[kind, KEPT]
-            left = ranks[kind, LEFT]
-            b = BINS
-            while ranks[kind, b] < left:
-                left -= ranks[kind, b]
-                b += 1
-            ranks[kind, LEFT] = left
-            ranks[kind, LAST] = ranks[kind, LAST] * 1024 + b - BINS
-            if level == 2:
-                # all that are as far as the last one that is kept are kept too
-                ranks[kind, KEPT] = ranks[kind, KEPT] + ranks[kind, b] - left
+def trim(keep, chunks, n, first, bins: ti.template()):
+    """For either kind of point: the farthest bin that is kept, and the weight of each pair that is."""
+    last = ti.Vector([-1, -1])
+    share = ti.Vector.zero(ti.f64, 2)
+    for kind in ti.static(range(2)):
+        found = 0
+        for b in range(first + kind * BINS, first + kind * BINS + BINS):
+            for c in range(1, chunks):
+                bins[b] = bins[b] + bins[b + 2 * c * BINS]
+            found += bins[b]
+        kept = 0
+        while kept < found and kept < ti.max(1, ti.cast(keep * found, ti.i32)):
+            last[kind] += 1
+            kept += bins[first + kind * BINS + last[kind]]
+        share[kind] = ti.min(0.5 * n / ti.max(1, kept), MOST_SHARE)
+    return last, share
 
 
 @ti.func
 def add_up(
-    T, about, width, rows: ti.template(), normals: ti.template(), source: ti.template(), memory: ti.template(),
-    ranks: ti.template(), state: ti.template(),
+    T, about, width, every, number, above, last, share, source: ti.template(), order: ti.template(),
+    partners: ti.template(), bins: ti.template(), state: ti.template(),
 ):  # fmt: skip
     """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs."""
     acc = ti.Vector.zero(ti.f64, 30)
-    n = source.shape[0] // 4
-    last = ti.Vector([ranks[0, LAST], ranks[1, LAST]])
-    share = ti.Vector(
-        [ti.min(0.5 * n / ti.max(1, ranks[kind, KEPT]), MOST_SHARE) for kind in ti.static(range(2))]
-    )
-    for i in range(n):
-        near = memory[6 * i + NEAR]
-        above = source[4 * i + 3] > 0
-        most = last[1] if above else last[0]
-        if near < NONE and ti.bit_cast(ti.cast(near, ti.f32), ti.i32) <= most:
-            row = ti.cast(memory[6 * i + ROW], ti.i32)
-            at = placed(T, floats(source, 4 * i))
-            normal = floats(normals, 3 * rows[4 * row + 3])
-            r = normal.dot(at - point_of(rows, row))
+    for k in range(number):
+        i = every * k
+        if bins[i] <= (last[0] if i < above else last[1]):
+            at = placed(T, floats(source, 3 * order[i]))
+            normal = floats(partners, PARTNER * i + 3)
+            r = normal.dot(at - floats(partners, PARTNER * i))
             ratio = r / width
-            w = (share[1] if above else share[0]) / (1.0 + ratio * ratio)
+            w = (share[0] if i < above else share[1]) / (1.0 + ratio * ratio)
             turn = (at - about).cross(normal)
-            J = ti.Vector([turn[0], turn[1], turn[2], normal[0], normal[1], normal[2]])
+            J = ti.Vector([turn[0], turn[1], turn[2], normal[0], normal[1], normal[2], r])
             for a in ti.static(range(6)):
                 wa = w * J[a]
-                for b in ti.static(range(a, 6)):
-                    acc[ti.static(6 * a - a * (a - 1) // 2 + b - a)] += wa * J[b]
-                acc[21 + a] += wa * r
+                for b in ti.static(range(a, 7)):
+                    acc[ti.static(7 * a - a * (a - 1) // 2 + b - a)] += wa * J[b]
             acc[27] += w * r * r
             acc[28] += w
             acc[29] += 1.0
@@ -159,13 +130,13 @@ def add_up(
 def solve(pivot, about, settings: ti.template(), state: ti.template(), system: ti.template()):
     """Fuse the sums with the prior into ``state``'s information; leave the increment in the system's last column."""
     variance = state[SUMS + 27] / state[SUMS + 28] + 1e-6
-    k = 0
+    k = SUMS
     for a in range(6):
-        for b in range(a, 6):
-            state[INFORMATION + 6 * a + b] = state[SUMS + k] / variance
-            state[INFORMATION + 6 * b + a] = state[SUMS + k] / variance
+        for b in range(a, 7):
+            system[a, b] = state[k] / variance
             k += 1
-        system[a, 6] = -state[SUMS + 21 + a] / variance
+        for b in range(6):
+            state[INFORMATION + 6 * a + b] = system[ti.min(a, b), ti.max(a, b)]
     if settings[PRIOR] > 0:
         mean = placed(ti.Vector([settings[MEAN + k] for k in ti.static(range(12))]), pivot)
         # half the sum of the columns' cross products is the sine part of T mean^-1
@@ -180,7 +151,7 @@ def solve(pivot, about, settings: ti.template(), state: ti.template(), system: t
             for b in range(6):
                 belief = settings[BELIEF + 6 * a + b]
                 state[INFORMATION + 6 * a + b] = state[INFORMATION + 6 * a + b] + belief
-                system[a, 6] = system[a, 6] - belief * state[OFF + b]
+                system[a, 6] = system[a, 6] + belief * state[OFF + b]
     for a in range(6):
         for b in range(6):
             system[a, b] = state[INFORMATION + 6 * a + b]
@@ -206,7 +177,7 @@ def eliminate(system: ti.template()):
                 for b in range(c, 7):
                     system[a, b] = system[a, b] - share * system[c, b]
     for c in range(6):
-        system[c, 6] /= system[c, c]
+        system[c, 6] = -system[c, 6] / system[c, c]
 
 
 @ti.func
@@ -249,47 +220,54 @@ def align(
     rows: WHOLES,
     normals: FLOATS,
     source: FLOATS,
+    order: WHOLES,
     memory: DOUBLES,
-    ranks: ti.types.ndarray(ti.i32, 2),
+    partners: FLOATS,
+    bins: WHOLES,
     system: ti.types.ndarray(ti.f64, 2),
     state: DOUBLES,
     chunks: ti.i32,
 ):
-    """Iterate from the state's pose until the status says why it ended, or until searches should be spread again.
-
-    With more than one chunk: only bring the partners up to date, which the iterations then begin with.
-    """
-    n = source.shape[0] // 4
-    each = (n + chunks - 1) // chunks
+    """Take a step from the state's pose; the status says whether another one should follow."""
+    n = order.shape[0]
     for q in range(chunks * SPAN):
-        c = q // SPAN
-        frame = ti.Vector([settings[k] for k in ti.static(range(8))])
-        again = q % SPAN == 0 and state[STATUS] == RUNNING
-        while again:
+        if q % SPAN == 0:
+            c = q // SPAN
+            frame = ti.Vector([settings[k] for k in ti.static(range(8))])
             T = ti.Vector([state[k] for k in ti.static(range(12))])
             scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
-            searched = 0
-            if state[PAIRED] == 0:
-                for i in range(ti.min(n, c * each), ti.min(n, (c + 1) * each)):
-                    searched += pair(
-                        frame,
-                        starts,
-                        rows,
-                        placed(T, floats(source, 4 * i)),
-                        i,
-                        settings[scale + RADIUS],
-                        memory,
-                    )
-            again = False
-            if chunks == 1:
-                state[PAIRED] = 0
-                pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
-                about = placed(T, pivot)
-                rank(settings[KEEP], source, memory, ranks)
-                add_up(T, about, settings[scale + WIDTH], rows, normals, source, memory, ranks, state)
-                if state[SUMS + 29] < settings[LEAST]:
-                    state[STATUS] = LOST
-                else:
-                    solve(pivot, about, settings, state, system)
-                    advance(about, settings, state, system)
-                again = state[STATUS] == RUNNING and searched < settings[BULK]
+            radius, every = settings[scale + RADIUS], ti.cast(settings[scale + EVERY], ti.i32)
+            above = ti.cast(settings[ABOVE], ti.i32)
+            mine = n + 2 * c * BINS
+            for b in range(mine, mine + 2 * BINS):
+                bins[b] = 0
+            for k in range(n // every // chunks + (2 << BLOCK)):
+                i = every * ((((k >> BLOCK) * chunks + c) << BLOCK) + (k & ((1 << BLOCK) - 1)))
+                if i < n:
+                    at = placed(T, floats(source, 3 * order[i]))
+                    near = pair(frame, starts, rows, normals, at, i, radius, memory, partners)
+                    b = BINS
+                    if near < radius * radius:
+                        octave = (ti.bit_cast(ti.cast(near, ti.f32), ti.i32) >> 17) - FIRST_BIN
+                        b = ti.min(ti.max(octave, 0), BINS - 1)
+                        place = mine + b if i < above else mine + b + BINS
+                        bins[place] = bins[place] + 1  # += would be atomic
+                    bins[i] = b
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        T = ti.Vector([state[k] for k in ti.static(range(12))])
+        scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
+        every = ti.cast(settings[scale + EVERY], ti.i32)
+        number = (n + every - 1) // every
+        pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
+        about = placed(T, pivot)
+        last, share = trim(settings[KEEP], chunks, number, n, bins)
+        add_up(
+            T, about, settings[scale + WIDTH], every, number, settings[ABOVE], last, share, source, order, partners,
+            bins, state,
+        )  # fmt: skip
+        if state[SUMS + 29] < settings[LEAST]:
+            state[STATUS] = LOST
+        else:
+            solve(pivot, about, settings, state, system)
+            advance(about, settings, state, system)

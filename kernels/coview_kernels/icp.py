@@ -1,7 +1,7 @@
 """Eq. 13, all of it: trimmed point-to-plane ICP, coarse to fine, with weights against outliers and a prior.
 
-Two things make it quick. The iterations run inside the kernel, so that a registration is one launch, seldom a few. And
-a point's partner is looked up, not searched for, where it cannot have changed: a search also tells how far all other
+Two things make it quick. An iteration is one prepared launch, of which the searches are spread over the threads. And a
+point's partner is looked up, not searched for, where it cannot have changed: a search also tells how far all other
 map points are at least, and as long as the point has moved less than that leaves room for, the partner is the same
 (the triangle inequality; exact). Late iterations, which move the cloud by centimetres, hardly search at all.
 """
@@ -19,17 +19,14 @@ from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, F64, Mask
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
-from coview_kernels.reference.icp import Alignment, Plan, Scale
+from coview_kernels.reference.icp import Alignment, Plan, Scale, by_kind
 
 __all__ = ["Alignment", "Belief", "Scale", "align_planes"]
 
-_BULK = 1500  # searches in one iteration that are worth another launch, to be spread over the threads
-_CHUNKS = 4  # for each thread: points that must search far come in clusters
-_TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS, _PAIRED = 14, 15, 16, 17, 53, 83
+_TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS = 14, 15, 16, 17, 53
 _LOST = 2
-_CHUNK_COUNT = 9  # which argument it is
 _BINS = 2048
-_UNKNOWN = (0.0, 0.0, 0.0, -1.0, -1.0, 0.0)
+_FAR = 1e18  # metres, where the partner of a point is that has none
 
 
 class Belief(NamedTuple):
@@ -58,8 +55,8 @@ def align_planes(
     """Register points to a map of points with normals.
 
     Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
-    keeps the floor(keep * found) nearest pairs, at least one (and all that are as far as the last of them); and it
-    takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r / width)^2). The share is
+    keeps the floor(keep * found) nearest pairs, at least one (and all that are as far as the last of them, to a
+    hundredth); and it takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r / width)^2). The share is
     such that both kinds weigh the same, whatever their numbers, but 5 at most.
 
     Args:
@@ -91,6 +88,8 @@ def align_planes(
         raise ValueError(f"at least one iteration and scale are needed, got {iterations} and {len(scales)}")
     if not all(math.isfinite(v) and v > 0 for pair in scales for v in pair):
         raise ValueError(f"scales must hold positive metres and radians, got {scales}")
+    if any(scale.every != int(scale.every) for scale in scales):
+        raise ValueError(f"scales must take every n-th point, n whole, got {scales}")
     belief = None
     if prior is not None:
         mean = check.finite64("the prior's mean", prior.mean, 4, 4)
@@ -109,33 +108,24 @@ def _twin(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) ->
 
 
 def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
-    cells, workers, n = grid.cells, runtime.workers(), len(source)
-    points = np.empty((n, 4), dtype=np.float32)
-    points[:, :3], points[:, 3] = source, kind
-    memory = np.empty((n, len(_UNKNOWN)))
-    memory[:] = _UNKNOWN
-    ranks = np.empty((2, 3 + _BINS), dtype=np.int32)
-    system, state = np.empty((6, 7)), np.zeros(_PAIRED + 7)
+    cells, chunks, n = grid.cells, runtime.workers(), len(source)
+    memory, partners = np.full(4 * n, -1.0), np.full(6 * n, _FAR, dtype=np.float32)
+    bins = np.empty(n + 2 * chunks * _BINS, dtype=np.int32)
+    system, state = np.empty((6, 7)), np.zeros(_SUMS + 36)
     state[:12] = plan.T[:3].ravel()
-    settings = _settings(cells.frame, plan, _BULK if workers > 1 else n + 1)
     launch = Launch(
         "icp", "align",
-        settings, cells.starts, cells.rows, normals.reshape(-1), points.reshape(-1), memory.reshape(-1),
-        ranks, system, state, 1,
+        _settings(cells.frame, plan, np.count_nonzero(kind)), cells.starts, cells.rows, normals.reshape(-1),
+        source.reshape(-1), by_kind(kind).astype(np.int32), memory, partners, bins, system, state, chunks,
     )  # fmt: skip
     while not state[_STATUS]:
-        if workers > 1:
-            launch.put(_CHUNK_COUNT, _CHUNKS * workers)
-            launch()
-            launch.put(_CHUNK_COUNT, 1)
-            state[_PAIRED] = 1
         launch()
     if state[_STATUS] == _LOST or not np.isfinite(state[:12]).all():
         return None
     pose = np.eye(4)
     pose[:3] = state[:12].reshape(3, 4)
     information = state[_INFORMATION:_SUMS].reshape(6, 6).copy()
-    squares, weights, pairs = state[_SUMS + 27 : _PAIRED]
+    squares, weights, pairs = state[_SUMS + 27 : _SUMS + 30]
     return Alignment(
         pose,
         information,
@@ -146,12 +136,12 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     )
 
 
-def _settings(frame: F64, plan: Plan, bulk: int) -> F64:
+def _settings(frame: F64, plan: Plan, above: int) -> F64:
     """All numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
-    values = np.zeros(65 + 4 * len(plan.scales))
+    values = np.zeros(65 + 5 * len(plan.scales))
     values[:8] = frame
     values[8:14] = (
-        plan.keep, plan.iterations, len(plan.scales), plan.least, plan.prior is not None, bulk,
+        plan.keep, plan.iterations, len(plan.scales), plan.least, plan.prior is not None, above,
     )  # fmt: skip
     values[14:17] = plan.pivot
     if plan.prior is not None:

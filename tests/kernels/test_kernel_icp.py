@@ -75,8 +75,8 @@ def assert_same(ours, plain, pivot):
 
 
 @settings(max_examples=25)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 10**9]))
-def test_agrees_with_the_twin(seed, outliers, believed, bulk):
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 3]))
+def test_agrees_with_the_twin(seed, outliers, believed, threads):
     rng = np.random.default_rng(seed)
     points, normals = room(rng, 0.01)
     truth = pose([0, 0, rng.uniform(-3, 3)], rng.uniform(-9, 9, 3))
@@ -85,12 +85,27 @@ def test_agrees_with_the_twin(seed, outliers, believed, bulk):
     start[:3, 3] += truth[:3, :3] @ pivot - start[:3, :3] @ pivot + rng.uniform(-0.4, 0.4, 3)
     local[::97] = np.nan
     prior = Belief(start, np.diag([1e4, 1e4, 1e3, 50.0, 40.0, 90.0])) if believed else None
-    # one launch, or one for each iteration
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(coview_kernels.icp, "_BULK", bulk)
+        patch.setattr(coview_kernels.icp.runtime, "workers", lambda: threads)  # in how many parts it is done
         ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior)
     assert_same(ours, plain, pivot)
     assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < 0.1
+
+
+def test_coarse_scales_make_do_with_some_points():
+    rng = np.random.default_rng(5)
+    points, normals = room(rng, 0.01)
+    truth = pose([0, 0, 1.0], points.mean(axis=0, dtype=np.float64))
+    local, above, pivot = scan_of(points, rng, truth, 0.1, 0.02)
+    start = truth + 0.0
+    start[:3, 3] += [0.2, -0.3, 0.1]
+    every = tuple(scale._replace(every=4) for scale in SCALES[:2])
+    grid = PointGrid(points)
+    ours, plain = both(grid, normals, local, above, start, pivot, scales=(*every, SCALES[2]))
+    assert_same(ours, plain, pivot)
+    ours, plain = both(grid, normals, local, above, start, pivot, scales=every)
+    assert_same(ours, plain, pivot)
+    assert ours.pairs <= len(local) // 4 + 1
 
 
 def test_equal_distances_are_kept_together():

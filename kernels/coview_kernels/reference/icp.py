@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, Mask
+from coview_kernels.arrays import F32, F64, I64, Mask
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.trimmed_icp import normal_equations
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 _MOST_SHARE = 5.0  # a handful of points must not outweigh thousands
+_FIRST_BIN, _BINS = 107 << 6, 2048  # of squared distances: 64 to an octave, from 2^-20 square metres up
 
 
 class Scale(NamedTuple):
@@ -27,6 +28,8 @@ class Scale(NamedTuple):
     """A step shorter than this, metres,"""
     turn: float = 5e-5
     """and than this, radians, ends it."""
+    every: int = 1
+    """Only every n-th point of either kind takes part."""
 
 
 class Plan(NamedTuple):
@@ -62,8 +65,9 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
     """See :func:`coview_kernels.align_planes`; ``tree`` holds the map."""
     T, total, answer = plan.T, 0, None
     for scale in plan.scales:
+        some = by_kind(kind)[:: scale.every]
         for _ in range(plan.iterations):
-            step = _step(tree, normals, source, kind, plan, T, scale)
+            step = _step(tree, normals, source[some], kind[some], plan, T, scale)
             if step is None:
                 return None
             increment, information, rmse, pairs = step
@@ -75,6 +79,11 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
             if converged:
                 break
     return answer
+
+
+def by_kind(kind: Mask) -> I64:
+    """Order (N,) of the points in which every n-th is every n-th of either kind, those of the first kind before."""
+    return np.concatenate((np.flatnonzero(kind), np.flatnonzero(~kind)))
 
 
 def _step(
@@ -112,11 +121,12 @@ def _step(
 def _shares(squares: F32, kind: Mask, keep: float, points: int) -> F64:
     """Weights (M,) of pairs by their squared distances: 0 for those trimmed, and equal sums for both kinds."""
     share = np.zeros(len(squares))
+    bins = np.clip((squares.view(np.int32) >> 17) - _FIRST_BIN, 0, _BINS - 1)
     for group in (kind, ~kind):
         index = np.flatnonzero(group)
         if len(index):
             number = max(1, int(keep * len(index)))
-            kept = index[squares[index] <= np.partition(squares[index], number - 1)[number - 1]]
+            kept = index[bins[index] <= np.partition(bins[index], number - 1)[number - 1]]
             share[kept] = min(0.5 * points / len(kept), _MOST_SHARE)
     return share
 
