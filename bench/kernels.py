@@ -34,12 +34,6 @@ def cases() -> Iterator[Case]:
         yield _both(f"polar_bin {n}", ck.polar_bin, reference.polar_bin, *polar)
     yield from _stations(rng)
     yield from _neighbours(rng)
-    for n in (2_000, 30_000):
-        source = cloud[:n]
-        pair = (source, source + np.float32(0.1), np.ones(n, np.float32), T, origin)
-        for label, normals in (("plane", source / np.float32(20)), ("point", None)):
-            a = (*pair[:2], normals, *pair[2:])
-            yield _both(f"normal_equations {label} {n}", ck.normal_equations, reference.normal_equations, *a)
     desc = rng.normal(2.0, 1.0, (9_527, 20, 60)).astype(np.float32)
     spectra = ck.column_spectra(desc)
     for q in (1, 8):  # BLAS beside einsum

@@ -75,14 +75,12 @@ def differing(native: Any, twin: Any) -> list[str]:
     """Names of the kernels whose results differ from their twins' on a small cloud."""
     rng = np.random.default_rng(0)
     cloud = rng.uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
-    normals = rng.normal(size=cloud.shape).astype(np.float32)
-    weights = np.ones(len(cloud), dtype=np.float32)
     T = np.eye(4)
     T[:3, 3] = 1.0, -2.0, 0.5
     cases: dict[str, tuple[Any, ...]] = {
         "transform_unique": (cloud, T, 0.5, 1.0, 20.0),
         "polar_bin": (cloud, np.zeros(3), 20, 60, 50.0),
-        "normal_equations": (cloud, cloud[::-1].copy(), normals, weights, T, np.zeros(3)),
+        "describe_points": (cloud, np.zeros(3), 20, 60, 50.0),
     }
     return [
         name

@@ -55,9 +55,9 @@ def align_planes(
     """Register points to a map of points with normals.
 
     Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
-    keeps the floor(keep * found) nearest pairs, at least one (and all that are as far as the last of them, to a
-    hundredth); and it takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r / width)^2). The share is
-    such that both kinds weigh the same, whatever their numbers, but 5 at most.
+    keeps the floor(keep * found) nearest pairs, at least one, and all that are as far as the last of them, to a
+    hundredth; and it takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r /
+    width)^2). The share is such that both kinds weigh the same, whatever their numbers, but 5 at most.
 
     Args:
         grid: the map, (K, 3).
@@ -115,7 +115,7 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     state[:12] = plan.T[:3].ravel()
     launch = Launch(
         "icp", "align",
-        _settings(cells.frame, plan, np.count_nonzero(kind)), cells.starts, cells.rows, normals.reshape(-1),
+        _settings(cells.frame, plan, int(np.count_nonzero(kind))), cells.starts, cells.rows, normals.reshape(-1),
         source.reshape(-1), by_kind(kind).astype(np.int32), memory, partners, bins, system, state, chunks,
     )  # fmt: skip
     while not state[_STATUS]:

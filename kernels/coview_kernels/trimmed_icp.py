@@ -1,15 +1,15 @@
-"""Eq. 13: the two numerical steps of trimmed ICP between which the nearest-neighbour search sits."""
+"""Eq. 13: the two numerical steps of trimmed ICP between which the nearest-neighbour search sits, in NumPy.
+
+For those who build a registration of their own; :func:`coview_kernels.align_planes` does all of it in one kernel.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference, runtime
+from coview_kernels import check, reference
 from coview_kernels.arrays import F32, F64
-
-_UPPER3 = np.triu_indices(3)
-_UPPER6 = np.triu_indices(6)
 
 
 def normal_equations(
@@ -47,39 +47,7 @@ def normal_equations(
     n = None if normals is None else check.float32("normals", normals, len(p), 3)
     w = check.float32("weights", weights, len(p))
     pose, middle = check.finite64("T", T, 4, 4), check.finite64("centre", centre, 3)
-    return runtime.dispatch(_normal_equations, reference.normal_equations, p, q, n, w, pose, middle)
-
-
-def _normal_equations(
-    source: F32, target: F32, normals: F32 | None, weights: F32, T: F64, centre: F64
-) -> tuple[F64, F64, float]:
-    module = runtime.kernels("trimmed_icp")
-    if normals is None:
-        parts = np.zeros((runtime.workers(), 17))
-        module.point_to_point(source, target, weights, T, centre, parts)
-        s = parts.sum(axis=0)
-        return _point_to_point(s[0], s[1:4], s[4:10]), s[10:16], float(s[16])
-    parts = np.zeros((runtime.workers(), 28))
-    module.point_to_plane(source, target, normals, weights, T, centre, parts)
-    s = parts.sum(axis=0)
-    H = np.empty((6, 6))
-    H[_UPPER6] = s[:21]
-    H.T[_UPPER6] = s[:21]
-    return H, s[21:27], float(s[27])
-
-
-def _point_to_point(w: float, arm: F64, outer: F64) -> F64:
-    """H from sum w, sum w arm and the upper triangle of sum w arm arm^T: J = [-[arm]x, I]."""
-    products = np.empty((3, 3))
-    products[_UPPER3] = outer
-    products.T[_UPPER3] = outer
-    cross = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
-    H = np.empty((6, 6))
-    H[:3, :3] = np.trace(products) * np.eye(3) - products
-    H[:3, 3:] = cross
-    H[3:, :3] = cross.T
-    H[3:, 3:] = w * np.eye(3)
-    return H
+    return reference.normal_equations(p, q, n, w, pose, middle)
 
 
 def trim(distances: npt.ArrayLike, keep: float) -> F32:

@@ -12,7 +12,6 @@ from coview_kernels.icp import Scale, align_planes
 from coview_kernels.intake import FrameIntake
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
-from coview_kernels.trimmed_icp import normal_equations
 from coview_kernels.voxel import transform_unique
 
 _CLOUD = np.ones((2, 3), dtype=np.float32)
@@ -26,18 +25,12 @@ def _align() -> None:
     )
 
 
-def _normal_equations() -> None:
-    for normals in (None, _CLOUD):
-        normal_equations(_CLOUD, _CLOUD, normals, np.ones(2), _EYE, _ORIGIN)
-
-
 _CALLS: dict[str, Callable[[], object]] = {
     "FrameIntake": lambda: FrameIntake(1.0)(_CLOUD, _EYE),
     "align_planes": _align,
     "coview": lambda: coview(*np.ones((3, 100, 20, 60))),
     "describe_points": lambda: describe_points(_CLOUD, _ORIGIN, 2, 4, 8.0),
     "nearest": lambda: nearest(PointGrid(_CLOUD), _CLOUD, 1.0),
-    "normal_equations": _normal_equations,
     "polar_bin": lambda: polar_bin(_CLOUD, _ORIGIN, 2, 4, 8.0),
     "station_bins": lambda: station_bins(
         np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, _ONE, _ONE, _ONE, 2, 4, 2.0
