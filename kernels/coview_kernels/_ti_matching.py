@@ -236,14 +236,20 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
             for i in range(k):
                 top[i] = -3.0
             least = ti.cast(-3.0, f64)
+            worth = -100000  # in whole units: spares most stations the look at what they miss
             for m in range(best.shape[0]):
-                bound = best[m] * unit - (ti.cast(missed[m], f64) * span + rest)
-                if bound > least:
-                    insert(top, k, bound)
-                    least = top[k - 1]
+                if best[m] > worth:
+                    bound = best[m] * unit - (ti.cast(missed[m], f64) * span + rest)
+                    if bound > least:
+                        insert(top, k, bound)
+                        least = top[k - 1]
+                        worth = ti.max(worth, ti.cast((least + rest) / unit, i32) - 1)
             least -= _ROUNDED
+            worth = ti.max(-100000, ti.cast((least - rest - (reach - 1.0) * span) / unit, i32) - 2)
             count = 0
             for m in range(best.shape[0]):
+                if best[m] < worth:
+                    continue
                 bound = best[m] * unit + (ti.cast(missed[m], f64) * span + rest)
                 if bound >= least:
                     if count < listed.shape[0]:

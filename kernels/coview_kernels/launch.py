@@ -26,7 +26,7 @@ chunks of work must run over ``C * SPAN`` and do the work in every SPAN-th itera
 
 
 class Launch:
-    """A kernel of module ``_ti_<module>`` and its arguments; to be used on the owner thread only.
+    """A kernel of module ``_ti_<module>`` and its arguments; to be used on the owner thread, or as :meth:`ready` says.
 
     The arrays must be C-contiguous and of the types that the kernel declares, numbers Python's own: nothing
     checks them. The arrays are kept alive here and may be written to between calls.
@@ -44,6 +44,10 @@ class Launch:
         self._arguments[index] = value
         if self._program is not None:
             _lay(self._context, index, value)
+
+    def ready(self) -> bool:
+        """Whether the kernel has run before in the program that runs now: from then on any thread may call it."""
+        return self._program is not None and self._program is runtime.program()
 
     def __call__(self) -> None:
         """Run the kernel and wait for its end."""

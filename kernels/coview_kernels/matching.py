@@ -99,10 +99,12 @@ class MatchIndex:
             return Nearest(np.arange(k), np.zeros(k, dtype=np.int64), np.ones(k, dtype=np.float32))
         if k == 0:
             return Nearest(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
-        return runtime.dispatch(self._native, self._plain, values, k, spectra)
+        return runtime.dispatch_here(self._ready, self._native, self._plain, values, k, spectra)
+
+    def _ready(self) -> bool:
+        return self._search is not None and self._search.ready()
 
     def _native(self, query: F32, k: int, spectra: C64 | None) -> Nearest:
-        """On the owner thread as a whole: one hand-over, and one launch, per query."""
         if self._search is None:
             self._search = Search(self._screen, self.descriptors)
         few = self._search.scored(query, k)

@@ -40,13 +40,15 @@ class OwnerThread:
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._stopped = False
+        self._busy = threading.Lock()  # held by whoever runs a call
         self._gate = threading.Lock()  # no job may enter the queue behind the one that ends the thread
         self._thread = threading.Thread(target=self._loop, name=name, daemon=True)
         self._thread.start()
 
     def _loop(self) -> None:
         while (job := self._jobs.get()) is not None:
-            job.run()
+            with self._busy:
+                job.run()
 
     def call(self, fn: Callable[[], R]) -> R:
         """Run ``fn()`` on the thread and return or raise what it does; StoppedError after :meth:`stop`."""
@@ -62,6 +64,13 @@ class OwnerThread:
             raise job.error
         result: R = job.result
         return result
+
+    def here(self, fn: Callable[[], R]) -> R:
+        """Run ``fn()`` on the caller's thread while no other call runs; ``fn`` must not come back for :meth:`call`."""
+        if threading.current_thread() is self._thread:
+            return fn()
+        with self._busy:
+            return fn()
 
     def stop(self) -> None:
         """Finish what is queued and end the thread; from the thread itself, end it after the current call."""

@@ -10,15 +10,16 @@ import numpy.typing as npt
 from coview_kernels import runtime
 from coview_kernels.arrays import F32, F64, I32, I64
 from coview_kernels.launch import Launch
-from coview_kernels.screen import Bounds, Screen
+from coview_kernels.screen import Bounds, Screen, aligned
 
 MOST_BEST = 128
 _LISTED = 2048  # stations that may be among the best; the kernel looks through all for each that it scores
+_SERIAL = 16_384  # stations from which on other threads are worth waking
 _FRESH, _K = 23, 24  # arguments of the kernel
 
 
 class Search:
-    """Screens all stations for a query and scores those that matter; on the owner thread only.
+    """Screens all stations for a query and scores those that matter; on the owner thread, or as :meth:`ready` says.
 
     Args:
         screen: of the stations.
@@ -29,8 +30,8 @@ class Search:
         rings, blocks, lanes = screen.rings, screen.blocks, screen.lanes
         self._scores_any = descriptors.dtype == np.float16 and descriptors.flags.c_contiguous
         self._missed = screen.missed
-        self.query = np.zeros((2, rings, 2, blocks), dtype=np.int16)
-        self.turn = np.zeros((6 + 2 * blocks, lanes), dtype=np.int16)
+        self.query = aligned((2, rings, 2, blocks))
+        self.turn = aligned((6 + 2 * blocks, lanes))
         self._raw = np.zeros((rings, screen.sectors), dtype=np.float32)
         self._found = np.zeros(
             4
@@ -51,13 +52,17 @@ class Search:
             descriptors.view(np.uint16) if self._scores_any else np.empty(1, dtype=np.uint16),
             *(np.empty(MOST_BEST), self._listed, np.empty(_LISTED), self._scores, self._shifts, 1, 0),
         )
-        serial = int(runtime.workers() == 1)
+        self._serial = runtime.workers() == 1 or len(descriptors) < _SERIAL
         self._launch = Launch(
             "matching",
-            f"match_{rings}_{screen.sectors}_{blocks}_{lanes}_{screen.shifts}_{serial}",
+            f"match_{rings}_{screen.sectors}_{blocks}_{lanes}_{screen.shifts}_{int(self._serial)}",
             *(np.ascontiguousarray(a).reshape(-1) if isinstance(a, np.ndarray) else a for a in arguments),
         )
         self._k = 0
+
+    def ready(self) -> bool:
+        """Whether :meth:`scored` may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
+        return self._serial and self._launch.ready()
 
     def scored(self, query: F32, k: int) -> tuple[I64, I64, F64] | None:
         """Stations, shifts and correlations, rounded to 1e-9: the ``k`` best of all and some more, in any order.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -14,7 +17,13 @@ TOLERANCE = 1e-6
 SHAPES = ((4, 12), (3, 7), (20, 60), (5, 2), (2, 1), (7, 33))
 
 
+NATIVE = pytest.mark.skipif(os.environ.get("COVIEW_KERNELS") == "numpy", reason="the kernel itself")
+
+
 def native_bounds(screen: Screen, desc, query) -> Bounds:
+    if ck.backend() == "numpy":
+        return screen.bounds(query)
+
     def run():
         search = Search(screen, desc)
         search.scored(query, 0)
@@ -130,6 +139,7 @@ def test_bounds_are_tight_enough_to_prune():
     assert (found.station[0], found.shift[0]) == (700, 9)
 
 
+@NATIVE
 @pytest.mark.parametrize("shape", [(20, 60), (3, 7), (1, 63), (40, 34)])
 def test_the_kernel_is_its_twin_to_the_bit(shape):
     rng = np.random.default_rng(6)
@@ -162,6 +172,25 @@ def test_an_index_takes_less_than_600_bytes_beyond_a_kilobyte_and_keeps_a_memory
     index = ck.MatchIndex(file)
     assert index.nbytes / len(index) < 1300
     assert index.descriptors is file
+
+
+def test_queries_from_many_threads_and_after_a_restart():
+    rng = np.random.default_rng(9)
+    desc, _ = scene(rng, "random", 200, (6, 20))
+    index = ck.MatchIndex(desc)
+    queries = [desc[n].astype(np.float32) for n in range(24)]
+
+    def ask(n):
+        ck.submit(int)  # the owner thread has work meanwhile
+        return index.top_k(queries[n], 5)
+
+    alone = [index.top_k(query, 5) for query in queries]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(ask, range(24)))
+    ck.shutdown()
+    for found in (together, [index.top_k(query, 5) for query in queries]):
+        np.testing.assert_array_equal([f.station for f in found], [f.station for f in alone])
+        np.testing.assert_array_equal([f.distance for f in found], [f.distance for f in alone])
 
 
 def test_no_stations_and_no_query():
