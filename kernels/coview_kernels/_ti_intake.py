@@ -18,7 +18,7 @@ place, look_up, add = sieve.place, sieve.look_up, polar.add
 @ti.kernel
 def intake(
     points: Floats,
-    rows: i32,
+    blocks: i32,
     generation: i64,
     bits: i32,
     merge: i64,
@@ -39,24 +39,22 @@ def intake(
     for _ in range(1):
         a, b, c = ti.Vector.zero(f32, BLOCK), ti.Vector.zero(f32, BLOCK), ti.Vector.zero(f32, BLOCK)
         plane, rest = ti.Vector.zero(i32, BLOCK), ti.Vector.zero(i32, BLOCK)
-        infinite, far, cubes, out, at = 0, 0, 0, 0, 0
-        last, seen = i64(0), i64(0)
-        binned = 0
-        for block in range((rows + BLOCK - 1) // BLOCK):
-            start = block * BLOCK
-            n = ti.min(BLOCK, rows - start)
-            odd, off = place(start, n, points, move, a, b, c, plane, rest)
+        out, infinite, far, cubes = totals[0], totals[1], totals[2], totals[3]
+        last, seen, at = i64(0), i64(0), 1 << bits
+        binned = out
+        for block in range(blocks):
+            odd, off = place(block * BLOCK, points, move, a, b, c, plane, rest)
             infinite += odd
             far += off
             if cubes + BLOCK <= 1 << (bits - 1):
                 out, more, at, last, seen = look_up(
-                    n, generation, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
+                    generation, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
                 )
                 cubes += more
-            least = ti.select(start + n == rows, 1, BLOCK)
+            least = ti.select(block == blocks - 1, 1, BLOCK)
             while out - binned >= least:
                 n = ti.min(BLOCK, out - binned)
                 add(binned, n, 0, moved, rings, sectors, params, edges, highest, total, count)
                 binned += n
-        totals[0], totals[1], totals[2] = out, infinite, far
-        totals[3] = ti.cast(cubes + BLOCK > 1 << (bits - 1), i32)
+        table[2 * at + 1] = seen
+        totals[0], totals[1], totals[2], totals[3] = out, infinite, far, cubes

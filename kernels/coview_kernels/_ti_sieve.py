@@ -4,6 +4,7 @@
 Points go by blocks. They are moved and their voxels numbered into local vectors, which the compiler does several
 points at a time (a store to an argument might alias and is never vectorised). Then they are looked up one by one: a
 cube has 64 bits, one for each voxel, so that the points of a surface, one beside the other, rarely need the table.
+Blocks are always full: loops of unknown length take half as long again to compile, at every start.
 """
 
 from coview_kernels import runtime
@@ -36,7 +37,6 @@ def voxel_of(p: f32, limit: f32, inverse: f64, middle: i32) -> i32:
 @ti.func
 def place(
     start: i32,
-    n: i32,
     points: ti.template(),
     move: ti.template(),
     a: ti.template(),
@@ -45,7 +45,7 @@ def place(
     plane: ti.template(),
     rest: ti.template(),
 ):
-    """Move ``n`` points to a, b, c and number their voxels; how many are not finite, how many out of reach.
+    """Move a block to a, b, c and number their voxels; how many are not finite, how many out of reach.
 
     ``plane`` is the cube's place along x and y, ``rest`` along z, the voxel in the cube (6 bits) and whether the
     point is in range.
@@ -55,7 +55,7 @@ def place(
     limit = ti.cast(move[15], f32)
     middle = ti.Vector([ti.cast(move[16 + k], i32) - FAR for k in ti.static(range(3))])
     infinite, far = 0, 0
-    for j in range(n):
+    for j in range(BLOCK):
         i = 3 * (start + j)
         x, y, z = ti.cast(points[i], f64), ti.cast(points[i + 1], f64), ti.cast(points[i + 2], f64)
         p = ti.cast(T[0] * x + T[1] * y + T[2] * z + T[3], f32)
@@ -81,7 +81,6 @@ def place(
 
 @ti.func
 def look_up(
-    n: i32,
     generation: i64,
     bits: i32,
     merge: i64,
@@ -103,7 +102,7 @@ def look_up(
     is ever cleared. The bits of the last cube, at ``at``, are in ``seen`` until there is another one.
     """
     cubes = 0
-    for j in range(n):
+    for j in range(BLOCK):
         w = rest[j]
         k = (generation << STAMP) | (ti.cast(plane[j], i64) << 14) | ti.cast(w >> 7, i64)
         voxel = ti.cast(w & 1, i64) << ti.cast((w >> 1) & 63, i64)
@@ -132,7 +131,7 @@ def look_up(
 @ti.kernel
 def sieve(
     points: Floats,
-    rows: i32,
+    blocks: i32,
     generation: i64,
     bits: i32,
     merge: i64,
@@ -141,28 +140,26 @@ def sieve(
     moved: Floats,
     totals: Integers,
 ):
-    """Leave the kept rows at the front of ``moved``.
+    """Append the kept rows to ``moved``.
 
     ``merge``: -1, or 0 to keep every point. ``move``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
-    and r_max, a coordinate beyond reach, the sensor's voxel. ``totals``: kept, not finite, out of reach, whether
-    the table was too small.
+    and r_max, a coordinate beyond reach, the sensor's voxel. ``totals``: kept, not finite, out of reach, cubes;
+    they go on from call to call. The table has a place behind its own, where nothing is kept.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
         a, b, c = ti.Vector.zero(f32, BLOCK), ti.Vector.zero(f32, BLOCK), ti.Vector.zero(f32, BLOCK)
         plane, rest = ti.Vector.zero(i32, BLOCK), ti.Vector.zero(i32, BLOCK)
-        infinite, far, cubes, out, at = 0, 0, 0, 0, 0
-        last, seen = i64(0), i64(0)
-        for block in range((rows + BLOCK - 1) // BLOCK):
-            start = block * BLOCK
-            n = ti.min(BLOCK, rows - start)
-            odd, off = place(start, n, points, move, a, b, c, plane, rest)
+        out, infinite, far, cubes = totals[0], totals[1], totals[2], totals[3]
+        last, seen, at = i64(0), i64(0), 1 << bits
+        for block in range(blocks):
+            odd, off = place(block * BLOCK, points, move, a, b, c, plane, rest)
             infinite += odd
             far += off
             if cubes + BLOCK <= 1 << (bits - 1):
                 out, more, at, last, seen = look_up(
-                    n, generation, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
+                    generation, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
                 )
                 cubes += more
-        totals[0], totals[1], totals[2] = out, infinite, far
-        totals[3] = ti.cast(cubes + BLOCK > 1 << (bits - 1), i32)
+        table[2 * at + 1] = seen
+        totals[0], totals[1], totals[2], totals[3] = out, infinite, far, cubes

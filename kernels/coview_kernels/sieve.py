@@ -20,7 +20,8 @@ _BEYOND = 1 << 30  # voxels from the origin, out of reach
 _GENERATIONS = 1 << 21  # fit into a key beside its cube
 _LEAST_BITS = 10  # of a hash table; doubled until no cloud fills more than half of it
 _FIRST_ROWS = 4096
-_POINTS, _ROWS, _GENERATION, _BITS, _MERGE = range(5)  # of the arguments, those that change
+_BLOCK = 64  # points that the kernels take at once
+_POINTS, _BLOCKS, _GENERATION, _BITS, _MERGE = range(5)  # of the arguments, those that change
 
 
 class Sieve:
@@ -35,6 +36,7 @@ class Sieve:
         self._generation = 0
         self._move = np.zeros(19)
         self._totals = np.zeros(4, dtype=np.int32)
+        self._tail = np.empty((_BLOCK, 3), dtype=np.float32)
         self._moved: F32 = np.empty((_FIRST_ROWS, 3), dtype=np.float32)
         self._tabulate(_LEAST_BITS)
 
@@ -63,18 +65,19 @@ class Sieve:
         self._move[12:16] = inverse, min(r_min * r_min, _HUGE), min(r_max * r_max, _HUGE), beyond
         np.floor(sensor, out=self._move[16:])
         while True:
-            kept, infinite, far, full = self._run(points, centre, -1 if inverse else 0)
+            kept, infinite, far, cubes = self._run(points, centre, -1 if inverse else 0)
             if far:
                 return None
-            if not full:
+            if cubes + _BLOCK <= 1 << (self._bits - 1):
                 return self._moved[:kept], infinite
             self._tabulate(self._bits + 1)
 
     def _tabulate(self, bits: int) -> None:
         self._bits = bits
-        table = np.zeros((2 << bits) + 8, dtype=np.int64)
+        size = (2 << bits) + 2
+        table = np.zeros(size + 8, dtype=np.int64)
         to_line = -table.__array_interface__["data"][0] // 8 % 8
-        self._table = table[to_line : to_line + (2 << bits)]
+        self._table = table[to_line : to_line + size]
         arguments = (_NOTHING, 0, 1, bits, -1, self._move, self._table, self._moved.reshape(-1), self._totals)
         if self._bins is None:
             self._launch = Launch("sieve", "sieve", *arguments)
@@ -88,11 +91,21 @@ class Sieve:
             self._generation = 1
         if self._bins is not None:
             self._bins.clear(centre)
-        self._launch.put(_POINTS, points.reshape(-1))
-        self._launch.put(_ROWS, len(points))
+        self._totals.fill(0)
         self._launch.put(_GENERATION, self._generation)
         self._launch.put(_MERGE, merge)
-        self._launch()
-        self._launch.put(_POINTS, _NOTHING)  # keeps no cloud alive
+        blocks, rows = divmod(len(points), _BLOCK)
+        self._add(points, blocks)
+        if rows:
+            self._tail[:rows] = points[-rows:]
+            self._tail[rows:] = np.nan
+            self._add(self._tail, 1)
+            self._totals[1] -= _BLOCK - rows
         totals: list[int] = self._totals.tolist()
         return totals
+
+    def _add(self, points: F32, blocks: int) -> None:
+        self._launch.put(_POINTS, points.reshape(-1))
+        self._launch.put(_BLOCKS, blocks)
+        self._launch()
+        self._launch.put(_POINTS, _NOTHING)  # keeps no cloud alive
