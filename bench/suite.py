@@ -36,8 +36,8 @@ class Entry:
 SUITE = (
     Entry("kernels", "each kernel beside its NumPy twin"),
     Entry("match", "one query against all stations at all shifts, top-K"),
-    Entry("intake", "a frame: transform, filter, voxels, polar bins", threads=(None,)),
-    Entry("describe", "descriptor and co-visibility of a keyframe", threads=(None,)),
+    Entry("intake", "a frame: transform, filter, voxels, polar bins"),
+    Entry("describe", "descriptor and co-visibility of a keyframe"),
     Entry("map_build", "descriptors of 10,000 stations", threads=(None,)),
     Entry("registration", "trimmed ICP beside small_gicp"),
     Entry("engine", "Localizer.step on a large map: times, CPU share, memory", threads=(None,)),
