@@ -14,7 +14,7 @@ from coview_kernels.screen import Bounds, Screen, aligned
 
 MOST_BEST = 128
 _LISTED = 2048  # stations that may be among the best; the kernel looks through all for each that it scores
-_SERIAL = 16_384  # stations from which on other threads are worth waking
+_SERIAL = 4_096  # stations from which other threads are worth waking
 _FRESH, _K = 23, 24  # arguments of the kernel
 
 
@@ -33,21 +33,16 @@ class Search:
         self.query = aligned((2, rings, 2, blocks))
         self.turn = aligned((6 + 2 * blocks, lanes))
         self._raw = np.zeros((rings, screen.sectors), dtype=np.float32)
-        self._found = np.zeros(
-            4
-        )  # the query's norm, the turn's unit, the error common to all, stations listed
+        # the query's norm, the turn's unit, the error common to all, stations listed
+        self._found = np.zeros(4)
         self._best = np.empty(len(descriptors), dtype=np.int32)
         self._listed, self._shifts = np.zeros((2, _LISTED), dtype=np.int32)
         self._scores = np.zeros(_LISTED)
         arguments = (
             *(self._raw, screen.waves, screen.step.astype(np.float64), screen.norm, screen.room()),
-            *(
-                screen.turns,
-                screen.reach,
-                np.empty((rings, 2, blocks)),
-                np.empty((rings, 2 * screen.sectors)),
-            ),
-            *(np.empty(blocks), self.query, self.turn, self._found),
+            *(screen.turns, screen.reach),
+            *(np.empty((rings, 2, blocks)), np.empty((rings, 2 * screen.sectors)), np.empty(blocks)),
+            *(self.query, self.turn, self._found),
             *(screen.stations, self._missed, self._best, lanes),
             descriptors.view(np.uint16) if self._scores_any else np.empty(1, dtype=np.uint16),
             *(np.empty(MOST_BEST), self._listed, np.empty(_LISTED), self._scores, self._shifts, 1, 0),
@@ -62,7 +57,7 @@ class Search:
 
     def ready(self) -> bool:
         """Whether :meth:`scored` may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
-        return self._serial and self._launch.ready()
+        return self._launch.ready()
 
     def scored(self, query: F32, k: int) -> tuple[I64, I64, F64] | None:
         """Stations, shifts and correlations, rounded to 1e-9: the ``k`` best of all and some more, in any order.
