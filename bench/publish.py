@@ -1,8 +1,9 @@
-"""Puts measured tables into a page: ``python -m bench.publish out/bench.json [--peers out/peers.json] [--page FILE]``.
+"""Puts measured tables into a page: ``python -m bench.publish out/bench.json [--peers FILE] [--where FILE]``.
 
 A table goes between ``<!-- table: NAME -->`` and the next ``<!-- end -->``. NAME is ``bench MODULE`` for rows of
-``python -m bench --json``, ``bench.peers`` for the answers of ``python -m bench.peers --json``, and ``machine`` for
-where that was: publish on the machine, and from the environment, that measured. What was not measured stays as it is.
+``python -m bench --json``, ``bench.peers`` for the answers of ``python -m bench.peers --json``, ``bench.where`` for
+what that prints, and ``machine`` for where that was: publish on the machine, and from the environment, that measured.
+What was not measured stays as it is.
 """
 
 from __future__ import annotations
@@ -111,6 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.publish", description=__doc__)
     parser.add_argument("rows", type=Path, metavar="BENCH.json", nargs="?")
     parser.add_argument("--peers", type=Path, metavar="PEERS.json")
+    parser.add_argument("--where", type=Path, metavar="FILE", help="what bench.where has printed")
     parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE})")
     options = parser.parse_args(arguments)
     try:
@@ -119,6 +121,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             tables |= suite_tables([Row.from_dict(row) for row in json.loads(options.rows.read_text())])
         if options.peers:
             tables["bench.peers"] = peers_table(json.loads(options.peers.read_text()))
+        if options.where:
+            tables["bench.where"] = options.where.read_text().strip()
         options.page.write_text(filled(options.page.read_text(), tables))
     except (OSError, ValueError) as error:
         print(f"bench.publish: {error}", file=sys.stderr)
