@@ -24,6 +24,7 @@ from bench.tables import line, rule
 
 HEAD = ("benchmark", "ours", "baseline", "unit", "ratio", "target", "verdict")
 _WIDTHS = (60, 9, 9, 7, 7, 12, 13)
+_BUSY = 0.7  # load average: someone else computes
 _VERDICTS = {True: "holds", False: "DOES NOT HOLD", None: "informs"}
 
 
@@ -127,6 +128,8 @@ def main(arguments: Sequence[str] | None = None, suite: Sequence[Entry] = SUITE)
         return 0
     chosen = [entry for entry in suite if not options.names or entry.name in options.names]
     begin = time.monotonic()
+    if (load := os.getloadavg()[0]) > _BUSY:
+        print(f"bench: the machine is busy (load {load:.1f}); figures and ratios suffer", file=sys.stderr)
     print(line(HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
     try:
         rows = _measure(chosen, options.threads, options.quick)

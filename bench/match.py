@@ -9,9 +9,9 @@ The ratio is against the faster of the two in the same run. Stations and keyfram
 (airborne map, ground run): a keyframe differs from every station, and nothing is pruned easily. ``noise`` are random
 numbers, for which there is nothing to tell stations apart by; ``all alike`` are copies of one station, each with noise
 of 1 in 1000: every station has to be scored. The run is one query at a time; BLAS and the kernel have the threads
-that the environment gives them (OPENBLAS_NUM_THREADS, COVIEW_THREADS).
-
-``python -m bench match``; ``python -m bench.match`` prints the memory bandwidth and the distance to it.
+that the environment gives them (OPENBLAS_NUM_THREADS, COVIEW_THREADS). The plain C++ loop is
+``peers/plain_loop.cpp``, built with -O2: every shift of every station, one by one, as a program would that knows
+neither spectra nor BLAS; one run of one thread.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def rows(quick: bool = False) -> Iterator[Row]:
     repeat = 5 if quick else REPEAT
     known, queries = town()
     bandwidth = gigabytes_per_second()
-    yield informs("match/memory bandwidth, one thread, sum of a large array", bandwidth, "GB/s")
+    yield informs("match/memory bandwidth, a large array summed by one thread", bandwidth, "GB/s")
     for name, stations in known.items():
         query = queries[name]
         some = stations[:STATIONS]
@@ -163,7 +163,7 @@ def _growth(stations: F16, query: F32, repeat: int) -> Iterator[Row]:
     few, many = (kernels.MatchIndex(multiplied(stations, count)) for count in (STATIONS, MANY))
     short, long = medians(partial(few.top_k, query, BEST), partial(many.top_k, query, BEST), repeat=repeat)
     yield informs(f"match/top 10 of {MANY} stations", long, "ms")
-    yield bounded("match/time per station, many over few", (long / MANY) / (short / STATIONS), "", 1.0)
+    yield bounded("match/time per station, many over few", (long / MANY) / (short / STATIONS), "x", 1.0)
 
 
 def _against_loop(index: Any, stations: F16, query: F32, repeat: int) -> Row:
@@ -234,19 +234,3 @@ def _agree(ours: Any, *others: tuple[npt.NDArray[Any], ...]) -> None:
     """All sides name the same distances."""
     for other in others:
         np.testing.assert_allclose(ours.distance, other[2], atol=2e-5)
-
-
-def main() -> None:
-    """Print the bandwidth and how far matching is from it."""
-    import coview_kernels as kernels
-
-    known, queries = town()
-    name, stations = next(iter(known.items()))
-    for row in _limits(
-        kernels.MatchIndex(stations[:STATIONS]), queries[name], gigabytes_per_second(), REPEAT
-    ):
-        print(f"{row.name:60}{row.ours:8.2f} {row.unit:4} {row.baseline or ''}")
-
-
-if __name__ == "__main__":
-    main()

@@ -71,8 +71,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in options.names or PLOTS:
         print(f"... {name}", file=sys.stderr, flush=True)
         shown = PLOTS[name](options.quick)
+        command = f"python -m bench.plots {name}{' --quick' if options.quick else ''}"
         path = options.out / f"performance_{name}.png"
-        draw(shown, f"python -m bench.plots {name}", path)
+        draw(shown, command, path)
         path.with_suffix(".json").write_text(json.dumps(asdict(shown), indent=1) + "\n")
         print(path)
     return 0

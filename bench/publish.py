@@ -15,15 +15,17 @@ import json
 import platform
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from bench.__main__ import HEAD, cells
 from bench.peers import __main__ as peers
 from bench.peers.trial import Trial
 from bench.rows import Row
 from bench.tables import table
+
+T = TypeVar("T")
 
 PAGE = Path("docs/performance.md")
 _PACKAGES = (
@@ -115,19 +117,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--where", type=Path, metavar="FILE", help="what bench.where has printed")
     parser.add_argument("--page", type=Path, default=PAGE, help=f"({PAGE})")
     options = parser.parse_args(arguments)
+    if not (options.rows or options.peers or options.where):
+        parser.error("nothing to publish: name a file")
+    tables = {"machine": machine()}
     try:
-        tables = {"machine": machine()}
         if options.rows:
-            tables |= suite_tables([Row.from_dict(row) for row in json.loads(options.rows.read_text())])
+            tables |= _read(options.rows, lambda text: suite_tables([Row.from_dict(r) for r in _list(text)]))
         if options.peers:
-            tables["bench.peers"] = peers_table(json.loads(options.peers.read_text()))
+            tables["bench.peers"] = _read(options.peers, lambda text: peers_table(_list(text)))
         if options.where:
-            tables["bench.where"] = options.where.read_text().strip()
-        options.page.write_text(filled(options.page.read_text(), tables))
-    except (OSError, ValueError) as error:
+            tables["bench.where"] = _read(options.where, str.strip)
+        options.page.write_text(_read(options.page, lambda page: filled(page, tables)))
+    except ValueError as error:
         print(f"bench.publish: {error}", file=sys.stderr)
         return 2
+    print(f"{options.page}: {', '.join(tables)}")
     return 0
+
+
+def _read(file: Path, parse: Callable[[str], T]) -> T:
+    """Parse a file; ValueError names the one that cannot be."""
+    try:
+        return parse(file.read_text())
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror}") from error
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{file} is not what belongs here: {error}") from error
+
+
+def _list(text: str) -> list[dict[str, Any]]:
+    found = json.loads(text)
+    if not isinstance(found, list) or not found:
+        raise ValueError("a list of objects is expected, with at least one")
+    return found
 
 
 if __name__ == "__main__":

@@ -29,7 +29,8 @@ def run(entry: Entry, threads: int | None, quick: bool, beat: Callable[[float], 
     A benchmark that ends in an exception, is killed, runs past its limit or yields nothing adds a row that does
     not hold and says so; what it printed itself is shown on stderr only then.
     """
-    label = entry.name if threads is None else f"{entry.name}, {counted(threads)}"
+    conditions = "".join(f", {said}" for said in (threads and counted(threads), quick and "quick") if said)
+    label = f"{entry.name}{conditions}"
     read, write = os.pipe()
     with tempfile.TemporaryFile("w+") as said, os.fdopen(read, "rb", buffering=0) as pipe:
         process = subprocess.Popen(
@@ -47,7 +48,7 @@ def run(entry: Entry, threads: int | None, quick: bool, beat: Callable[[float], 
             for line in _lines(pipe, process, begin + entry.limit_s, beat):
                 count += 1
                 row = Row.from_dict(json.loads(line))
-                yield row if threads is None else replace(row, name=f"{row.name}, {counted(threads)}")
+                yield replace(row, name=f"{row.name}{conditions}")
             why = _verdict(process, begin + entry.limit_s, count, entry.limit_s)
         finally:
             _end(process)

@@ -118,7 +118,9 @@ def shown(frames: Sequence[Times]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Drive and print both tables."""
     parser = argparse.ArgumentParser(prog="python -m bench.where", description=__doc__)
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"({FRAMES})")
+    parser.add_argument(
+        "--frames", type=int, default=FRAMES, help=f"({FRAMES}; the first {_SETTLED} do not count)"
+    )
     options = parser.parse_args(arguments)
     if options.frames <= _SETTLED:
         print(f"bench.where: --frames {options.frames}: {_SETTLED} go by before it counts", file=sys.stderr)

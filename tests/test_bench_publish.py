@@ -65,3 +65,16 @@ def test_the_page_has_a_place_for_every_benchmark_of_the_suite():
 
     page = (Path(__file__).parent.parent / PAGE).read_text()
     filled(page, {f"bench {entry.name}": "" for entry in SUITE} | {"bench.peers": "", "machine": ""})
+
+
+def test_a_file_of_another_kind_is_named(tmp_path, capsys):
+    page, other = tmp_path / "page.md", tmp_path / "other.json"
+    page.write_text(PLACED)
+    for text in ("[]", "{}", "no json", '[{"name": "match/x"}]'):
+        other.write_text(text)
+        for arguments in ([str(other)], ["--peers", str(other)]):
+            assert main([*arguments, "--page", str(page)]) == 2
+            assert str(other) in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["--page", str(page)])
+    assert page.read_text() == PLACED

@@ -86,7 +86,7 @@ def test_every_row_is_printed_with_its_verdict_and_written(entry, tmp_path, capf
     written = json.loads(file.read_text())
     assert [list(row) for row in written] == [KEYS] * 3
     assert written[0] == {
-        "name": "fake/good", "ours": 1.0, "baseline": 3.0, "unit": "ms", "ratio": 3.0, "target": ">= 2", "holds": True,
+        "name": "fake/good, quick", "ours": 1.0, "baseline": 3.0, "unit": "ms", "ratio": 3.0, "target": ">= 2", "holds": True,
     }  # fmt: skip
     out, err = capfd.readouterr()
     verdicts = [line.split("|")[-2].strip() for line in out.splitlines() if "fake/" in line]
@@ -118,9 +118,9 @@ def test_a_benchmark_that_fails_is_a_row_and_the_next_one_runs(entry, tmp_path, 
     suite = [entry(kind, limit_s=limit_s), entry("good")]
     assert bench.main(["--quick", "--json", str(file)], suite) == 1
     failures = [row for row in json.loads(file.read_text()) if row["holds"] is False]
-    assert [row["name"] for row in failures] == [f"{kind}: {why}"]
+    assert [row["name"] for row in failures] == [f"{kind}, quick: {why}"]
     assert failures[0]["ours"] is None
-    assert names(file)[-3:] == ["fake/good", "fake/threads", "fake/quick"]
+    assert names(file)[-3:] == ["fake/good, quick", "fake/threads, quick", "fake/quick, quick"]
     assert ("no such luck" in capfd.readouterr().err) == (kind == "raises")
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from bench.engine import folder
 from bench.peers.contest import contest
+from bench.peers.method import Peer
 from bench.peers.places import WORLDS
 from bench.peers.roster import PEERS
 from bench.peers.trial import Trial
@@ -53,19 +54,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every answer of every peer")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} places a world instead of {PLACES}")
     parser.add_argument("--worlds", type=Path, default=folder(), help=f"keeps the worlds ({folder()})")
-    parser.add_argument("--only", nargs="+", metavar="PEER", help="these peers only, as the table names them")
+    parser.add_argument(
+        "--only", nargs="+", metavar="PEER", help="those whose name has this in it: small_gicp kiss"
+    )
     parser.add_argument(
         "--limit", type=float, default=LIMIT_S, metavar="S", help=f"per world and peer ({LIMIT_S:g} s)"
     )
     options = parser.parse_args(arguments)
-    unknown = set(options.only or ()) - {peer.name for peer in PEERS}
+    unknown = [word for word in options.only or () if not any(_is_named(peer, word) for peer in PEERS)]
     if unknown:
         print(
             f"bench.peers: no peer {', '.join(unknown)}; there are {'; '.join(p.name for p in PEERS)}",
             file=sys.stderr,
         )
         return 2
-    chosen = [peer for peer in PEERS if not options.only or peer.name in options.only]
+    chosen = [peer for peer in PEERS if not options.only or any(_is_named(peer, w) for w in options.only)]
     count, trials = QUICK if options.quick else PLACES, []
     print(line(HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
     for trial in contest(options.worlds, count, options.limit, chosen, tuple(WORLDS)):
@@ -80,6 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         part.write_text(text)
         part.replace(options.json)
     return 0
+
+
+def _is_named(peer: Peer, word: str) -> bool:
+    return word.lower() in peer.name.lower()
 
 
 def _plain(trial: Trial) -> dict[str, object]:
