@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 
 Values = npt.NDArray[np.float32]
 
-_MARGIN = 100  # cells around the stations; steps of more find nothing
+_MARGIN = 100  # cells around the stations that are looked up; steps of more find nothing there
 _LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys
 _FILLED = 0.25  # share of the cells that must have a station, or the values are not laid out on them
 
@@ -15,9 +17,10 @@ _FILLED = 0.25  # share of the cells that must have a station, or the values are
 class StationGrid:
     """Finds the station at a position: stations stand at the centres of a square grid, one per level.
 
-    The values of stations, ``(S, M)``, are added up a step apart in either of two layouts that agree. Where most
-    cells have one station they are laid out on the cells, ``(S, H, W)``, and a step is a shifted slice; otherwise (a
-    lone road, or storeys) each is looked up, ``(S, M + 1)``, where the last column means no station.
+    The values of stations, ``(S, M)``, are added up a step apart in either of two layouts, which agree for steps of
+    less than 100 cells. Where most cells have one station they are laid out on the cells, ``(S, H, W)``, and a step is
+    a shifted slice; otherwise (a lone road, or storeys) each is looked up, ``(S, M + 1)``, where the last column means
+    no station.
 
     Attributes:
         laid_out: whether the first layout is used.
@@ -33,16 +36,20 @@ class StationGrid:
         self._cell = cells[:, 0] * columns + cells[:, 1]
         single = len(np.unique(self._cell)) == len(stations)
         self.laid_out = bool(single and len(stations) >= _FILLED * rows * columns)
-        cells += _MARGIN
         self._width = columns + 2 * _MARGIN
-        self._flat = cells[:, 0] * self._width + cells[:, 1]
-        order = np.lexsort((stations[:, 2], self._flat))
+        self._flat = (cells[:, 0] + _MARGIN) * self._width + cells[:, 1] + _MARGIN
+
+    @cached_property
+    def _grid(self) -> npt.NDArray[np.intp]:
+        """Station (L, cells) of each level and cell with its margin, lowest level first, -1 for none."""
+        order = np.lexsort((self.stations[:, 2], self._flat))
         unique, first, count = np.unique(self._flat[order], return_index=True, return_counts=True)
-        size = (rows + 2 * _MARGIN) * self._width
-        self._grid = np.full((int(count.max()), size), -1, dtype=np.intp)
-        for level in range(len(self._grid)):
+        size = (self._shape[0] + 2 * _MARGIN) * self._width
+        grid = np.full((int(count.max()), size), -1, dtype=np.intp)
+        for level in range(len(grid)):
             has = count > level
-            self._grid[level, unique[has]] = order[first[has] + level]
+            grid[level, unique[has]] = order[first[has] + level]
+        return grid
 
     def moved(self, step: npt.NDArray[np.int64], rise: float) -> npt.NDArray[np.intp]:
         """Index (M,) of the station that lies ``step`` (2,) cells from each station, -1 where there is none.

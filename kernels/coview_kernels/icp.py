@@ -90,6 +90,10 @@ def align_planes(
         raise ValueError(f"scales must hold positive metres and radians, got {scales}")
     if any(scale.every != int(scale.every) for scale in scales):
         raise ValueError(f"scales must take every n-th point, n whole, got {scales}")
+    if least < 1:
+        raise ValueError(f"least must be at least 1, got {least}")
+    # the kernel counts in 32 bits
+    scales = [scale._replace(every=min(int(scale.every), max(1, len(points)))) for scale in scales]
     belief = None
     if prior is not None:
         mean = check.finite64("the prior's mean", prior.mean, 4, 4)

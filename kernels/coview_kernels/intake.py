@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy.typing as npt
 
@@ -63,6 +63,10 @@ class FrameIntake:
         self._bins = bins
         self._polar: PolarBins | None = None
         self._sieve: Sieve | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what may be copied or sent to another process: all but buffers and prepared launches."""
+        return self.__dict__ | {"_sieve": None, "_polar": None}
 
     def __call__(
         self, points: npt.ArrayLike, T: npt.ArrayLike, centre: npt.ArrayLike | None = None

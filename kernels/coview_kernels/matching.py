@@ -45,11 +45,11 @@ class MatchIndex:
     """What the search keeps of M stations: about 1.3 kB each at 20 x 60, beside the descriptors themselves.
 
     Args:
-        descriptors: (M, R, S) of a floating type, finite; kept, not copied: a memory map stays one. S is at
+        descriptors: (M, R, S) float16 or float32, finite; kept, not copied: a memory map stays one. S is at
             most 63.
 
     Raises:
-        ValueError: another shape, too many sectors, NaN or inf.
+        ValueError: another shape or type, too many sectors, NaN or inf.
     """
 
     MAX_SECTORS = MAX_SECTORS
@@ -59,6 +59,8 @@ class MatchIndex:
             raise ValueError(
                 f"descriptors have shape {descriptors.shape}, expected (M, rings, 1 to {MAX_SECTORS} sectors)"
             )
+        if descriptors.dtype not in (np.float16, np.float32):
+            raise ValueError(f"descriptors are {descriptors.dtype}, expected float16 or float32")
         if not all(
             np.isfinite(descriptors[i : i + _CHECKED]).all() for i in range(0, len(descriptors), _CHECKED)
         ):
@@ -99,19 +101,21 @@ class MatchIndex:
             return Nearest(np.arange(k), np.zeros(k, dtype=np.int64), np.ones(k, dtype=np.float32))
         if k == 0:
             return Nearest(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
-        return runtime.dispatch_here(self._ready, self._native, self._plain, values, k, spectra)
+        found = runtime.dispatch_here(self._ready, self._native, self._screen.bounds, values, k)
+        return self._nearest(values, found, k, spectra) if isinstance(found, Bounds) else found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what may be copied or sent to another process: all but the prepared launch."""
+        return self.__dict__ | {"_search": None}
 
     def _ready(self) -> bool:
         return self._search is not None and self._search.ready()
 
-    def _native(self, query: F32, k: int, spectra: C64 | None) -> Nearest:
+    def _native(self, query: F32, k: int) -> Nearest | Bounds:
         if self._search is None:
             self._search = Search(self._screen, self.descriptors)
         few = self._search.scored(query, k)
-        return self._nearest(query, self._search.bounds(), k, spectra) if few is None else _first(k, *few)
-
-    def _plain(self, query: F32, k: int, spectra: C64 | None) -> Nearest:
-        return self._nearest(query, self._screen.bounds(query), k, spectra)
+        return self._search.bounds() if few is None else _first(k, *few)
 
     def _nearest(self, query: F32, bounds: Bounds, k: int, spectra: C64 | None) -> Nearest:
         """Score exactly whatever may be among the best."""

@@ -66,7 +66,11 @@ class OwnerThread:
         return result
 
     def here(self, fn: Callable[[], R]) -> R:
-        """Run ``fn()`` on the caller's thread while no other call runs; ``fn`` must not come back for :meth:`call`."""
+        """Run ``fn()`` on the caller's thread while no other call runs.
+
+        ``fn`` must be short and must not come back for :meth:`call` or :meth:`here`; nor may a signal handler of the
+        caller's, which would wait for the call that it interrupts.
+        """
         if threading.current_thread() is self._thread:
             return fn()
         with self._busy:

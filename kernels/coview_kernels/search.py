@@ -86,7 +86,9 @@ class Search:
         self.query[:] = query
         self.turn[:] = turn
         self._launch.put(_FRESH, 0)
-        self._launch()
-        self._launch.put(_FRESH, 1)
+        try:
+            self._launch()
+        finally:
+            self._launch.put(_FRESH, 1)
         copied: I32 = self._best.copy()
         return copied
