@@ -4,10 +4,15 @@ Both sides start from the same points and stations and end with both channels of
 map once and gathers cells. The baseline is vectorised: it keeps the highest point of every 0.5 m voxel (what the
 density counts, and a tenth of the points: with all of them it is several times slower), puts them into SciPy's
 cKDTree, and for each station asks the tree for those within 50 m, bins them in NumPy and finds the co-visible
-bins. It is measured at stations spread over the site and scaled to all; thinning and the tree count once.
+bins. It is measured at stations spread over the site and scaled to all, as the row's name says; thinning and the
+tree count once.
 
 The rows below say how far the results are apart: a raster cell counts at its centre, so points within 0.35 m of
-an edge may move to the next bin. The whole build, with reading and ground, is ``python -m bench.build_map``.
+an edge may move to the next bin. For 2.8 % of the scan context's bins and 4.9 % of the co-view's (2.5 and 3.6 with
+``--quick``) that is more than 0.5 m; the means are 0.14 and 0.21 m. With a raster one cell off it is 4.9 and 7.6 %
+(3.9 and 5.3); with heights 0.3 m off (``--quick``) the means are 0.28 and 0.31 m. The bounds lie between.
+
+The whole build, with reading and ground, is ``python -m bench.build_map``.
 """
 
 from __future__ import annotations
@@ -19,11 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.build_map import synthetic, terrain
-from bench.rows import Row, against, informs
+from bench.rows import Row, against, bounded, informs
 
 _BLOCK = 2.0
 _LEAST = 10.0
 _SAMPLE = 40
+_MOST_OFF = {"scan_context": 3.5, "coview": 5.1}  # % of the bins
+_MOST_MEAN = {"scan_context": 0.2, "coview": 0.26}  # metres
 Floats = npt.NDArray[np.float32]
 
 
@@ -98,11 +105,13 @@ def rows(quick: bool = False) -> Iterator[Row]:
     seconds, described = ours(cloud, stations)
     once, each, expected = baseline(cloud, stations, chosen)
     name = f"map, {count} stations, {points / 1e6:.0f} M points"
-    yield against(name, seconds, once + each * count, "s", _LEAST)
+    extrapolated = f"{name}, baseline extrapolated from {len(chosen)} stations"
+    yield against(extrapolated, seconds, once + each * count, "s", _LEAST)
     for channel, exact in expected.items():
         off = np.abs(described[channel][chosen].astype(np.float32) - exact)
-        yield informs(f"{name}, {channel}: bins off by more than 0.5 m", 100 * float((off > 0.5).mean()), "%")
-        yield informs(f"{name}, {channel}: mean difference", float(off.mean()), "m")
+        share, most = 100 * float((off > 0.5).mean()), _MOST_OFF[channel]
+        yield bounded(f"{name}, {channel}: bins off by more than 0.5 m", share, "%", most)
+        yield bounded(f"{name}, {channel}: mean difference", float(off.mean()), "m", _MOST_MEAN[channel])
         ours_, theirs = (
             a.reshape(len(chosen), -1) for a in (described[channel][chosen].astype(np.float32), exact)
         )

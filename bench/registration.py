@@ -18,7 +18,7 @@ that ("tracking").
   does not need, are part of the time. "align only" leaves them out, and has no target: a scan needs them.
 
 A row compares the median times; the sides take turns at every start. It holds where we are 1.5 times as fast at
-equal error: our root mean square, in metres and in degrees, at most 5 % above the peer's; a row's name has both.
+equal error: our root mean square, in metres and in degrees, at most 5 % above the peer's; rows of their own have both.
 The time is taken with the threads that COVIEW_THREADS grants.
 """
 
@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.rows import Row, against
+from bench.rows import Row, against, informs
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import RegistrationConfig
@@ -170,19 +170,16 @@ def compare(found: list[Place]) -> Iterator[Row]:
         for way in WAYS:
             for name, least in ((way, LEAST), (f"{way}, align only", None)):
                 theirs = results[name]
-                row = against(
-                    f"registration/{kind}: {name}; {_errors(ours)} against {_errors(theirs)}",
-                    float(np.median(ours.ms)), float(np.median(theirs.ms)), "ms", least,
-                )  # fmt: skip
+                took, took_them = float(np.median(ours.ms)), float(np.median(theirs.ms))
+                row = against(f"registration/{kind}: {name}", took, took_them, "ms", least)
                 if least is not None:
                     holds = bool(row.holds) and ours.no_worse_than(theirs)
                     row = replace(row, target=f">= {LEAST:g} at equal error", holds=holds)
                 yield row
-
-
-def _errors(trials: Trials) -> str:
-    metres, degrees = trials.rms()
-    return f"{100 * metres:.2f} cm {degrees:.3f} deg rms"
+        for name in ("ours", *WAYS):
+            metres, degrees = results[name].rms()
+            yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm")
+            yield informs(f"registration/{kind}: {name}, rms of the rotation's error", degrees, "deg")
 
 
 Way = Callable[[Place, Pose], tuple[float, Pose | None]]

@@ -34,7 +34,7 @@ class Row:
     ratio: float | None
     """How many times better ours is; None where there is no baseline."""
     target: str
-    """In words, e.g. ``>= 3`` (a ratio) or ``<= 8 ms``; empty where the row only informs."""
+    """In words, e.g. ``>= 3`` (a ratio), ``<= 8 ms`` or ``>= 95 %``; empty where the row only informs."""
     holds: bool | None
     """Whether the target holds; None where the row only informs."""
 
@@ -112,6 +112,11 @@ def against(name: str, ours: float, baseline: float, unit: str, least: float | N
 def bounded(name: str, value: float, unit: str, most: float) -> Row:
     """Row of one figure that may be ``most`` at most; NaN does not hold."""
     return Row(name, float(value), None, unit, None, f"<= {most:g} {unit}".rstrip(), bool(value <= most))
+
+
+def reached(name: str, value: float, unit: str, least: float) -> Row:
+    """Row of one figure that has to be ``least`` at least; NaN does not hold."""
+    return Row(name, float(value), None, unit, None, f">= {least:g} {unit}".rstrip(), bool(value >= least))
 
 
 def informs(name: str, value: float, unit: str) -> Row:

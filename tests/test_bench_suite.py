@@ -7,7 +7,7 @@ import pytest
 
 from bench import __main__ as bench
 from bench import rows
-from bench.rows import Row, against, bounded, compared, failed, informs, medians
+from bench.rows import Row, against, bounded, compared, failed, informs, medians, reached
 from bench.suite import OWN, SUITE, Entry, thread_settings
 
 KEYS = ["name", "ours", "baseline", "unit", "ratio", "target", "holds"]
@@ -55,6 +55,9 @@ def test_rows_judge_what_they_compare(monkeypatch):
     assert bounded("b", 8.0, "ms", 8.0) == Row("b", 8.0, None, "ms", None, "<= 8 ms", True)
     assert bounded("b", 8.1, "ms", 8.0).holds is False
     assert bounded("b", math.nan, "ms", 8.0).holds is False
+    assert reached("r", 95.0, "%", 95.0) == Row("r", 95.0, None, "%", None, ">= 95 %", True)
+    assert reached("r", 94.9, "%", 95.0).holds is False
+    assert reached("r", math.nan, "%", 95.0).holds is False
     assert informs("c", 1.0, "MB").holds is None
     assert failed("d", "gone").holds is False
     monkeypatch.setattr(rows, "medians", lambda *sides, repeat: [2.0, 10.0])
@@ -86,7 +89,8 @@ def test_every_row_is_printed_with_its_verdict_and_written(entry, tmp_path, capf
     written = json.loads(file.read_text())
     assert [list(row) for row in written] == [KEYS] * 3
     assert written[0] == {
-        "name": "fake/good, quick", "ours": 1.0, "baseline": 3.0, "unit": "ms", "ratio": 3.0, "target": ">= 2", "holds": True,
+        "name": "fake/good, quick", "ours": 1.0, "baseline": 3.0, "unit": "ms", "ratio": 3.0,
+        "target": ">= 2", "holds": True,
     }  # fmt: skip
     out, err = capfd.readouterr()
     verdicts = [line.split("|")[-2].strip() for line in out.splitlines() if "fake/" in line]
