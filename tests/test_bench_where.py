@@ -1,30 +1,35 @@
 """Clocks around stages: they add up, keep what a class method is, and leave nothing behind."""
 
-import time
+from types import SimpleNamespace
 
+from bench import where
 from bench.where import clocks, shown, stages
 
 
 class Owner:
+    now = 0.0
+
     @classmethod
     def make(cls, value):
+        Owner.now += 1.0
         return cls, value
 
     def work(self, seconds):
-        time.sleep(seconds)
+        Owner.now += seconds
         return seconds
 
 
-def test_stages_are_timed_and_put_back():
+def test_stages_are_timed_and_put_back(monkeypatch):
+    monkeypatch.setattr(where, "time", SimpleNamespace(perf_counter=lambda: Owner.now))
+    monkeypatch.setattr(Owner, "now", 0.0)
     before = dict(vars(Owner))
     with clocks([("make", Owner, "make"), ("work", Owner, "work")]) as spent:
         assert Owner.make(3) == (Owner, 3)
-        assert [Owner().work(0.01) for _ in range(2)] == [0.01, 0.01]
-    assert spent["work"] >= 0.02
-    assert 0 < spent["make"] < spent["work"]
-    assert dict(vars(Owner)) == before
-    assert Owner().work(0) == 0
-    assert spent["work"] < 10
+        assert [Owner().work(seconds) for seconds in (2.0, 4.0)] == [2.0, 4.0]
+    assert spent == {"make": 1.0, "work": 6.0}
+    assert dict(vars(Owner)) == before | {"now": 7.0}
+    assert Owner().work(8.0) == 8.0
+    assert spent == {"make": 1.0, "work": 6.0}
 
 
 def test_every_stage_exists():

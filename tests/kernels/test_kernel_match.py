@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 
 import numpy as np
 import pytest
 
 import coview_kernels as ck
-from coview_kernels import reference
+from coview_kernels import reference, runtime, search
 from coview_kernels.screen import Bounds, Screen
 from coview_kernels.search import Search
 
@@ -32,17 +33,18 @@ def native_bounds(screen: Screen, desc, query) -> Bounds:
     return ck.submit(run)
 
 
+def transforms(columns):
+    """Transforms of whole unit columns, in float64."""
+    columns = np.asarray(columns, dtype=np.float64)
+    norm = np.sqrt((columns**2).sum(axis=-2, keepdims=True))
+    return np.fft.rfft(np.divide(columns, norm, out=np.zeros_like(columns), where=norm > 0), axis=-1)
+
+
 def correlations(query, descriptors):
-    """Eqs 7-9 in float64, (M, S): an oracle of its own, by Fourier transforms of whole columns."""
-
-    def unit(columns):
-        columns = np.asarray(columns, dtype=np.float64)
-        norm = np.sqrt((columns**2).sum(axis=-2, keepdims=True))
-        return np.divide(columns, norm, out=np.zeros_like(columns), where=norm > 0)
-
+    """Eqs 7-9 in float64, (M, S): an oracle of its own, by Fourier transforms; of descriptors or their transforms."""
     sectors = query.shape[1]
-    a, b = (np.fft.rfft(unit(x), axis=-1) for x in (query, descriptors))
-    return np.fft.irfft((a * b.conj()).sum(axis=-2), n=sectors, axis=-1) / sectors
+    b = descriptors if np.iscomplexobj(descriptors) else transforms(descriptors)
+    return np.fft.irfft((transforms(query) * b.conj()).sum(axis=-2), n=sectors, axis=-1) / sectors
 
 
 def agrees(found, query, descriptors, k):
@@ -61,7 +63,7 @@ def agrees(found, query, descriptors, k):
     assert (np.diff(found.station)[same & exact] > 0).all()
 
 
-def scene(rng, kind, m, shape):
+def scene(rng, kind, m, shape, dtype=np.float16):
     """Descriptors and a query of one kind of difficulty."""
     rings, sectors = shape
     desc = rng.uniform(0.2, 12, (m, rings, sectors)) * (rng.random((m, rings, sectors)) < 0.6)
@@ -93,7 +95,7 @@ def scene(rng, kind, m, shape):
         desc[-1] = rng.standard_normal(shape)
     elif kind == "constant":
         desc, query = np.ones_like(desc), np.ones_like(query)
-    return desc.astype(np.float16), query.astype(np.float32)
+    return desc.astype(dtype), query.astype(np.float32)
 
 
 KINDS = (
@@ -102,19 +104,30 @@ KINDS = (
 )
 
 
+SPREAD = 1200  # stations; a thread takes 512 at least
+
+
+@pytest.mark.parametrize("way", ["serial", pytest.param("parallel", marks=NATIVE), "float32"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_equals_the_exhaustive_answer(kind):
-    # 11 kinds x 6 shapes x (2 to 24 maps x 32 queries): more than 10,000 cases
+def test_equals_the_exhaustive_answer(kind, way, monkeypatch):
+    # 11 kinds x (6 shapes serial, 3 parallel, 3 float32) x 4 maps x 24 queries: 12,672 cases
+    if way == "parallel":
+        monkeypatch.setattr(search, "_SERIAL", 1)
     rng = np.random.default_rng(KINDS.index(kind))
-    for shape in SHAPES:
-        for _ in range(4 if shape == (20, 60) else 8):
-            m = int(rng.integers(1, 60))
-            desc, query = scene(rng, kind, m, shape)
-            index = ck.MatchIndex(desc)
+    serial = set()
+    for shape in SHAPES if way == "serial" else SHAPES[:3]:
+        for trial in range(4):
+            m = SPREAD if way == "parallel" and trial == 0 else int(rng.integers(1, 60))
+            desc, query = scene(rng, kind, m, shape, np.float32 if way == "float32" else np.float16)
+            index, oracle = ck.MatchIndex(desc), transforms(desc)
             for turn in range(24):
                 asked = np.roll(query, turn, axis=1) * (rng.random(query.shape) < 0.97)
                 k = int(rng.choice([1, 2, 10, m, m + 3]))
-                agrees(index.top_k(asked, k), asked, desc, k)
+                agrees(index.top_k(asked, k), asked, oracle, k)
+            if index._search is not None:
+                serial.add(index._search._serial)
+    if ck.backend() != "numpy":
+        assert serial == {way != "parallel" or runtime.workers() == 1}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -174,23 +187,41 @@ def test_an_index_takes_less_than_600_bytes_beyond_a_kilobyte_and_keeps_a_memory
     assert index.descriptors is file
 
 
-def test_queries_from_many_threads_and_after_a_restart():
+def test_queries_beside_frames_and_a_shutdown_from_many_threads():
     rng = np.random.default_rng(9)
     desc, _ = scene(rng, "random", 200, (6, 20))
     index = ck.MatchIndex(desc)
     queries = [desc[n].astype(np.float32) for n in range(24)]
+    cloud = rng.uniform(-9, 9, (400, 3)).astype(np.float32)
+    points = ck.FrameIntake(1.0)(cloud, np.eye(4)).points.copy()
+    half_way = Barrier(5, timeout=60)
 
-    def ask(n):
-        ck.submit(int)  # the owner thread has work meanwhile
-        return index.top_k(queries[n], 5)
+    def ask(_):
+        take = ck.FrameIntake(1.0)
+        answers = []
+        for n, query in enumerate(queries):
+            if n == 12:
+                half_way.wait()
+            # the frame runs on the owner thread, the query on this one, while others do the same
+            np.testing.assert_array_equal(take(cloud, np.eye(4)).points, points)
+            answers.append(index.top_k(query, 5))
+        return answers
+
+    def stop():
+        half_way.wait()
+        ck.shutdown()
 
     alone = [index.top_k(query, 5) for query in queries]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(ask, range(24)))
-    ck.shutdown()
-    for found in (together, [index.top_k(query, 5) for query in queries]):
-        np.testing.assert_array_equal([f.station for f in found], [f.station for f in alone])
-        np.testing.assert_array_equal([f.distance for f in found], [f.distance for f in alone])
+    with ThreadPoolExecutor(5) as pool:
+        stopping = pool.submit(stop)
+        together = list(pool.map(ask, range(4)))
+        stopping.result()
+    for answers in (*together, [index.top_k(query, 5) for query in queries]):
+        np.testing.assert_array_equal([f.station for f in answers], [f.station for f in alone])
+        np.testing.assert_array_equal([f.shift for f in answers], [f.shift for f in alone])
+        # while the owner starts again NumPy may answer
+        distances = [f.distance for f in answers], [f.distance for f in alone]
+        np.testing.assert_allclose(*distances, rtol=0, atol=TOLERANCE)
 
 
 def test_no_stations_and_no_query():
@@ -202,7 +233,7 @@ def test_no_stations_and_no_query():
 
 
 def test_bad_arguments_are_named():
-    index = ck.MatchIndex(np.ones((3, 4, 6)))
+    index = ck.MatchIndex(np.ones((3, 4, 6), dtype=np.float16))
     with pytest.raises(ValueError, match="query has shape"):
         index.top_k(np.ones((4, 7)), 1)
     with pytest.raises(ValueError, match="query holds"):
@@ -214,4 +245,4 @@ def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="descriptors have"):
         ck.MatchIndex(np.ones((3, 4, 64)))
     with pytest.raises(ValueError, match="descriptors hold"):
-        ck.MatchIndex(np.full((3, 4, 6), np.inf))
+        ck.MatchIndex(np.full((3, 4, 6), np.inf, dtype=np.float16))
