@@ -101,7 +101,7 @@ class MatchIndex:
             return Nearest(np.arange(k), np.zeros(k, dtype=np.int64), np.ones(k, dtype=np.float32))
         if k == 0:
             return Nearest(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
-        found = runtime.dispatch_here(self._ready, self._native, self._screen.bounds, values, k)
+        found = runtime.dispatch_here(self._ready, self._native, self._plain, values, k)
         return self._nearest(values, found, k, spectra) if isinstance(found, Bounds) else found
 
     def __getstate__(self) -> dict[str, Any]:
@@ -116,6 +116,9 @@ class MatchIndex:
             self._search = Search(self._screen, self.descriptors)
         few = self._search.scored(query, k)
         return self._search.bounds() if few is None else _first(k, *few)
+
+    def _plain(self, query: F32, k: int) -> Nearest | Bounds:
+        return self._screen.bounds(query)
 
     def _nearest(self, query: F32, bounds: Bounds, k: int, spectra: C64 | None) -> Nearest:
         """Score exactly whatever may be among the best."""
