@@ -104,7 +104,7 @@ def rows(quick: bool = False) -> Iterator[Row]:
     chosen = np.linspace(0, count - 1, 10 if quick else _SAMPLE).astype(np.intp)
     seconds, described = ours(cloud, stations)
     once, each, expected = baseline(cloud, stations, chosen)
-    name = f"map, {count} stations, {points / 1e6:.0f} M points"
+    name = f"map_build, {count} stations, {points / 1e6:.0f} M points"
     extrapolated = f"{name}, baseline extrapolated from {len(chosen)} stations"
     yield against(extrapolated, seconds, once + each * count, "s", _LEAST)
     for channel, exact in expected.items():
