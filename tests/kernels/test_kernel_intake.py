@@ -102,8 +102,8 @@ def test_a_steady_stream_allocates_no_arrays():
     finally:
         tracemalloc.stop()
     assert len(taken.points) > 10_000
-    # a frame has 360 kB; views, numbers and the job in the queue are all there is
-    assert peak - before < 16_000
+    # a frame has 360 kB; views, numbers and the job in the queue are all there is, and 20 kB of a quadrants launch
+    assert peak - before < 32_000
     assert after - before < 8_000
 
 
