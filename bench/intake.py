@@ -9,11 +9,15 @@ COVIEW_THREADS, all cores by default.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.rows import REPEAT, Row, against, bounded, informs, medians
+
+if TYPE_CHECKING:
+    from coview_kernels.arrays import F32, PolarGrid
 
 _LEAST = 4.0
 _LIMITS = 0.3, 0.5, 80.0
@@ -46,7 +50,7 @@ def pose() -> npt.NDArray[np.float64]:
     return T
 
 
-def best_numpy(points: npt.NDArray[np.float32], T: npt.NDArray[np.float64]) -> tuple[object, object]:
+def best_numpy(points: npt.NDArray[np.float32], T: npt.NDArray[np.float64]) -> tuple[F32, PolarGrid]:
     """Return the same points and bins; presumes finite points near the sensor."""
     from coview_kernels import reference
 
@@ -80,13 +84,14 @@ def measure(repeat: int) -> list[float]:
     points, T = frame(), pose()
     full, thin = FrameIntake(*_LIMITS, _BINS), FrameIntake(*_LIMITS)
 
-    def plain() -> tuple[object, object]:
+    def plain() -> tuple[F32, PolarGrid]:
         unique, _ = reference.transform_unique(points, T, *_LIMITS)
         return unique, reference.polar_bin(unique, T[:3, 3], *_BINS)[0]
 
     taken = full(points, T)
     for unique, grid in (plain(), best_numpy(points, T)):
-        if not np.array_equal(taken.points, unique) or not all(map(np.array_equal, taken.grid or (), grid)):  # type: ignore[call-overload]
+        same = taken.grid is not None and all(map(np.array_equal, taken.grid, grid))
+        if not same or not np.array_equal(taken.points, unique):
             raise AssertionError("ours and NumPy disagree")
     sides = (lambda: full(points, T), lambda: thin(points, T), plain, lambda: best_numpy(points, T))
     return medians(*sides, repeat=repeat)
