@@ -56,6 +56,7 @@ OWN = {
     "ablation": "what each choice of the method is worth",
     "build_map": "seconds and memory of building a map",
     "ground": "the ground filter on labelled LAS files",
+    "tracking": "errors, covariance, loss and recovery while tracked",
     "stream": "robots over zenoh: rates, delays, attacks",
     "peers": "each peer in each world, every answer as JSON",
     "plots": "the plots of docs/performance.md",

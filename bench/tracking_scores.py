@@ -1,0 +1,273 @@
+"""How a tracked drive is scored: pure functions of what was said frame by frame and of the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+FALSE_METRES, FALSE_DEGREES = 1.0, 5.0
+"""A pose further from the truth than either is a false one ..."""
+DOUBTFUL_METRES = 0.5
+"""... and one further than this is counted beside them."""
+
+MOST_HELD = 0.5
+"""Seconds that a false pose counts at most: until the next frame, or so long."""
+
+FIRST_MINUTE = 60.0
+"""Seconds after a fix in which its covariance is judged apart."""
+
+NOMINAL = tuple(float(p) for p in chi2.cdf([1.0, 4.0, 9.0], 1))
+"""Shares that 1, 2 and 3 sigma promise."""
+
+AXES: dict[str, tuple[int, ...]] = {
+    "x": (0,), "y": (1,), "z": (2,), "roll": (3,), "pitch": (4,), "yaw": (5,),
+    "x,y": (0, 1), "x,y,z": (0, 1, 2), "pose": (0, 1, 2, 3, 4, 5),
+}  # fmt: skip
+"""What coverage is judged of: one axis alone, or several by their squared Mahalanobis distance."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the localizer said, frame by frame (N).
+
+    Attributes:
+        stamps: seconds.
+        states: names; ``SKIPPED`` for a frame that it refused.
+        reasons: of the newest evidence.
+        poses: (N, 4, 4) map <- body, NaN where there was none.
+        covariances: (N, 6, 6) over (x, y, z, roll, pitch, yaw), NaN where there was no pose.
+        seconds: that each step took.
+    """
+
+    stamps: Floats
+    states: Sequence[str]
+    reasons: Sequence[str]
+    poses: Floats
+    covariances: Floats
+    seconds: Floats
+
+    @property
+    def tracking(self) -> Mask:
+        """(N,) whether the frame has a pose."""
+        posed = ~np.isnan(self.poses[:, 0, 0])
+        return np.asarray(posed & (np.asarray(self.states) == "TRACKING"))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of all frames, NaN where there is no pose.
+
+    Attributes:
+        twist: (N, 6) over (x, y, z, roll, pitch, yaw) in map axes, metres and radians.
+        metres: (N,) length of the first three.
+        degrees: (N,) angle of the others.
+    """
+
+    twist: Floats
+    metres: Floats
+    degrees: Floats
+
+    @property
+    def right(self) -> Mask:
+        """(N,) whether the frame has a pose that is not false."""
+        return np.asarray((self.metres <= FALSE_METRES) & (self.degrees <= FALSE_DEGREES))
+
+
+def errors(told: Told, truth: Floats) -> Errors:
+    """Compare with the true poses (N, 4, 4), map <- body."""
+    twist = np.full((len(truth), 6), np.nan)
+    known = told.tracking
+    if known.any():
+        poses, true = told.poses[known], truth[known]
+        twist[known, :3] = poses[:, :3, 3] - true[:, :3, 3]
+        apart = poses[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
+        twist[known, 3:] = Rotation.from_matrix(apart).as_rotvec()
+    lengths = [np.linalg.norm(twist[:, k : k + 3], axis=1) for k in (0, 3)]
+    return Errors(twist, lengths[0], np.degrees(lengths[1]))
+
+
+def held(stamps: Floats) -> Floats:
+    """(N,) seconds for which each frame's answer counts: until the next frame, at most :data:`MOST_HELD`."""
+    if len(stamps) < 2:
+        return np.zeros(len(stamps))
+    gaps = np.diff(stamps)
+    return np.asarray(np.minimum(np.r_[gaps, np.median(gaps)], MOST_HELD))
+
+
+def recovery(right: Mask, stamps: Floats, driven: Floats, end: int) -> tuple[float, float] | None:
+    """Seconds and metres driven from the frame ``end`` to the first right pose; None if there is none."""
+    again = np.flatnonzero(right[end:])
+    if not len(again):
+        return None
+    k = end + int(again[0])
+    return float(stamps[k] - stamps[end]), float(driven[k] - driven[end])
+
+
+def losses(states: Sequence[str], reasons: Sequence[str]) -> list[str]:
+    """Reason of each loss: of each frame that is LOST after one that was not."""
+    pairs = zip(states[:-1], states[1:], reasons[1:], strict=True)
+    return [reason for before, state, reason in pairs if state == "LOST" != before]
+
+
+def transitions(told: Told) -> list[tuple[float, str, str]]:
+    """(seconds since the first frame, new state, reason) of every change of state."""
+    out = []
+    for k, state in enumerate(told.states):
+        if not k or state != told.states[k - 1]:
+            out.append((round(float(told.stamps[k] - told.stamps[0]), 2), state, told.reasons[k]))
+    return out
+
+
+def since_fix(told: Told) -> Floats:
+    """(N,) seconds since the fix that each pose goes back to, NaN where there is none.
+
+    A fix is the first pose after a search (SEARCHING or LOST); a doubt in between does not end it.
+    """
+    out = np.full(len(told.stamps), np.nan)
+    fixed: float | None = None
+    for k, (state, known) in enumerate(zip(told.states, told.tracking, strict=True)):
+        if state in ("SEARCHING", "LOST"):
+            fixed = None
+        elif known:
+            fixed = float(told.stamps[k]) if fixed is None else fixed
+            out[k] = told.stamps[k] - fixed
+    return out
+
+
+def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
+    """(N,) squared Mahalanobis distances over some axes; infinite where a covariance is none."""
+    pick = np.asarray(axes)
+    error = twist[:, pick]
+    cov = covariances[:, pick[:, None], pick]
+    out = np.full(len(twist), np.inf)
+    sane: Mask = np.asarray(np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1))
+    cov = np.where(sane[:, None, None], cov, np.eye(len(pick)))
+    # metres stand beside radians: compare each by its own size
+    scale = np.sqrt(np.abs(np.einsum("nii->ni", cov)))
+    scale = np.where(scale > 0, scale, 1.0)
+    level = cov / (scale[:, :, None] * scale[:, None, :])
+    sane = np.asarray(sane & (np.linalg.eigvalsh(level)[:, 0] > 1e-12))
+    unit = (error / scale)[sane]
+    out[sane] = np.einsum("ni,ni->n", unit, np.linalg.solve(level[sane], unit[:, :, None])[:, :, 0])
+    return out
+
+
+def spread(told: Told, error: Errors) -> dict[str, dict[str, Floats]]:
+    """Squared distances of all poses by name of the axes, in the ``first minute`` after a fix and ``later``."""
+    age = since_fix(told)
+    parts: dict[str, Mask] = {
+        "first minute": np.asarray(age < FIRST_MINUTE),
+        "later": np.asarray(age >= FIRST_MINUTE),
+    }
+    return {
+        part: {n: squares(error.twist[mask], told.covariances[mask], axes) for n, axes in AXES.items()}
+        for part, mask in parts.items()
+    }
+
+
+def pooled(parts: Sequence[Mapping[str, Mapping[str, Floats]]]) -> dict[str, dict[str, Floats]]:
+    """Put those of several drives together, and add ``all``, which is both parts."""
+    names = ("first minute", "later")
+    out = {p: {n: np.concatenate([[], *(d[p][n] for d in parts)]) for n in AXES} for p in names}
+    out["all"] = {n: np.concatenate([out[p][n] for p in names]) for n in AXES}
+    return out
+
+
+def coverage(squared: Floats, count: int) -> dict[str, Any]:
+    """Shares within 1, 2 and 3 sigma (of ``count`` axes: within the chi-square quantiles of the same shares).
+
+    ``nees`` is the mean squared distance per axis, 1 if the covariance is right; ``median_nees`` the median relative to
+    its own nominal value, which outliers do not move.
+    """
+    if not len(squared):
+        return {"frames": 0, "inside": None, "nees": None, "median_nees": None}
+    limits = chi2.ppf(NOMINAL, count)
+    return {
+        "frames": len(squared),
+        "inside": [float((squared <= limit).mean()) for limit in limits],
+        "nees": _finite(squared.mean() / count),
+        "median_nees": _finite(np.median(squared) / chi2.ppf(0.5, count)),
+    }
+
+
+def score(
+    told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]
+) -> dict[str, Any]:
+    """All figures of one drive but coverage; metres, degrees, seconds, milliseconds.
+
+    Args:
+        told: what was said.
+        truth: (N, 4, 4) map <- body.
+        driven: (N,) metres.
+        events: what happened, the first frame of it and the first after it.
+    """
+    error, known = errors(told, truth), told.tracking
+    right, hold = error.right, held(told.stamps)
+    false = known & ~right
+    first = int(np.argmax(known)) if known.any() else None
+    before = np.r_[False, known[:-1]]  # stepping from a pose searches no map
+    lost = losses(told.states, told.reasons)
+    return {
+        "frames": len(known),
+        "driven_m": float(driven[-1]),
+        "share_right": float(right.mean()),
+        "share_right_after_first": None if first is None else float(right[first:].mean()),
+        "first_fix_m": None if first is None else float(driven[first]),
+        "metres": _summary(error.metres[known]),
+        "degrees": _summary(error.degrees[known]),
+        "false_frames": int(false.sum()),
+        "false_s": float(hold[false].sum()),
+        "doubtful_frames": int((error.metres[known] > DOUBTFUL_METRES).sum()),
+        "losses": len(lost),
+        "reasons": lost,
+        "transitions": transitions(told),
+        "events": [
+            _event(what, begin, end, right, false, told.stamps, driven, hold) for what, begin, end in events
+        ],
+        "step_ms": _percentiles(told.seconds * 1e3),
+        "tracking_step_ms": _percentiles(told.seconds[before] * 1e3),
+        "skipped": sum(state == "SKIPPED" for state in told.states),
+    }
+
+
+def _event(
+    what: str, begin: int, end: int, right: Mask, false: Mask, stamps: Floats, driven: Floats, hold: Floats
+) -> dict[str, Any]:
+    back = recovery(right, stamps, driven, end)
+    until = len(right) if back is None else end + int(np.argmax(right[end:])) + 1
+    during = slice(begin, until)
+    return {
+        "what": what,
+        "begin_m": float(driven[begin]),
+        "recovery_s": None if back is None else back[0],
+        "recovery_m": None if back is None else back[1],
+        "false_s": float(hold[during][false[during]].sum()),
+    }
+
+
+def _summary(values: Floats) -> dict[str, float] | None:
+    if not len(values):
+        return None
+    p50, p95, p99 = np.percentile(values, [50, 95, 99])
+    rmse = float(np.sqrt(np.mean(values**2)))
+    return {"rmse": rmse, "p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
+
+
+def _percentiles(values: Floats) -> dict[str, float] | None:
+    if not len(values):
+        return None
+    p50, p99 = np.percentile(values, [50, 99])
+    return {"p50": float(p50), "p99": float(p99)}
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
