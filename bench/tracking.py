@@ -24,10 +24,12 @@ from typing import Any
 import numpy as np
 
 from bench.tables import line, number, rule, table
-from bench.tracking_plot import WITHIN, draw
+from bench.tracking_coverage import WITHIN, coverage_table, honest, pooled, shares, spread
+from bench.tracking_drives import drift_share
+from bench.tracking_plot import draw
 from bench.tracking_run import told_of
-from bench.tracking_scenarios import QUICK, SCENARIOS, Scenario, drift_share
-from bench.tracking_scores import AXES, NOMINAL, coverage, errors, pooled, score, spread
+from bench.tracking_scenarios import QUICK, SCENARIOS, Scenario
+from bench.tracking_scores import errors, score
 from bench.worlds import fingerprint
 
 MOST_METRES, MOST_DEGREES, MOST_RECOVERY = 0.12, 0.35, 20.0
@@ -60,14 +62,6 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Row, Any]:
     return row, parts
 
 
-def shares(squared: Any) -> dict[str, dict[str, Any]]:
-    """Coverage by part and axes."""
-    return {
-        part: {name: coverage(values, len(AXES[name])) for name, values in by_axes.items()}
-        for part, by_axes in squared.items()
-    }
-
-
 def cells(row: Row) -> list[str]:
     """One line of the table; of several events the worst."""
     metres, degrees = row["metres"] or {}, row["degrees"] or {}
@@ -93,35 +87,6 @@ def cells(row: Row) -> list[str]:
     ]
 
 
-def coverage_table(found: dict[str, dict[str, Any]]) -> str:
-    """Lay out shares in per cent; what is out of its band is marked. The medians of squared distances are 1 if right."""
-    head = ("coverage, %", "promised", "first minute", "median", "later", "median", "all", "median")
-    promised = " / ".join(f"{100 * p:.1f}" for p in NOMINAL)
-    rows = []
-    for name in AXES:
-        parts = [found[part][name] for part in ("first minute", "later", "all")]
-        rows.append((name, promised, *(text for part in parts for text in (_shares(part), _nees(part)))))
-    counts = [str(found[part]["yaw"]["frames"]) for part in ("first minute", "later", "all")]
-    rows.append(("poses", "", counts[0], "", counts[1], "", counts[2], ""))
-    return table(head, rows)
-
-
-def _shares(part: dict[str, Any]) -> str:
-    if part["inside"] is None:
-        return "-"
-    mark = "" if _honest(part) else " !"
-    return " / ".join(f"{100 * share:.1f}" for share in part["inside"]) + mark
-
-
-def _nees(part: dict[str, Any]) -> str:
-    return number(part["median_nees"], 2)
-
-
-def _honest(part: dict[str, Any]) -> bool:
-    inside = part["inside"]
-    return inside is not None and bool(np.all(np.abs(np.subtract(inside, NOMINAL)) <= WITHIN))
-
-
 def verdicts(rows: Sequence[Row], found: dict[str, dict[str, Any]]) -> list[tuple[str, str, str, bool]]:
     """Judge: (what, target, measured, met) per target. ``found`` is the coverage of all drives together."""
     plain = [row for row in rows if row["plain"]]
@@ -144,7 +109,7 @@ def verdicts(rows: Sequence[Row], found: dict[str, dict[str, Any]]) -> list[tupl
         text = f"{np.median(metres):.1f} median, {max(metres):.1f} worst; {late} of {len(metres)} later"
         out.append(("recovery, m driven", f"<= {MOST_RECOVERY:.0f}", text, not late))
     for part in ("first minute", "later"):
-        wrong = [name for name in _JUDGED if not _honest(found[part][name])]
+        wrong = [name for name in _JUDGED if not honest(found[part][name])]
         if found[part]["yaw"]["frames"]:
             text = f"out of it: {'; '.join(wrong)}" if wrong else "all within"
             out.append((f"coverage, {part}", f"+-{100 * WITHIN:.0f} points", text, not wrong))

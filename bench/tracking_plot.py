@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from bench.tracking_scores import AXES, NOMINAL, Floats
-
-WITHIN = 0.05
-"""Share by which an observed coverage may differ from the nominal one."""
+from bench.tracking_coverage import AXES, NOMINAL, WITHIN
+from bench.tracking_scores import Floats
 
 _SHOWN = {"x,y": "#0072B2", "x,y,z": "#009E73", "yaw": "#D55E00"}
 _LEAST = 20  # frames that make a curve
@@ -21,7 +19,7 @@ def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> 
     """Draw observed over nominal coverage for position and yaw, in the first minute after a fix and later.
 
     Args:
-        spread: squared distances by part and axes, see :func:`bench.tracking_scores.pooled`.
+        spread: squared distances by part and axes, see :func:`bench.tracking_coverage.pooled`.
         path: picture to write.
         title: what was measured.
 

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.tracking_scenarios import Drive, Scenario, seen
+from bench.tracking_drives import Drive, seen
+from bench.tracking_scenarios import Scenario
 from bench.tracking_scores import Told
 from bench.tracking_worlds import Recorded, map_of, open_world
 from bench.worlds import fingerprint, remembered
 
-_SELVES = ("bench/tracking_run.py", "bench/tracking_scenarios.py", "bench/tracking_worlds.py")
+_SELVES = tuple(f"bench/tracking_{part}.py" for part in ("run", "drives", "scenarios", "worlds"))
 
 
 def told_of(folder: Path, scenario: Scenario) -> tuple[Told, Drive]:

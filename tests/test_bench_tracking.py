@@ -6,15 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench import tracking, tracking_run, tracking_scores, tracking_worlds
+from bench import tracking, tracking_coverage, tracking_run, tracking_worlds
 from bench.suite import OWN
-from bench.tracking_plot import draw
-from bench.tracking_scenarios import (
+from bench.tracking_coverage import AXES, NOMINAL, coverage, pooled, shares, spread
+from bench.tracking_drives import (
     CLOTH,
     DUST,
-    QUICK,
-    SCENARIOS,
-    Scenario,
     carried,
     covered,
     drift_share,
@@ -26,18 +23,9 @@ from bench.tracking_scenarios import (
     seen,
     start,
 )
-from bench.tracking_scores import (
-    AXES,
-    NOMINAL,
-    Told,
-    coverage,
-    errors,
-    losses,
-    pooled,
-    recovery,
-    score,
-    spread,
-)
+from bench.tracking_plot import draw
+from bench.tracking_scenarios import QUICK, SCENARIOS, Scenario
+from bench.tracking_scores import Told, errors, losses, recovery, score
 from bench.tracking_worlds import GAP, World, earlier, in_gap, open_world
 from bench.worlds import TUNED_SEEDS
 from coview_stream.geometry import inverse, pose_from, rot_z, tilt_of, yaw_of
@@ -86,7 +74,7 @@ def covariance():
 
 def found(covariance, scale=1.0):
     said, truth = gaussian(covariance, scale)
-    return tracking.shares(pooled([spread(said, errors(said, truth))]))
+    return shares(pooled([spread(said, errors(said, truth))]))
 
 
 def test_an_honest_covariance_covers_what_it_promises_on_every_axis(covariance):
@@ -111,7 +99,7 @@ def test_a_covariance_of_wrong_size_is_found_out(covariance, scale, one_sigma, n
 
 def test_a_covariance_that_is_none_covers_nothing():
     broken = np.stack([np.full((6, 6), np.nan), np.diag([1.0, 1, 1, 1, 1, -1]), np.zeros((6, 6)), np.eye(6)])
-    squared = tracking_scores.squares(np.full((4, 6), 0.1), broken, AXES["pose"])
+    squared = tracking_coverage.squares(np.full((4, 6), 0.1), broken, AXES["pose"])
     np.testing.assert_allclose(squared, [np.inf, np.inf, np.inf, 0.06])
     assert coverage(squared, 6)["inside"][2] == 0.25
     assert coverage(squared, 6)["nees"] is None
@@ -160,6 +148,7 @@ def test_events_tell_how_long_the_robot_was_wrong_about_itself():
     truth = poses.copy()
     truth[2:, 0, 3] = 50.0
     poses[7:, 0, 3] = 50.1
+    poses[[1, 9], 0, 3] = 90.0  # false, but neither of the event nor before it is over
     figures = score(told(states, poses), truth, np.arange(10.0), [("kidnapped", 2, 2)])
     event = figures["events"][0]
     assert event["false_s"] == pytest.approx(0.2)
@@ -182,7 +171,7 @@ def test_a_loss_is_a_change_to_lost():
 
 def test_time_since_a_fix_starts_anew_after_a_search_but_not_after_a_doubt():
     states = ["SEARCHING", "TRACKING", "AMBIGUOUS", "TRACKING", "LOST", "AMBIGUOUS", "TRACKING"]
-    age = tracking_scores.since_fix(told(states))
+    age = tracking_coverage.since_fix(told(states))
     np.testing.assert_allclose(age, [np.nan, 0.0, np.nan, 0.2, np.nan, np.nan, 0.0])
 
 
