@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coview_stream.odometry.lidar import LidarOdometry
 
 HELP = "localize a recorded run on a base map, offline"
 
@@ -16,7 +20,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="directory to write")
-    parser.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry to use (auto)")
+    parser.add_argument(
+        "--odometry",
+        default="auto",
+        metavar="auto|FILE|kiss-icp",
+        help="the run's, a file's, or made of the clouds (auto)",
+    )
+    parser.add_argument(
+        "--gravity",
+        nargs="+",
+        metavar=("ground|level|X", "Y Z"),
+        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame (ground)",
+    )
     parser.add_argument(
         "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
     )
@@ -33,20 +48,27 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.clouds.runs import open_run
     from coview_stream.config import LocalizerConfig, RetrievalConfig
-    from coview_stream.errors import ConfigError, InputError
+    from coview_stream.errors import InputError
     from coview_stream.fix import Fix
     from coview_stream.offline import locate, summary, write
 
-    if args.odometry == "kiss-icp":
-        raise ConfigError("--odometry kiss-icp is not supported yet; give the robot's odometry as a TUM file")
+    lidar = _lidar(args.odometry, args.gravity)
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     base_map = BaseMap.load(args.map)
-    recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic)
+    quiet = not (args.progress or sys.stderr.isatty())
+    with tqdm(desc="odometry", unit="frame", disable=quiet or lidar is None, leave=False) as bar:
+
+        def follow(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        recorded = open_run(
+            args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow
+        )
     for note in recorded.notes:
         print(note, file=sys.stderr)
     config = LocalizerConfig(retrieval=RetrievalConfig(mode=args.retrieval))
-    quiet = not (args.progress or sys.stderr.isatty())
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
 
         def step(done: int, total: int, fix: Fix | None) -> None:
@@ -58,3 +80,18 @@ def run(args: argparse.Namespace) -> int:
     write(located, base_map, args.output, pictures=not args.no_pictures)
     print(summary(located))
     return 0 if located.posed else 1
+
+
+def _lidar(odometry: str, gravity: list[str] | None) -> LidarOdometry | None:
+    """Return what makes odometry of the clouds, if that is asked for; it may be missing, so ask before reading."""
+    from coview_stream.clouds.runs import KISS_ICP
+    from coview_stream.errors import ConfigError
+
+    if odometry != KISS_ICP:
+        if gravity is not None:
+            raise ConfigError(f"--gravity goes with --odometry {KISS_ICP}: other odometry is gravity aligned")
+        return None
+    from coview_stream.odometry.config import LidarOdometryConfig, parse_gravity
+    from coview_stream.odometry.lidar import LidarOdometry
+
+    return LidarOdometry(LidarOdometryConfig(gravity=parse_gravity(gravity or ["ground"])))

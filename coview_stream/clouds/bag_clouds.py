@@ -35,19 +35,25 @@ class BagClouds:
 
     def read(self, index: int) -> Cloud:
         """Frame ``index`` in the body frame at its stamp; CloudError if it is damaged or holds no usable point."""
-        stamp = int(self.stamps[index])
-        name = f"{self.reader.path}: cloud of {self.topic} at {_NS * stamp:.6f}"
-        with self._lock, explained(name, CloudError):
-            payload = self._payload(index)
-        try:
-            message = ros2.decode_cloud(Sample(self.topic, payload))
-        except MessageError as error:
-            raise CloudError(f"{name}: {error}; skip it, or repair the recording") from error
+        message = self.message(index)
         # false for NaN as well
         usable: npt.NDArray[np.bool_] = np.all(np.abs(message.points) < ABSURD, axis=1)
         builder = CloudBuilder(dropped=int((~usable).sum()))
         builder.add(self._deskewed(index, message, usable))
-        return builder.finish(name)
+        return builder.finish(self._name(index))
+
+    def message(self, index: int) -> CloudMessage:
+        """Frame ``index`` as it was recorded; CloudError if it is damaged."""
+        name = self._name(index)
+        with self._lock, explained(name, CloudError):
+            payload = self._payload(index)
+        try:
+            return ros2.decode_cloud(Sample(self.topic, payload))
+        except MessageError as error:
+            raise CloudError(f"{name}: {error}; skip it, or repair the recording") from error
+
+    def _name(self, index: int) -> str:
+        return f"{self.reader.path}: cloud of {self.topic} at {_NS * int(self.stamps[index]):.6f}"
 
     def _payload(self, index: int) -> bytes:
         reads_on = index == self._next and self.arrivals[index] > self.arrivals[index - 1]

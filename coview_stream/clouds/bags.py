@@ -6,6 +6,7 @@ place where ``clouds`` builds on ``stream``, and :mod:`coview_stream.clouds.runs
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,10 @@ from coview_stream.stream.messages import Sample
 _NS = 1e-9
 _LONGEST_WAY_BACK = 5_000_000_000  # ns of stamps going back: less is messages overtaking each other
 _STRAY = 0.01  # share of stamps that may go back farther, and are left out
+
+
+FromClouds = Callable[[BagClouds], Track]
+"""Makes odometry of nothing but the clouds, which are not deskewed."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ def open_bag(
     explicit: Path | None = None,
     cloud_topic: str | None = None,
     odometry_topic: str | None = None,
+    from_clouds: FromClouds | None = None,
 ) -> Opened:
     """Read all stamps and odometry of a recording in one pass, and keep where each cloud is.
 
@@ -62,6 +68,7 @@ def open_bag(
         explicit: TUM file to be taken for the odometry, with any stamps; None takes the recording's.
         cloud_topic: needed where there is more than one topic with PointCloud2.
         odometry_topic: likewise with Odometry.
+        from_clouds: makes the odometry, whatever the recording has.
 
     Raises:
         RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
@@ -70,6 +77,9 @@ def open_bag(
     counts = reader.counts()
     clouds = _choose(path, counts, ros2.CLOUD, cloud_topic, "--cloud-topic")
     topics = {clouds: ros2.CLOUD}
+    if from_clouds is not None:
+        survey = _survey(reader, topics)
+        return _pair(reader, clouds, survey, from_clouds(_bare(reader, clouds, survey)))
     if explicit is not None and odometry_topic is not None:
         raise RunError(
             f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them"
@@ -150,19 +160,43 @@ def _steady(path: Path, stamps: StampsNs, what: str) -> npt.NDArray[np.bool_]:
     return ~strays
 
 
-def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opened:
-    """Frames in order of their stamps, those without odometry left out."""
-    path = reader.path
+@dataclass(frozen=True)
+class _Order:
+    """Clouds by stamp (K,), of those whose stamp is ``steady`` (N,); ``fresh`` (K,) if none before has the same one."""
+
+    stamps: StampsNs
+    arrivals: StampsNs
+    fresh: npt.NDArray[np.bool_]
+    steady: npt.NDArray[np.bool_]
+
+
+def _in_order(path: Path, survey: _Survey) -> _Order:
     stamps, arrivals = np.array(survey.stamps, np.int64), np.array(survey.arrivals, np.int64)
     steady = _steady(path, stamps, "clouds")
     order = np.argsort(stamps[steady], kind="stable")
-    sorted_stamps, sorted_arrivals = stamps[steady][order], arrivals[steady][order]
-    fresh = np.diff(sorted_stamps, prepend=sorted_stamps[0] - SAME_NS - 1) > SAME_NS
-    poses, known = track.at(sorted_stamps)
+    in_order = stamps[steady][order]
+    fresh = np.diff(in_order, prepend=in_order[0] - SAME_NS - 1) > SAME_NS
+    return _Order(in_order, arrivals[steady][order], fresh, steady)
+
+
+def _bare(reader: BagReader, topic: str, survey: _Survey) -> BagClouds:
+    """All clouds that have a stamp of their own, without odometry."""
+    order = _in_order(reader.path, survey)
+    stamps, arrivals = order.stamps[order.fresh], order.arrivals[order.fresh]
+    nowhere = np.tile(np.eye(4), (len(stamps), 1, 1))
+    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, nowhere), nowhere)
+
+
+def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opened:
+    """Frames in order of their stamps, those without odometry left out."""
+    path = reader.path
+    order = _in_order(path, survey)
+    fresh, steady, stamps = order.fresh, order.steady, order.stamps
+    poses, known = track.at(stamps)
     kept = fresh & known
     if not kept.any():
         raise RunError(
-            f"{path}: not one of {len(stamps)} clouds has odometry at its stamp: clouds are stamped "
+            f"{path}: not one of {len(steady)} clouds has odometry at its stamp: clouds are stamped "
             f"{_span(stamps)}, odometry {_span(track.stamps)}; are their clocks the same, and their headers stamped?"
         )
     reasons = (
@@ -173,7 +207,7 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opene
     notes = []
     if not kept.all() or not steady.all():
         text = ", ".join(f"{count} {reason}" for count, reason in reasons if count)
-        notes.append(f"{path}: {len(stamps) - int(kept.sum())} of {len(stamps)} clouds left out: {text}")
+        notes.append(f"{path}: {len(steady) - int(kept.sum())} of {len(steady)} clouds left out: {text}")
     if survey.damaged:
         notes.append(f"{path}: {survey.damaged} damaged messages left out")
     if survey.lidar and survey.body and survey.lidar != survey.body:
@@ -181,7 +215,7 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opene
             f"{path}: clouds are in frame {survey.lidar!r}, odometry moves {survey.body!r}: taken for one; "
             "if the lidar is mounted away from it, write the odometry of the lidar (--odometry FILE)"
         )
-    source = BagClouds(reader, topic, sorted_stamps[kept], sorted_arrivals[kept], track, poses[kept])
+    source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept])
     return Opened(source.stamps, source.poses, source, tuple(notes))
 
 

@@ -124,6 +124,22 @@ def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Stamps,
     return stamps, poses
 
 
+def read_stamps(layout: Layout) -> Stamps | None:
+    """Stamps (N,) in seconds, one per frame, of a run whose odometry is not asked for; None if it has none.
+
+    Raises:
+        RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
+    """
+    file, stamps = layout.times, None
+    if file is not None:
+        stamps = read_times(file)
+    elif layout.odometry is not None and columns_of(layout.odometry) != _KITTI_COLUMNS:
+        file, stamps = layout.odometry, read_tum(layout.odometry)[0]
+    if file is not None and stamps is not None:
+        _check_count(file, len(stamps), "stamps", layout)
+    return stamps
+
+
 def _check_count(file: Path, count: int, what: str, layout: Layout) -> None:
     if count != len(layout.frames):
         relation = "too short" if count < len(layout.frames) else "too long"

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,14 @@ from coview_stream.clouds.readers import read_cloud
 from coview_stream.clouds.trajectory import Poses, Stamps
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry import Points, Pose
+
+if TYPE_CHECKING:  # they build on this
+    from coview_stream.clouds.bags import Opened
+    from coview_stream.odometry.lidar import LidarOdometry
+    from coview_stream.odometry.runs import Progress
+
+KISS_ICP = "kiss-icp"
+"""In place of an odometry file: make the odometry out of the clouds."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +127,8 @@ def open_run(
     odometry: str | os.PathLike[str] = "auto",
     cloud_topic: str | None = None,
     odometry_topic: str | None = None,
+    lidar: LidarOdometry | None = None,
+    progress: Progress | None = None,
 ) -> Run:
     """Open a run and validate all but the clouds themselves.
 
@@ -131,14 +141,22 @@ def open_run(
     Args:
         path: directory, cloud file or recording.
         odometry: ``"auto"`` takes what the layout brings; otherwise a TUM file, or KITTI poses (12 columns)
-            where the run has a ``times.txt``. For a recording a TUM file with poses at any stamps.
+            where the run has a ``times.txt``. For a recording a TUM file with poses at any stamps. ``"kiss-icp"``
+            makes odometry out of the clouds, each of which is read for that: :mod:`coview_stream.odometry`.
         cloud_topic: which clouds of a recording, if it has several topics with PointCloud2.
         odometry_topic: which odometry of a recording, if it has several topics with Odometry.
+        lidar: makes the odometry that ``"kiss-icp"`` asks for, instead of a ``LidarOdometry()``.
+        progress: called with (frames done, frames) while it does.
 
     Raises:
         RunError: no frames, no odometry or odometry that does not fit; the message names file and line.
+        DependencyError: kiss-icp is missing.
     """
     path = Path(path)
+    if odometry == KISS_ICP:
+        from coview_stream.odometry.runs import open_lidar_run
+
+        return open_lidar_run(path, lidar, cloud_topic, odometry_topic, progress)
     if (bag := find_bag(path)) is not None:
         return _recorded(bag, None if odometry == "auto" else Path(odometry), cloud_topic, odometry_topic)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):
@@ -150,16 +168,17 @@ def open_run(
     explicit = None if odometry == "auto" else Path(odometry)
     if explicit is None and layout.odometry is None:
         if count == 1:
-            return _single(layout)
+            return single(layout)
         raise RunError(
             f"{path}: {count} frames but no odometry; add {path / 'odometry.tum'} "
-            "(t x y z qx qy qz qw per frame) or name a file"
+            "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
         )
     stamps, poses = read_odometry(layout, explicit)
     return Run(path, layout.frames, stamps, poses)
 
 
-def _single(layout: Layout) -> Run:
+def single(layout: Layout) -> Run:
+    """Run of one frame, which needs no odometry."""
     return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None])
 
 
@@ -167,6 +186,10 @@ def _recorded(bag: Path, explicit: Path | None, cloud_topic: str | None, odometr
     # imported here, for bags are read by the decoders of live messages, and those read no runs
     from coview_stream.clouds.bags import open_bag
 
-    opened = open_bag(bag, explicit, cloud_topic, odometry_topic)
+    return of_bag(bag, open_bag(bag, explicit, cloud_topic, odometry_topic))
+
+
+def of_bag(bag: Path, opened: Opened) -> Run:
+    """Run of a recording that has been opened."""
     paths = (bag,) * len(opened.stamps)
     return Run(bag, paths, opened.stamps / 1e9, opened.poses, opened.source, opened.notes)

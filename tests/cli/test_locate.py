@@ -104,7 +104,6 @@ def test_bad_paths_and_options(world_file, world_run, tmp_path, capsys):
         ([str(world_file), str(tmp_path / "none"), *out], "none"),
         ([str(world_file), str(tmp_path), *out], tmp_path.name),
         ([str(world_file), str(world_run), "-o", str(tmp_path / "file")], "is a file"),
-        ([str(world_file), str(world_run), *out, "--odometry", "kiss-icp"], "not supported yet"),
         ([str(world_file), str(world_run), *out, "--odometry", str(tmp_path / "no.tum")], "no.tum"),
         ([str(world_file), str(world_run), *out, "--odometry", str(wheel)], "wheel.tum"),
         ([str(world_file), str(world_run), *out, "--retrieval", "magic"], "--retrieval"),

@@ -1,0 +1,1 @@
+"""Odometry from lidar frames alone, for robots that have no other."""

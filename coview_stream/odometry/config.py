@@ -1,0 +1,99 @@
+"""How odometry is made of lidar frames, and where down is said to be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import ConfigError
+
+Gravity = Literal["ground", "level"] | tuple[float, float, float]
+"""Where down is: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
+
+MOST_TILT = math.radians(60.0)
+"""A body frame has z up (x forward): one that leans more was not meant."""
+
+
+@dataclass(frozen=True)
+class LidarOdometryConfig:
+    """Lidar odometry.
+
+    Attributes:
+        gravity: see :data:`Gravity`. An accelerometer at rest points up, a gravity vector points down.
+        min_range: metres; nearer points are the robot itself, or what covers the sensor.
+        max_range: metres; farther points are left out.
+        voxel: of the local map, metres.
+        least_points: between the two ranges; a frame with fewer cannot be placed.
+        max_gap: seconds without a usable frame after which the local map is begun anew, where the last frame was:
+            how far the robot went meanwhile is not known.
+        max_speed: metres per second; what says more is refused, and the local map begun anew.
+        max_turn_rate: radians per second, likewise.
+        threads: of kiss-icp.
+        convergence: its registration ends at a smaller step than this, metres and radians.
+        iterations: or after so many.
+    """
+
+    gravity: Gravity = "ground"
+    min_range: float = 1.0
+    max_range: float = 100.0
+    voxel: float = 1.0
+    least_points: int = 100
+    max_gap: float = 1.5
+    max_speed: float = 50.0
+    max_turn_rate: float = 10.0
+    threads: int = 1
+    convergence: float = 1e-3
+    iterations: int = 60
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self) if f.name != "gravity"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"LidarOdometryConfig.{name} is {value}; it must be positive and finite")
+        if self.max_range <= self.min_range:
+            raise ConfigError(
+                f"LidarOdometryConfig.max_range is {self.max_range}, not beyond min_range {self.min_range}"
+            )
+        if self.gravity not in ("ground", "level"):
+            down(self.gravity)
+
+
+def down(gravity: Gravity) -> npt.NDArray[np.float64]:
+    """(3,) unit vector in the body frame that points down; not for ``"ground"``.
+
+    Raises:
+        ConfigError: no vector, or one that leaves the body lying or upside down.
+    """
+    vector = np.array((0.0, 0.0, -1.0) if gravity == "level" else gravity, dtype=object)
+    try:
+        g = vector.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"gravity is {gravity!r}; give ground, level, or three numbers X Y Z") from error
+    length = float(np.linalg.norm(g))
+    if g.shape != (3,) or not (math.isfinite(length) and length > 0):
+        raise ConfigError(f"gravity is {gravity!r}; give ground, level, or three numbers X Y Z, not all zero")
+    g /= length
+    if -g[2] < math.cos(MOST_TILT):
+        raise ConfigError(
+            f"gravity {gravity!r} does not point down in the body frame (x forward, z up), where a level sensor has "
+            "0 0 -1; an accelerometer at rest shows the opposite: turn the signs"
+        )
+    return g
+
+
+def parse_gravity(words: Sequence[str]) -> Gravity:
+    """Read the words of an option: ``ground``, ``level`` or three numbers; ConfigError for others."""
+    if len(words) == 1 and words[0] in ("ground", "level"):
+        return "ground" if words[0] == "ground" else "level"
+    try:
+        x, y, z = (float(word) for word in words)
+    except ValueError as error:
+        said = " ".join(words)
+        raise ConfigError(f"--gravity {said}: give ground, level, or three numbers X Y Z") from error
+    down((x, y, z))
+    return x, y, z

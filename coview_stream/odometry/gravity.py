@@ -1,0 +1,121 @@
+"""Where down is, from the ground around a lidar: a plane through the lowest points, if there is one.
+
+The ground's normal is gravity's direction only where the ground is level; walls correct it where there are some
+(:mod:`coview_stream.odometry.walls`). On a slope without walls the odometry frame leans with the slope.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.odometry.config import MOST_TILT
+from coview_stream.odometry.walls import upright
+
+Array = npt.NDArray[np.float64]
+
+_REACH = 25.0  # metres around the sensor
+_CELL = 1.0  # metres: of each such cell the lowest point
+_BAND = 0.15  # metres to both sides of the plane
+_LEAST_HEIGHT = 0.1  # metres of the sensor above the ground
+_TRIES = 400
+_ROUNDS = 5  # of refinement
+_LEAST_CELLS = 40
+_LEAST_SHARE = 0.4  # of the cells whose lowest point could be ground
+_MOST_BELOW = 0.25  # of all cells may lie below the plane: a table top is not the ground
+_LEAST_SPREAD = 2.0  # metres, one sigma, of the ground's cells along the shorter axis
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A plane below the sensor.
+
+    Attributes:
+        up: (3,) unit vector in the body frame: the plane's normal, corrected by walls.
+        height: of the sensor above it, metres.
+        share: of the cells around whose lowest point lies in it.
+        cells: how many those are.
+        walls: patches of wall that agreed on ``up``, or corrected it.
+    """
+
+    up: Array
+    height: float
+    share: float
+    cells: int
+    walls: int = 0
+
+
+def find_ground(points: npt.NDArray[np.floating]) -> Ground | str:
+    """Find the ground in a cloud (N, 3), body frame with z about up, metres; or say in a clause why there is none."""
+    lowest = _lowest(np.asarray(points, dtype=np.float64))
+    if len(lowest) < _LEAST_CELLS:
+        return f"only {len(lowest)} cells of {_CELL:g} m within {_REACH:g} m hold points"
+    plane = _refined(lowest, _best_of_many(lowest))
+    if plane is None:
+        return "no plane below the sensor fits three of the lowest points"
+    up, height = plane
+    if up[2] < np.cos(MOST_TILT) or height < _LEAST_HEIGHT:  # it wandered there while it was refined
+        return "the best plane does not lie below the sensor"
+    above = lowest @ up + height
+    inside = np.abs(above) < _BAND
+    share, below = float(inside.mean()), float((above < -2 * _BAND).mean())
+    if inside.sum() < _LEAST_CELLS or share < _LEAST_SHARE:
+        return (
+            f"the best plane holds {share:.0%} of the lowest points around; {_LEAST_SHARE:.0%} are asked for"
+        )
+    if below > _MOST_BELOW:
+        return f"{below:.0%} of the lowest points around lie below the best plane"
+    spread = np.sqrt(np.linalg.eigvalsh(np.cov(lowest[inside].T))[1])
+    if spread < _LEAST_SPREAD:
+        return f"the best plane is a strip, {spread:.1f} m wide (one sigma)"
+    corrected, walls = upright(points, up)
+    return Ground(corrected, float(height), share, int(inside.sum()), walls)
+
+
+def aligned(up: Array) -> Array:
+    """Rotation (3, 3) that turns ``up`` (3,) to z and keeps x pointing forward: odometry <- body at the start."""
+    x = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    x /= np.linalg.norm(x)  # up leans by 60 degrees at most, so x is never along it
+    return np.stack([x, np.cross(up, x), up])
+
+
+def _lowest(points: Array) -> Array:
+    """Return the lowest point of every cell around, (K, 3)."""
+    near = points[(points[:, :2] ** 2).sum(axis=1) < _REACH**2]
+    cell = np.floor(near[:, :2] / _CELL).astype(np.int64) @ np.array([1 << 20, 1])
+    order = np.lexsort((near[:, 2], cell))
+    first = np.r_[True, np.diff(cell[order]) != 0] if len(order) else np.empty(0, dtype=bool)
+    return np.asarray(near[order][first])
+
+
+def _best_of_many(lowest: Array) -> tuple[Array, float] | None:
+    """Of planes through three points each, the one that most points lie in."""
+    rng = np.random.default_rng(0)  # equal clouds have equal grounds
+    a, b, c = np.moveaxis(lowest[rng.integers(len(lowest), size=(_TRIES, 3))], 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    usable = lengths > 1.0  # square metres, twice the triangle's: slivers say nothing
+    normals = normals[usable] / lengths[usable, None] * np.sign(normals[usable, 2:])
+    heights = -(normals * a[usable]).sum(axis=1)
+    ground = (normals[:, 2] > np.cos(MOST_TILT)) & (heights > _LEAST_HEIGHT)
+    if not ground.any():
+        return None
+    normals, heights = normals[ground], heights[ground]
+    inside = np.abs(lowest @ normals.T + heights) < _BAND
+    best = int(inside.sum(axis=0).argmax())
+    return normals[best], float(heights[best])
+
+
+def _refined(lowest: Array, plane: tuple[Array, float] | None) -> tuple[Array, float] | None:
+    """Least squares over what lies in the plane, a few times over."""
+    for _ in range(_ROUNDS if plane else 0):
+        assert plane is not None
+        up, height = plane
+        inside = lowest[np.abs(lowest @ up + height) < _BAND]
+        centre = inside.mean(axis=0)
+        normal = np.linalg.svd(inside - centre, full_matrices=False)[2][2]
+        normal *= np.sign(normal[2]) or 1.0
+        plane = normal, float(-normal @ centre)
+    return plane

@@ -1,0 +1,103 @@
+"""Where down is: from the ground, from a vector, and when it is not said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lidar_fakes import frame
+
+from coview_stream.errors import ConfigError
+from coview_stream.odometry.config import LidarOdometryConfig, down, parse_gravity
+from coview_stream.odometry.gravity import aligned, find_ground
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.2), (-0.3, 0.15)])
+def test_the_ground_tells_up_and_the_sensors_height(scene, tilt):
+    cloud, up = frame(scene, tilt)
+    found = find_ground(cloud)
+    assert not isinstance(found, str)
+    assert np.degrees(np.arccos(found.up @ up)) < 0.2
+    assert found.height == pytest.approx(1.7, abs=0.03)
+    assert found.share > 0.5
+
+
+def wall():
+    rng = np.random.default_rng(1)
+    return np.column_stack([np.full(5000, 8.0), rng.uniform(-15, 15, 5000), rng.uniform(-1, 9, 5000)])
+
+
+def noise():
+    return np.random.default_rng(2).uniform([-20, -20, -9], [20, 20, 9], (4000, 3))
+
+
+def table_top():
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(-20, 20, (20000, 2))
+    near = np.abs(xy).max(axis=1) < 14
+    return np.column_stack([xy, np.where(near, -1.0, -6.0 - 0.4 * np.abs(xy[:, 0]))])
+
+
+def few():
+    return np.array([[1.0, 2.0, -1.0], [3.0, 4.0, -1.0]])
+
+
+@pytest.mark.parametrize("cloud", [wall, noise, table_top, few, lambda: np.empty((0, 3))])
+def test_no_ground_is_said_in_words(cloud):
+    assert isinstance(find_ground(cloud()), str)
+
+
+def test_a_ceiling_is_no_ground(scene):
+    cloud, _ = frame(scene)
+    assert isinstance(find_ground(cloud * [1, 1, -1]), str)
+
+
+def test_a_plane_at_the_sensors_own_height_is_no_ground(scene):
+    cloud, _ = frame(scene)
+    assert isinstance(find_ground(np.abs(cloud)), str)  # walls end there
+
+
+def test_equal_clouds_have_equal_grounds(scene):
+    cloud, _ = frame(scene, (0.1, 0.1))
+    assert (find_ground(cloud).up == find_ground(cloud).up).all()
+
+
+def test_alignment_turns_up_to_z_and_keeps_the_heading():
+    up = np.array([0.2, -0.1, 0.9]) / np.linalg.norm([0.2, -0.1, 0.9])
+    R = aligned(up)
+    assert np.allclose(R @ up, [0, 0, 1])
+    assert np.allclose(R @ R.T, np.eye(3))
+    assert np.linalg.det(R) > 0
+    forward = R @ [1, 0, 0]
+    assert forward[1] == pytest.approx(0.0, abs=1e-12)
+    assert forward[0] > 0
+
+
+def test_words_for_gravity():
+    assert parse_gravity(["ground"]) == "ground"
+    assert parse_gravity(["level"]) == "level"
+    assert parse_gravity(["0.5", "0", "-9.8"]) == (0.5, 0.0, -9.8)
+    assert np.allclose(down((0.0, 0.0, -9.81)), [0, 0, -1])
+    assert np.allclose(down("level"), [0, 0, -1])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["up"], ["1", "2"], ["0", "0", "0"], ["0", "0", "nan"], ["1", "0", "0"], ["0", "0", "x"], ["0"] * 4],
+)
+def test_what_is_no_gravity(words):
+    with pytest.raises(ConfigError, match="gravity"):
+        parse_gravity(words)
+
+
+def test_an_accelerometers_sign_is_explained():
+    with pytest.raises(ConfigError, match="accelerometer"):
+        LidarOdometryConfig(gravity=(0.0, 0.0, 9.81))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"voxel": 0.0}, {"max_gap": np.nan}, {"max_range": 0.5}, {"gravity": "moon"}, {"gravity": (1.0, 2.0)}],
+)
+def test_configurations_out_of_range(wrong):
+    with pytest.raises(ConfigError):
+        LidarOdometryConfig(**wrong)
