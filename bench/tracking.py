@@ -52,7 +52,7 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Row, Any]:
     told, drive = told_of(folder, scenario)
     row = score(told, drive.truth, drive.driven, [(e.what, e.begin, e.end) for e in drive.events])
     parts = spread(told, errors(told, drive.truth))
-    drift = drift_share(drive.truth, drive.odometry) if scenario.plain else scenario.drift
+    drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
     row |= {
         "name": scenario.name,
         "plain": scenario.plain,

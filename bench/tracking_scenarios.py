@@ -127,8 +127,8 @@ SCENARIOS = (
     Scenario("jump/town", _TOWN, _jump),
     Scenario("jump/forest", _FOREST, _jump),
     Scenario("reset/campus", _CAMPUS, _restart),
-    Scenario("scale/town", _TOWN, _scale),
-    Scenario("scale/forest", _FOREST, _scale),
+    Scenario("scale/town", _TOWN, _scale, drift=0.005),
+    Scenario("scale/forest", _FOREST, _scale, drift=0.005),
 )
 """All that ``python -m bench.tracking`` measures."""
 

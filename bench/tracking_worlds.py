@@ -50,7 +50,7 @@ class World:
 
     Attributes:
         kind: town, campus or sparse-forest (120 stems per hectare, a third of the simulator's forest).
-        drift: share of the distance, over 100 m (see :func:`bench.tracking_scenarios.drift_share`).
+        drift: share of the distance, over 100 m (see :func:`bench.tracking_drives.drift_share`).
     """
 
     kind: str

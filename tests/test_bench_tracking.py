@@ -192,7 +192,11 @@ def drive():
 @pytest.mark.parametrize("share", [0.005, 0.05])
 def test_odometry_drifts_as_asked(share):
     truth = way()
-    assert drift_share(truth, start(truth, share, 9).odometry) == pytest.approx(share, rel=0.02)
+    for seed, longer in ((8, 1), (9, -1)):
+        odometry = start(truth, share, seed).odometry
+        assert drift_share(truth, odometry) == pytest.approx(share, rel=0.02)
+        lengths = [np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum() for T in (odometry, truth)]
+        assert 0.2 * share < longer * (lengths[0] / lengths[1] - 1.0) < share
     assert drift_share(truth, truth) == pytest.approx(0.0, abs=1e-9)
 
 
