@@ -40,7 +40,7 @@ def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> 
                     _curve(axes, spread[part][name], name, colour, nominal)
             if count < _LEAST:
                 say(axes, "too few poses")
-            axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="promised share", aspect="equal")
+            axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="promised share", aspect="equal")
             axes.set_title(
                 f"{part} after a fix, {count} poses" if part != "later" else f"{part}, {count} poses"
             )
