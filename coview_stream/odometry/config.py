@@ -33,6 +33,7 @@ class LidarOdometryConfig:
             how far the robot went meanwhile is not known.
         max_speed: metres per second; what says more is refused, and the local map begun anew.
         max_turn_rate: radians per second, likewise.
+        plumb: keep roll and pitch from drifting by the walls in each frame.
         threads: of kiss-icp.
         convergence: its registration ends at a smaller step than this, metres and radians.
         iterations: or after so many.
@@ -46,12 +47,13 @@ class LidarOdometryConfig:
     max_gap: float = 1.5
     max_speed: float = 50.0
     max_turn_rate: float = 10.0
+    plumb: bool = True
     threads: int = 1
     convergence: float = 1e-3
     iterations: int = 60
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self) if f.name != "gravity"):
+        for name in (f.name for f in fields(self) if f.name not in ("gravity", "plumb")):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ConfigError(f"LidarOdometryConfig.{name} is {value}; it must be positive and finite")

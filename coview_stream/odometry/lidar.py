@@ -11,7 +11,8 @@ from coview_stream.odometry.config import LidarOdometryConfig, down
 from coview_stream.odometry.frames import checked, dated
 from coview_stream.odometry.gravity import Ground, aligned, find_ground
 from coview_stream.odometry.kiss import KissRegistration, Registration
-from coview_stream.rotation import between
+from coview_stream.odometry.walls import upright
+from coview_stream.rotation import between, exp_so3
 from coview_stream.stream.deskew import deskew
 from coview_stream.stream.odometry import Segment
 
@@ -19,14 +20,15 @@ _NS = 1e9
 _BRIEF = 0.02  # seconds: a motion over less is mostly noise and predicts nothing
 _SLACK = 0.5  # metres that a registration may always move: the first motion cannot be predicted
 _SLACK_ANGLE = np.radians(20.0)
+_DRIFT = float(np.radians(1.5))  # one sigma by which registration tilts a frame against the one before
 
 
 class LidarOdometry:
     """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
 
     The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
-    then, level. It drifts. The motion between two frames is predicted from that before, over the time between their
-    stamps; it deskews the frame, too. 64k points take 30 to 60 ms, see ``docs/odometry.md``.
+    then, level. It drifts, but not in tilt where there are walls. The motion between two frames is predicted from that
+    before, over the time between their stamps; it deskews the frame, too.
 
     Attributes:
         config: see there.
@@ -54,6 +56,7 @@ class LidarOdometry:
         self.points: Points = np.empty((0, 3), dtype=np.float32)
         self.restarts = 0
         self._pose: Pose | None = None
+        self._local = np.eye(4)  # the same in the local map, whose tilt drifts
         self._stamp = 0.0
         self._rest()
         self._registration.clear()
@@ -89,14 +92,18 @@ class LidarOdometry:
             )
         if seconds > self.config.max_gap:
             self._restart()
-        guess = self._pose @ self._motion(seconds)
+        guess = self._local @ self._motion(seconds)
         if times is not None:
             finite = self._deskewed(finite, times)
-        pose = self._registration.register(finite.astype(np.float64), guess)
-        self._check(pose, seconds)
+        local = self._registration.register(finite.astype(np.float64), guess)
+        step = inverse(self._local) @ local
+        self._check(step, seconds)
         if seconds >= _BRIEF:
-            self._step, self._step_seconds = inverse(self._pose) @ pose, seconds
-        self._pose, self._stamp, self.points = orthonormal(pose), stamp, finite
+            self._step, self._step_seconds = step, seconds
+        self._pose = orthonormal(self._pose @ step)
+        if self.config.plumb:
+            self._plumb(finite)
+        self._local, self._stamp, self.points = orthonormal(local), stamp, finite
         return np.array(self._pose)
 
     def _begin(self, points: Points, stamp: float) -> Pose:
@@ -111,11 +118,21 @@ class LidarOdometry:
             self.ground, up = found, found.up
         else:
             up = -down(self.config.gravity)
-        self._pose = self._registration.register(
-            points.astype(np.float64), pose_from(aligned(up), np.zeros(3))
-        )
-        self._stamp, self.points = stamp, points
-        return np.array(self._pose)
+        start = pose_from(aligned(up), np.zeros(3))
+        self._local = self._registration.register(points.astype(np.float64), start)
+        self._pose, self._stamp, self.points = start, stamp, points
+        return np.array(start)
+
+    def _plumb(self, points: Points) -> None:
+        """Turn the pose about where it is until walls stand upright again, as far as they are believed."""
+        assert self._pose is not None
+        up = self._pose[2, :3]
+        better, _ = upright(points, up, _DRIFT)
+        axis = np.cross(better, up)
+        sine = float(np.linalg.norm(axis))
+        if sine > 0.0:
+            turn = exp_so3(axis * (np.arcsin(min(1.0, sine)) / sine))
+            self._pose[:3, :3] = self._pose[:3, :3] @ turn
 
     def _motion(self, seconds: float) -> Pose:
         """Motion over ``seconds``, which may be negative, if it goes on like the last one."""
@@ -131,13 +148,11 @@ class LidarOdometry:
         sweep = Segment(stamps, np.array([self._motion(t) for t in ends]))
         return deskew(points, times, sweep, 0, np.eye(4))
 
-    def _check(self, pose: Pose, seconds: float) -> None:
+    def _check(self, step: Pose, seconds: float) -> None:
         """Refuse what no robot drives. The local map holds the frame already, at the wrong place: begin it anew."""
-        assert self._pose is not None
-        step = inverse(self._pose) @ pose
         far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
         most = _SLACK + self.config.max_speed * seconds
-        if is_pose(pose) and far <= most and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
+        if is_pose(step) and far <= most and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
             return
         self._restart()
         raise CloudError(
@@ -146,7 +161,9 @@ class LidarOdometry:
         )
 
     def _restart(self) -> None:
+        assert self._pose is not None
         self.restarts += 1
+        self._local = self._pose
         self._registration.clear()
         self._rest()
 

@@ -12,31 +12,34 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+SLOPE = float(np.radians(4.0))
+"""One sigma of how far the ground's normal leans, radians."""
+
+_MOST_POINTS = 20_000
 _REACH = 40.0  # metres around the sensor
 _CELL = 2.0  # metres: points of one such cube are fitted by a plane
 _LEAST_POINTS = 8
 _THICKEST = 0.04  # metres, one sigma, off the plane
 _LEAST_WIDTH = 0.2  # metres, one sigma, along the shorter axis in the plane
 _UPRIGHT = np.sin(np.radians(15.0))
-_GROUND_SIGMA = np.radians(4.0)  # of the ground's slope
 _WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
 _ROUNDS = 10
 
 
-def upright(points: npt.NDArray[np.floating], up: Array) -> tuple[Array, int]:
-    """Return ``up`` (3,), turned so that it agrees with the walls in a cloud (N, 3) about as well as with itself.
+def upright(points: npt.NDArray[np.floating], up: Array, sigma: float = SLOPE) -> tuple[Array, int]:
+    """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
 
     Where there are none, or all face one way, it stays as it is in the directions that they say nothing of.
 
     Returns:
         The unit vector, and how many patches of wall it was taken from.
     """
-    normals = _patches(np.asarray(points, dtype=np.float64), up)
+    normals = _patches(points[:: 1 + len(points) // _MOST_POINTS].astype(np.float64), up)
     better = up
     for _ in range(_ROUNDS):
         weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's: a car's door is no wall
-        information = (normals.T * weights) @ normals + np.eye(3) / _GROUND_SIGMA**2
-        better = np.linalg.solve(information, up / _GROUND_SIGMA**2)
+        information = (normals.T * weights) @ normals + np.eye(3) / sigma**2
+        better = np.linalg.solve(information, up / sigma**2)
         better /= np.linalg.norm(better)
     return better, len(normals)
 

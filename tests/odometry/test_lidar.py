@@ -14,7 +14,7 @@ from coview_stream.geometry import inverse, is_pose, pose_from, rot_z, tilt_of
 from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.odometry.lidar import LidarOdometry
 
-LEVEL = LidarOdometryConfig(gravity="level")
+LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +187,21 @@ def test_reset_begins_another_odometry_frame(cloud):
     odometry.step(cloud, None, 10.1)
     odometry.reset()
     assert np.allclose(odometry.step(cloud, None, 3.0), np.eye(4))
+
+
+def test_walls_undo_a_tilt_that_drifts(cloud):
+    tilt = np.eye(4)
+    tilt[:3, :3] = [[np.cos(0.002), 0, np.sin(0.002)], [0, 1, 0], [-np.sin(0.002), 0, np.cos(0.002)]]
+    lean = [np.linalg.matrix_power(tilt, k) for k in range(25)]  # the robot stands, and registration tilts it
+    ends = {}
+    for plumb in (True, False):
+        odometry = LidarOdometry(LidarOdometryConfig(gravity="level", plumb=plumb), Told(*lean))
+        for k in range(25):
+            T = odometry.step(cloud, None, 0.1 * k)
+        ends[plumb] = np.degrees(tilt_of(T))
+        assert is_pose(T)
+    assert ends[False] > 2.5
+    assert ends[True] < 0.3
 
 
 def test_a_localizer_goes_by_it(world_map, world_drive):

