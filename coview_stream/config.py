@@ -15,6 +15,7 @@ from coview_stream.errors import ConfigError
 Channel = Literal["scan_context", "coview", "coview_strict", "density"]
 Visibility = Literal["paper", "eye", "off"]
 Preset = Literal["slam", "tls"]
+GraphBackend = Literal["auto", "gtsam", "numpy"]
 
 
 def _require(ok: bool, config: object, name: str, allowed: str) -> None:
@@ -165,7 +166,9 @@ class RegistrationConfig:
     list the largest correspondence distances of the successive scales. Points above the ground and points on it are
     trimmed apart, else the ground, which fits anywhere, pushes out the facades that fix the position (KITTI 04: 0.25 m
     median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not
-    independent).
+    independent). A direction in which that leaves more than ``weak_floors`` times ``sigma_floor`` (an angle counts as
+    what it moves at ``weak_lever`` metres) is one that the map hardly shows: its sigma is widened further, up to
+    ``weak_sigma`` metres (see :func:`coview_stream.pose.covariance.registration_covariance`).
     """
 
     keep: float = 0.7
@@ -180,10 +183,14 @@ class RegistrationConfig:
     sigma_floor: float = 0.02
     sigma_floor_angle: float = math.radians(0.05)
     gravity_sigma: float = math.radians(1.0)
+    weak_lever: float = 10.0
+    weak_floors: float = 5.0
+    weak_sigma: float = 10.0
 
     def __post_init__(self) -> None:
         _fraction(self, "keep")
         _counts(self, "iterations", "source_points")
+        _positive(self, "weak_lever", "weak_floors", "weak_sigma")
         _positive(self, "source_voxel", "source_range", "residual_scale", "inflation", "gravity_sigma")
         _positive(self, "sigma_floor", "sigma_floor_angle")
         for name in ("search", "track"):
@@ -283,6 +290,32 @@ class TrackingConfig:
             "position_drift",
         )
         _counts(self, "min_points", "max_points")
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """How poses are smoothed (see :mod:`coview_stream.pose.graph`).
+
+    ``backend`` is ``gtsam``, ``numpy``, or ``auto``: gtsam where it can be imported, else NumPy. Both answer alike for
+    the newest pose. The gtsam graph grows to ``restart`` keyframes and begins anew with the newest ``window`` of them;
+    the NumPy one does so when it has a quarter more. What they drop lives on in the belief that it left behind, so
+    a longer window only lets old registrations be weighed again, and linearised again, in the light of later ones.
+    ``huber`` is where, in standard deviations of the whitened residual's norm, a registration's pull stops growing;
+    1.345 is the usual choice. It must not be a kernel that lets go altogether: with an optimistic covariance that locks
+    the map out for good.
+    """
+
+    backend: GraphBackend = "auto"
+    window: int = 120
+    restart: int = 360
+    huber: float = 1.345
+
+    def __post_init__(self) -> None:
+        allowed = get_args(GraphBackend)
+        _require(self.backend in allowed, self, "backend", f"one of {', '.join(allowed)}")
+        _counts(self, "window", "restart", least=2)
+        _require(self.restart > self.window, self, "restart", f"greater than window ({self.window})")
+        _positive(self, "huber")
 
 
 @dataclass(frozen=True)

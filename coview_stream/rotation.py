@@ -34,6 +34,17 @@ def exp_so3(rotvec: npt.ArrayLike) -> Array:
     return np.asarray(np.eye(3) + sine * K + cosine * (K @ K))
 
 
+def log_so3(R: npt.NDArray[np.floating]) -> Array:
+    """Rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    turn = quaternions(R)
+    turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, turn[..., 3:])
+    return np.asarray(
+        turn[..., :3] * np.where(sine < _SMALL, 2.0, angle / np.where(sine < _SMALL, 1.0, sine))
+    )
+
+
 def matrices(quaternions: npt.ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
     q = np.asarray(quaternions, dtype=np.float64)
@@ -73,9 +84,5 @@ def quaternions(R: npt.NDArray[np.floating]) -> Array:
 
 def between(start: npt.NDArray[np.floating], end: npt.NDArray[np.floating], share: npt.ArrayLike) -> Array:
     """Rotations (..., 3, 3) a ``share`` (...) of the way from ``start`` to ``end`` (..., 3, 3), the short way round."""
-    turn = quaternions(np.swapaxes(start, -1, -2) @ end)
-    turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
-    sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, turn[..., 3:])
-    rotvec = turn[..., :3] * np.where(sine < _SMALL, 2.0, angle / np.where(sine < _SMALL, 1.0, sine))
+    rotvec = log_so3(np.swapaxes(start, -1, -2) @ end)
     return np.asarray(start @ exp_so3(np.asarray(share, dtype=np.float64)[..., None] * rotvec))

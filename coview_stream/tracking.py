@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
+from coview_stream.config import AcceptanceConfig, LocalizerConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
 from coview_stream.place.keyframes import thinned
+from coview_stream.pose.covariance import angles_first, drift_covariance
 from coview_stream.pose.rays import RangeImage
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
 
 _MOST_FRAMES = 40
-_ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
 _START_COVARIANCE = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 
@@ -111,7 +111,7 @@ class Tracker:
         target = self.local_maps.around(transform(self.T_map_odom, position[None])[0])
         covariance = self.predicted_covariance()
         if idle:
-            covariance = covariance + _angles_first(drift_covariance(self.config.tracking, _IDLE_DRIVE, 0.0))
+            covariance = covariance + angles_first(drift_covariance(self.config.tracking, _IDLE_DRIVE, 0.0))
         self._registered_at, self._turned, self.covariance = self.travelled, 0.0, covariance
         if target is None:
             return None
@@ -139,13 +139,13 @@ class Tracker:
     def predicted_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the last registration."""
         grown = drift_covariance(self.config.tracking, self.travelled - self._registered_at, self._turned)
-        return self.covariance + _angles_first(grown)
+        return self.covariance + angles_first(grown)
 
     def reported_covariance(self) -> npt.NDArray[np.float64]:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), floors included, map axes."""
         settings = self.config.registration
         floor = np.array([settings.sigma_floor] * 3 + [settings.sigma_floor_angle] * 3) ** 2
-        return np.asarray(self.predicted_covariance()[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)] + np.diag(floor))
+        return np.asarray(angles_first(self.predicted_covariance()) + np.diag(floor))
 
     def _posterior(self, registration: Registration) -> npt.NDArray[np.float64]:
         information = registration.information + 1e-6 * np.eye(6)
@@ -163,22 +163,6 @@ class Tracker:
             parts.append(frame.points)
             count += len(frame.points)
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
-
-
-def drift_covariance(config: TrackingConfig, driven: float, turned: float) -> npt.NDArray[np.float64]:
-    """Covariance (6, 6) over (x, y, z, roll, pitch, yaw) that odometry gathers in metres driven and radians turned."""
-    rates = np.array(
-        [*[config.position_drift] * 3, config.tilt_drift, config.tilt_drift, config.yaw_drift],
-        dtype=np.float64,
-    )
-    variances = rates**2 * driven
-    variances[5] += (config.turn_drift * turned) ** 2
-    return np.diag(variances)
-
-
-def _angles_first(covariance: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(6, 6) over (x, y, z, roll, pitch, yaw) as over (rx, ry, rz, x, y, z), or the other way round."""
-    return np.asarray(covariance[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)])
 
 
 def kept(evidence: Evidence, rule: AcceptanceConfig) -> bool:

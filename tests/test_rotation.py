@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from coview_stream.rotation import between, exp_so3, matrices, nearest_rotation, quaternions
+from coview_stream.rotation import between, exp_so3, log_so3, matrices, nearest_rotation, quaternions
 
 RNG = np.random.default_rng(3)
 VECTORS = np.concatenate(
@@ -36,6 +36,12 @@ def test_quaternions_and_back():
     np.testing.assert_array_equal(quaternions(R[0]), q[0])
     assert quaternions(R[:0]).shape == (0, 4)
     assert matrices(np.empty((0, 4))).shape == (0, 3, 3)
+
+
+def test_the_logarithm_is_scipys():
+    R = Rotation.random(200, random_state=5)
+    np.testing.assert_allclose(log_so3(R.as_matrix()), R.as_rotvec(), atol=1e-9)
+    np.testing.assert_array_equal(log_so3(np.eye(3)), np.zeros(3))
 
 
 def test_the_way_between_is_slerp():

@@ -10,9 +10,9 @@ import numpy.typing as npt
 from coview_stream.config import TrackingConfig
 from coview_stream.fix import Fix, State
 from coview_stream.geometry import Pose
+from coview_stream.pose.covariance import drift_covariance
 from coview_stream.stream.messages import PoseMessage
 from coview_stream.stream.odometry import OdometryBuffer
-from coview_stream.tracking import drift_covariance
 
 _NS = 1_000_000_000
 

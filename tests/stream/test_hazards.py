@@ -18,10 +18,10 @@ from coview_stream.config import TrackingConfig
 from coview_stream.fix import State
 from coview_stream.geometry import pose_from
 from coview_stream.localizer import Localizer
+from coview_stream.pose.covariance import drift_covariance
 from coview_stream.stream.deskew import deskew
 from coview_stream.stream.odometry import Segment
 from coview_stream.stream.status import PoseRate
-from coview_stream.tracking import drift_covariance
 
 
 def test_what_was_under_way_at_a_reset_is_nobodys():

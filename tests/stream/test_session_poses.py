@@ -8,8 +8,8 @@ from robots import SHA, T_MAP_ODOM, Robot, ns, pose, reason, state, tracking, un
 
 from coview_stream.config import TrackingConfig
 from coview_stream.fix import State
+from coview_stream.pose.covariance import drift_covariance
 from coview_stream.stream.config import NodeConfig
-from coview_stream.tracking import drift_covariance
 
 
 @pytest.fixture
