@@ -28,7 +28,8 @@ class LidarOdometry:
 
     The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
     then, level. It drifts, but not in tilt where there are walls. The motion between two frames is predicted from that
-    before, over the time between their stamps; it deskews the frame, too.
+    before, over the time between their stamps; it deskews the frame, too. Costs: see ``docs/odometry.md``; kiss-icp
+    holds the interpreter lock.
 
     Attributes:
         config: see there.
