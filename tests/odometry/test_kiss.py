@@ -91,9 +91,11 @@ print("alive")
 
 ABORTS = """
 import numpy as np
-from kiss_icp.config.parser import load_config
+from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
-kiss_icp = KissICP(load_config(None))
+config = KISSConfig()
+config.mapping.voxel_size = 1.0
+kiss_icp = KissICP(config)
 cloud = np.random.default_rng(0).uniform(-30, 30, (3000, 3))
 kiss_icp.register_frame(cloud, np.zeros(3000))
 print("alive")
