@@ -24,8 +24,8 @@ Kernel = Callable[[Array], Array]
 
 _BAND = 11  # diagonals above the main one
 _MOST_STEPS = 30
-_STOP_SHIFT = 1e-4  # metres; a hundredth of what a registration knows
-_STOP_TURN = 1e-5  # radians
+_STOP_SHIFT = 3e-4  # metres; a registration knows centimetres
+_STOP_TURN = 3e-5  # radians
 _SAME_A, _SAME_B = np.triu_indices(6)
 _NEXT_A, _NEXT_B = (index.ravel() for index in np.indices((6, 6)))
 
