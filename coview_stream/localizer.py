@@ -17,12 +17,14 @@ from coview_stream.place.keyframes import KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.pose.verification import Evidence
 from coview_stream.search import GlobalSearch, Query, Verdict
+from coview_stream.suggestions import Suggestions
 from coview_stream.tracking import Tracker, kept, relative_to, unanchored
 
 _LEAST_POINTS = 10
 _LOOKED_AT = 2000  # of a frame's points, to see how far they lie
 _HURRIED = 3.0  # times as far apart are registrations in a hurry
 _FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
+_OTHER_WORLD = 1e7  # metres from the map's origin: no place on this planet
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Localizer:
         self._anchor: npt.NDArray[np.float64] | None = None
         self._evidence: KeyframeEvidence | None = None
         self._newest: _Frame | None = None
+        self._suggestions = Suggestions()
         self._doubts = 0
         self._doubted_at = 0.0  # metres driven
         self._doubted = self._registered = 0.0  # stamps of the first doubt and of the newest registration
@@ -119,12 +122,17 @@ class Localizer:
             else:
                 self._tracker.look_around(T_odom_body)
             return None
+        suggested = self._suggested(T_odom_body)
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
         if keyframe is None:
             return None
         scan = self.base_map.descriptor_config
-        return Query.of(self._buffer, keyframe, cloud, scan, self._tracker.travelled, self._generation)
+        travelled = self._tracker.travelled
+        return Query.of(self._buffer, keyframe, cloud, scan, travelled, self._generation, suggested)
+
+    def _suggested(self, T_odom_body: Pose) -> tuple[Pose, ...]:
+        return () if self._anchor is None else self._suggestions.about(self._anchor, T_odom_body)
 
     def adopt(self, verdict: Verdict) -> None:
         """Second half of :meth:`step`: take note of a search, and start tracking when one place stands alone.
@@ -137,6 +145,7 @@ class Localizer:
         self._evidence = verdict.evidence
         if verdict.accepted is not None:
             self._tracker.start(verdict.accepted.registration, verdict.travelled)
+            self._suggestions.clear()
             self.state, self._doubts = State.TRACKING, 0
             self._buffer.clear()
             self._registered = newest.stamp
@@ -144,6 +153,30 @@ class Localizer:
                 self.suspect()  # what it sees now does not fit: it may have driven on or been carried since
         elif self.state is not State.LOST:
             self.state = verdict.evidence.state
+
+    def suggest(self, T_map_body: Pose) -> None:
+        """Say that the robot may be here at the next frame, until a place is accepted or :meth:`reset`.
+
+        It is never trusted: the search registers, verifies and judges it as whatever it finds itself. Ignored while
+        the state is TRACKING.
+
+        Args:
+            T_map_body: (4, 4) in the frame of the map's sources, as :attr:`Fix.T_map_body`, metres.
+
+        Raises:
+            RunError: it is not a finite rigid transform, or no place on this planet.
+        """
+        try:
+            T = np.asarray(T_map_body, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise RunError(f"T_map_body is not numeric ({error})") from error
+        if not is_pose(T):
+            raise RunError("T_map_body is not a finite rigid 4x4 transform")
+        local = orthonormal(pose_from(T[:3, :3], T[:3, 3] - self.base_map.origin))
+        if np.abs(local[:3, 3]).max() > _OTHER_WORLD:
+            raise RunError("T_map_body lies 10,000 km off the map; is it in the frame of the map's sources?")
+        if self.state is not State.TRACKING:
+            self._suggestions.robot_at(local)
 
     def suspect(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
@@ -185,7 +218,12 @@ class Localizer:
         self._evidence = KeyframeEvidence(stamp, self.state, reason, score, 0.0, evidence)
 
     def _lose(self) -> None:
-        """Search again from nothing: what lost the place may be an odometry that jumped or started anew."""
+        """Search again from nothing: what lost the place may be an odometry that jumped or started anew.
+
+        It may also be the sensor or the map, so where odometry says that the robot is now is worth a try.
+        """
+        if self._anchor is not None:
+            self._suggestions.frames_were(self._tracker.T_map_odom, self._anchor)
         self.state, self._anchor = State.LOST, None
         self._buffer.clear()
         self._tracker.forget()

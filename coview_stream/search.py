@@ -30,6 +30,7 @@ from coview_stream.pose.rays import RangeImage
 from coview_stream.pose.registration import LocalMaps, Prior, Registration, Source, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import Evidence, verify
+from coview_stream.suggestions import FROM_THERE, Trials, robot_in
 
 _SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
 _SAME_ANGLE = np.radians(5.0)
@@ -55,6 +56,7 @@ class Query:
         cloud: (N, 3) float32 newest frame, body frame.
         travelled: metres that odometry had driven.
         generation: of the localizer's memory; a query of another generation starts the search anew.
+        suggested: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
     """
 
     stamp: float
@@ -64,6 +66,7 @@ class Query:
     cloud: Points
     travelled: float = 0.0
     generation: int = 0
+    suggested: tuple[Pose, ...] = ()
 
     @property
     def position(self) -> npt.NDArray[np.float64]:
@@ -84,11 +87,14 @@ class Query:
         descriptor: DescriptorConfig,
         travelled: float = 0.0,
         generation: int = 0,
+        suggested: tuple[Pose, ...] = (),
     ) -> Query:
         """Ask about the newest keyframe of a buffer; ``cloud`` (N, 3) is its newest frame, body frame."""
         scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
         submap = buffer.recent(_SUBMAP_KEYFRAMES)
-        return cls(keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation)
+        return cls(
+            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation, suggested
+        )
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,7 @@ class GlobalSearch:
         self.consensus = Consensus(base_map.stations, base_map.config.block, config.consensus)
         self.last_query: dict[Channel, Descriptor] = {}
         self._remembered: list[Hypothesis] = []
+        self._trials = Trials()
         self._favourite: Candidate | None = None
         self._confirmed = 0
         self._proof = 0.0
@@ -135,6 +142,7 @@ class GlobalSearch:
         """Forget all votes and confirmations."""
         self.consensus.clear()
         self._remembered = []
+        self._trials = Trials()
         self._forget_favourite()
 
     def update(self, query: Query) -> Verdict:
@@ -145,8 +153,11 @@ class GlobalSearch:
         self._vote(query)
         # what was good at the last keyframe is tried again, whatever the votes say now
         hypotheses = [*self.consensus.hypotheses(), *self._remembered]
+        suggested = self._suggested(query)
         source = local_source(query.submap, query.position, self.config.registration)
-        candidates = self._refine(hypotheses, source, query)
+        candidates = self._refine([*hypotheses, *suggested], source, query)
+        if suggested:
+            self._trials.tried(self._refuted(suggested, candidates, query))
         self._remembered = [
             replace(c.hypothesis, T_map_odom=c.T_map_odom)
             for c in candidates[:_REMEMBERED]
@@ -169,6 +180,20 @@ class GlobalSearch:
             self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
         else:
             self.consensus.vote(centre, self.retrieval.distances(self.last_query))
+
+    def _suggested(self, query: Query) -> list[Hypothesis]:
+        """Return the suggestions to try now, but none that is remembered from the last keyframe."""
+        return [
+            each
+            for each in self._trials.due(query.suggested)
+            if not any(_same(each.T_map_odom, other.T_map_odom, query) for other in self._remembered)
+        ]
+
+    def _refuted(self, suggested: list[Hypothesis], candidates: list[Candidate], query: Query) -> bool:
+        """Whether this keyframe speaks against all suggestions; where the map knows nothing, it does not."""
+        best = max((c.evidence.score for c in candidates if c.hypothesis.station is None), default=0.0)
+        known = [self.base_map.surveyed(robot_in(h.T_map_odom, query.T_odom_body)).all() for h in suggested]
+        return all(known) and best < self.config.acceptance.score
 
     def _refine(self, hypotheses: list[Hypothesis], source: Source, query: Query) -> list[Candidate]:
         """Return verified candidates, best first. All go through the coarse scales, the promising ones through all."""
@@ -234,11 +259,16 @@ class GlobalSearch:
         if not self._agrees(best, query):
             self._forget_favourite()
         state, doubt = self._doubt(best.evidence, rival)
+        if doubt is None and not self._has_rivals(best, candidates, query):
+            needed = self.config.acceptance.confirmations
+            doubt = f"rivals rest on {len(self.consensus)} keyframes' votes, {needed} needed"
         if doubt is None:
             self._favourite = best
             self._confirmed += 1
             self._proof += max(0.0, best.evidence.score - self.config.acceptance.proof_floor)
             state, doubt = self._confirmation()
+        if best.hypothesis.station is None:
+            doubt += FROM_THERE
         return Verdict(
             best if state is State.TRACKING else None,
             KeyframeEvidence(
@@ -262,6 +292,14 @@ class GlobalSearch:
         if evidence.score - rival < lead:
             return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
         return State.AMBIGUOUS, None
+
+    def _has_rivals(self, best: Candidate, candidates: list[Candidate], query: Query) -> bool:
+        """Whether enough keyframes have voted for what else it might be; a place found by votes needs no more."""
+        voted = any(
+            c.hypothesis.station is not None and _same(c.T_map_odom, best.T_map_odom, query)
+            for c in candidates
+        )
+        return voted or len(self.consensus) >= self.config.acceptance.confirmations
 
     def _confirmation(self) -> tuple[State, str]:
         rule = self.config.acceptance

@@ -27,11 +27,14 @@ _SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A coarse ``T_map_odom`` (4 x 4), with its station, shift and summed score (lower is better)."""
+    """A coarse ``T_map_odom`` (4 x 4), with its station, shift and summed score (lower is better).
+
+    Station and shift are None where no vote stands behind it: somebody suggested it.
+    """
 
     T_map_odom: Pose
-    station: int
-    shift: int
+    station: int | None
+    shift: int | None
     score: float
 
 
