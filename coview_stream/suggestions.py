@@ -37,7 +37,7 @@ class Suggestions:
         self._awaited = T_map_body
 
     def frames_were(self, T_map_odom: Pose, anchor: npt.NDArray[np.float64]) -> None:
-        """Suggest, in place of all others, that odometry goes on as it was: (4, 4) with its origin at ``anchor`` (3,)."""
+        """Suggest, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
         self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
 
     def about(self, anchor: npt.NDArray[np.float64], T_odom_body: Pose) -> tuple[Pose, ...]:
