@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.odometry import add_gravity, lidar_options
+
 if TYPE_CHECKING:
     from coview_stream.odometry.lidar import LidarOdometry
 
@@ -26,12 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|FILE|kiss-icp",
         help="the run's, a file's, or made of the clouds (auto)",
     )
-    parser.add_argument(
-        "--gravity",
-        nargs="+",
-        metavar=("ground|level|X", "Y Z"),
-        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame (ground)",
-    )
+    add_gravity(parser)
     parser.add_argument(
         "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
     )
@@ -84,14 +81,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _lidar(odometry: str, gravity: list[str] | None) -> LidarOdometry | None:
     """Return what makes odometry of the clouds, if that is asked for; it may be missing, so ask before reading."""
-    from coview_stream.clouds.runs import KISS_ICP
-    from coview_stream.errors import ConfigError
-
-    if odometry != KISS_ICP:
-        if gravity is not None:
-            raise ConfigError(f"--gravity goes with --odometry {KISS_ICP}: other odometry is gravity aligned")
+    config = lidar_options(odometry, gravity)
+    if config is None:
         return None
-    from coview_stream.odometry.config import LidarOdometryConfig, parse_gravity
     from coview_stream.odometry.lidar import LidarOdometry
 
-    return LidarOdometry(LidarOdometryConfig(gravity=parse_gravity(gravity or ["ground"])))
+    return LidarOdometry(config)

@@ -8,6 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.odometry import KISS_ICP, ROBOT, add_gravity, lidar_options
+from coview_stream.errors import ConfigError
+
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
     from coview_stream.stream.node import Node
@@ -49,6 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument(
         "--pose-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson (the preset's)"
     )
+    source = parser.add_argument_group("odometry")
+    source.add_argument(
+        "--odometry",
+        choices=(ROBOT, KISS_ICP),
+        default=ROBOT,
+        help="who makes it: the robot, or this node out of the clouds (robot)",
+    )
+    add_gravity(source)
     limits = parser.add_argument_group("rates and limits")
     limits.add_argument("--pose-rate", type=float, default=10.0, metavar="HZ", help="(10)")
     limits.add_argument(
@@ -87,6 +98,9 @@ def run(args: argparse.Namespace) -> int:
     _check("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     _check("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     _check("--pose-encoding", args.pose_encoding, POSE_CODECS)
+    lidar = lidar_options(args.odometry, args.gravity, args.max_speed)
+    if lidar is not None and (args.odometry_key or args.odometry_encoding):
+        raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
     given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
     keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
     alone = not (args.connect or args.listen or args.config)
@@ -102,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     )
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
-        args.cloud_encoding, args.odometry_encoding, args.pose_encoding,
+        args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
     )  # fmt: skip
     with stop_on_signals() as stop:
         ended = _serve(options, stop)
@@ -156,7 +170,5 @@ def _leave() -> None:
 
 
 def _check(option: str, name: str | None, known: Iterable[str]) -> None:
-    from coview_stream.errors import ConfigError
-
     if name is not None and name not in known:
         raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")

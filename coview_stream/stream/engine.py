@@ -1,7 +1,7 @@
 """The engine of many robots on one map, in two halves: the quick one tracks, the slow one searches.
 
 They share nothing but the map's file, so each can have a process of its own: a search of 0.3 s must delay neither the
-frames of other robots nor the pose clock.
+frames of other robots nor the pose clock. A third one, :mod:`coview_stream.odometry.engine`, needs no map.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from coview_stream.localizer import Localizer
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch, Verdict
 from coview_stream.stream.deskew import deskew
-from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
+from coview_stream.stream.jobs import FrameJob, FrameResult, Job, Result, SearchJob
 
 _CROPS = 24  # of the map with their search grids, shared by all robots
 
@@ -25,7 +25,7 @@ _CROPS = 24  # of the map with their search grids, shared by all robots
 class Engine(Protocol):
     """Works through jobs one at a time; an exception concerns the job's robot only."""
 
-    def run(self, job: FrameJob | SearchJob) -> FrameResult | Verdict:
+    def run(self, job: Job) -> Result:
         """Do one job."""
         ...
 
@@ -54,7 +54,7 @@ class TrackEngine:
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, Localizer]] = {}
 
-    def run(self, job: FrameJob | SearchJob) -> FrameResult:
+    def run(self, job: Job) -> FrameResult:
         """Take in one frame.
 
         Raises:
@@ -103,7 +103,7 @@ class SearchEngine:
         self._robots: dict[str, tuple[int, GlobalSearch]] = {}
         self._retrieval = GlobalSearch(base_map, self.config, self._local_maps).retrieval
 
-    def run(self, job: FrameJob | SearchJob) -> Verdict:
+    def run(self, job: Job) -> Verdict:
         """Search for one keyframe."""
         if not isinstance(job, SearchJob):
             raise TypeError(f"{type(job).__name__} is no search")
@@ -128,7 +128,15 @@ class SearchEngine:
 def open_engine(
     kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None
 ) -> Engine:
-    """Load the map and make the engine ``track`` or ``search``; MapError for an unusable map, or another one."""
+    """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map.
+
+    Raises:
+        MapError: an unusable map, or another one than ``sha256`` says. DependencyError: no kiss-icp.
+    """
+    if kind == "odometry":
+        from coview_stream.odometry.engine import OdometryEngine
+
+        return OdometryEngine()
     base_map = BaseMap.load(map_path)
     if base_map.sha256 != sha256:
         raise MapError(f"{map_path}: has been replaced by another map; start the node again")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from coview_stream.fix import Fix
 from coview_stream.geometry import Points, Pose
+from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.search import Query, Verdict
 from coview_stream.stream.odometry import Segment
 
@@ -58,3 +60,45 @@ class SearchJob:
     robot: str
     epoch: int
     query: Query
+
+
+@dataclass(frozen=True)
+class SweepJob:
+    """One frame to make odometry of, for robots that send none.
+
+    Attributes:
+        robot: name.
+        generation: of its odometry; with a new one it begins anew.
+        stamp_ns: sensor time, nanoseconds.
+        points: (N, 3) float32 body frame, metres.
+        times: (N,) seconds after the stamp at which each point was measured, None if not to be deskewed.
+        config: of its lidar odometry.
+    """
+
+    robot: str
+    generation: int
+    stamp_ns: int
+    points: Points
+    times: npt.NDArray[np.float64] | None
+    config: LidarOdometryConfig
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """Where a frame was taken.
+
+    Attributes:
+        T_odom_body: (4, 4) odometry at its stamp.
+        points: (N, 3) deskewed; None if nothing was to be deskewed.
+        begun: the pose has nothing to do with those before it.
+        seconds: that it took.
+    """
+
+    T_odom_body: Pose
+    points: Points | None
+    begun: bool
+    seconds: float
+
+
+Job: TypeAlias = FrameJob | SearchJob | SweepJob
+Result: TypeAlias = FrameResult | Verdict | SweepResult

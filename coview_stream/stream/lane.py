@@ -16,18 +16,14 @@ import threading
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol
 
 from coview_stream.errors import CoViewError
 from coview_stream.stream.watchdog import Watchdog
 
 if TYPE_CHECKING:  # the child imports them; that a node opens should not wait for it here too
-    from coview_stream.search import Verdict
     from coview_stream.stream.engine import Engine
-    from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
-
-Job: TypeAlias = "FrameJob | SearchJob"
-Result: TypeAlias = "FrameResult | Verdict"
+    from coview_stream.stream.jobs import Job, Result
 
 _GLANCE = 0.1  # seconds between two looks at whether the opening has been cancelled
 
@@ -79,7 +75,7 @@ class ProcessLane:
     """Runs jobs in a child process. A child that hangs, wherever, is killed.
 
     Args:
-        kind: ``track`` or ``search``.
+        kind: ``track``, ``search`` or ``odometry``.
         map_path: the map's file, which every process maps for itself.
         sha256: what the map has to be; if the file was replaced meanwhile, poses would be of another map than is said.
         nice: how far the child stands back from us, so that the clock here is never late.

@@ -1,4 +1,4 @@
-"""The node: threads and clocks around the pure sessions, between a transport and two engine lanes.
+"""The node: threads and clocks around the pure sessions, between a transport and engine lanes.
 
 Who waits for whom: transport threads decode and enqueue; one thread feeds each lane and waits for it; the pose clock
 and the status clock wait for nobody.
@@ -14,16 +14,16 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from coview_stream.search import Verdict
 from coview_stream.stream import rmw
 from coview_stream.stream.codecs import encode_pose
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.guard import Guard
-from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
+from coview_stream.stream.jobs import Job, Result
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.lane import DiedError, FailedError, Lane, RejectedError
 from coview_stream.stream.messages import Encoded, Sample
 from coview_stream.stream.metronome import Metronome
+from coview_stream.stream.outcome import take_sweep, tell_done, tell_failed
 from coview_stream.stream.reporting import Reporter
 from coview_stream.stream.session import Session
 from coview_stream.stream.transport import Publisher, Transport
@@ -47,6 +47,7 @@ class Node:
         transport: where messages come from and go to; the node closes it.
         track: lane to the engine that takes in frames.
         search: lane to the engine that searches the map.
+        odometry: lane to the engine that makes odometry, for robots that send none; None if there are none.
         config: rates and limits.
         pose_format: codec of the poses; None leaves it to each robot's keys.
     """
@@ -59,12 +60,13 @@ class Node:
         search: Lane,
         config: NodeConfig | None = None,
         pose_format: str | None = None,
+        odometry: Lane | None = None,
     ) -> None:
         self.sessions = list(sessions)
         self.transport = transport
         self.config = config or NodeConfig()
         self._pose_format = pose_format
-        self._lanes = {"track": track, "search": search}
+        self._lanes = {"track": track, "search": search} | ({"odometry": odometry} if odometry else {})
         self._wake = threading.Condition()
         self._deaths = dict.fromkeys(self._lanes, 0)  # in a row
         self._turns = {name: Turns(len(self.sessions)) for name in self._lanes}
@@ -95,7 +97,8 @@ class Node:
             keys = session.keys
             self._poses[keys.robot] = self._pose_publisher(keys)
             self._reporter.declare(session)
-            self.transport.subscribe(keys.odometry, partial(self._receive, session.on_odometry), "all")
+            if session.odometry_source == "robot":
+                self.transport.subscribe(keys.odometry, partial(self._receive, session.on_odometry), "all")
             self.transport.subscribe(keys.cloud, partial(self._receive, session.on_cloud), "newest")
             begin_anew = partial(session.begin_anew, "asked to search again")
             self.transport.answer(keys.relocalize, partial(self._ask, session, begin_anew))
@@ -169,41 +172,40 @@ class Node:
         with self._wake:
             self._wake.wait(timeout=0.05)
 
-    def next_job(self, name: str) -> tuple[Session, FrameJob | SearchJob] | None:
+    def next_job(self, name: str) -> tuple[Session, Job] | None:
         """Return whose turn it is in a lane, and with which job; None if there is nothing to do."""
         if name == "track":
             return self._turns[name].next(self.sessions, Session.take_frame)
+        if name == "odometry":
+            return self._turns[name].next(self.sessions, take_sweep)
         # who has a candidate already needs but a few more searches; all the others have to start from nothing
         return self._turns[name].next(self.sessions, Session.take_search, Session.hopeful)
 
-    def work(self, name: str, session: Session, job: FrameJob | SearchJob) -> None:
+    def work(self, name: str, session: Session, job: Job) -> None:
         """Do one job; what goes wrong is counted and concerns this robot, unless the engine died."""
         try:
             result = self._lanes[name].run(job)
         except RejectedError as error:
-            self._failed(session, job, error)
+            tell_failed(session, job, error)
         except FailedError as error:
             self._guard.report(f"{job.robot}: the {name} engine", error)
-            self._failed(session, job, error)
+            tell_failed(session, job, error)
         except DiedError as error:
             if not self._stopping.is_set():
                 self._died(name, error)
-                self._failed(session, job, error)
+                tell_failed(session, job, error)
                 self._deaths[name] += 1
                 self._stopping.wait(min(0.1 * 2.0 ** self._deaths[name], _LONGEST_PAUSE))
         except Exception as error:  # nobody thought of it, but the other robots' work goes on
             self._guard.report(f"{job.robot}: unexpected, in the {name} lane", error)
-            self._failed(session, job, error)
+            tell_failed(session, job, error)
             self._stopping.wait(_AFTER_SURPRISE)
         else:
             self._deaths[name] = 0
             self._done(session, job, result)
 
-    def _done(self, session: Session, job: FrameJob | SearchJob, result: FrameResult | Verdict) -> None:
-        if isinstance(job, FrameJob) and isinstance(result, FrameResult):
-            session.frame_done(job, result, time.monotonic())
-        elif isinstance(job, SearchJob) and isinstance(result, Verdict):
-            session.search_done(job, result)
+    def _done(self, session: Session, job: Job, result: Result) -> None:
+        tell_done(session, job, result, time.monotonic())
         if self._reporter.has_news(session):
             self._reporter.changed.set()
         self._poke()  # a frame may have asked for a search
@@ -213,13 +215,6 @@ class Node:
         for each in self.sessions:
             each.engine_restarted(name)
         self._reporter.changed.set()
-
-    def _failed(self, session: Session, job: FrameJob | SearchJob, error: Exception) -> None:
-        reason = str(error) if isinstance(error, (RejectedError, FailedError, DiedError)) else repr(error)
-        if isinstance(job, FrameJob):
-            session.frame_failed(job, reason, isinstance(error, RejectedError))
-        else:
-            session.search_failed(job, reason)
 
     # ---- the pose clock
 

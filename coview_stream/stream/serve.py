@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import MapError, TransportError
+from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.stream.apart import check_apart
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.keys import RobotKeys
@@ -19,9 +20,11 @@ from coview_stream.stream.transport import Transport
 
 if TYPE_CHECKING:
     from coview_stream.stream.node import Node
+    from coview_stream.stream.session import Session
 
 log = logging.getLogger("coview_stream.node")
 
+_ODOMETRY_NICE = 2  # every pose waits for it
 _TRACK_NICE = 4  # the engines stand back: the pose clock and the receiving threads are in this process
 _SEARCH_NICE = 10
 
@@ -40,6 +43,7 @@ class ServeOptions:
         cloud_codec: of all clouds, whatever they say; None believes them.
         odometry_codec: likewise.
         pose_codec: of the poses; None is the preset's.
+        lidar: how odometry is made of the clouds; None if the robots send theirs.
     """
 
     map_path: Path
@@ -51,6 +55,7 @@ class ServeOptions:
     cloud_codec: str | None = None
     odometry_codec: str | None = None
     pose_codec: str | None = None
+    lidar: LidarOdometryConfig | None = None
 
 
 def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
@@ -62,7 +67,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
 
     Raises:
         MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
-        CancelledError: as asked.
+        CancelledError: as asked. CoViewError: odometry is to be made here, and there is no kiss-icp.
     """
     check_apart(options.keys)
     names = [k.robot for k in options.keys]
@@ -73,6 +78,10 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE),
         search := ProcessLane("search", path, base_map.sha256, _SEARCH_NICE),
     ]
+    odometry = None
+    if options.lidar is not None:
+        odometry = ProcessLane("odometry", path, base_map.sha256, _ODOMETRY_NICE)
+        lanes.append(odometry)
     transport = None
     try:
         for lane in lanes:
@@ -80,20 +89,20 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         # imported while the engines start, which takes longer
         from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node import Node
-        from coview_stream.stream.session import Session
         from coview_stream.stream.zenoh_transport import open_transport
 
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload
         )
         warn_of_others(transport, options.keys)
-        codecs = (options.cloud_codec, options.odometry_codec)
-        sessions = [Session(k, base_map.sha256, options.node, options=codecs) for k in options.keys]
+        sessions = make_sessions(options, base_map.sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
+        if odometry is not None:
+            odometry.wait_ready(cancelled)
         track.wait_ready(cancelled)  # the other one has until the first keyframe
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        node = Node(sessions, transport, track, search, options.node, options.pose_codec)
+        node = Node(sessions, transport, track, search, options.node, options.pose_codec, odometry)
         node.start()
     except BaseException as error:
         for lane in lanes:
@@ -107,6 +116,20 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
     )
     return node
+
+
+def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
+    """Return a session for each robot, that makes its odometry if that is asked for."""
+    from coview_stream.stream.lidar_session import LidarSession
+    from coview_stream.stream.session import Session
+
+    codecs = (options.cloud_codec, options.odometry_codec)
+    if options.lidar is None:
+        return [Session(keys, map_sha256, options.node, options=codecs) for keys in options.keys]
+    return [
+        LidarSession(keys, map_sha256, options.node, options=codecs, lidar=options.lidar)
+        for keys in options.keys
+    ]
 
 
 def warn_of_others(transport: Transport, keys: Sequence[RobotKeys]) -> None:

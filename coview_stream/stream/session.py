@@ -34,7 +34,10 @@ class Session:
         keys: where its messages come and go.
         counters: what became of them.
         complaints: about its input, for people.
+        odometry_source: who makes the odometry: ``robot``, or what does so here.
     """
+
+    odometry_source = "robot"
 
     def __init__(
         self,
@@ -281,9 +284,13 @@ class Session:
             silent = now - self.odometry.arrived
             unseen = now - (self._processed_at if self._processed_at is not None else now)
             if silent > self.config.odometry_timeout:
-                self._stop(f"no odometry for {self.config.odometry_timeout:g} s")
+                self._stop(self._silence(now))
             elif unseen > self.config.coast:
                 self._stop(f"no usable frame for {self.config.coast:g} s")
+
+    def _silence(self, now: float) -> str:
+        """Why there is no pose without odometry."""
+        return f"no odometry for {self.config.odometry_timeout:g} s"
 
     def _stop(self, reason: str) -> None:
         self._suspect = True
@@ -316,7 +323,7 @@ class Session:
             if self._fix_state is State.TRACKING:
                 return State.AMBIGUOUS, "verifying the place after a pause of odometry"
             if self.last_frame_ns is None:
-                has_odometry = self.odometry.newest is not None
+                has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
                 return self._fix_state, why_nothing(self.keys, self.counters, has_odometry)
             return self._fix_state, evidence or self._begun or "too little has been seen"
 

@@ -48,6 +48,7 @@ def status(
         "reason": reason,
         "version": __version__,
         "map_sha256": session.map_sha256,
+        "odometry": session.odometry_source,
         "uptime_s": round(uptime, 1),
         "last_frame_ns": session.last_frame_ns,
         "evidence": session.evidence.to_json() if session.evidence else None,

@@ -21,7 +21,8 @@ def main(argv: list[str]) -> int:
 
     try:
         engine = open_engine(kind, map_path, sha256)
-        warm_up(*engine.kernels)
+        if engine.kernels:
+            warm_up(*engine.kernels)
     except CoViewError as error:
         pipe.send(("error", str(error)))
         return 1

@@ -1,0 +1,125 @@
+"""A robot that sends nothing but clouds: its odometry is made of them here, and then taken in as if it had sent it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from coview_stream.config import TrackingConfig
+from coview_stream.odometry.config import LidarOdometryConfig
+from coview_stream.stream.codecs import decode_cloud
+from coview_stream.stream.config import NodeConfig
+from coview_stream.stream.jobs import SweepJob, SweepResult
+from coview_stream.stream.keys import RobotKeys
+from coview_stream.stream.messages import CloudMessage, OdometryMessage, Sample
+from coview_stream.stream.odometry import Intake
+from coview_stream.stream.reception import last_line, note, received, thinned
+from coview_stream.stream.session import Session
+from coview_stream.stream.sweeps import Sweeps
+
+
+class LidarSession(Session):
+    """A session whose frames go through lidar odometry before they are paired with it.
+
+    Whenever lidar odometry begins anew, the robot does: what it drove in between is not known.
+    """
+
+    odometry_source = "kiss-icp"
+
+    def __init__(
+        self,
+        keys: RobotKeys,
+        map_sha256: str,
+        config: NodeConfig | None = None,
+        tracking: TrackingConfig | None = None,
+        options: tuple[str | None, str | None] = (None, None),
+        lidar: LidarOdometryConfig | None = None,
+    ) -> None:
+        """As of a :class:`Session`; ``lidar`` says how odometry is made."""
+        self.lidar = lidar or LidarOdometryConfig()
+        self._generation = 0
+        super().__init__(keys, map_sha256, config, tracking, options)
+
+    def _clear(self) -> None:
+        super()._clear()
+        self._generation += 1
+        self._first_generation = self._generation  # what was under way before is nobody's
+        self._sweeps = Sweeps(self.keys.robot, self.config, self.lidar, self.counters)
+        self._seen = float("-inf")  # local time of the newest readable cloud
+
+    def on_cloud(self, sample: Sample, now: float) -> None:
+        """Take in a cloud: decode, check, have its odometry made. Never raises for what the sample holds."""
+        limit, hint = self.config.max_payload, self.keys.cloud_hint
+        message, name, reason = received(sample, decode_cloud, self.options[0], hint, limit)
+        with self._lock:
+            self.counters.received += 1
+            if message is None:
+                note(self.counters, self.complaints, "", name, sample.key, reason)
+                return
+            self._seen = now
+            self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
+            if self._sweeps.put(thinned(message, self.config.max_points), now) is Intake.RESTART:
+                self.counters.clock_restarts += 1
+                self._odometry_anew("the sender's clock started anew")
+
+    def take_sweep(self) -> SweepJob | None:
+        """Hand out a frame to make odometry of; its result or failure must be reported before the next one."""
+        with self._lock:
+            return self._sweeps.take(self._generation)
+
+    def sweep_done(self, job: SweepJob, result: SweepResult, now: float) -> None:
+        """Take in the odometry of a frame, and the frame."""
+        with self._lock:
+            if job.generation < self._first_generation:
+                return
+            sweep = self._sweeps.over()
+            if sweep is None or job.generation != self._generation:
+                self.counters.dropped += 1
+                return
+            if result.begun and self.odometry.newest is not None:
+                self.odometry.clear()
+                self.begin_anew("lidar odometry began anew")
+            made = OdometryMessage(job.stamp_ns, result.T_odom_body)
+            self.counters.odometry_received += 1
+            self._continue(self.odometry.add(made, now), made)
+            self._pairing.add(_placed(sweep.message, result), sweep.received)
+            self._pair(now)
+
+    def sweep_failed(self, job: SweepJob, reason: str, rejected: bool) -> None:
+        """Take note that no odometry could be made of a frame; if not ``rejected``, the robot's has been forgotten."""
+        with self._lock:
+            if job.generation < self._first_generation:
+                return
+            self._sweeps.over()
+            self.counters.count("rejected" if rejected else "engine_errors")
+            kind = (
+                "frames that lidar odometry cannot place"
+                if rejected
+                else "frames that lidar odometry failed at"
+            )
+            self.complaints.add_first(f"{self.keys.robot}: {kind}", last_line(reason))
+            if not rejected and job.generation == self._generation:
+                self._odometry_anew("lidar odometry failed on a frame")
+
+    def engine_restarted(self, kind: str = "track") -> None:
+        """As of a session; that of ``odometry`` knew where odometry had come to."""
+        with self._lock:
+            super().engine_restarted(kind)
+            if kind == "odometry":
+                self._odometry_anew("lidar odometry was started again")
+
+    def _odometry_anew(self, reason: str) -> None:
+        self._generation += 1
+        self.odometry.clear()
+        self.begin_anew(reason)
+
+    def _silence(self, now: float) -> str:
+        timeout = self.config.odometry_timeout
+        if now - self._seen > timeout:
+            return f"no clouds for {timeout:g} s"
+        return f"lidar odometry has placed no frame for {timeout:g} s; see errors and counters"
+
+
+def _placed(message: CloudMessage, result: SweepResult) -> CloudMessage:
+    """Return the frame as odometry left it: with nothing to be deskewed any more."""
+    points = message.points if result.points is None else result.points
+    return replace(message, points=points, times=None, rings=None)
