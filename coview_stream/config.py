@@ -16,6 +16,7 @@ Channel = Literal["scan_context", "coview", "coview_strict", "density"]
 Visibility = Literal["paper", "eye", "off"]
 Preset = Literal["slam", "tls"]
 GraphBackend = Literal["auto", "gtsam", "numpy"]
+RegistrationMethod = Literal["trimmed-icp", "gicp"]
 
 
 def _require(ok: bool, config: object, name: str, allowed: str) -> None:
@@ -160,10 +161,12 @@ class ConsensusConfig:
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """Trimmed ICP (eq. 13): point-to-plane, coarse to fine.
+    """Trimmed ICP (eq. 13): point-to-plane, coarse to fine; or GICP, with the same schedule and settings.
 
-    ``keep`` is the overlap; the paper keeps 60 %, 70 % converges faster here and as well. ``search`` and ``track``
-    list the largest correspondence distances of the successive scales. Points above the ground and points on it are
+    ``method`` is ``trimmed-icp`` or ``gicp``; the latter needs the extra of that name (see
+    :mod:`coview_stream.pose.gicp`). ``residual_scale`` is trimmed ICP's alone. ``keep`` is the overlap; the paper keeps
+    60 %, 70 % converges faster here and as well. ``search`` and ``track`` list the largest correspondence distances of
+    the successive scales. Points above the ground and points on it are
     trimmed apart, else the ground, which fits anywhere, pushes out the facades that fix the position (KITTI 04: 0.25 m
     median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic (points are not
     independent). A direction in which that leaves more than ``weak_floors`` times ``sigma_floor`` (an angle counts as
@@ -171,6 +174,7 @@ class RegistrationConfig:
     ``weak_sigma`` metres (see :func:`coview_stream.pose.covariance.registration_covariance`).
     """
 
+    method: RegistrationMethod = "trimmed-icp"
     keep: float = 0.7
     search: tuple[float, ...] = (3.0, 1.5, 0.8, 0.4)
     track: tuple[float, ...] = (0.8, 0.4)
@@ -188,6 +192,8 @@ class RegistrationConfig:
     weak_sigma: float = 10.0
 
     def __post_init__(self) -> None:
+        methods = get_args(RegistrationMethod)
+        _require(self.method in methods, self, "method", f"one of {', '.join(methods)}")
         _fraction(self, "keep")
         _counts(self, "iterations", "source_points")
         _positive(self, "weak_lever", "weak_floors", "weak_sigma")

@@ -95,7 +95,7 @@ class Tracker:
         """Crop the map here already, on a frame that registers nothing: a new crop takes as long as a registration."""
         position = transform(self.T_map_odom, T_odom_body[None, :3, 3])[0]
         if (target := self.local_maps.around(position)) is not None:
-            target.prepare()
+            target.prepare(self.config.registration.method)
 
     def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False) -> Evidence | None:
         """Register the recent points from the predicted pose; None where the map offers nothing to register to.

@@ -1,4 +1,4 @@
-"""Registration of a local scan to the base map: trimmed ICP (eq. 13), point-to-plane, coarse to fine."""
+"""Registration of a local scan to the base map, coarse to fine: trimmed point-to-plane ICP (eq. 13), or GICP."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.config import RegistrationConfig
+from coview_stream.config import RegistrationConfig, RegistrationMethod
 from coview_stream.geometry import Points, Pose
 from coview_stream.pose.edges import EdgeRaster, edge_raster
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.pose.gicp import Surfaces
 
 Matrix6 = npt.NDArray[np.float64]
 
@@ -44,9 +45,11 @@ class LocalMap:
         """The points, to be searched by :func:`coview_kernels.nearest`."""
         return kernels.PointGrid(self.points)
 
-    def prepare(self) -> None:
-        """Make now what is made when asked for."""
+    def prepare(self, method: RegistrationMethod = "trimmed-icp") -> None:
+        """Make now what a registration by ``method`` would make when it asks for it."""
         _ = self.edges, self._sorted
+        if method == "gicp":
+            _ = self.surfaces
 
     @cached_property
     def _sorted(self) -> bool:
@@ -57,6 +60,13 @@ class LocalMap:
     def edges(self) -> EdgeRaster:
         """Where the map must have walls that it does not show."""
         return edge_raster(self.points)
+
+    @cached_property
+    def surfaces(self) -> Surfaces | None:
+        """The points as GICP takes them; None where they are too few."""
+        from coview_stream.pose.gicp import surfaces
+
+        return surfaces(self.points)
 
 
 class LocalMaps:
@@ -127,6 +137,14 @@ class Source:
         order = np.concatenate((np.flatnonzero(self.above), np.flatnonzero(~self.above)))[::nth]
         return Source(self.points[order], self.above[order], self.height[order])
 
+    @cached_property
+    def surfaces(self) -> list[Surfaces]:
+        """The points above the ground and those on it as GICP takes them, what there is of them."""
+        from coview_stream.pose.gicp import surfaces
+
+        kinds = [surfaces(self.points[some]) for some in (self.above, ~self.above)]
+        return [kind for kind in kinds if kind is not None]
+
 
 def register(
     source: Source,
@@ -139,13 +157,13 @@ def register(
     iterations: int | None = None,
     thin: int = 1,
 ) -> Registration | None:
-    """Trimmed ICP from an initial pose.
+    """Trimmed ICP or GICP, as ``config.method`` says, from an initial pose.
 
     Args:
         source: the local scan.
         T_map_source: (4, 4) initial guess.
         target: the map around it.
-        config: overlap, residual scale, iterations.
+        config: method, overlap, residual scale, iterations.
         scales: largest correspondence distance of each scale, metres.
         prior: belief to fuse; its mean is about ``centre`` too.
         centre: (3,) source-frame point that rotations are about (the body's position); default the mean.
@@ -154,12 +172,19 @@ def register(
 
     Returns:
         The result, or None where fewer than 50 points find a partner.
+
+    Raises:
+        DependencyError: the method is GICP and small_gicp is missing.
     """
     pivot = source.points.mean(axis=0, dtype=np.float64) if centre is None else centre
     # the pairs count correlated points; weigh the prior alike
     belief = None
     if prior is not None:
         belief = kernels.Belief(prior.T_map_source, prior.information * config.inflation**2)
+    if config.method == "gicp":
+        return _by_gicp(
+            source, T_map_source, target, config, _stages(scales, config, thin), belief, pivot, iterations
+        )
     found = kernels.align_planes(
         target.grid,
         target.normals,
@@ -171,6 +196,36 @@ def register(
         keep=config.keep,
         iterations=iterations or config.iterations,
         least=_LEAST_PAIRS,
+        prior=belief,
+    )
+    return None if found is None else Registration(*found)
+
+
+def _by_gicp(
+    source: Source,
+    T_map_source: Pose,
+    target: LocalMap,
+    config: RegistrationConfig,
+    stages: list[kernels.Scale],
+    belief: kernels.Belief | None,
+    pivot: npt.NDArray[np.float64],
+    iterations: int | None,
+) -> Registration | None:
+    from coview_stream.pose.gicp import register_surfaces
+
+    if target.surfaces is None:
+        return None
+    thinned = {n: source if n == 1 else source.every(n) for n in {stage.every for stage in stages}}
+    found = register_surfaces(
+        [thinned[stage.every].surfaces for stage in stages],
+        target.surfaces,
+        target.grid,
+        target.normals,
+        T_map_source,
+        pivot,
+        stages,
+        keep=config.keep,
+        iterations=iterations or config.iterations,
         prior=belief,
     )
     return None if found is None else Registration(*found)
