@@ -34,6 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
+    parser.add_argument(
+        "--registration",
+        choices=("trimmed-icp", "gicp"),
+        default="trimmed-icp",
+        help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
+    )
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
 
@@ -44,12 +50,15 @@ def run(args: argparse.Namespace) -> int:
 
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.clouds.runs import open_run
-    from coview_stream.config import LocalizerConfig, RetrievalConfig
+    from coview_stream.config import LocalizerConfig, RegistrationConfig, RetrievalConfig
     from coview_stream.errors import InputError
     from coview_stream.fix import Fix
     from coview_stream.offline import locate, summary, write
+    from coview_stream.pose.gicp import library
 
     lidar = _lidar(args.odometry, args.gravity)
+    if args.registration == "gicp":
+        library()  # it may be missing, so ask before reading
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     base_map = BaseMap.load(args.map)
@@ -65,7 +74,10 @@ def run(args: argparse.Namespace) -> int:
         )
     for note in recorded.notes:
         print(note, file=sys.stderr)
-    config = LocalizerConfig(retrieval=RetrievalConfig(mode=args.retrieval))
+    config = LocalizerConfig(
+        retrieval=RetrievalConfig(mode=args.retrieval),
+        registration=RegistrationConfig(method=args.registration),
+    )
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
 
         def step(done: int, total: int, fix: Fix | None) -> None:

@@ -78,6 +78,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-payload", type=int, default=16 << 20, metavar="BYTES", help="larger is not looked at (16 MiB)"
     )
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
+    parser.add_argument(
+        "--registration",
+        choices=("trimmed-icp", "gicp"),
+        default="trimmed-icp",
+        help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
+    )
     parser.add_argument("--quiet", action="store_true", help="log errors only")
 
 
@@ -117,6 +123,7 @@ def run(args: argparse.Namespace) -> int:
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
+        args.registration,
     )  # fmt: skip
     with stop_on_signals() as stop:
         ended = _serve(options, stop)

@@ -4,13 +4,14 @@ The one place that imports small_gicp (MIT; Koide, JOSS 2024). A pair costs r^T 
 r = T p - q and covariances that are flat along the surface around each point. small_gicp has no prior, does not trim
 and does not tell ground from structure, so it only does what is slow: its ``align`` with one iteration is asked for
 the Hessian and the gradient at the pose it is given, of either kind of point by itself. The rest is as for trimmed ICP
-(see :func:`coview_kernels.align_planes`): of either kind the ``keep`` nearest pairs, both kinds weighing the same, and the
-prior in every step, so that a direction that the map does not show is the prior's from the first step on.
+(see :func:`coview_kernels.align_planes`): of either kind the ``keep`` nearest pairs, both kinds weighing the same, and
+the prior in every step, so that a direction that the map does not show is the prior's from the first step on.
 
 small_gicp holds the interpreter's lock while it works and aborts the interpreter on empty clouds and NaN. Nothing of
 that kind is passed to it. What else would run in this process waits meanwhile: some 10 ms a call, and a quarter of a
-second for the covariances of a new crop of the map (160,000 points), of which there is one every 16 m. ``serve`` registers in its lanes' processes only
-(:mod:`coview_stream.stream.lane`), whichever the method, so the pose clock's process never imports small_gicp.
+second for the covariances of a new crop of the map (160,000 points), of which there is one every 16 m. ``serve``
+registers in its lanes' processes only (:mod:`coview_stream.stream.lane`), whichever the method, so the pose clock's
+process never imports small_gicp.
 """
 
 from __future__ import annotations

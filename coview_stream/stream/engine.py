@@ -14,6 +14,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import MapError
 from coview_stream.localizer import Localizer
+from coview_stream.pose import gicp
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch, Verdict
 from coview_stream.stream.deskew import deskew
@@ -131,12 +132,15 @@ def open_engine(
     """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map.
 
     Raises:
-        MapError: an unusable map, or another one than ``sha256`` says. DependencyError: no kiss-icp.
+        MapError: an unusable map, or another one than ``sha256`` says. DependencyError: no kiss-icp, or no small_gicp
+            where ``config`` wants it.
     """
     if kind == "odometry":
         from coview_stream.odometry.engine import OdometryEngine
 
         return OdometryEngine()
+    if config is not None and config.registration.method == "gicp":
+        gicp.library()
     base_map = BaseMap.load(map_path)
     if base_map.sha256 != sha256:
         raise MapError(f"{map_path}: has been replaced by another map; start the node again")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import RegistrationMethod
 from coview_stream.errors import MapError, TransportError
 from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.stream.apart import check_apart
@@ -44,6 +45,7 @@ class ServeOptions:
         odometry_codec: likewise.
         pose_codec: of the poses; None is the preset's.
         lidar: how odometry is made of the clouds; None if the robots send theirs.
+        registration: how scans are registered to the map.
     """
 
     map_path: Path
@@ -56,6 +58,7 @@ class ServeOptions:
     odometry_codec: str | None = None
     pose_codec: str | None = None
     lidar: LidarOdometryConfig | None = None
+    registration: RegistrationMethod = "trimmed-icp"
 
 
 def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
@@ -67,16 +70,16 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
 
     Raises:
         MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
-        CancelledError: as asked. CoViewError: odometry is to be made here, and there is no kiss-icp.
+        CancelledError: as asked. CoViewError: a library that the options ask for is missing.
     """
     check_apart(options.keys)
     names = [k.robot for k in options.keys]
     begin = time.monotonic()
     base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
-    path = str(options.map_path)
+    path, method = str(options.map_path), options.registration
     lanes = [
-        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE),
-        search := ProcessLane("search", path, base_map.sha256, _SEARCH_NICE),
+        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE, registration=method),
+        search := ProcessLane("search", path, base_map.sha256, _SEARCH_NICE, registration=method),
     ]
     odometry = None
     if options.lidar is not None:

@@ -1,4 +1,7 @@
-"""The child process of a lane: ``python -m coview_stream.stream.worker FD KIND MAP SHA256 NICE``; not for people."""
+"""The child process of a lane; not for people.
+
+``python -m coview_stream.stream.worker FD KIND MAP SHA256 NICE METHOD``, the last being that of registration.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,14 @@ def main(argv: list[str]) -> int:
     with contextlib.suppress(OSError):
         os.nice(nice)
     from coview_kernels import warm_up
+    from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import CoViewError
     from coview_stream.stream.engine import open_engine
     from coview_stream.stream.lane import attempt
 
     try:
-        engine = open_engine(kind, map_path, sha256)
+        config = LocalizerConfig(registration=RegistrationConfig(method=argv[5]))  # type: ignore[arg-type]
+        engine = open_engine(kind, map_path, sha256, config)
         if engine.kernels:
             warm_up(*engine.kernels)
     except CoViewError as error:
