@@ -1,0 +1,142 @@
+"""The last known pose of a robot on a map, on disk: what the next start tries first, and never trusts."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from coview_stream.errors import ConfigError
+from coview_stream.geometry import Pose, is_pose
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+
+_FORMAT = "coview_stream last pose"
+_LARGEST = 65_536  # bytes; what we write has 500
+_LONGEST_NAME = 60
+
+
+@dataclass(frozen=True)
+class LastPose:
+    """Where a robot was when it was last known.
+
+    Attributes:
+        robot: its name.
+        map_sha256: of the base map, 64 hexadecimal digits.
+        stamp_ns: sensor time, nanoseconds.
+        T_map_body: (4, 4) float64 in the frame of the map's sources, metres.
+    """
+
+    robot: str
+    map_sha256: str
+    stamp_ns: int
+    T_map_body: Pose
+
+
+def save(folder: Path, last: LastPose) -> Path:
+    """Write ``last`` for its robot and map, and return the file; what was there before stays whole until it is done.
+
+    Raises:
+        OSError: the directory cannot be made or written.
+    """
+    path = file_of(folder, last.robot, last.map_sha256)
+    document = {
+        "format": _FORMAT,
+        "version": VERSION,
+        "robot": last.robot,
+        "map_sha256": last.map_sha256,
+        "stamp_ns": int(last.stamp_ns),
+        "T_map_body": np.asarray(last.T_map_body, dtype=np.float64).tolist(),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".part")  # always the same one: a power cut leaves one behind at most
+    with temporary.open("w", encoding="utf-8") as file:
+        json.dump(document, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())  # else a power cut, the usual end of a robot's day, leaves an empty file
+    temporary.replace(path)
+    return path
+
+
+def load(folder: Path, robot: str, map_sha256: str) -> LastPose | None:
+    """Read what was saved for a robot and a map.
+
+    Returns:
+        None if there is nothing, and, after a warning that names the file, if it cannot be used: it is damaged, of
+        another version, or not of this robot and map.
+    """
+    path = file_of(folder, robot, map_sha256)
+    try:
+        with path.open("rb") as file:
+            last = _parsed(file.read(_LARGEST + 1))
+        if (last.robot, last.map_sha256) != (robot, map_sha256):
+            raise ValueError("it is of another robot or map")
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        log.warning("%s: the last pose cannot be read (%s); searching without", path, error.strerror or error)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        log.warning("%s: is no last pose to be used (%s); searching without", path, error)
+    else:
+        return last
+    return None
+
+
+def forget(folder: Path, robot: str, map_sha256: str) -> None:
+    """Delete what was saved for a robot and a map, if anything; OSError if that cannot be done."""
+    file_of(folder, robot, map_sha256).unlink(missing_ok=True)
+
+
+def file_of(folder: Path, robot: str, map_sha256: str) -> Path:
+    """Return where the pose of a robot on a map is kept: its name, made safe for every file system, and 16 digits."""
+    name = quote(robot, safe="")
+    if name != robot.lower() or len(name) > _LONGEST_NAME:  # 'R1' and 'r1' are one file on some systems
+        name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
+    return folder / f"{name}-{map_sha256[:16]}.json"
+
+
+def default_folder() -> Path:
+    """Return where programs of this user keep what they know from one run to the next.
+
+    Raises:
+        ConfigError: the user has no home directory.
+    """
+    if sys.platform == "win32":
+        place = os.environ.get("LOCALAPPDATA", "")
+        behind_home = "AppData/Local"
+    else:
+        place = os.environ.get("XDG_STATE_HOME", "")
+        behind_home = ".local/state"
+    try:
+        # the specification says that a relative one is to be ignored
+        root = Path(place) if place and Path(place).is_absolute() else Path.home() / behind_home
+    except RuntimeError as error:
+        raise ConfigError(
+            f"cannot tell where to keep the last poses ({error}); use --state DIR or --no-state"
+        ) from error
+    return root / "coview-stream"
+
+
+def _parsed(data: bytes) -> LastPose:
+    """ValueError, TypeError, KeyError, OverflowError or RecursionError if it is not what :func:`save` writes."""
+    if len(data) > _LARGEST:
+        raise ValueError(f"longer than {_LARGEST} bytes")
+    document: Any = json.loads(data.decode("utf-8"))
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise ValueError("it is something else")
+    if document.get("version") != VERSION:
+        raise ValueError(f"version {document.get('version')!r:.20}, this release reads {VERSION}")
+    T = np.asarray(document["T_map_body"], dtype=np.float64)
+    if not is_pose(T):
+        raise ValueError("T_map_body is not a finite rigid 4x4 transform")
+    return LastPose(str(document["robot"]), str(document["map_sha256"]), int(document["stamp_ns"]), T)
