@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from coview_stream.geometry import Pose
 from coview_stream.search import Query, Verdict
 from coview_stream.stream.jobs import FrameJob, SearchJob
 from coview_stream.stream.pairing import Paired
@@ -60,12 +61,12 @@ class Desk:
         self._ready = Ready(job, frame.received, since, travelled, turned)
         return before is not None
 
-    def take_frame(self, suspect: bool) -> FrameJob | None:
+    def take_frame(self, suspect: bool, suggested: Pose | None = None) -> FrameJob | None:
         """Hand out the newest frame, with the verdict of a search if one has come; None while one is under way."""
         if self._ready is None or self._busy is not None:
             return None
         self._busy, self._ready = self._ready, None
-        job = replace(self._busy.job, suspect=suspect, verdict=self._verdict)
+        job = replace(self._busy.job, suspect=suspect, verdict=self._verdict, suggested=suggested)
         self._verdict = None
         return job
 

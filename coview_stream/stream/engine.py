@@ -6,13 +6,14 @@ frames of other robots nor the pose clock. A third one, :mod:`coview_stream.odom
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.errors import MapError
+from coview_stream.errors import MapError, RunError
 from coview_stream.localizer import Localizer
 from coview_stream.pose import gicp
 from coview_stream.pose.registration import LocalMaps
@@ -72,6 +73,9 @@ class TrackEngine:
             localizer.adopt(job.verdict)
         if job.suspect:
             localizer.suspect()
+        if job.suggested is not None:
+            with contextlib.suppress(RunError):  # a guess of no use is no reason to drop the frame
+                localizer.suggest(job.suggested)
         query = localizer.take(points, job.T_odom_body, job.stamp_ns * 1e-9, job.hurry)
         return FrameResult(localizer.fix(), query, time.perf_counter() - begin)
 

@@ -30,6 +30,7 @@ class FrameJob:
         suspect: give no pose before this frame has verified the place.
         verdict: of an earlier search, to be taken note of first.
         hurry: the engine is behind with its work: leave what can wait.
+        suggested: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like anything else.
     """
 
     robot: str
@@ -42,6 +43,7 @@ class FrameJob:
     suspect: bool = False
     verdict: Verdict | None = None
     hurry: bool = False
+    suggested: Pose | None = None
 
 
 @dataclass(frozen=True)

@@ -100,8 +100,7 @@ class Node:
             if session.odometry_source == "robot":
                 self.transport.subscribe(keys.odometry, partial(self._receive, session.on_odometry), "all")
             self.transport.subscribe(keys.cloud, partial(self._receive, session.on_cloud), "newest")
-            begin_anew = partial(session.begin_anew, "asked to search again")
-            self.transport.answer(keys.relocalize, partial(self._ask, session, begin_anew))
+            self.transport.answer(keys.relocalize, partial(self._ask, session, session.relocalize))
             self.transport.answer(keys.reset, partial(self._ask, session, session.reset))
             self.transport.announce(keys.alive)
 

@@ -10,6 +10,7 @@ import threading
 
 from coview_stream.config import TrackingConfig
 from coview_stream.fix import KeyframeEvidence, State
+from coview_stream.geometry import Pose
 from coview_stream.search import Verdict
 from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.config import NodeConfig
@@ -18,6 +19,7 @@ from coview_stream.stream.counters import Counters, Latency, Missing
 from coview_stream.stream.desk import Desk, Ready
 from coview_stream.stream.jobs import FrameJob, FrameResult, SearchJob
 from coview_stream.stream.keys import RobotKeys
+from coview_stream.stream.last_place import LastPlace, Recollection
 from coview_stream.stream.messages import OdometryMessage, PoseMessage, Sample
 from coview_stream.stream.odometry import Intake, OdometryBuffer
 from coview_stream.stream.pairing import Pairing
@@ -56,6 +58,7 @@ class Session:
         self._lock = threading.RLock()
         self._epoch = 0
         self._desk = Desk(keys.robot, 0)
+        self._place = LastPlace()
         self.counters, self.odometry = Counters(), OdometryBuffer(self.config)
         self._pairing = Pairing(self.config, self.odometry, self.counters)
         self._clear()
@@ -89,6 +92,7 @@ class Session:
         self.evidence: KeyframeEvidence | None = None
         self._pairing = Pairing(self.config, self.odometry, self.counters)
         self._desk = Desk(self.keys.robot, self._epoch)
+        self._place.begin_anew()
         self._correction: Correction | None = None
         self._suspect = False
         self._trusted_from = -(1 << 63)
@@ -166,10 +170,32 @@ class Session:
             self._begun = f"searching anew: {reason}"
             self._forget_frame()
 
-    def reset(self) -> None:
-        """Forget everything, counters and odometry too."""
+    def relocalize(self) -> None:
+        """Search from nothing because somebody asks: not even where the robot was last known to be."""
         with self._lock:
+            self._place.forget()
+            self.begin_anew("asked to search again")
+
+    def reset(self) -> None:
+        """Forget everything, counters and odometry too, and where the robot was last known to be."""
+        with self._lock:
+            self._place.forget()
             self._clear()
+
+    def suggest(self, T_map_body: Pose) -> None:
+        """Hand the engine (4, 4) where the robot may be, as a hypothesis; ignored once something better is known."""
+        with self._lock:
+            if self._correction is None and not self._place.forgotten:
+                self._place.suggest(T_map_body)
+
+    def recall(self) -> Recollection:
+        """Say where the robot is, if that is known, for the next start."""
+        with self._lock:
+            forgotten, known = self._place.forgotten, self._correction
+            pose = known and known.pose(self.odometry, self.tracking, self.keys.robot, self.map_sha256)
+            return (
+                Recollection(forgotten, pose.stamp_ns, pose.T_map_body) if pose else Recollection(forgotten)
+            )
 
     def _lose(self, reason: str) -> None:
         if self._lost is None:
@@ -193,7 +219,7 @@ class Session:
     def take_frame(self) -> FrameJob | None:
         """Hand the newest ready frame to the engine; its result or failure must be reported before the next one."""
         with self._lock:
-            return self._desk.take_frame(self._suspect)
+            return self._desk.take_frame(self._suspect, self._place.due)
 
     def take_search(self) -> SearchJob | None:
         """Hand the newest keyframe to the search; its verdict or failure must be reported before the next one."""
@@ -216,6 +242,7 @@ class Session:
             if busy is not None:
                 self.latency.add(now - busy.received)
                 self.longest_wait = max(self.longest_wait, now - busy.since)
+                self._place.told(job.suggested)
                 self._note(result, busy, job.suspect)
 
     def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> None:
@@ -229,6 +256,8 @@ class Session:
             if job.epoch == self._epoch:
                 self._desk.frame_over(unused=job.verdict)
                 if not rejected:
+                    if job.suggested is not None:
+                        self._place.drop()  # for it may be the reason
                     self.begin_anew("the engine failed on a frame")
 
     def search_done(self, job: SearchJob, verdict: Verdict | None) -> None:
@@ -272,6 +301,8 @@ class Session:
             self.counters.fixes += self._correction is None
             self._lost = None
             self._correction = Correction.of(fix, job.stamp_ns, ready.travelled, ready.turned)
+            if fix.T_map_body is not None:
+                self._place.seen(fix.T_map_body)
 
     # ---- what goes out
 
