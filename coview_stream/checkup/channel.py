@@ -42,6 +42,10 @@ def cloud_findings(heard: Heard, elsewhere: str) -> Iterator[Finding]:
 def odometry_findings(heard: Heard, elsewhere: str) -> Iterator[Finding]:
     """Judge the odometry; ``elsewhere`` likewise."""
     robot, seen = heard.keys.robot, heard.odometry
+    maker = str((heard.status or {}).get("odometry", "robot"))
+    if maker != "robot":
+        yield _made_by_the_node(maker, len(seen), robot)
+        return
     good = [s for s in seen if s.stamp_ns is not None]
     if not seen:
         yield _nothing("odometry", heard, heard.keys.odometry, elsewhere)
@@ -54,9 +58,19 @@ def odometry_findings(heard: Heard, elsewhere: str) -> Iterator[Finding]:
 
 
 def _nothing(what: str, heard: Heard, key: str, elsewhere: str) -> Finding:
-    remedy = elsewhere or "does the robot publish, on this key, and do access rules let it?"
+    remedy = "does the robot publish, on this key, and do access rules let it?"
+    if what == "odometry":
+        remedy += " If it has none: `serve --odometry kiss-icp`"
     found = f"none in {heard.ended - heard.began:.1f} s on {key}"
-    return Finding("FAIL", what, found, remedy, heard.keys.robot)
+    return Finding("FAIL", what, found, elsewhere or remedy, heard.keys.robot)
+
+
+def _made_by_the_node(maker: str, ignored: int, robot: str) -> Finding:
+    found = f"the node makes it of the clouds ({maker})"
+    if ignored:
+        remedy = "the robot's is as a rule better: `serve --odometry robot`"
+        return Finding("warn", "odometry", f"{found} and ignores the {ignored} samples heard", remedy, robot)
+    return Finding("ok", "odometry", found, robot=robot)
 
 
 def _unreadable(

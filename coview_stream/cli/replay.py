@@ -8,6 +8,7 @@ from pathlib import Path
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
+_NONE = "none"
 _LOOK = 0.5  # seconds; a session learns of subscribers a moment after it first asks
 _SPARSE = 0.4  # seconds; the node takes odometry older than 0.5 s for lost, and some jitter has to fit in
 
@@ -37,7 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry-rate", type=float, metavar="HZ", help="odometry per second, interpolated (one per frame)"
     )
-    parser.add_argument("--odometry", default="auto", metavar="auto|FILE", help="odometry to use (auto)")
+    parser.add_argument(
+        "--odometry",
+        default="auto",
+        metavar="auto|FILE|none",
+        help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
+    )
     parser.add_argument(
         "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
     )
@@ -54,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.clouds.bare import open_bare_run
     from coview_stream.clouds.runs import open_run
     from coview_stream.errors import ConfigError
     from coview_stream.stream.keys import robot_keys
@@ -64,15 +71,21 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.wait >= 0:
         raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")
-    config = ReplayConfig(rate=args.rate, speed=args.speed, odometry_rate=args.odometry_rate, loop=args.loop)
+    bare = args.odometry == _NONE
+    config = ReplayConfig(args.rate, args.speed, args.odometry_rate, clouds_only=bare, loop=args.loop)
     keys = robot_keys(args.preset, args.base, args.robot)
-    recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic)
+    if bare:
+        if args.odometry_topic is not None:
+            raise ConfigError("--odometry none and --odometry-topic: give one of them")
+        recorded = open_bare_run(args.run_path, args.cloud_topic)
+    else:
+        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic)
     for note in recorded.notes:
         print(note, file=sys.stderr)
     transport = open_client(args.connect, args.listen, args.config)
     try:
         sender = Sender(transport, keys, args.encoding, args.odometry_encoding)
-        if (spacing := odometry_spacing(recorded, config)) > _SPARSE:
+        if not bare and (spacing := odometry_spacing(recorded, config)) > _SPARSE:
             print(
                 f"one odometry sample in {spacing:.2f} s is too few for a node's defaults; see --odometry-rate",
                 file=sys.stderr,

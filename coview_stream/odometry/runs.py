@@ -10,7 +10,8 @@ import numpy as np
 
 from coview_stream.clouds.bag_clouds import BagClouds
 from coview_stream.clouds.bags import open_bag
-from coview_stream.clouds.layout import find_bag, find_layout, read_stamps
+from coview_stream.clouds.bare import open_bare_run
+from coview_stream.clouds.layout import find_bag, find_layout
 from coview_stream.clouds.runs import Run, of_bag, single
 from coview_stream.clouds.track import Track
 from coview_stream.clouds.trajectory import Poses
@@ -22,7 +23,6 @@ Progress = Callable[[int, int], None]
 """Called with (frames done, frames)."""
 
 _FEW_WALLS = 15  # patches: with fewer the slope of the ground decides
-_PERIOD = 0.1  # seconds between frames that nobody has dated
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,15 @@ def open_lidar_run(
     if len(layout.frames) == 1:
         return single(layout)
     lidar = lidar or LidarOdometry()
-    told = read_stamps(layout)
-    stamps = np.arange(len(layout.frames), dtype=np.float64) * np.float64(_PERIOD) if told is None else told
-    assumed = (f"{path}: no times.txt; frames are taken for {_PERIOD:g} s apart",) if told is None else ()
-    nowhere = np.tile(np.eye(4), (len(stamps), 1, 1))
-    run = Run(path, layout.frames, stamps, nowhere)
+    run = open_bare_run(path)
 
     def place(index: int) -> Pose:
         frame = run.read(index)
         return lidar.step(frame.points, None, frame.stamp)
 
     followed = follow(path, lidar, len(run), place, progress)
-    files = tuple(layout.frames[index] for index in followed.kept)
-    return Run(path, files, stamps[followed.kept], followed.poses, notes=(*assumed, *followed.notes))
+    files = tuple(run.frames_paths[index] for index in followed.kept)
+    return Run(path, files, run.stamps[followed.kept], followed.poses, notes=(*run.notes, *followed.notes))
 
 
 def _of_bag(bag: Path, lidar: LidarOdometry | None, topic: str | None, progress: Progress | None) -> Run:

@@ -89,7 +89,7 @@ class _Parcel:
     """A beat with its messages encoded."""
 
     due: float
-    odometry: Encoded
+    odometry: Encoded | None
     cloud: Encoded | None = None
     points: int = 0
     error: CloudError | None = None
@@ -131,8 +131,9 @@ def replay(
 
 
 def _send(parcel: _Parcel, sender: Sender, clock: Clock, report: ReplayReport) -> None:
-    sender.put_odometry(parcel.odometry)
-    report.odometry += 1
+    if parcel.odometry is not None:
+        sender.put_odometry(parcel.odometry)
+        report.odometry += 1
     if parcel.error is not None:
         report.damaged += 1
         report.first_error = report.first_error or parcel.error
@@ -146,11 +147,12 @@ def _send(parcel: _Parcel, sender: Sender, clock: Clock, report: ReplayReport) -
 
 def _parcels(run: Run, sender: Sender, config: ReplayConfig) -> Iterator[_Parcel]:
     for beat in beats(run, config):
-        odometry = sender.odometry(beat.T_odom_body, nanoseconds(beat.stamp))
+        stamp = nanoseconds(beat.stamp)
+        odometry = None if config.clouds_only else sender.odometry(beat.T_odom_body, stamp)
         yield _parcel(run, beat, sender, odometry)
 
 
-def _parcel(run: Run, beat: Beat, sender: Sender, odometry: Encoded) -> _Parcel:
+def _parcel(run: Run, beat: Beat, sender: Sender, odometry: Encoded | None) -> _Parcel:
     if beat.frame is None:
         return _Parcel(beat.due, odometry)
     try:

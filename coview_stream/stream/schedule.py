@@ -28,6 +28,7 @@ class ReplayConfig:
         rate: frames sent per second; None keeps the spacing of the run's stamps.
         speed: factor on that spacing; 2 sends a run in half its time. Not together with ``rate``.
         odometry_rate: odometry samples sent per second, interpolated between frames; None sends one per frame.
+        clouds_only: send no odometry: the node makes its own.
         loop: start over for ever; stamps go on increasing, and the robot is back where it started.
         read_ahead: frames read and encoded before their time.
     """
@@ -35,6 +36,7 @@ class ReplayConfig:
     rate: float | None = None
     speed: float = 1.0
     odometry_rate: float | None = None
+    clouds_only: bool = False
     loop: bool = False
     read_ahead: int = 8
 
@@ -46,6 +48,8 @@ class ReplayConfig:
                 raise ConfigError(f"--{option} {value!r} is out of range: give a number above 0, up to 10000")
         if self.rate is not None and self.speed != 1.0:
             raise ConfigError("--rate and --speed both say how fast: give one of them")
+        if self.clouds_only and self.odometry_rate is not None:
+            raise ConfigError("--odometry none and --odometry-rate: give one of them")
         if self.read_ahead < 1:
             raise ConfigError(f"read_ahead is {self.read_ahead}: give at least 1")
 

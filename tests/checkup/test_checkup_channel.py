@@ -49,6 +49,21 @@ def test_nothing_says_where_else():
     assert clouds_of([])["clouds"].remedy
 
 
+def test_odometry_that_the_node_makes_is_not_missed():
+    silent = heard(odometry=[])
+    (missing,) = odometry_findings(silent, "")
+    assert missing.remedy.endswith("`serve --odometry kiss-icp`")
+    silent.status = {"odometry": "kiss-icp"}
+    (made,) = odometry_findings(silent, "odometry comes on x: try y")
+    assert (made.verdict, made.what) == ("ok", "odometry")
+    speaking = heard(odometry=[(t, odometry(t)) for t in steps(50)], status={"odometry": "kiss-icp"})
+    (ignored,) = odometry_findings(speaking, "")
+    assert ignored.verdict == "warn"
+    assert "ignores the 150 samples" in ignored.found
+    speaking.status = {"odometry": "robot"}
+    assert [f.what for f in odometry_findings(speaking, "")] == ["odometry", "odometry stamps", "gravity"]
+
+
 @pytest.mark.parametrize(
     ("sample", "reason", "remedy"),
     [

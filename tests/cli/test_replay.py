@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -71,6 +72,23 @@ def test_a_run_arrives_whole(node, run_folder, capsys):
     assert "16 odometry samples sent" in captured.out
     assert "put p50" in captured.out
     assert captured.err == ""
+
+
+def test_clouds_alone(node, run_folder, tmp_path, capsys):
+    bare = tmp_path / "run"
+    shutil.copytree(run_folder / "frames", bare / "frames")
+    node.subscribe()
+    command = ["--robot", "r1", "--connect", node.endpoint, "--rate", "50", "--odometry", "none"]
+    assert main(["replay", str(bare), *command]) == 0
+    until(lambda: len(node.clouds()) == 6)
+    assert sorted(m.stamp_ns for m in node.clouds()) == [k * 10**8 for k in range(6)]
+    captured = capsys.readouterr()
+    assert "and 0 odometry samples sent" in captured.out
+    assert captured.err == f"{bare}: no times.txt; frames are taken for 0.1 s apart\n"
+    assert main(["replay", str(run_folder), *command]) == 0
+    until(lambda: len(node.clouds()) == 12)
+    assert max(m.stamp_ns for m in node.clouds()) == 25 * 10**9
+    assert node.odometry() == []
 
 
 @pytest.mark.parametrize("encoding", ["xyzi", "foxglove", "cdr"])
@@ -149,6 +167,8 @@ def test_a_signal_ends_a_loop_cleanly(node, run_folder, number):
         (["--connect", "nonsense"], "nonsense"),
         (["--config", "none.json5"], "none.json5"),
         (["--odometry", "none.tum"], "none.tum"),
+        (["--odometry", "none", "--odometry-rate", "9"], "--odometry-rate"),
+        (["--odometry", "none", "--odometry-topic", "/odom"], "--odometry-topic"),
         (["--robot", "a/b"], "--robot"),
         (["--base", "x*"], "--base"),
         (["--wait", "-1"], "--wait"),

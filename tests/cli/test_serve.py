@@ -118,11 +118,25 @@ def test_what_goes_wrong_in_opening_is_the_callers(monkeypatch):
         (["--robot", "a", "--pose-key", "coview/a/in/cloud"], "--pose-key"),
         (["--robot", "a", "--max-speed", "0"], "max_speed"),
         (["--robot", "a", "--max-outage", "-1"], "max_outage"),
+        (["--robot", "a", "--gravity", "level"], "--gravity goes with --odometry kiss-icp"),
+        (["--robot", "a", "--odometry", "kiss-icp", "--gravity", "0", "0", "9.8"], "accelerometer"),
+        (["--robot", "a", "--odometry", "kiss-icp", "--odometry-key", "k"], "reads no odometry"),
     ],
 )
 def test_refused(args, message, world_file, capsys):
     assert main(["serve", str(world_file), *args]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_without_kiss_icp(tmp_path, monkeypatch, world_file, capsys):
+    (tmp_path / "kiss_icp").mkdir()
+    (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
+    monkeypatch.syspath_prepend(tmp_path)
+    command = ["serve", str(world_file), "--robot", "r1", "--listen", free_endpoint(), "--quiet"]
+    assert main([*command, "--odometry", "kiss-icp"]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'coview-stream[kiss-icp]'" in said
+    assert said.count("\n") == 1
 
 
 def test_a_map_that_cannot_be_read(tmp_path, capsys):
@@ -146,12 +160,17 @@ def test_what_is_asked_for_arrives(monkeypatch, world_file):
 
     monkeypatch.setattr(serve, "open_node", open_node)
     options = ["--odometry-timeout", "1.5", "--max-speed", "9", "--max-outage", "7", "--max-payload", "99"]
+    options += ["--odometry", "kiss-icp", "--gravity", "0", "0.1", "-9.8"]
     names = ["--preset", "rmw_zenoh", "--humble", "--robot", "r1"]
     assert main(["serve", str(world_file), *names, *options]) == 0
     node = asked[0].node
     assert (node.odometry_timeout, node.max_gap, node.max_speed, node.max_outage) == (1.5, 1.5, 9.0, 7.0)
     assert node.max_payload == 99
     assert asked[0].keys[0].pose.endswith("/TypeHashNotSupported")
+    lidar = asked[0].lidar
+    assert (lidar.gravity, lidar.max_speed) == ((0.0, 0.1, -9.8), 9.0)
+    assert [s.odometry_source for s in serve.make_sessions(asked[0], "")] == ["kiss-icp"]
+    assert serve.make_sessions(asked[0], "")[0].lidar is lidar
 
 
 def test_another_node_of_the_same_robot_is_named(caplog):
