@@ -58,7 +58,7 @@ def stream(
         def start(name: str, *args: str) -> subprocess.Popen[bytes]:
             return stack.enter_context(_process(logs / f"{name}.log", name, *args))
 
-        node = start("serve", str(map_path), "--robot", ROBOT, "--listen", endpoint)
+        node = start("serve", str(map_path), "--robot", ROBOT, "--listen", endpoint, "--no-state")
         watcher = start("watch", "--json", "--robot", ROBOT, "--connect", endpoint)
         lines = _lines(watcher)
         _await_first(lines, recording, (node, watcher), logs)

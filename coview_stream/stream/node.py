@@ -10,7 +10,7 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -50,6 +50,7 @@ class Node:
         odometry: lane to the engine that makes odometry, for robots that send none; None if there are none.
         config: rates and limits.
         pose_format: codec of the poses; None leaves it to each robot's keys.
+        aside: what else has a thread of its own, by name; each runs until the event that it is given is set.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class Node:
         config: NodeConfig | None = None,
         pose_format: str | None = None,
         odometry: Lane | None = None,
+        aside: Mapping[str, Callable[[threading.Event], None]] | None = None,
     ) -> None:
         self.sessions = list(sessions)
         self.transport = transport
@@ -73,6 +75,7 @@ class Node:
         self._guard = Guard(log)
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._aside = dict(aside or {})
         self._identity = uuid.uuid4().hex  # of our ROS node, where there is one
         self._reporter = Reporter(self.sessions, transport, self._guard)
         self._poses: dict[str, Publisher] = {}
@@ -86,6 +89,7 @@ class Node:
         work: dict[str, Callable[[], None]] = {name: partial(self._feed, name) for name in self._lanes}
         work["poses"] = self._run_poses
         work["status"] = partial(self._reporter.run, self.config.status_rate, self._stopping)
+        work |= {name: partial(run, self._stopping) for name, run in self._aside.items()}
         for name, target in work.items():
             thread = threading.Thread(target=target, name=f"coview-{name}", daemon=True)
             self._threads.append(thread)

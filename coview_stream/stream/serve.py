@@ -46,6 +46,7 @@ class ServeOptions:
         pose_codec: of the poses; None is the preset's.
         lidar: how odometry is made of the clouds; None if the robots send theirs.
         registration: how scans are registered to the map.
+        state: directory that keeps where robots were last known to be; None for none.
     """
 
     map_path: Path
@@ -59,6 +60,7 @@ class ServeOptions:
     pose_codec: str | None = None
     lidar: LidarOdometryConfig | None = None
     registration: RegistrationMethod = "trimmed-icp"
+    state: Path | None = None
 
 
 def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
@@ -91,6 +93,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
             lane.start()
         # imported while the engines start, which takes longer
         from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
+        from coview_stream.stream.memory import Memory
         from coview_stream.stream.node import Node
         from coview_stream.stream.zenoh_transport import open_transport
 
@@ -105,7 +108,8 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         track.wait_ready(cancelled)  # the other one has until the first keyframe
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        node = Node(sessions, transport, track, search, options.node, options.pose_codec, odometry)
+        aside = {} if options.state is None else {"memory": Memory(options.state, sessions).run}
+        node = Node(sessions, transport, track, search, options.node, options.pose_codec, odometry, aside)
         node.start()
     except BaseException as error:
         for lane in lanes:
