@@ -36,7 +36,7 @@ def imported() -> float:
 def served(map_path: Path, cache: Path | None = None) -> float:
     """Seconds until a new ``coview-stream serve`` says that it is ready; NaN if it never does."""
     env = environment() | ({} if cache is None else {"TI_OFFLINE_CACHE_FILE_PATH": str(cache)})
-    command = [sys.executable, "-m", "coview_stream", "serve", str(map_path)]
+    command = [sys.executable, "-m", "coview_stream", "serve", str(map_path), "--no-state"]
     begin = time.perf_counter()
     node = subprocess.Popen(
         [*command, "--robot", "bench", "--listen", "tcp/127.0.0.1:0"],

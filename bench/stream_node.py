@@ -15,7 +15,7 @@ import psutil
 _ROOT = Path(__file__).parents[1]
 _GRACE = 10.0
 
-PRODUCT = (sys.executable, "-m", "coview_stream", "serve")
+PRODUCT = (sys.executable, "-m", "coview_stream", "serve", "--no-state")
 
 
 def environment() -> dict[str, str]:

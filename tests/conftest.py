@@ -13,6 +13,15 @@ from coview_stream.localizer import Localizer
 RADIUS = 30.0
 
 
+@pytest.fixture(scope="session", autouse=True)
+def state_home(tmp_path_factory):
+    """Nodes of tests leave nothing in the state directory of whoever runs them."""
+    folder = tmp_path_factory.mktemp("state")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(folder))
+        yield folder
+
+
 @pytest.fixture(scope="session")
 def scene():
     return small_world.boxes(seed=3)
