@@ -126,7 +126,8 @@ class GlobalSearch:
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
         self.base_map = base_map
-        self.config = config
+        # eight places a keyframe: GICP would have to prepare the map at each, and tracking starts with it anyway
+        self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
         self.local_maps = local_maps
         self.retrieval = Retrieval(base_map, config.retrieval)
         self.consensus = Consensus(base_map.stations, base_map.config.block, config.consensus)

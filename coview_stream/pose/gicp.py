@@ -7,11 +7,17 @@ the Hessian and the gradient at the pose it is given, of either kind of point by
 (see :func:`coview_kernels.align_planes`): of either kind the ``keep`` nearest pairs, both kinds weighing the same, and
 the prior in every step, so that a direction that the map does not show is the prior's from the first step on.
 
+A covariance's variance along its surface is one square metre by definition, so the weight of a pair is at least 1/2 in
+every direction: a thousand pairs in a corridor claim to know where along it they are to 0.15 m, and mean that they do
+not like to move. That half is taken out again, from Hessian and gradient, which leaves a weight that is positive
+semi-definite and says nothing where surfaces say nothing.
+
 small_gicp holds the interpreter's lock while it works and aborts the interpreter on empty clouds and NaN. Nothing of
 that kind is passed to it. What else would run in this process waits meanwhile: some 10 ms a call, and a quarter of a
-second for the covariances of a new crop of the map (160,000 points), of which there is one every 16 m. ``serve``
-registers in its lanes' processes only (:mod:`coview_stream.stream.lane`), whichever the method, so the pose clock's
-process never imports small_gicp.
+second for the covariances of a new crop of the map (160,000 points), of which there is one every 16 m. That is why
+the global search, which looks at many places, keeps to trimmed ICP whatever the method. ``serve`` registers in its
+lanes' processes only (:mod:`coview_stream.stream.lane`), whichever the method, so the pose clock's process never
+imports small_gicp.
 """
 
 from __future__ import annotations
@@ -39,6 +45,8 @@ the inflation of 8, 0.16 to 0.18 (town, campus), 0.35 (sparse forest) and 0.2 to
 trimmed ICP; for GICP, before this factor, 0.01 to 0.03, and 0.06 to 0.09 in the forest. With it no kind of world gets
 less honest than it is with trimmed ICP. The residual itself tells nothing: 0.05 of what small_gicp expects everywhere.
 """
+_ALONG = 0.5
+"""Times the identity, what every pair's weight holds in all directions, per square metre: see the module."""
 _TINY = 1e-6  # information: keeps what has none solvable
 _ROUNDING = 1e-3  # metres: the farthest pair that is kept must not be lost to float32
 
@@ -125,25 +133,20 @@ def register_surfaces(
     T, total, answer = np.array(T_map_source, dtype=np.float64), 0, None
     for scale, clouds in zip(scales, kinds, strict=True):
         for _ in range(iterations):
-            system = _system(clouds, target, grid, T, scale.radius, keep)
-            if system is None:
+            pairs = _pairs(clouds, target, grid, normals, T, pivot, scale.radius, keep)
+            if pairs is None:
                 return None
-            information, gradient = about_pivot(system.H, system.b, T, pivot)
-            step, information = fused_step(information, gradient, T, pivot, prior)
-            before, T = T, moved(T, step, pivot)
+            step, information = fused_step(pairs.information, pairs.gradient, T, pivot, prior)
+            T = moved(T, step, pivot)
             if not np.isfinite(T).all():
                 return None
             total += 1
             turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             converged = bool(shift < scale.shift and turn < scale.turn)
-            answer = before, T, information, system, converged
+            answer = Found(T, information, pairs.rmse, pairs.kept, total, converged)
             if converged:
                 break
-    if answer is None:
-        return None
-    before, T, information, system, converged = answer
-    rmse = _off_planes(system.kept, grid, normals, before)
-    return Found(orthonormal(T), information, rmse, system.pairs, total, converged)
+    return None if answer is None else answer._replace(T_map_source=orthonormal(T))
 
 
 def about_pivot(H: Matrix6, b: Vector6, T: Pose, pivot: npt.NDArray[np.float64]) -> tuple[Matrix6, Vector6]:
@@ -190,22 +193,43 @@ def _with_pivot(T: npt.ArrayLike, pivot: npt.NDArray[np.float64]) -> Pose:
     return there
 
 
-class _System(NamedTuple):
-    H: Matrix6
-    b: Vector6
-    pairs: int
-    kept: list[tuple[Points, float, float]]  # of each kind: its points, the farthest pair, the share
+def pulls(
+    moved_points: npt.NDArray[np.float64], gap: npt.NDArray[np.float64], about: npt.NDArray[np.float64]
+) -> tuple[Matrix6, Vector6]:
+    """Hessian and gradient of |gap|^2 / 2 of pairs: points (N, 3) in the map, gaps (N, 3), the moved pivot (3,)."""
+    a = moved_points - about
+    H, b = np.zeros((6, 6)), np.zeros(6)
+    H[:3, :3] = np.einsum("ij,ij->", a, a) * np.eye(3) - a.T @ a
+    H[:3, 3:] = cross(a.sum(axis=0))
+    H[3:, :3] = -H[:3, 3:]
+    H[3:, 3:] = len(a) * np.eye(3)
+    b[:3], b[3:] = np.cross(a, gap).sum(axis=0), gap.sum(axis=0)
+    return H, b
 
 
-def _system(
-    clouds: list[Surfaces], target: Surfaces, grid: kernels.PointGrid, T: Pose, radius: float, keep: float
-) -> _System | None:
-    """Hessian and gradient at a pose, both kinds weighing the same; None where too few points find a partner."""
-    gicp = library()
-    H, b, pairs, kept = np.zeros((6, 6)), np.zeros(6), 0, []
+class _Pairs(NamedTuple):
+    information: Matrix6
+    gradient: Vector6
+    kept: int
+    rmse: float
+
+
+def _pairs(
+    clouds: list[Surfaces],
+    target: Surfaces,
+    grid: kernels.PointGrid,
+    normals: Points,
+    T: Pose,
+    pivot: npt.NDArray[np.float64],
+    radius: float,
+    keep: float,
+) -> _Pairs | None:
+    """Ask what the pairs say at a pose, both kinds weighing the same; None where too few points find a partner."""
+    gicp, about = library(), T[:3, :3] @ pivot + T[:3, 3]
+    H, b, kept, squares, weights = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     points = sum(len(kind.points) for kind in clouds)
     for kind in clouds:
-        distance, _ = kernels.nearest(grid, kind.points, radius, T)
+        distance, partner = kernels.nearest(grid, kind.points, radius, T)
         found = distance[np.isfinite(distance)]
         if not len(found):
             continue
@@ -215,27 +239,15 @@ def _system(
             target.cloud, kind.cloud, target.tree, T, registration_type="GICP",
             max_correspondence_distance=farthest, num_threads=1, max_iterations=1,
         )  # fmt: skip
-        count = int(answer.num_inliers)
-        if count:
-            share = min(0.5 * points / count, _MOST_SHARE)
-            H, b, pairs = (
-                H + share * _INFORMATION * answer.H,
-                b + share * _INFORMATION * answer.b,
-                pairs + count,
-            )
-            kept.append((kind.points, farthest, share))
-    return _System(H, b, pairs, kept) if pairs >= LEAST_PAIRS else None
-
-
-def _off_planes(
-    kept: list[tuple[Points, float, float]], grid: kernels.PointGrid, normals: Points, T: Pose
-) -> float:
-    """Root mean square distance of the pairs' points from the map's planes, metres."""
-    squares = weights = 0.0
-    for points, farthest, share in kept:
-        distance, partner = kernels.nearest(grid, points, farthest, T)
-        found = np.isfinite(distance)
-        gap = points[found] @ T[:3, :3].T + T[:3, 3] - grid.points[partner[found]]
-        off = np.einsum("ij,ij->i", gap, normals[partner[found]])
-        squares, weights = squares + share * float(off @ off), weights + share * len(off)
-    return float(np.sqrt(squares / max(weights, _TINY)))
+        near = np.flatnonzero(distance <= farthest)
+        there = kind.points[near] @ T[:3, :3].T + T[:3, 3]
+        gap = there - grid.points[partner[near]]
+        off = np.einsum("ij,ij->i", gap, normals[partner[near]])
+        share = min(0.5 * points / len(near), _MOST_SHARE)
+        turned, slope = about_pivot(answer.H, answer.b, T, pivot)
+        pull, drag = pulls(there, gap, about)
+        H = H + share * _INFORMATION * (turned - _ALONG * pull)
+        b = b + share * _INFORMATION * (slope - _ALONG * drag)
+        kept += len(near)
+        squares, weights = squares + share * float(off @ off), weights + share * len(near)
+    return _Pairs(H, b, kept, float(np.sqrt(squares / weights))) if kept >= LEAST_PAIRS else None
