@@ -1,0 +1,63 @@
+"""``serve --state`` and ``--no-state``: where the last poses go, by default and by word."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from coview_stream.cli import serve, state
+from coview_stream.stream import serve as opening
+from coview_stream.stream import zenoh_transport
+from coview_stream.stream.fake import FakeTransport
+from coview_stream.stream.keys import robot_keys
+from coview_stream.stream.lane import ProcessLane
+
+
+def folder(*args):
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    return state.state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+
+
+def test_the_users_state_directory_unless_told_otherwise(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert folder() == tmp_path / "coview-stream"
+    assert folder("--state", "here/there") == Path("here/there")
+    assert folder("--no-state") is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_both_at_once_make_no_sense(capsys):
+    with pytest.raises(SystemExit):
+        folder("--state", "x", "--no-state")
+    assert "not allowed with" in capsys.readouterr().err
+
+
+def test_a_service_without_a_home_keeps_nothing(monkeypatch, caplog):
+    def homeless():
+        raise RuntimeError("no home")
+
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert folder() is None
+    assert "--state DIR" in caplog.text
+    assert folder("--state", "/var/lib/coview") == Path("/var/lib/coview")
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_node_runs_it_beside_its_clocks(monkeypatch, world_file, tmp_path, kept):
+    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: FakeTransport())
+    monkeypatch.setattr(opening, "warn_of_others", lambda *args: None)
+    for name in ("start", "wait_ready", "close"):
+        monkeypatch.setattr(ProcessLane, name, lambda self, *args: None)
+    options = opening.ServeOptions(
+        world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None
+    )
+    node = opening.open_node(options)
+    try:
+        assert ("coview-memory" in [t.name for t in node._threads]) == kept
+    finally:
+        node.close(5.0)
