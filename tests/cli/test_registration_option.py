@@ -1,0 +1,39 @@
+"""``--registration`` of ``locate`` and ``serve``: it reaches those who register, in processes of their own too."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from coview_stream.cli import main, serve
+from coview_stream.errors import CoViewError
+from coview_stream.stream.lane import ProcessLane
+
+
+def test_locate_says_at_once_what_is_missing(world_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
+    assert main(["locate", str(world_file), str(run), "-o", str(out), "--registration", "gicp"]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'coview-stream[gicp]'" in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(("given", "wanted"), [([], "trimmed-icp"), (["--registration", "gicp"], "gicp")])
+def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
+    asked = []
+    monkeypatch.setattr(serve, "_serve", lambda options, stop: asked.append(options) or True)
+    assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
+    assert [options.registration for options in asked] == [wanted]
+
+
+def test_it_travels_to_a_lanes_process(world_file):
+    """Which refuses what is no method."""
+    lane = ProcessLane("track", str(world_file), "0" * 64, registration="guesswork")  # type: ignore[arg-type]
+    try:
+        lane.start()
+        with pytest.raises(CoViewError, match="'guesswork'"):
+            lane.wait_ready()
+    finally:
+        lane.close()
