@@ -42,9 +42,8 @@ class KissRegistration:
     def register(self, points: npt.NDArray[np.float64], guess: Pose) -> Pose:
         """As of :class:`Registration`."""
         icp = self._icp
-        icp.last_delta = (
-            inverse(icp.last_pose) @ guess
-        )  # it predicts by the last motion, whatever the time between
+        # it predicts by the last motion, whatever the time between
+        icp.last_delta = inverse(icp.last_pose) @ guess
         icp.register_frame(points, _NO_TIMES)
         return np.array(icp.last_pose, dtype=np.float64)
 

@@ -117,11 +117,8 @@ def follow(
     if lidar.ground is not None:
         ground = lidar.ground
         lean = np.degrees(np.arccos(np.clip(ground.up[2], -1.0, 1.0)))
-        slope = (
-            ""
-            if ground.walls >= _FEW_WALLS
-            else "; it is off by the slope, if there is one: --gravity says better"
-        )
+        sure = ground.walls >= _FEW_WALLS
+        slope = "" if sure else "; it is off by the slope, if there is one: --gravity says better"
         notes.append(
             f"{path}: down is taken from the ground, {ground.height:.1f} m below the sensor, and {ground.walls} "
             f"patches of wall: the sensor leans {lean:.1f} deg{slope}"
