@@ -39,11 +39,11 @@ _MOST_SHARE = 5.0  # as trimmed ICP: a handful of points must not outweigh thous
 _INFORMATION = 4.0
 """Times small_gicp's Hessian, so that the configuration's ``inflation`` suits both methods.
 
-Measured on simulated drives against the truth (worlds 5101 to 5109 of ``bench.tracking``, 20 to 40 places each, starts
-off by 0.12 m and 0.3 degrees, no prior, no floors): the mean squared Mahalanobis error of a degree of freedom is, with
-the inflation of 8, 0.16 to 0.18 (town, campus), 0.35 (sparse forest) and 0.2 to 0.5 (changed town, campus by vlp16) for
-trimmed ICP; for GICP, before this factor, 0.01 to 0.03, and 0.06 to 0.09 in the forest. With it no kind of world gets
-less honest than it is with trimmed ICP. The residual itself tells nothing: 0.05 of what small_gicp expects everywhere.
+Measured on simulated drives against the truth (worlds 5101 to 5109 of ``bench.tracking``, 30 places each, starts off by
+0.12 m and 0.3 degrees, no prior, no floors): with the inflation of 8 the mean squared Mahalanobis error per degree of
+freedom is, for trimmed ICP and for GICP with this factor, 0.14 to 0.17 and 0.05 to 0.08 in towns and on a campus, 0.35
+and 0.23 to 0.34 in a sparse forest, 0.39 and 0.08 in a town that has changed. So in no kind of world is GICP less
+honest than trimmed ICP. Its residual would be no better guide: 0.05 of what small_gicp expects, in all of them.
 """
 _ALONG = 0.5
 """Times the identity, what every pair's weight holds in all directions, per square metre: see the module."""
