@@ -324,6 +324,19 @@ def test_a_disk_that_hangs_holds_up_nobody(tmp_path, monkeypatch):
         released.set()
 
 
+def test_a_disk_that_hangs_at_the_start_holds_up_nobody(tmp_path, monkeypatch):
+    released = threading.Event()
+    monkeypatch.setattr(memory, "load", lambda *args: released.wait(30.0))
+    site = Site("r1")
+    running(site, Memory(tmp_path, list(site.sessions.values()), interval=0.02))
+    try:
+        site.sees("r1", 0.0)
+        until(lambda: site.net.samples("coview/r1/out/pose"))
+        assert site.node.close(5.0)
+    finally:
+        released.set()
+
+
 def test_an_engine_that_died_is_told_where_the_robot_was(tmp_path):
     site, _ = remembering(tmp_path, "r1")
     site.frame("r1", 0.0)
