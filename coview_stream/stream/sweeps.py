@@ -14,7 +14,7 @@ from coview_stream.stream.jobs import SweepJob
 from coview_stream.stream.messages import CloudMessage, OdometryMessage
 from coview_stream.stream.odometry import Intake, OdometryBuffer
 
-_WAITING = 3  # frames at most: odometry wants every one, and yet none that is old
+_WAITING = 2  # frames at most: odometry wants every one, and yet none that is old
 
 
 @dataclass(frozen=True)
