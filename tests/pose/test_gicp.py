@@ -309,3 +309,8 @@ def test_a_drive_is_tracked(world_map, world_drive, monkeypatch):
         metres, degrees = pose_error(fixes[k].T_map_body, world_drive.T_map_body[k])
         assert metres < 0.08
         assert degrees < 0.4
+    # on a frame that registers nothing the crop is prepared, for the method that will ask for it
+    asked = []
+    monkeypatch.setattr(LocalMap, "prepare", lambda self, *method: asked.append(method))
+    localizer.step(world_drive.clouds[-1], world_drive.T_odom_body[-1], 0.5 * (len(fixes) - 1) + 0.1)
+    assert asked == [("gicp",)]
