@@ -11,7 +11,7 @@ from coview_stream.geometry import Pose, inverse, pose_from, rot_z, transform, y
 from coview_stream.place.consensus import Hypothesis
 
 _TRIES = 5  # keyframes in a row that must refute all suggestions before they are tried less often
-_LONGEST_WAIT = 10  # as a power of two, keyframes
+_PAUSE = 4  # keyframes between two tries then
 
 FROM_THERE = " (from the last known place)"
 """What an evidence's reason ends with where the best hypothesis began as a suggestion."""
@@ -54,7 +54,7 @@ class Suggestions:
 class Trials:
     """Which suggestions a search tries at a keyframe: all, until a few keyframes in a row have refuted them.
 
-    Then ever more rarely, not never: the sensor may only have been covered.
+    Then at every fifth, not never: the sensor may only have been covered.
     """
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class Trials:
         """Take note of a keyframe at which they were tried, and whether it spoke against all of them."""
         self._refuted = self._refuted + 1 if refuted else 0
         if self._refuted >= _TRIES:
-            self._wait = 2 ** min(self._refuted - _TRIES + 1, _LONGEST_WAIT)
+            self._wait = _PAUSE
 
 
 def robot_in(T_map_odom: Pose, T_odom_body: Pose) -> npt.NDArray[np.float64]:
