@@ -1,4 +1,4 @@
-"""How tracking holds, loses and recovers: ``python -m bench.tracking [NAME...] [--json FILE] [--plot FILE] [--quick]``.
+"""How tracking holds, loses and recovers: ``python -m bench.tracking [NAME...] [--json F] [--plot F] [--seeds N]``.
 
 Ten plain drives of 300 to 600 m in towns, on campuses and in sparse forests, with odometry that drifts by 0.5 to 5 %;
 and drives on which the robot is kidnapped or carried, crosses 100 m without a map, is covered for half a minute, meets
@@ -28,7 +28,7 @@ from bench.tracking_coverage import WITHIN, coverage_table, honest, pooled, shar
 from bench.tracking_drives import drift_share
 from bench.tracking_plot import draw
 from bench.tracking_run import told_of
-from bench.tracking_scenarios import QUICK, SCENARIOS, Scenario
+from bench.tracking_scenarios import QUICK, SEEDS, Scenario, scenarios
 from bench.tracking_scores import errors, score
 from bench.worlds import fingerprint
 
@@ -126,9 +126,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--worlds", type=Path, default=Path("out/worlds"), help="worlds, maps, answers (out/worlds)"
     )
     parser.add_argument("--quick", action="store_true", help="two short drives in one small town")
+    parser.add_argument(
+        "--seeds", type=int, default=SEEDS, metavar="N", help=f"worlds of the ten seeds after N ({SEEDS})"
+    )
     parser.add_argument("--list", action="store_true", help="name the scenarios and end")
     options = parser.parse_args(arguments)
-    every = QUICK if options.quick else SCENARIOS
+    every = QUICK if options.quick else scenarios(options.seeds)
     chosen = [s for s in every if not options.names or any(name in s.name for name in options.names)]
     if not chosen:
         print(f"bench.tracking: no scenario like {' or '.join(options.names)}; see --list", file=sys.stderr)

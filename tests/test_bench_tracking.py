@@ -24,7 +24,7 @@ from bench.tracking_drives import (
     start,
 )
 from bench.tracking_plot import draw
-from bench.tracking_scenarios import QUICK, SCENARIOS, Scenario
+from bench.tracking_scenarios import QUICK, Scenario, scenarios
 from bench.tracking_scores import Told, errors, losses, recovery, score
 from bench.tracking_worlds import GAP, World, earlier, in_gap, open_world
 from bench.worlds import TUNED_SEEDS
@@ -303,13 +303,13 @@ def test_an_earlier_place_has_other_buildings_and_is_driven_through_as_it_is():
 
 
 def test_scenarios_are_named_once_and_driven_where_nobody_tunes():
-    assert len({s.name for s in SCENARIOS}) == len(SCENARIOS)
-    plain = [s for s in SCENARIOS if s.plain]
+    assert len({s.name for s in scenarios()}) == len(scenarios())
+    plain = [s for s in scenarios() if s.plain]
     assert len(plain) == 10
     assert {s.world.kind for s in plain} == {"town", "campus", "sparse-forest"}
     assert {min(s.drift for s in plain), max(s.drift for s in plain)} == {0.005, 0.05}
     assert all(300.0 <= s.world.length <= 600.0 for s in plain)
-    seeds = {s.world.seed for s in SCENARIOS}
+    seeds = {s.world.seed for s in scenarios()}
     assert seeds == set(range(5001, 5011))
     assert not seeds & TUNED_SEEDS
     assert "tracking" in OWN
