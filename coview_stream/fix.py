@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry import Pose
+from coview_stream.pose.drift import Drift
 from coview_stream.pose.verification import Evidence
 
 
@@ -26,6 +27,27 @@ class State(str, Enum):
     """It was known; the evidence has gone. Searching again."""
 
 
+class Cause(str, Enum):
+    """What decided about a registration while tracking; docs/tracking.md says what an operator can do about each."""
+
+    VERIFIED = "verified"
+    """Nothing speaks against the place."""
+    BLIND = "blind"
+    """Too few points: the sensor is covered, or nothing is within its reach."""
+    OFF_MAP = "off-map"
+    """The robot sees what the map does not cover."""
+    TILT = "tilt"
+    """The pose leans against gravity."""
+    FITNESS = "fitness"
+    """What stands above the ground is not where the map has it."""
+    GROUND = "ground"
+    """The ground is not where the map has it."""
+    FREE_SPACE = "free-space"
+    """Rays passed through what the map shows."""
+    ODOMETRY = "odometry"
+    """The place fits, but not where odometry says that the robot has moved."""
+
+
 @dataclass(frozen=True)
 class KeyframeEvidence:
     """Why a keyframe decided what it decided.
@@ -39,6 +61,9 @@ class KeyframeEvidence:
         evidence: its parts, if a hypothesis could be registered.
         station: winning station, if this keyframe searched.
         shift: winning shift.
+        cause: what decided, while tracking; None from a search.
+        innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
+            from the ones before; None where nothing could be registered, and from a search.
     """
 
     stamp: float
@@ -49,6 +74,8 @@ class KeyframeEvidence:
     evidence: Evidence | None = None
     station: int | None = None
     shift: int | None = None
+    cause: Cause | None = None
+    innovation: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for ``result.json``."""
@@ -62,6 +89,8 @@ class KeyframeEvidence:
             **parts,
             "station": self.station,
             "shift": self.shift,
+            "cause": None if self.cause is None else self.cause.value,
+            "innovation": None if self.innovation is None else round(self.innovation, 2),
         }
 
     @classmethod
@@ -72,6 +101,7 @@ class KeyframeEvidence:
         return cls(
             float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
             float(data["rival"]), parts, data["station"], data["shift"],
+            None if data.get("cause") is None else Cause(data["cause"]), data.get("innovation"),
         )  # fmt: skip
 
 
@@ -87,6 +117,7 @@ class Fix:
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map frame, m2 and rad2; None unless TRACKING.
         confidence: in [0, 1]: the evidence score, less what the best rival has of it.
         evidence: of the newest keyframe, None before the first.
+        drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
     """
 
     stamp: float
@@ -96,3 +127,4 @@ class Fix:
     covariance: npt.NDArray[np.float64] | None = None
     confidence: float = 0.0
     evidence: KeyframeEvidence | None = field(default=None)
+    drift: Drift | None = None

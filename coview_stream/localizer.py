@@ -9,16 +9,17 @@ import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.doubt import Doubt
 from coview_stream.errors import CloudError, RunError
-from coview_stream.fix import Fix, KeyframeEvidence, State
+from coview_stream.fix import Cause, Fix, KeyframeEvidence, State
 from coview_stream.geometry import Points, Pose, is_pose, orthonormal, pose_from
+from coview_stream.place.continuity import Continuity
 from coview_stream.place.descriptor import Descriptor
 from coview_stream.place.keyframes import KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps
-from coview_stream.pose.verification import Evidence
 from coview_stream.search import GlobalSearch, Query, Verdict
 from coview_stream.suggestions import Suggestions
-from coview_stream.tracking import Tracker, kept, relative_to, unanchored
+from coview_stream.tracking import Tracker, relative_to, unanchored
 
 _LEAST_POINTS = 10
 _LOOKED_AT = 2000  # of a frame's points, to see how far they lie
@@ -65,9 +66,9 @@ class Localizer:
         self._evidence: KeyframeEvidence | None = None
         self._newest: _Frame | None = None
         self._suggestions = Suggestions()
-        self._doubts = 0
-        self._doubted_at = 0.0  # metres driven
-        self._doubted = self._registered = 0.0  # stamps of the first doubt and of the newest registration
+        self._continuity = Continuity()
+        self._doubt = Doubt(self.config.acceptance, self.config.tracking.distance)
+        self._registered = 0.0  # stamp of the newest registration
         self._generation += 1
 
     @property
@@ -116,15 +117,20 @@ class Localizer:
         if self.state is State.TRACKING:  # keyframes are for searching: a loss starts from nothing
             self._tracker.observe(cloud, T_odom_body, self._buffer.thin(cloud, T_odom_body))
             patience = _HURRIED if hurry else 1.0
-            due = self._tracker.due(patience) or self._doubts > 0
-            if due or stamp - self._registered >= patience * self.config.tracking.seconds:
-                self._track(cloud, T_odom_body, stamp, idle=not due)
+            due = self._tracker.due(patience)
+            still = stamp - self._registered >= patience * self.config.tracking.seconds
+            doubted = self._doubt.active or self._tracker.alarmed(T_odom_body)
+            if due or still or doubted:
+                self._track(cloud, T_odom_body, stamp, idle=not due, alone=doubted)
             else:
                 self._tracker.look_around(T_odom_body)
             return None
         suggested = self._suggested(T_odom_body)
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
+        if self._continuity.broken(self._buffer.newest, T_odom_body[:3, 3]):
+            self._break_off(stamp)
+            return None
         if keyframe is None:
             return None
         scan = self.base_map.descriptor_config
@@ -144,12 +150,14 @@ class Localizer:
             return
         self._evidence = verdict.evidence
         if verdict.accepted is not None:
-            self._tracker.start(verdict.accepted.registration, verdict.travelled)
+            self._tracker.start(verdict.accepted.registration, newest.T_odom_body, verdict.travelled)
             self._suggestions.clear()
-            self.state, self._doubts = State.TRACKING, 0
+            self.state = State.TRACKING
+            self._doubt.clear()
             self._buffer.clear()
             self._registered = newest.stamp
-            if not self._speaks_for(self._tracker.update(newest.cloud, newest.T_odom_body)):
+            judgement = self._tracker.update(newest.cloud, newest.T_odom_body)
+            if not judgement.verified:
                 self.suspect()  # what it sees now does not fit: it may have driven on or been carried since
         elif self.state is not State.LOST:
             self.state = verdict.evidence.state
@@ -181,9 +189,8 @@ class Localizer:
     def suspect(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
         self._tracker.forget_points()
-        if self.state is State.TRACKING and not self._doubts:
-            self._doubts, self._doubted_at = 1, self._tracker.travelled
-            self._doubted = self._newest.stamp if self._newest else 0.0
+        if self.state is State.TRACKING:
+            self._doubt.begin(self._newest.stamp if self._newest else 0.0, self._tracker.travelled)
 
     def fix(self) -> Fix:
         """Say what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
@@ -191,31 +198,21 @@ class Localizer:
             raise RuntimeError("no frame yet; call take or step first")
         return self._fix(self._newest.T_odom_body, self._newest.stamp)
 
-    def _speaks_for(self, evidence: Evidence | None) -> bool:
-        return evidence is not None and kept(evidence, self.config.acceptance)
-
-    def _track(self, cloud: Points, T_odom_body: Pose, stamp: float, idle: bool) -> None:
+    def _track(self, cloud: Points, T_odom_body: Pose, stamp: float, idle: bool, alone: bool) -> None:
         """Correct the drift since the last registration, and verify again that the place is right.
 
         ``idle``: by its odometry the robot stands still. It may be carried, so what it saw before does not count.
+        ``alone``: nor does it where there is a doubt.
         """
-        evidence = self._tracker.update(cloud, T_odom_body, idle)
+        judgement = self._tracker.update(cloud, T_odom_body, idle, alone)
         self._registered = stamp
-        rule = self.config.acceptance
-        score = evidence.score if evidence else 0.0
-        doubtful = not self._speaks_for(evidence)
-        driven = self._tracker.travelled - self._doubted_at
-        if not doubtful:
-            self._doubts = 0
-        elif not self._doubts or driven >= self.config.tracking.distance:
-            # every frame may clear a doubt, but only driving on adds to it: one covered frame loses nothing
-            self._doubted = self._doubted if self._doubts else stamp
-            self._doubts += 1
-            self._doubted_at = self._tracker.travelled
-        if self._doubts >= rule.patience or (doubtful and stamp - self._doubted >= rule.patience_seconds):
+        reason = self._doubt.note(judgement, stamp, self._tracker.travelled)
+        if self._doubt.hopeless:
             self._lose()
-        reason = f"evidence gone, {self._doubts} times in a row" if doubtful else "verified"
-        self._evidence = KeyframeEvidence(stamp, self.state, reason, score, 0.0, evidence)
+        self._evidence = KeyframeEvidence(
+            stamp, self.state, reason, judgement.score, 0.0, judgement.evidence,
+            cause=judgement.cause, innovation=judgement.innovation,
+        )  # fmt: skip
 
     def _lose(self) -> None:
         """Search again from nothing: what lost the place may be an odometry that jumped or started anew.
@@ -226,14 +223,25 @@ class Localizer:
             self._suggestions.frames_were(self._tracker.T_map_odom, self._anchor)
         self.state, self._anchor = State.LOST, None
         self._buffer.clear()
+        self._continuity.clear()
         self._tracker.forget()
         self._generation += 1
+
+    def _break_off(self, stamp: float) -> None:
+        """Search again from nothing, for the keyframes so far do not belong together with what is seen now."""
+        self._buffer.clear()
+        self._tracker.forget_points()
+        self._generation += 1
+        if self.state is State.AMBIGUOUS:
+            self.state = State.SEARCHING
+        reason = "searching anew: frames do not fit together where odometry puts them"
+        self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=Cause.ODOMETRY)
 
     def _fix(self, T_odom_body: Pose, stamp: float) -> Fix:
         evidence = self._evidence
         if self.state is not State.TRACKING or self._anchor is None:
             return Fix(stamp, self.state, evidence=evidence)
-        if self._doubts:  # a pose that the newest registration speaks against is none
+        if self._doubt.active:  # a pose that the newest registration speaks against is none
             return Fix(stamp, State.AMBIGUOUS, evidence=evidence)
         T_map_local = orthonormal(self._tracker.T_map_odom)
         T_map_body = T_map_local @ T_odom_body
@@ -246,6 +254,7 @@ class Localizer:
             self._tracker.reported_covariance(),
             confidence,
             evidence,
+            self._tracker.drift,
         )
 
     def _checked(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:

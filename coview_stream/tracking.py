@@ -1,4 +1,4 @@
-"""Tracking: keep ``T_map_odom`` right by registering recent points, a Kalman filter with ICP as its measurement."""
+"""Tracking: registrations of the newest frames and odometry between them, in one graph of poses."""
 
 from __future__ import annotations
 
@@ -9,18 +9,33 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import AcceptanceConfig, LocalizerConfig
-from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, tilt_of, transform
+from coview_stream.config import LocalizerConfig
+from coview_stream.fix import Cause
+from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, transform
 from coview_stream.place.keyframes import thinned
-from coview_stream.pose.covariance import angles_first, drift_covariance
-from coview_stream.pose.rays import RangeImage
-from coview_stream.pose.registration import LocalMaps, Prior, Registration, register
+from coview_stream.pose.attempt import Attempt, Scan, attempt
+from coview_stream.pose.chain import Estimate
+from coview_stream.pose.covariance import (
+    angles_first,
+    carried_along,
+    registration_covariance,
+    shared_covariance,
+)
+from coview_stream.pose.drift import Drift, DriftEstimator, worth_learning
+from coview_stream.pose.glance import Glance
+from coview_stream.pose.graph import Smoother, make_smoother
+from coview_stream.pose.judgement import Habit, Judgement
+from coview_stream.pose.registration import LocalMap, LocalMaps, Registration
 from coview_stream.pose.source import local_source
-from coview_stream.pose.verification import Evidence, verify
+from coview_stream.pose.tangent import Matrix6, difference
 
 _MOST_FRAMES = 40
+_LEAST_SOURCE = 100  # points to register
 _IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
-_START_COVARIANCE = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
+_OWN_NOISE = 0.4  # share of two neighbouring registrations' variances that their difference has; the rest they share
+_START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
+_SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
+"""What odometry may be off by where it contradicts the lidar: wheels that slip, a robot that is carried."""
 
 
 @dataclass(frozen=True)
@@ -29,15 +44,29 @@ class _Recent:
     points: Points  # (N, 3) odometry frame
 
 
-class Tracker:
-    """Belief over ``T_map_odom``: a mean and a covariance (6, 6) over (rx, ry, rz, x, y, z) about the body.
+@dataclass(frozen=True)
+class _Mark:
+    """Odometry at one moment: pose (4, 4), metres driven and radians turned so far."""
 
-    Odometry adds random-walk noise with every metre driven; a registration of the last metres' points, with the
-    predicted pose as its prior, takes it away.
+    T_odom_body: Pose
+    travelled: float
+    turned: float
+
+
+@dataclass(frozen=True)
+class _Registered:
+    """A registration that was believed: the pose (4, 4) as the map alone has it, its variances (6,), and when."""
+
+    T_map_body: Pose
+    variances: npt.NDArray[np.float64]
+    mark: _Mark
+
+
+class Tracker:
+    """Belief over the robot's pose: a graph of keyframes, one per registration, and odometry since the newest.
 
     Attributes:
-        T_map_odom: (4, 4) map <- odometry, the mean.
-        covariance: (6, 6) right after the newest registration.
+        T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
         travelled: metres that odometry has driven.
     """
 
@@ -46,13 +75,20 @@ class Tracker:
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
-        self.covariance: npt.NDArray[np.float64] = np.eye(6)
-        self._recent: deque[_Recent] = deque(maxlen=_MOST_FRAMES)
         self.travelled = 0.0
-        self._registered_at = 0.0
         self._turned = 0.0
+        self._graph: Smoother | None = None
+        self._rates = DriftEstimator(config.tracking)
+        self._habit = Habit()
+        self._glance = Glance()
+        self._recent: deque[_Recent] = deque(maxlen=_MOST_FRAMES)
         self._unseen = 0  # frames since the last update
         self._last: Pose | None = None
+        self._keyframe = _Mark(np.eye(4), 0.0, 0.0)
+        self._registered: _Registered | None = None
+        self._newest: Matrix6 = np.zeros((6, 6))  # covariance of the newest registration that was believed
+
+    # ---- frames
 
     def observe(self, cloud: Points, T_odom_body: Pose, thin: Points | None = None) -> None:
         """Remember a frame's points (body frame) and how far odometry has driven.
@@ -76,83 +112,178 @@ class Tracker:
         """Drop the points that the next registration would use beside the next frame's."""
         self._recent.clear()
 
-    def start(self, registration: Registration, travelled: float) -> None:
-        """Begin with an accepted fix, found where odometry had driven ``travelled`` metres.
+    def look_around(self, T_odom_body: Pose) -> None:
+        """Crop the map here already, on a frame that registers nothing: a new crop takes as long as a registration."""
+        if (target := self._target(T_odom_body)) is not None:
+            target.prepare(self.config.registration.method)
 
-        It may not have converged yet: its own covariance is not believed.
-        """
-        self.T_map_odom = registration.T_map_source
-        self.covariance = self._posterior(registration) + _START_COVARIANCE
-        self._registered_at, self._turned = travelled, 0.0
+    # ---- when to register
 
     def due(self, patience: float = 1.0) -> bool:
         """Whether the robot has driven or turned far enough for another registration; ``patience`` times as far."""
-        driven, turned = self.travelled - self._registered_at, self._turned
+        driven, turned = self._since_keyframe()
         settings = self.config.tracking
-        return driven >= patience * settings.distance or turned >= patience * settings.turn
+        if driven >= patience * settings.distance or turned >= patience * settings.turn:
+            return True
+        if driven < patience * settings.least_distance:
+            return False
+        grown = self._rates.drift.variances(driven, turned)
+        yaw, position = patience * settings.unsure_yaw, patience * settings.unsure_position
+        return bool(grown[2] > yaw**2 or grown[3] > position**2)
 
-    def look_around(self, T_odom_body: Pose) -> None:
-        """Crop the map here already, on a frame that registers nothing: a new crop takes as long as a registration."""
-        position = transform(self.T_map_odom, T_odom_body[None, :3, 3])[0]
-        if (target := self.local_maps.around(position)) is not None:
-            target.prepare(self.config.registration.method)
+    def alarmed(self, T_odom_body: Pose) -> bool:
+        """Whether the newest frame lies on the map so much less than the ones before that it should be registered."""
+        target = self._target(T_odom_body)
+        if target is None or not self._recent:
+            return False
+        points = self._recent[-1].points
+        return self._glance.alarming(points, T_odom_body[:3, 3], self.T_map_odom, target)
 
-    def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False) -> Evidence | None:
-        """Register the recent points from the predicted pose; None where the map offers nothing to register to.
+    # ---- the belief
 
-        ``idle``: use only frames since the last update, for a robot that by its odometry stands still, and believe the
-        odometry a little less: standing and looking again and again must not add up to certainty.
+    def start(self, registration: Registration, T_odom_body: Pose, travelled: float) -> None:
+        """Begin with an accepted fix, found where odometry had driven ``travelled`` metres, at the newest frame.
+
+        It may not have converged yet: its own covariance is not believed.
         """
-        if idle:
-            while len(self._recent) > max(1, self._unseen):
-                self._recent.popleft()
+        self._habit.clear()
+        self._glance.clear()
+        own = self._newest = registration_covariance(registration.information, self.config.registration)
+        drifted = self._rates.drift.covariance(self.travelled - travelled, 0.0)
+        self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
+
+    def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False, alone: bool = False) -> Judgement:
+        """Register the newest frames from the predicted pose, judge, and correct the belief if that went well.
+
+        Args:
+            cloud: (N, 3) the newest frame, body frame, which has been observed.
+            T_odom_body: (4, 4) its odometry.
+            idle: by its odometry the robot stands still: use only frames since the last update, and believe the
+                odometry a little less; standing and looking again and again must not add up to certainty.
+            alone: use the newest frame alone: something is wrong with it, or with what came before.
+        """
+        graph = self._moved(T_odom_body, idle)
+        most = 1 if alone else max(1, self._unseen) if idle else _MOST_FRAMES
+        while len(self._recent) > most:
+            self._recent.popleft()
         self._unseen = 0
-        position = T_odom_body[:3, 3]
-        target = self.local_maps.around(transform(self.T_map_odom, position[None])[0])
-        covariance = self.predicted_covariance()
-        if idle:
-            covariance = covariance + angles_first(drift_covariance(self.config.tracking, _IDLE_DRIVE, 0.0))
-        self._registered_at, self._turned, self.covariance = self.travelled, 0.0, covariance
+        target = self._target(T_odom_body)
         if target is None:
-            return None
-        source = local_source(self._window(), position, self.config.registration)
-        if len(source.points) < 100:
-            return None
-        found = register(
-            source, self.T_map_odom, target, self.config.registration, self.config.registration.track,
-            Prior(self.T_map_odom, np.asarray(np.linalg.inv(covariance))), position,
-        )  # fmt: skip
-        T = self.T_map_odom if found is None else found.T_map_source
-        surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
-        evidence = verify(source, T, RangeImage.of(cloud), T @ T_odom_body, target, surveyed)
-        rule = self.config.acceptance
-        if tilt_of(T) > rule.most_tilt:
-            return None
-        if found is not None and kept(evidence, rule):
-            self.T_map_odom = found.T_map_source
-            self.covariance = self._posterior(found)
-        else:
-            # bad frames among the last metres' must not spoil the next registration too
-            self._recent.clear()
-        return evidence
+            return Judgement(Cause.OFF_MAP, "the map is empty here")
+        source = local_source(self._window(), T_odom_body[:3, 3], self.config.registration)
+        # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
+        seen = min(len(source.points), len(self._recent[-1].points) if self._recent else 0)
+        if seen < _LEAST_SOURCE:
+            return self._rejected(Judgement(Cause.BLIND, f"only {seen} points to register"))
+        scan = Scan(source, cloud, T_odom_body)
+        belief = graph.estimate
+        tried = self._attempt(scan, belief, target, self.config.registration.track)
+        limit = self.config.acceptance.keep_innovation
+        if alone or not tried.judgement.verified or tried.innovation > limit:
+            doubted = Estimate(belief.T_map_body, belief.covariance + _SLIP)
+            again = self._attempt(scan, doubted, target, self.config.registration.search[1:])
+            tried = max(tried, again, key=_rank)
+        if not tried.judgement.verified:
+            return self._rejected(tried.judgement)
+        if tried.innovation > limit:
+            return self._slipped(tried, belief, T_odom_body)
+        graph.correct(tried.T_map_body, tried.covariance)
+        self._believe(T_odom_body)
+        self._learn(tried)
+        self._glance.learn(self._recent[-1].points, T_odom_body[:3, 3], self.T_map_odom, target)
+        return tried.judgement
 
-    def predicted_covariance(self) -> npt.NDArray[np.float64]:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the last registration."""
-        grown = drift_covariance(self.config.tracking, self.travelled - self._registered_at, self._turned)
-        return self.covariance + angles_first(grown)
+    def predicted_covariance(self) -> Matrix6:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
+        if self._graph is None or self._last is None:
+            return np.asarray(_START.copy())
+        belief = self._graph.estimate
+        here = self.T_map_odom @ self._last
+        carried = carried_along(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
+        return np.asarray(carried + self.drift.covariance(*self._since_keyframe()))
 
-    def reported_covariance(self) -> npt.NDArray[np.float64]:
-        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), floors included, map axes."""
-        settings = self.config.registration
-        floor = np.array([settings.sigma_floor] * 3 + [settings.sigma_floor_angle] * 3) ** 2
-        return np.asarray(angles_first(self.predicted_covariance()) + np.diag(floor))
+    def reported_covariance(self) -> Matrix6:
+        """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
+        shared = shared_covariance(self._newest, self.config.registration)
+        return angles_first(self.predicted_covariance() + shared)
 
-    def _posterior(self, registration: Registration) -> npt.NDArray[np.float64]:
-        information = registration.information + 1e-6 * np.eye(6)
-        return np.asarray(np.linalg.inv(information) * self.config.registration.inflation**2)
+    @property
+    def drift(self) -> Drift:
+        """How fast odometry seems to drift."""
+        return self._rates.drift
+
+    # ---- inside
+
+    def _since_keyframe(self) -> tuple[float, float]:
+        return self.travelled - self._keyframe.travelled, self._turned - self._keyframe.turned
+
+    def _mark(self, T_odom_body: Pose) -> _Mark:
+        return _Mark(T_odom_body, self.travelled, self._turned)
+
+    def _target(self, T_odom_body: Pose) -> LocalMap | None:
+        return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
+
+    def _restart(self, T_map_body: Pose, covariance: Matrix6, T_odom_body: Pose) -> None:
+        """Begin a new graph: nothing that was believed before counts."""
+        self._graph = self._graph or make_smoother(self.config.graph)
+        self._graph.start(T_map_body, covariance)
+        self._registered = None
+        self._keyframe = self._mark(T_odom_body)
+        self._believe(T_odom_body)
+
+    def _moved(self, T_odom_body: Pose, idle: bool) -> Smoother:
+        """Add a keyframe where odometry leads."""
+        if self._graph is None:
+            raise RuntimeError("no fix yet; call start first")
+        driven, turned = self._since_keyframe()
+        spread = self.drift.covariance(driven + _IDLE_DRIVE * idle, turned)
+        self._graph.move(inverse(self._keyframe.T_odom_body) @ T_odom_body, spread)
+        self._keyframe = self._mark(T_odom_body)
+        return self._graph
+
+    def _attempt(self, scan: Scan, belief: Estimate, target: LocalMap, scales: tuple[float, ...]) -> Attempt:
+        assert self._graph is not None  # there is a belief
+        return attempt(scan, belief, target, scales, self.base_map, self.config, self._habit, self._graph)
+
+    def _believe(self, T_odom_body: Pose) -> None:
+        assert self._graph is not None  # who corrects it has one
+        self.T_map_odom = self._graph.estimate.T_map_body @ inverse(T_odom_body)
+
+    def _learn(self, tried: Attempt) -> None:
+        """Take note of what a registration says of odometry, and of what evidence is like here."""
+        before, now = self._registered, self._keyframe
+        variances = np.diag(tried.covariance)
+        self._newest = tried.covariance
+        assert tried.judgement.evidence is not None  # it was verified
+        self._habit.learn(tried.judgement.evidence)
+        if before is not None:
+            driven, turned = now.travelled - before.mark.travelled, now.turned - before.mark.turned
+            if not worth_learning(driven, turned):
+                return
+            step = inverse(before.mark.T_odom_body) @ now.T_odom_body
+            gap = difference(tried.T_map_body, before.T_map_body @ step)
+            noise = _OWN_NOISE * (variances + before.variances)
+            self._rates.add(gap, noise, driven, turned)
+        self._registered = _Registered(tried.T_map_body, variances, now)
+
+    def _rejected(self, judgement: Judgement) -> Judgement:
+        """Believe nothing of it: bad frames among the newest must not spoil the next registration too."""
+        self._recent.clear()
+        return judgement
+
+    def _slipped(self, tried: Attempt, belief: Estimate, T_odom_body: Pose) -> Judgement:
+        """Go on where the lidar says, for the next frame to confirm: odometry says otherwise."""
+        gap = difference(tried.T_map_body, belief.T_map_body)
+        metres, degrees = float(np.linalg.norm(gap[3:])), np.degrees(float(np.linalg.norm(gap[:3])))
+        self._newest = tried.covariance
+        known = tried.covariance + shared_covariance(tried.covariance, self.config.registration)
+        self._restart(tried.T_map_body, known, T_odom_body)
+        self._recent.clear()
+        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
+        return Judgement(Cause.ODOMETRY, reason, tried.judgement.evidence, tried.innovation)
 
     def _window(self) -> Points:
-        """Points of the last metres, more if they are too few."""
+        """Points of the newest frames: of the last metres, more if they are too few."""
         settings = self.config.tracking
         parts: list[Points] = []
         count = 0
@@ -165,13 +296,8 @@ class Tracker:
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
 
-def kept(evidence: Evidence, rule: AcceptanceConfig) -> bool:
-    """Whether a registration while tracking speaks for the place it found."""
-    return (
-        evidence.inside >= rule.inside
-        and evidence.score >= rule.keep_score
-        and evidence.ground >= rule.keep_ground
-    )
+def _rank(tried: Attempt) -> tuple[bool, float]:
+    return tried.judgement.verified, tried.judgement.score
 
 
 def relative_to(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:

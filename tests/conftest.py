@@ -61,6 +61,12 @@ def world_drive(scene):
 
 
 @pytest.fixture(scope="session")
+def slow_drive(scene):
+    """The first eight metres of the same way, a frame every 0.2 m."""
+    return small_world.record_along(scene, small_world.drive(5), 0.2)
+
+
+@pytest.fixture(scope="session")
 def elsewhere():
     """A run through another world."""
     return small_world.record(small_world.boxes(seed=77), frames=4)

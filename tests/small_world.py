@@ -12,7 +12,7 @@ import numpy as np
 
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.clouds.writers import write_cloud
-from coview_stream.geometry import inverse, pose_from, rot_z, transform
+from coview_stream.geometry import inverse, pose_from, rot_z, transform, yaw_of
 
 SENSOR_HEIGHT = 1.7
 HALF = 34.0  # metres: half the side of the map
@@ -129,6 +129,24 @@ def record(scene: list[Box], T_odom_map: np.ndarray = ODOM_FAR, frames: int = FR
     truth = drive(frames)
     clouds = [scan(scene, T, seed) for seed, T in enumerate(truth)]
     return Drive(clouds, [T_odom_map @ T for T in truth], truth)
+
+
+def along(poses: list[np.ndarray], spacing: float) -> list[np.ndarray]:
+    """Poses ``spacing`` metres apart on straight lines between the given ones; headings turn evenly."""
+    places = np.array([T[:3, 3] for T in poses])
+    headings = np.unwrap([yaw_of(T) for T in poses])
+    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
+    at = np.arange(0.0, way[-1], spacing)
+    xyz = np.column_stack([np.interp(at, way, places[:, axis]) for axis in range(3)])
+    yaws = np.interp(at, way, headings)
+    return [pose_from(rot_z(yaw), place) for yaw, place in zip(yaws, xyz, strict=True)]
+
+
+def record_along(scene: list[Box], poses: list[np.ndarray], spacing: float) -> Drive:
+    """Scan a frame every ``spacing`` metres on the way through the poses."""
+    truth = along(poses, spacing)
+    clouds = [scan(scene, T, seed) for seed, T in enumerate(truth, start=100)]
+    return Drive(clouds, [ODOM_FAR @ T for T in truth], truth)
 
 
 def pose_error(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""How sure a measurement is: odometry by how far it has driven, a registration by its Hessian, less what it was told.
+"""How sure a registration is: by its Hessian, less what it was told; and how sure a pose is on its way from one.
 
 Covariances and informations are (6, 6), radians and metres, along the map's axes, about the body. Their order is
 (rx, ry, rz, x, y, z) unless a function says that it is the report's, (x, y, z, roll, pitch, yaw).
@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coview_stream.config import RegistrationConfig, TrackingConfig
+from coview_stream.config import RegistrationConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry import Pose
-from coview_stream.pose.tangent import Matrix6, difference, shifted
+from coview_stream.pose.tangent import Matrix6, Vector6, cross, difference, shifted
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _LEAST_SHARE = 0.01  # of what is known of a direction: where the pairs have less, their minimum is guesswork
-_LEAST_DRIVEN = 1e-3  # metres: standing still, a covariance of zero would be none
 
 
 class Measured(NamedTuple):
@@ -32,28 +31,6 @@ class Measured(NamedTuple):
 def angles_first(covariance: Matrix6) -> Matrix6:
     """(6, 6) over (x, y, z, roll, pitch, yaw) as over (rx, ry, rz, x, y, z), or the other way round."""
     return np.asarray(covariance[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)])
-
-
-def drift_covariance(config: TrackingConfig, driven: float, turned: float) -> Matrix6:
-    """Covariance (6, 6) over (x, y, z, roll, pitch, yaw) that odometry gathers in metres driven and radians turned."""
-    rates = np.array(
-        [*[config.position_drift] * 3, config.tilt_drift, config.tilt_drift, config.yaw_drift],
-        dtype=np.float64,
-    )
-    variances = rates**2 * driven
-    variances[5] += (config.turn_drift * turned) ** 2
-    return np.diag(variances)
-
-
-def odometry_covariance(distance: float, turn: float, config: TrackingConfig) -> Matrix6:
-    """Covariance of a motion by odometry: a random walk with every metre driven, and yaw with every radian turned.
-
-    Args:
-        distance: metres driven; a millimetre at least is assumed, so that the answer has an inverse.
-        turn: radians turned.
-        config: the drifts.
-    """
-    return angles_first(drift_covariance(config, max(distance, _LEAST_DRIVEN), turn))
 
 
 def without_prior(
@@ -101,10 +78,9 @@ def registration_covariance(information: Matrix6, config: RegistrationConfig) ->
     The inverse Hessian is optimistic, as points next to each other are not independent: its sigma is multiplied by
     ``inflation``. Where the map hardly shows a direction (along a tunnel, on a bare field) what there is of a Hessian
     comes from noise in the normals, so that its sigma means little. In units that compare, metres and metres at a lever
-    arm of ``weak_lever``, a direction's sigma s becomes s sqrt(1 + (s / w)^2), w = ``weak_floors`` *
-    ``sigma_floor``: well below w nothing happens, far above it the sigma grows with its square, up to ``weak_sigma``,
-    which also stands for none at all. At last ``sigma_floor`` and ``sigma_floor_angle`` are added: errors that all
-    points share.
+    arm of ``weak_lever``, a direction's sigma s becomes s sqrt(1 + (s / w)^2), w = ``weak_from``: well below w nothing
+    happens, far above it the sigma grows with its square, up to ``weak_sigma``, which also stands for none at all. At
+    last ``sigma_floor`` and ``sigma_floor_angle`` are added.
 
     Args:
         information: (6, 6) of the pairs alone: no prior in it (see :func:`without_prior`), before inflation.
@@ -121,8 +97,39 @@ def registration_covariance(information: Matrix6, config: RegistrationConfig) ->
     strength, directions = np.linalg.eigh(balanced)
     widest = config.weak_sigma**2
     variance = 1.0 / np.maximum(strength, 1.0 / widest)
-    weak = (config.weak_floors * config.sigma_floor) ** 2
+    weak = config.weak_from**2
     variance = np.minimum(variance * (1.0 + variance / weak), widest)
     spread = unit[:, None] * directions
     floor = np.array([config.sigma_floor_angle] * 3 + [config.sigma_floor] * 3) ** 2
     return np.asarray((spread * variance) @ spread.T + np.diag(floor))
+
+
+def carried_along(covariance: Matrix6, shift: Vector6) -> Matrix6:
+    """Covariance (6, 6) after a known motion by ``shift`` (3,), metres along the map's axes.
+
+    An error in the heading at its beginning is one in the place at its end: s' = s + r x shift.
+    """
+    J = np.eye(6)
+    J[3:, :3] = -cross(shift)
+    return np.asarray(J @ covariance @ J.T)
+
+
+def shared_covariance(registered: Matrix6, config: RegistrationConfig) -> Matrix6:
+    """Covariance (6, 6) of the error that neighbouring registrations share, and that does not average out over them.
+
+    The map's points lie a little off its surfaces, trees look different from above, and odometry's roll and pitch
+    tremble from frame to frame. In a direction that the map shows badly all of that is larger, so that most of it is
+    ``shared`` times the sigma of the registration itself; the other settings are what is left where it shows all well.
+
+    Args:
+        registered: (6, 6) of the newest registration, as :func:`registration_covariance` has it.
+        config: how much of it is shared, and the rest.
+    """
+    tilt, yaw, place, height = (
+        config.shared_tilt,
+        config.shared_yaw,
+        config.shared_position,
+        config.shared_height,
+    )
+    rest = np.diag(np.square([tilt, tilt, yaw, place, place, height]))
+    return np.asarray(config.shared**2 * registered + rest)

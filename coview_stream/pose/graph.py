@@ -57,7 +57,7 @@ class Smoother(Protocol):
         Args:
             T_between: (4, 4) the new body in the frame of the newest keyframe's, ``inverse(T_odom_last) @ T_odom_new``.
             covariance: of the new pose if the last one were known, along the map's axes as the estimate has them now
-                (see :func:`coview_stream.pose.covariance.odometry_covariance`).
+                (see :func:`coview_stream.pose.drift.Drift.covariance`).
         """
 
     def correct(self, T_map_body: Pose, covariance: Matrix6) -> None:

@@ -15,7 +15,7 @@ from coview_stream.config import GraphConfig
 from coview_stream.pose.chain import Chain, Gaussian, Keyframe
 
 _RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are weighed again
-_MOST_UPDATES = 20
+_MOST_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
 
 
 class GtsamSmoother(Chain):

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.config import TrackingConfig
 from coview_stream.fix import Fix, State
 from coview_stream.geometry import Pose
-from coview_stream.pose.covariance import drift_covariance
+from coview_stream.pose.drift import Drift
 from coview_stream.stream.messages import PoseMessage
 from coview_stream.stream.odometry import OdometryBuffer
 
@@ -28,6 +27,7 @@ class Correction:
         verified_ns: stamp of the newest registration that spoke for it.
         travelled: metres that odometry had driven at the frame.
         turned: radians that it had turned.
+        drift: how fast it seems to drift.
     """
 
     T_map_odom: Pose
@@ -36,22 +36,21 @@ class Correction:
     verified_ns: int
     travelled: float
     turned: float
+    drift: Drift
 
     @classmethod
     def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> Correction:
         """Take over a fix that has a pose; ``stamp_ns`` is its frame's."""
-        if fix.T_map_odom is None or fix.covariance is None:
+        if fix.T_map_odom is None or fix.covariance is None or fix.drift is None:
             raise ValueError("a fix without a pose corrects nothing")
         verified = stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS))
-        return cls(fix.T_map_odom, fix.covariance, fix.confidence, verified, travelled, turned)
+        return cls(fix.T_map_odom, fix.covariance, fix.confidence, verified, travelled, turned, fix.drift)
 
     def age(self, stamp_ns: int) -> float:
         """Seconds of sensor time from the newest registration to ``stamp_ns``."""
         return max(0.0, (stamp_ns - self.verified_ns) / _NS)
 
-    def pose(
-        self, odometry: OdometryBuffer, drift: TrackingConfig, robot: str, map_sha256: str
-    ) -> PoseMessage | None:
+    def pose(self, odometry: OdometryBuffer, robot: str, map_sha256: str) -> PoseMessage | None:
         """Newest odometry, corrected, with its own stamp and what it may have drifted meanwhile; None before any."""
         newest = odometry.newest
         if newest is None:
@@ -63,7 +62,7 @@ class Correction:
             robot=robot,
             state=State.TRACKING.value,
             T_map_body=self.T_map_odom @ newest.T_odom_body,
-            covariance=self.covariance + drift_covariance(drift, driven, turned),
+            covariance=self.covariance + self.drift.reported(driven, turned),
             confidence=self.confidence,
             map_sha256=map_sha256,
             age=self.age(newest.stamp_ns),

@@ -16,6 +16,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.errors import MapError, RunError
 from coview_stream.localizer import Localizer
 from coview_stream.pose import gicp
+from coview_stream.pose.graph import make_smoother
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch, Verdict
 from coview_stream.stream.deskew import deskew
@@ -84,7 +85,8 @@ class TrackEngine:
         self._robots.pop(robot, None)
 
     def prepare(self) -> None:
-        """Nothing: the map is cropped where robots are."""
+        """Import what the graph of poses runs on; the map is cropped where robots are."""
+        make_smoother(self.config.graph)
 
     def _localizer(self, job: FrameJob) -> Localizer:
         epoch, localizer = self._robots.get(job.robot, (None, None))

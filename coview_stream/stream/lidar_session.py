@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from coview_stream.config import TrackingConfig
 from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.stream.codecs import decode_cloud
 from coview_stream.stream.config import NodeConfig
@@ -30,14 +29,13 @@ class LidarSession(Session):
         keys: RobotKeys,
         map_sha256: str,
         config: NodeConfig | None = None,
-        tracking: TrackingConfig | None = None,
         options: tuple[str | None, str | None] = (None, None),
         lidar: LidarOdometryConfig | None = None,
     ) -> None:
         """As of a :class:`Session`; ``lidar`` says how odometry is made."""
         self.lidar = lidar or LidarOdometryConfig()
         self._generation = 0
-        super().__init__(keys, map_sha256, config, tracking, options)
+        super().__init__(keys, map_sha256, config, options)
 
     def _clear(self) -> None:
         super()._clear()

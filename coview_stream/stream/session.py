@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 
-from coview_stream.config import TrackingConfig
 from coview_stream.fix import KeyframeEvidence, State
 from coview_stream.geometry import Pose
 from coview_stream.search import Verdict
@@ -25,6 +24,7 @@ from coview_stream.stream.odometry import Intake, OdometryBuffer
 from coview_stream.stream.pairing import Pairing
 from coview_stream.stream.reasons import why_nothing
 from coview_stream.stream.reception import Complaints, last_line, note, received, thinned
+from coview_stream.stream.transitions import Transitions
 
 _NS = 1_000_000_000
 
@@ -36,6 +36,7 @@ class Session:
         keys: where its messages come and go.
         counters: what became of them.
         complaints: about its input, for people.
+        transitions: of its state.
         odometry_source: who makes the odometry: ``robot``, or what does so here.
     """
 
@@ -46,14 +47,12 @@ class Session:
         keys: RobotKeys,
         map_sha256: str,
         config: NodeConfig | None = None,
-        tracking: TrackingConfig | None = None,
         options: tuple[str | None, str | None] = (None, None),
     ) -> None:
         """Begin to know nothing; ``options`` force the codecs of clouds and odometry."""
         self.keys = keys
         self.map_sha256 = map_sha256
         self.config = config or NodeConfig()
-        self.tracking = tracking or TrackingConfig()
         self.options = options
         self._lock = threading.RLock()
         self._epoch = 0
@@ -67,6 +66,7 @@ class Session:
         """Forget everything."""
         self.counters = Counters()
         self.complaints = Complaints()
+        self.transitions = Transitions()
         self.latency = Latency()
         self.engine_latency = Latency()
         self.odometry = OdometryBuffer(self.config)
@@ -127,6 +127,7 @@ class Session:
             unreachable = self._unreachable > self.odometry.arrived
             self._continue(self.odometry.add(message, now, unreachable), message)
             self._pair(now)
+            self._look()
 
     def _continue(self, intake: Intake, message: OdometryMessage) -> None:
         """Draw the consequences of what an odometry sample was."""
@@ -169,6 +170,7 @@ class Session:
                 self._lose(reason)
             self._begun = f"searching anew: {reason}"
             self._forget_frame()
+            self._look()
 
     def relocalize(self) -> None:
         """Search from nothing because somebody asks: not even where the robot was last known to be."""
@@ -192,7 +194,7 @@ class Session:
         """Say where the robot is, if that is known, for the next start."""
         with self._lock:
             forgotten, known = self._place.forgotten, self._correction
-            pose = known and known.pose(self.odometry, self.tracking, self.keys.robot, self.map_sha256)
+            pose = known and known.pose(self.odometry, self.keys.robot, self.map_sha256)
             return (
                 Recollection(forgotten, pose.stamp_ns, pose.T_map_body) if pose else Recollection(forgotten)
             )
@@ -244,6 +246,7 @@ class Session:
                 self.longest_wait = max(self.longest_wait, now - busy.since)
                 self._place.told(job.suggested)
                 self._note(result, busy, job.suspect)
+                self._look()
 
     def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> None:
         """Take note that the engine could not use a frame (``rejected``) or failed and has forgotten the robot."""
@@ -318,6 +321,7 @@ class Session:
                 self._stop(self._silence(now))
             elif unseen > self.config.coast:
                 self._stop(f"no usable frame for {self.config.coast:g} s")
+            self._look()
 
     def _silence(self, now: float) -> str:
         """Why there is no pose without odometry."""
@@ -333,7 +337,7 @@ class Session:
         with self._lock:
             if self._correction is None:
                 return None
-            pose = self._correction.pose(self.odometry, self.tracking, self.keys.robot, self.map_sha256)
+            pose = self._correction.pose(self.odometry, self.keys.robot, self.map_sha256)
             before = self._published
             if pose is None or (before is not None and pose.stamp_ns < before.stamp_ns):
                 return None
@@ -357,6 +361,10 @@ class Session:
                 has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
                 return self._fix_state, why_nothing(self.keys, self.counters, has_odometry)
             return self._fix_state, evidence or self._begun or "too little has been seen"
+
+    def _look(self) -> None:
+        """Take note of the state, wherever it may have changed."""
+        self.transitions.note(*self.state(), self.last_frame_ns, self.evidence)
 
     def age(self) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""

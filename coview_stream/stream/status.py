@@ -52,6 +52,7 @@ def status(
         "uptime_s": round(uptime, 1),
         "last_frame_ns": session.last_frame_ns,
         "evidence": session.evidence.to_json() if session.evidence else None,
+        "transitions": session.transitions.to_json(),
         "pose": {"rate_hz": rate, "age_s": None if age is None else round(age, 3)},
         "latency_ms": session.latency.to_json(),
         "engine_ms": session.engine_latency.to_json(),

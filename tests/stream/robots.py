@@ -6,8 +6,10 @@ import struct
 
 import numpy as np
 
+from coview_stream.config import TrackingConfig
 from coview_stream.fix import Fix, KeyframeEvidence, State
 from coview_stream.geometry import pose_from, rot_z
+from coview_stream.pose.drift import Drift
 from coview_stream.search import Query, Verdict
 from coview_stream.stream.codecs import encode_cloud, encode_odometry
 from coview_stream.stream.jobs import FrameResult
@@ -20,6 +22,7 @@ KEYS = robot_keys("native", "coview", "r1")
 POINTS = np.arange(36, dtype=np.float32).reshape(12, 3)
 SHA = "ab" * 32
 T_MAP_ODOM = pose_from(rot_z(0.5), [100.0, -20.0, 3.0])
+DRIFT = Drift.of(TrackingConfig())
 ENDS = (
     "processed",
     "rejected",
@@ -67,12 +70,13 @@ def verdict(seconds=0.0, reason="two places fit", accepted=None):
     return Verdict(accepted, KeyframeEvidence(seconds, State.AMBIGUOUS, reason))
 
 
-def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1):
+def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT):
     """The engine's answer: here you are."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.TRACKING, "verified", 0.8)
     covariance = np.eye(6) * sigma**2
     stamp = job.stamp_ns * 1e-9
-    fix = Fix(stamp, State.TRACKING, T_map_odom @ job.T_odom_body, T_map_odom, covariance, 0.8, evidence)
+    T = T_map_odom @ job.T_odom_body
+    fix = Fix(stamp, State.TRACKING, T, T_map_odom, covariance, 0.8, evidence, drift)
     return FrameResult(fix, None, 0.01)
 
 
@@ -118,9 +122,9 @@ class Robot:
         self.session.frame_done(job, answer(job, **more), self.now)
         return job
 
-    def localized(self, seconds=0.0):
+    def localized(self, seconds=0.0, **more):
         """Bring the session to TRACKING by a frame at ``seconds``."""
-        self.frame(seconds)
+        self.frame(seconds, **more)
         assert self.session.pose() is not None
         return self
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from live import until
-from robots import Robot, ns, numbered, pose, query, tracking, unknown, verdict
+from robots import DRIFT, Robot, ns, numbered, pose, query, tracking, unknown, verdict
 from sites import Site
 from small_world import pose_error
 from test_session_random import live, quiet, usual
 
-from coview_stream.config import TrackingConfig
 from coview_stream.fix import State
 from coview_stream.geometry import pose_from
 from coview_stream.localizer import Localizer
-from coview_stream.pose.covariance import drift_covariance
 from coview_stream.stream.deskew import deskew
 from coview_stream.stream.odometry import Segment
 from coview_stream.stream.status import PoseRate
@@ -125,14 +124,14 @@ def test_a_stamp_is_not_given_two_poses():
 
 
 def test_covariance_of_a_cloud_that_comes_late():
-    rates = TrackingConfig(position_drift=0.2)
-    robot = Robot(tracking=rates)
+    drift = replace(DRIFT, position=0.2, height=0.2)
+    robot = Robot()
     robot.drive(0.0, 3.0)  # 2 m/s
     robot.saw(1.0, now=1003.0)  # two seconds in the network
     job = robot.session.take_frame()
-    robot.session.frame_done(job, tracking(job), 1003.0)
+    robot.session.frame_done(job, tracking(job, drift=drift), 1003.0)
     grown = robot.session.pose().covariance - 0.01 * np.eye(6)
-    np.testing.assert_allclose(grown, drift_covariance(rates, 4.0, 0.0), rtol=0.05)
+    np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)
 
 
 @pytest.mark.parametrize("second", [None, verdict(1.0)])

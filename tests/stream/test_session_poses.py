@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from robots import SHA, T_MAP_ODOM, Robot, ns, pose, reason, state, tracking, unknown
+from robots import DRIFT, SHA, T_MAP_ODOM, Robot, ns, pose, reason, state, tracking, unknown
 
-from coview_stream.config import TrackingConfig
 from coview_stream.fix import State
-from coview_stream.pose.covariance import drift_covariance
 from coview_stream.stream.config import NodeConfig
 
 
@@ -40,17 +40,17 @@ def test_a_pose_is_the_newest_odometry_corrected(robot):
 
 
 def test_covariance_grows_with_what_was_driven_and_turned():
-    rates = TrackingConfig(position_drift=0.2, turn_drift=0.3)
-    robot = Robot(tracking=rates)
-    robot.localized(0.0)
+    drift = replace(DRIFT, position=0.2, height=0.2, turn=0.3)
+    robot = Robot()
+    robot.localized(0.0, drift=drift)
     begin = robot.session.pose().covariance
     robot.moved(1.0)
     robot.moved(2.0)
-    robot.frame(2.1)
+    robot.frame(2.1, drift=drift)
     np.testing.assert_allclose(np.diag(robot.session.pose().covariance), np.diag(begin), atol=2e-3)
     robot.drive(2.2, 4.1)
     later = robot.session.pose().covariance
-    np.testing.assert_allclose(later, 0.01 * np.eye(6) + drift_covariance(rates, 4.0, 0.0), rtol=0.03)
+    np.testing.assert_allclose(later, 0.01 * np.eye(6) + drift.reported(4.0, 0.0), rtol=0.03)
     for k in range(20):
         robot.moved(4.15 + 0.05 * k, x=8.2, yaw=0.05 * k)
     turned = robot.session.pose().covariance

@@ -1,0 +1,97 @@
+"""One attempt to register a scan from a belief about its pose: what was found, and what is to be thought of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.fix import Cause
+from coview_stream.geometry import Points, Pose, inverse, tilt_of, transform
+from coview_stream.pose.chain import Estimate
+from coview_stream.pose.covariance import registration_covariance, without_prior
+from coview_stream.pose.graph import Smoother
+from coview_stream.pose.judgement import Habit, Judgement
+from coview_stream.pose.rays import RangeImage
+from coview_stream.pose.registration import LocalMap, Prior, Source, register
+from coview_stream.pose.tangent import Matrix6
+from coview_stream.pose.verification import verify
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What is registered: the newest frames' points (odometry frame), the newest frame (body), its odometry (4, 4)."""
+
+    source: Source
+    cloud: Points
+    T_odom_body: Pose
+
+    @cached_property
+    def seen(self) -> RangeImage:
+        """The newest frame by direction."""
+        return RangeImage.of(self.cloud)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A registration and its judgement.
+
+    Attributes:
+        judgement: whether it is believed, were it not for odometry.
+        T_map_body: (4, 4) as the map alone has it.
+        covariance: (6, 6) of that, over (rx, ry, rz, x, y, z) along the map's axes.
+        innovation: squared Mahalanobis distance from where the graph predicts the pose.
+    """
+
+    judgement: Judgement
+    T_map_body: Pose
+    covariance: Matrix6
+    innovation: float
+
+
+def attempt(
+    scan: Scan,
+    belief: Estimate,
+    target: LocalMap,
+    scales: tuple[float, ...],
+    base_map: BaseMap,
+    config: LocalizerConfig,
+    habit: Habit,
+    graph: Smoother,
+) -> Attempt:
+    """Register, verify and judge.
+
+    Args:
+        scan: what to register.
+        belief: pose and covariance that it starts from, and that take part in it as a prior.
+        target: the map around it.
+        scales: largest correspondence distance of each scale, metres.
+        base_map: knows where it has been surveyed.
+        config: of registration and acceptance.
+        habit: what evidence has been like.
+        graph: predicts the pose.
+    """
+    back = inverse(scan.T_odom_body)
+    T_start = belief.T_map_body @ back
+    prior = Prior(T_start, np.asarray(np.linalg.inv(belief.covariance)))
+    settings = config.registration
+    found = register(scan.source, T_start, target, settings, scales, prior, scan.T_odom_body[:3, 3])
+    T = T_start if found is None else found.T_map_source
+    surveyed = base_map.surveyed(transform(T, scan.source.points)[:, :2])
+    evidence = verify(scan.source, T, scan.seen, T @ scan.T_odom_body, target, surveyed)
+    cause, reason = habit.judge(evidence, config.acceptance)
+    if found is None:
+        if cause is Cause.VERIFIED:
+            cause, reason = Cause.FITNESS, "no hold: too few points have a partner in the map"
+        return Attempt(Judgement(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
+    if tilt_of(T) > config.acceptance.most_tilt:
+        cause, reason = Cause.TILT, f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity"
+    alone = without_prior(
+        T @ scan.T_odom_body, found.information, belief.T_map_body, prior.information, settings
+    )
+    covariance = registration_covariance(alone.information, settings)
+    innovation = graph.innovation(alone.T_map_body, covariance)
+    return Attempt(Judgement(cause, reason, evidence, innovation), alone.T_map_body, covariance, innovation)

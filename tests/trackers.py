@@ -1,0 +1,95 @@
+"""A tracker in the small world, and drives to show it: in short steps, and with odometry that lies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import small_world
+
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry import inverse, pose_from, rot_z
+from coview_stream.pose.registration import LocalMaps, Registration
+from coview_stream.tracking import Tracker
+
+T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])
+OFF = pose_from(np.eye(3), [0.2, -0.15, 0.0])
+"""How far from the truth a tracker begins."""
+
+
+def registration(T_map_odom):
+    return Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
+
+
+def garbage(seed=1, count=6000):
+    """A frame that is like no place."""
+    return np.random.default_rng(seed).uniform([-20, -20, -1.5], [20, 20, 6], (count, 3)).astype(np.float32)
+
+
+def tracker_of(world_map, config=None):
+    """A tracker that has not been started."""
+    config = config or LocalizerConfig()
+    return Tracker(world_map, config, LocalMaps(world_map, config.registration.source_range))
+
+
+@dataclass
+class Ride:
+    """A tracker and the odometry that it is shown.
+
+    Attributes:
+        tracker: see :class:`coview_stream.tracking.Tracker`.
+        T_odom_map: (4, 4) what odometry is off by; change it for a slip.
+    """
+
+    tracker: Tracker
+    T_odom_map: np.ndarray
+
+    @classmethod
+    def begin(cls, world_map, config, cloud, truth, off=OFF, T_map_odom=T_MAP_ODOM):
+        """Start ``off`` the truth at the first frame."""
+        ride = cls(tracker_of(world_map, config), inverse(T_map_odom))
+        ride.see(cloud, truth)
+        ride.tracker.start(registration(off @ T_map_odom), ride.odometry(truth), 0.0)
+        return ride
+
+    def odometry(self, truth):
+        return self.T_odom_map @ truth
+
+    def see(self, cloud, truth):
+        self.tracker.observe(cloud, self.odometry(truth))
+
+    def update(self, cloud, truth, **how):
+        """Observe a frame and register it."""
+        self.see(cloud, truth)
+        return self.tracker.update(cloud, self.odometry(truth), **how)
+
+    def error(self, truth):
+        """Metres and degrees that the belief is off at a pose."""
+        return small_world.pose_error(self.tracker.T_map_odom @ self.odometry(truth), truth)
+
+    def slips(self, by, truth):
+        """From here on odometry is off by a motion (4, 4) of the body at ``truth`` that was none."""
+        self.T_odom_map = self.odometry(truth) @ by @ inverse(truth)
+
+
+def ride_of(world_map, drive, config=None, frame=4, **more):
+    """A ride that has been started at a frame of the drive, and has seen it."""
+    return Ride.begin(world_map, config, drive.clouds[frame], drive.T_map_body[frame], **more)
+
+
+def on_the_way(world_map, drive, config=None, frames=8):
+    """A ride that has been verified at every frame so far."""
+    ride = ride_of(world_map, drive, config, 0)
+    for k in range(1, frames):
+        assert ride.update(drive.clouds[k], drive.T_map_body[k]).verified
+    return ride
+
+
+def refused(ride, cloud, truth, **how):
+    """Update with something that is not believed; the judgement. The belief stays where odometry leads."""
+    before, sure = ride.tracker.T_map_odom.copy(), np.diag(ride.tracker.predicted_covariance())
+    judgement = ride.update(cloud, truth, **how)
+    assert not judgement.verified
+    np.testing.assert_array_equal(ride.tracker.T_map_odom, before)
+    assert (np.diag(ride.tracker.predicted_covariance()) >= 0.999 * sure).all()
+    return judgement
