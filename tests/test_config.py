@@ -6,7 +6,6 @@ from dataclasses import FrozenInstanceError, asdict, fields
 
 import pytest
 
-from coview_stream import config
 from coview_stream.config import (
     AcceptanceConfig,
     ConsensusConfig,
@@ -117,4 +116,4 @@ def test_unknown_presets_and_options_are_named():
 
 
 def test_config_errors_are_value_errors():
-    assert issubclass(config.ConfigError, ValueError)
+    assert issubclass(ConfigError, ValueError)

@@ -1,0 +1,33 @@
+"""Configuration: frozen dataclasses with validated ranges, paper defaults and named presets.
+
+Lengths in metres, angles in radians. What shapes the map's descriptors (:class:`DescriptorConfig`) is stored in
+the map and read back from it, so that the two can never drift apart; the rest belongs to the localizer.
+"""
+
+from __future__ import annotations
+
+from coview_stream.config.acceptance import AcceptanceConfig
+from coview_stream.config.localizer import LocalizerConfig
+from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, Visibility, map_preset
+from coview_stream.config.place import ConsensusConfig, KeyframeConfig, RetrievalConfig
+from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
+from coview_stream.config.tracking import GraphBackend, GraphConfig, TrackingConfig
+
+__all__ = [
+    "AcceptanceConfig",
+    "Channel",
+    "ConsensusConfig",
+    "DescriptorConfig",
+    "GraphBackend",
+    "GraphConfig",
+    "KeyframeConfig",
+    "LocalizerConfig",
+    "MapConfig",
+    "Preset",
+    "RegistrationConfig",
+    "RegistrationMethod",
+    "RetrievalConfig",
+    "TrackingConfig",
+    "Visibility",
+    "map_preset",
+]

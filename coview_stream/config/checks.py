@@ -1,0 +1,34 @@
+"""Ranges of a configuration's fields, checked when it is made: what is wrong, where, and what is allowed."""
+
+from __future__ import annotations
+
+import math
+
+from coview_stream.errors import ConfigError
+
+
+def require(ok: bool, config: object, name: str, allowed: str) -> None:
+    """Raise :class:`ConfigError`, naming the field, its value and what is ``allowed``, unless ``ok``."""
+    if not ok:
+        value = getattr(config, name)
+        raise ConfigError(f"{name} is {value!r}; it must be {allowed} ({type(config).__name__}.{name})")
+
+
+def positive(config: object, *names: str) -> None:
+    """Refuse fields that are not positive and finite."""
+    for name in names:
+        value = getattr(config, name)
+        require(math.isfinite(value) and value > 0, config, name, "a positive, finite number")
+
+
+def counts(config: object, *names: str, least: int = 1) -> None:
+    """Refuse fields that are not whole numbers of at least ``least``."""
+    for name in names:
+        value = getattr(config, name)
+        require(isinstance(value, int) and value >= least, config, name, f"a whole number >= {least}")
+
+
+def fraction(config: object, *names: str) -> None:
+    """Refuse fields outside (0, 1]."""
+    for name in names:
+        require(0 < getattr(config, name) <= 1, config, name, "in (0, 1]")

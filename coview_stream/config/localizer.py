@@ -1,0 +1,27 @@
+"""All of the localizer's settings in one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from coview_stream.config.acceptance import AcceptanceConfig
+from coview_stream.config.place import ConsensusConfig, KeyframeConfig, RetrievalConfig
+from coview_stream.config.registration import RegistrationConfig
+from coview_stream.config.tracking import GraphConfig, TrackingConfig
+
+
+@dataclass(frozen=True)
+class LocalizerConfig:
+    """Everything that the localizer decides by; the defaults need no change.
+
+    ``stationary`` is the paper's path for terrestrial scans: one frame may be enough for a fix.
+    """
+
+    keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
+    retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
+    consensus: ConsensusConfig = field(default_factory=ConsensusConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    stationary: bool = False
