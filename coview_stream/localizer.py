@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.decision import Verdict
 from coview_stream.doubt import Doubt
 from coview_stream.errors import CloudError, RunError
 from coview_stream.fix import Cause, Fix, KeyframeEvidence, State
@@ -17,7 +18,8 @@ from coview_stream.place.continuity import Continuity
 from coview_stream.place.descriptor import Descriptor
 from coview_stream.place.keyframes import KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps
-from coview_stream.search import GlobalSearch, Query, Verdict
+from coview_stream.query import Query
+from coview_stream.search import GlobalSearch
 from coview_stream.suggestions import Suggestions
 from coview_stream.tracking import Tracker, relative_to, unanchored
 

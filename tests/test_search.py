@@ -1,4 +1,4 @@
-"""Global search: what `_judge` believes, case by case, and what each rule is good for on the small world."""
+"""Global search: what its decision believes, case by case, and what each rule is good for on the small world."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ from coview_stream.place.consensus import Hypothesis
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps, Registration
 from coview_stream.pose.verification import Evidence
-from coview_stream.search import Candidate, GlobalSearch, Query, gravity_information
+from coview_stream.query import Query
+from coview_stream.refinement import Candidate, gravity_information
+from coview_stream.search import GlobalSearch
 
 RULE = AcceptanceConfig()
 KEYFRAME = Keyframe(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), np.empty((0, 3), np.float32))
@@ -60,7 +62,8 @@ def stationary(world_map):
 
 def judged(search, *keyframes):
     """Verdicts on one list of candidates (best first) per keyframe."""
-    return [search._judge(candidates, KEYFRAME) for candidates in keyframes]
+    votes = len(search.consensus)
+    return [search._decision.judge(candidates, KEYFRAME, votes) for candidates in keyframes]
 
 
 # ---- what counts against a pose

@@ -18,7 +18,8 @@ from coview_stream.fix import State
 from coview_stream.geometry import exp_se3, inverse, pose_from, rot_z, tilt_of
 from coview_stream.localizer import Localizer
 from coview_stream.pose.registration import LocalMaps
-from coview_stream.search import GlobalSearch, _same
+from coview_stream.query import same_place
+from coview_stream.search import GlobalSearch
 from coview_stream.suggestions import FROM_THERE, Suggestions, Trials
 
 RULE = AcceptanceConfig()
@@ -304,13 +305,13 @@ def test_another_suggestion_is_tried_at_once():
 def counted(localizer, monkeypatch):
     """Suggestions that went through registration, keyframe by keyframe."""
     made = []
-    whole = localizer._search._refine
+    whole = localizer._search._refinement.refine
 
     def refine(hypotheses, source, query):
         made.append(sum(h.station is None for h in hypotheses))
         return whole(hypotheses, source, query)
 
-    monkeypatch.setattr(localizer._search, "_refine", refine)
+    monkeypatch.setattr(localizer._search._refinement, "refine", refine)
     return made
 
 
@@ -343,31 +344,32 @@ def test_what_is_remembered_is_not_registered_twice(world_map, world_drive, monk
 
 @pytest.mark.parametrize("votes", [0, 1, RULE.confirmations - 1, RULE.confirmations])
 def test_the_judge_wants_rivals_before_it_believes_a_suggestion(world_map, votes):
-    from test_search import HERE, KEYFRAME, candidate
+    from test_search import HERE, KEYFRAME, candidate, judged
 
     search = GlobalSearch(world_map, LocalizerConfig(), LocalMaps(world_map, 50.0))
     for _ in range(votes):
         search.consensus._ballots.append(None)
     best = candidate(0.7)
     alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
-    assert _same(HERE, HERE, KEYFRAME)
-    verdicts = [search._judge([alone, candidate(0.2, BESIDE @ HERE)], KEYFRAME) for _ in range(5)]
+    assert same_place(HERE, HERE, KEYFRAME)
+    verdicts = judged(search, *[[alone, candidate(0.2, BESIDE @ HERE)]] * 5)
     accepted = [v.accepted is not None for v in verdicts]
     assert accepted == ([False] * 2 + [True] * 3 if votes == RULE.confirmations else [False] * 5)
     # a vote for the same place is worth as much as any
     search.clear()
     both = [alone, candidate(0.69)]
-    assert [search._judge(both, KEYFRAME).accepted is not None for _ in range(3)] == [False, False, True]
+    assert [v.accepted is not None for v in judged(search, *[both] * 3)] == [False, False, True]
 
 
 def test_one_scan_alone_never_believes_a_suggestion_that_no_vote_supports(world_map):
-    from test_search import KEYFRAME, candidate
+    from test_search import candidate, judged
 
     search = GlobalSearch(world_map, LocalizerConfig(stationary=True), LocalMaps(world_map, 50.0))
     best = candidate(0.9)
     alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
-    assert search._judge([alone], KEYFRAME).accepted is None
-    assert search._judge([alone, best], KEYFRAME).accepted is not None
+    (unsupported, supported) = judged(search, [alone], [alone, best])
+    assert unsupported.accepted is None
+    assert supported.accepted is not None
 
 
 def test_inverse_of_a_suggestion_is_where_odometry_began():

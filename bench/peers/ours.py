@@ -21,7 +21,8 @@ from coview_stream.geometry import inverse, transform
 from coview_stream.pose.registration import LocalMaps, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import verify
-from coview_stream.search import GlobalSearch, Query
+from coview_stream.query import Query
+from coview_stream.search import GlobalSearch
 from coview_stream.tracking import kept
 
 

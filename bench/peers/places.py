@@ -19,7 +19,7 @@ from coview_stream.clouds.runs import Run
 from coview_stream.config import DescriptorConfig, KeyframeConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from
 from coview_stream.place.keyframes import KeyframeBuffer
-from coview_stream.search import Query
+from coview_stream.query import Query
 from coview_stream.sim import SimulationConfig
 
 KEYFRAMES = 5

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from coview_stream.decision import Verdict
 from coview_stream.geometry import Pose
-from coview_stream.search import Query, Verdict
+from coview_stream.query import Query
 from coview_stream.stream.jobs import FrameJob, SearchJob
 from coview_stream.stream.pairing import Paired
 

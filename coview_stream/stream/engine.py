@@ -13,12 +13,13 @@ from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.decision import Verdict
 from coview_stream.errors import MapError, RunError
 from coview_stream.localizer import Localizer
 from coview_stream.pose import gicp
 from coview_stream.pose.graph import make_smoother
 from coview_stream.pose.registration import LocalMaps
-from coview_stream.search import GlobalSearch, Verdict
+from coview_stream.search import GlobalSearch
 from coview_stream.stream.deskew import deskew
 from coview_stream.stream.jobs import FrameJob, FrameResult, Job, Result, SearchJob
 

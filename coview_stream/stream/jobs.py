@@ -8,10 +8,11 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.decision import Verdict
 from coview_stream.fix import Fix
 from coview_stream.geometry import Points, Pose
 from coview_stream.odometry.config import LidarOdometryConfig
-from coview_stream.search import Query, Verdict
+from coview_stream.query import Query
 from coview_stream.stream.odometry import Segment
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from coview_stream.search import Verdict
+from coview_stream.decision import Verdict
 from coview_stream.stream.jobs import FrameJob, FrameResult, Job, Result, SearchJob, SweepJob, SweepResult
 from coview_stream.stream.lane import DiedError, FailedError, RejectedError
 from coview_stream.stream.lidar_session import LidarSession

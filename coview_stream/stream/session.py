@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import threading
 
+from coview_stream.decision import Verdict
 from coview_stream.fix import KeyframeEvidence, State
 from coview_stream.geometry import Pose
-from coview_stream.search import Verdict
 from coview_stream.stream.codecs import decode_cloud, decode_odometry
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.correction import Correction

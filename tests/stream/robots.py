@@ -7,10 +7,11 @@ import struct
 import numpy as np
 
 from coview_stream.config import TrackingConfig
+from coview_stream.decision import Verdict
 from coview_stream.fix import Fix, KeyframeEvidence, State
 from coview_stream.geometry import pose_from, rot_z
 from coview_stream.pose.drift import Drift
-from coview_stream.search import Query, Verdict
+from coview_stream.query import Query
 from coview_stream.stream.codecs import encode_cloud, encode_odometry
 from coview_stream.stream.jobs import FrameResult
 from coview_stream.stream.keys import robot_keys

@@ -1,0 +1,110 @@
+"""When to believe what a search has found: once one place has stood alone, often and clearly enough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coview_stream.config import LocalizerConfig
+from coview_stream.fix import KeyframeEvidence, State
+from coview_stream.pose.verification import Evidence
+from coview_stream.query import Query, same_place
+from coview_stream.refinement import Candidate
+from coview_stream.suggestions import FROM_THERE
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What one keyframe's search came to: the accepted candidate if any, why, and the query's book-keeping."""
+
+    accepted: Candidate | None
+    evidence: KeyframeEvidence
+    travelled: float = 0.0
+    generation: int = 0
+
+
+class Decision:
+    """Judges keyframe by keyframe, and remembers the favourite and what has spoken for it."""
+
+    def __init__(self, config: LocalizerConfig) -> None:
+        self.config = config
+        self.clear()
+
+    def clear(self) -> None:
+        """Have no favourite."""
+        self._favourite: Candidate | None = None
+        self._confirmed = 0
+        self._proof = 0.0
+
+    def judge(self, candidates: list[Candidate], query: Query, votes: int) -> Verdict:
+        """Take in a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
+        if not candidates:
+            self.clear()
+            reason = "no hypothesis fits the map" if votes else "too few points to search with"
+            return Verdict(None, KeyframeEvidence(query.stamp, State.SEARCHING, reason))
+        best = candidates[0]
+        rival = max(
+            (
+                c.evidence.score
+                for c in candidates[1:]
+                if not same_place(c.T_map_odom, best.T_map_odom, query)
+            ),
+            default=0.0,
+        )
+        if not self._agrees(best, query):
+            self.clear()
+        state, doubt = self._doubt(best.evidence, rival)
+        if doubt is None and not self._has_rivals(best, candidates, query, votes):
+            needed = self.config.acceptance.confirmations
+            doubt = f"rivals rest on {votes} keyframes' votes, {needed} needed"
+        if doubt is None:
+            self._favourite = best
+            self._confirmed += 1
+            self._proof += max(0.0, best.evidence.score - self.config.acceptance.proof_floor)
+            state, doubt = self._confirmation()
+        if best.hypothesis.station is None:
+            doubt += FROM_THERE
+        return Verdict(
+            best if state is State.TRACKING else None,
+            KeyframeEvidence(
+                query.stamp, state, doubt, best.evidence.score, rival, best.evidence,
+                best.hypothesis.station, best.hypothesis.shift,
+            ),
+        )  # fmt: skip
+
+    def _doubt(self, evidence: Evidence, rival: float) -> tuple[State, str | None]:
+        """Say why this keyframe does not count for its best candidate; None if it does."""
+        rule, alone = self.config.acceptance, self.config.stationary
+        least = rule.single_score if alone else rule.score
+        lead = rule.single_lead if alone else rule.lead
+        if evidence.score < least or evidence.inside < rule.inside:
+            return State.SEARCHING, f"no place fits: best score {evidence.score:.2f}, {least:.2f} needed"
+        if evidence.ground < rule.ground:
+            return (
+                State.AMBIGUOUS,
+                f"the ground does not fit: {evidence.ground:.2f}, {rule.ground:.2f} needed",
+            )
+        if evidence.score - rival < lead:
+            return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
+        return State.AMBIGUOUS, None
+
+    def _has_rivals(self, best: Candidate, candidates: list[Candidate], query: Query, votes: int) -> bool:
+        """Whether enough keyframes have voted for what else it might be; a place found by votes needs no more."""
+        voted = any(
+            c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, query)
+            for c in candidates
+        )
+        return voted or votes >= self.config.acceptance.confirmations
+
+    def _confirmation(self) -> tuple[State, str]:
+        rule = self.config.acceptance
+        if self.config.stationary:
+            return State.TRACKING, "one scan, and it stands alone"
+        reason = f"confirmed by {self._confirmed} keyframes, proof {self._proof:.2f} of {rule.proof:.2f}"
+        enough = self._confirmed >= rule.confirmations and self._proof >= rule.proof
+        return State.TRACKING if enough else State.AMBIGUOUS, reason
+
+    def _agrees(self, best: Candidate, query: Query) -> bool:
+        rule = self.config.acceptance
+        return self._favourite is not None and same_place(
+            best.T_map_odom, self._favourite.T_map_odom, query, rule.agree_distance, rule.agree_angle
+        )

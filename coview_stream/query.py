@@ -1,0 +1,84 @@
+"""What a search has to know of a keyframe; plain data, so that it may be asked later and elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config import DescriptorConfig
+from coview_stream.geometry import Points, Pose, inverse, rotation_angle
+from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
+from coview_stream.pose.rays import RangeImage
+
+_SUBMAP_KEYFRAMES = 4  # of the newest in the local scan that is registered: more are smeared by drift
+_SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
+_SAME_ANGLE = np.radians(5.0)
+
+
+@dataclass(frozen=True)
+class Query:
+    """All that a search needs to know of one keyframe; whoever searches may do it later and elsewhere.
+
+    Attributes:
+        stamp: seconds, of the keyframe.
+        T_odom_body: (4, 4) of the keyframe.
+        scan: (N, 3) float32 virtual local scan, odometry frame, metres.
+        submap: (N, 3) float32 points of the newest keyframes, odometry frame: what is registered.
+        cloud: (N, 3) float32 newest frame, body frame.
+        travelled: metres that odometry had driven.
+        generation: of the localizer's memory; a query of another generation starts the search anew.
+        suggested: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
+    """
+
+    stamp: float
+    T_odom_body: Pose
+    scan: Points
+    submap: Points
+    cloud: Points
+    travelled: float = 0.0
+    generation: int = 0
+    suggested: tuple[Pose, ...] = ()
+
+    @property
+    def position(self) -> npt.NDArray[np.float64]:
+        """(3,) sensor position in the odometry frame, metres."""
+        return np.asarray(self.T_odom_body[:3, 3])
+
+    @cached_property
+    def seen(self) -> RangeImage:
+        """The newest frame by direction."""
+        return RangeImage.of(self.cloud)
+
+    @classmethod
+    def of(
+        cls,
+        buffer: KeyframeBuffer,
+        keyframe: Keyframe,
+        cloud: Points,
+        descriptor: DescriptorConfig,
+        travelled: float = 0.0,
+        generation: int = 0,
+        suggested: tuple[Pose, ...] = (),
+    ) -> Query:
+        """Ask about the newest keyframe of a buffer; ``cloud`` (N, 3) is its newest frame, body frame."""
+        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
+        submap = buffer.recent(_SUBMAP_KEYFRAMES)
+        return cls(
+            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation, suggested
+        )
+
+
+def same_place(
+    T_a: Pose,
+    T_b: Pose,
+    query: Query,
+    distance: float = _SAME_DISTANCE,
+    angle: float = float(_SAME_ANGLE),
+) -> bool:
+    """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
+    a, b = T_a @ query.T_odom_body, T_b @ query.T_odom_body
+    apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    return apart < distance and rotation_angle(inverse(a) @ b) < angle
