@@ -17,13 +17,14 @@ from bench.peers.places import Place
 from bench.peers.start import started
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.fix import Cause
 from coview_stream.geometry import inverse, transform
+from coview_stream.pose.judgement import Habit
 from coview_stream.pose.registration import LocalMaps, register
 from coview_stream.pose.source import local_source
 from coview_stream.pose.verification import verify
 from coview_stream.query import Query
 from coview_stream.search import GlobalSearch
-from coview_stream.tracking import kept
 
 
 class Keyframes:
@@ -89,4 +90,5 @@ class Tracking:
         surveyed = self._site.surveyed(transform(T, source.points)[:, :2])
         T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
         evidence = verify(source, T, newest.seen, T_map_body, target, surveyed)
-        return Answer(T, kept(evidence, LocalizerConfig().acceptance), evidence.score)
+        cause, _ = Habit().judge(evidence, LocalizerConfig().acceptance)
+        return Answer(T, cause is Cause.VERIFIED, evidence.score)
