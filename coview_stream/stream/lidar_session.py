@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from coview_stream.odometry.config import LidarOdometryConfig
-from coview_stream.stream.codecs import decode_cloud
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.jobs import SweepJob, SweepResult
 from coview_stream.stream.keys import RobotKeys
-from coview_stream.stream.messages import CloudMessage, OdometryMessage, Sample
+from coview_stream.stream.messages import CloudMessage, OdometryMessage
 from coview_stream.stream.odometry import Intake
-from coview_stream.stream.reception import last_line, note, received, thinned
+from coview_stream.stream.reception import last_line
 from coview_stream.stream.session import Session
 from coview_stream.stream.sweeps import Sweeps
 
@@ -44,20 +43,12 @@ class LidarSession(Session):
         self._sweeps = Sweeps(self.keys.robot, self.config, self.lidar, self.counters)
         self._seen = float("-inf")  # local time of the newest readable cloud
 
-    def on_cloud(self, sample: Sample, now: float) -> None:
-        """Take in a cloud: decode, check, have its odometry made. Never raises for what the sample holds."""
-        limit, hint = self.config.max_payload, self.keys.cloud_hint
-        message, name, reason = received(sample, decode_cloud, self.options[0], hint, limit)
-        with self._lock:
-            self.counters.received += 1
-            if message is None:
-                note(self.counters, self.complaints, "", name, sample.key, reason)
-                return
-            self._seen = now
-            self.counters.missing += self._missing.after(message.stamp_ns, message.sequence)
-            if self._sweeps.put(thinned(message, self.config.max_points), now) is Intake.RESTART:
-                self.counters.clock_restarts += 1
-                self._odometry_anew("the sender's clock started anew")
+    def _take_in(self, message: CloudMessage, now: float) -> None:
+        """Have a cloud's odometry made first."""
+        self._seen = now
+        if self._sweeps.put(message, now) is Intake.RESTART:
+            self.counters.clock_restarts += 1
+            self._odometry_anew("the sender's clock started anew")
 
     def take_sweep(self) -> SweepJob | None:
         """Hand out a frame to make odometry of; its result or failure must be reported before the next one."""

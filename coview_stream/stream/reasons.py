@@ -1,9 +1,29 @@
-"""Why nothing is known yet, in a clause for people."""
+"""Why nothing is known yet, or not any more, in clauses for people."""
 
 from __future__ import annotations
 
 from coview_stream.stream.counters import Counters
 from coview_stream.stream.keys import RobotKeys
+from coview_stream.stream.odometry import Intake
+
+COUNTED_AS = {
+    Intake.GAP: "odometry_gaps",
+    Intake.OUTAGE: "odometry_gaps",
+    Intake.JUMP: "odometry_jumps",
+    Intake.RESTART: "clock_restarts",
+    Intake.DUPLICATE: "odometry_duplicate",
+    Intake.OUT_OF_ORDER: "odometry_out_of_order",
+}
+"""Counter of an odometry sample that does not just continue."""
+
+WHY_ANEW = {
+    # frames from before and after a pause must not be searched for as one place
+    Intake.GAP: "odometry paused",
+    Intake.OUTAGE: "odometry was away for too long",
+    Intake.JUMP: "odometry jumped",
+    Intake.RESTART: "the sender's clock started anew",
+}
+"""Why the search begins anew with such a sample; after a gap only where no place is known that could be verified."""
 
 
 def why_nothing(keys: RobotKeys, counted: Counters, has_odometry: bool) -> str:

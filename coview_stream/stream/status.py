@@ -41,6 +41,7 @@ def status(
     """Plain data for ``out/status``. ``stamp_ns`` is the wall clock of the node; all other stamps are the robot's."""
     state, reason = session.state()
     age = session.age()
+    evidence = session.whereabouts.evidence
     return {
         "robot": session.keys.robot,
         "stamp_ns": time.time_ns(),
@@ -50,13 +51,13 @@ def status(
         "map_sha256": session.map_sha256,
         "odometry": session.odometry_source,
         "uptime_s": round(uptime, 1),
-        "last_frame_ns": session.last_frame_ns,
-        "evidence": session.evidence.to_json() if session.evidence else None,
+        "last_frame_ns": session.whereabouts.last_frame_ns,
+        "evidence": None if evidence is None else evidence.to_json(),
         "transitions": session.transitions.to_json(),
         "pose": {"rate_hz": rate, "age_s": None if age is None else round(age, 3)},
-        "latency_ms": session.latency.to_json(),
-        "engine_ms": session.engine_latency.to_json(),
-        "longest_wait_s": round(session.longest_wait, 3),
+        "latency_ms": session.work.latency.to_json(),
+        "engine_ms": session.work.engine_latency.to_json(),
+        "longest_wait_s": round(session.work.longest_wait, 3),
         "counters": session.counters.to_json(),
         "connection": {
             "routers": list(connection.routers),

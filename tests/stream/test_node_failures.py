@@ -161,12 +161,12 @@ class Unsayable:
 
 
 def test_one_robots_status_that_raises_silences_nobody(pair):
-    pair.sessions["r1"].evidence = Unsayable()
+    pair.sessions["r1"].whereabouts.evidence = Unsayable()
     for _ in range(3):
         pair.node.publish_statuses(time.monotonic())
     assert len(pair.statuses("r2")) == 3
     assert pair.statuses("r1") == []
-    pair.sessions["r1"].evidence = None
+    pair.sessions["r1"].whereabouts.evidence = None
     assert pair.status("r1")["robot"] == "r1"
 
 
@@ -189,7 +189,7 @@ def test_a_status_that_raises_is_not_tried_over_and_over():
             asked.append(time.monotonic())
             return super().to_json()
 
-    site.sessions["r1"].evidence = Counting()
+    site.sessions["r1"].whereabouts.evidence = Counting()
     site.node.start()
     try:
         until(lambda: len(asked) >= 3)

@@ -40,9 +40,9 @@ def test_reset_forgets_everything(robot):
     assert counted(robot) == {}
     assert not robot.session.complaints.texts
     assert robot.session.pose() is None
-    assert robot.session.evidence is None
-    assert robot.session.last_frame_ns is None
-    assert robot.session.latency.to_json()["p50"] is None
+    assert robot.session.whereabouts.evidence is None
+    assert robot.session.whereabouts.last_frame_ns is None
+    assert robot.session.work.latency.to_json()["p50"] is None
     assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
     assert robot.frame(0.2, unknown).epoch != epoch
 

@@ -133,20 +133,20 @@ def test_latency_is_from_the_cloud_to_its_result(robot):
     robot.saw(0.15, now=1000.2)
     job = robot.session.take_frame()
     robot.session.frame_done(job, tracking(job), 1000.26)
-    assert robot.session.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
-    assert robot.session.engine_latency.to_json()["p50"] == 10.0
+    assert robot.session.work.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
+    assert robot.session.work.engine_latency.to_json()["p50"] == 10.0
 
 
 def test_the_longest_wait_is_for_the_engine_not_for_the_sender(robot):
     robot.frame(0.0)
     robot.frame(60.0)  # a minute without clouds
-    assert robot.session.longest_wait < 0.1
+    assert robot.session.work.longest_wait < 0.1
     robot.drive(60.1, 60.4)
     robot.saw(60.2)
     robot.saw(60.3)  # takes the place of the other, which has waited since 60.2
     job = robot.session.take_frame()
     robot.session.frame_done(job, tracking(job), 1061.0)
-    assert robot.session.longest_wait == pytest.approx(0.8, abs=0.01)
+    assert robot.session.work.longest_wait == pytest.approx(0.8, abs=0.01)
 
 
 def test_options_force_the_codecs():
