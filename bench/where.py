@@ -32,7 +32,7 @@ Times = dict[str, float]
 def stages() -> list[tuple[str, Any, str]]:
     """Return what is timed: name in the table, and where the function is looked up."""
     from coview_stream import localizer, tracking
-    from coview_stream.pose import registration, verification
+    from coview_stream.pose import attempt, registration, verification
 
     return [
         ("take the frame in, check it", localizer.Localizer, "_checked"),
@@ -40,9 +40,9 @@ def stages() -> list[tuple[str, Any, str]]:
         ("update", localizer.Tracker, "update"),
         ("  crop of the map", registration.LocalMaps, "around"),
         ("  points to register", tracking, "local_source"),
-        ("  registration", tracking, "register"),
-        ("  rays of the newest frame", tracking.RangeImage, "of"),
-        ("  verification", tracking, "verify"),
+        ("  registration", attempt, "register"),
+        ("  rays of the newest frame", attempt.RangeImage, "of"),
+        ("  verification", attempt, "verify"),
         ("    nearest map points", verification.kernels, "nearest"),
         ("    rays against the map", verification, "rays_against_map"),
     ]

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.anchor import relative_to, unanchored
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.decision import Verdict
 from coview_stream.doubt import Doubt
-from coview_stream.errors import CloudError, RunError
 from coview_stream.fix import Cause, Fix, KeyframeEvidence, State
-from coview_stream.geometry import Points, Pose, is_pose, orthonormal, pose_from
+from coview_stream.geometry import Points, Pose, orthonormal, pose_from
+from coview_stream.inputs import checked_cloud, checked_odometry, checked_place
 from coview_stream.place.continuity import Continuity
 from coview_stream.place.descriptor import Descriptor
 from coview_stream.place.keyframes import KeyframeBuffer
@@ -21,13 +22,9 @@ from coview_stream.pose.registration import LocalMaps
 from coview_stream.query import Query
 from coview_stream.search import GlobalSearch
 from coview_stream.suggestions import Suggestions
-from coview_stream.tracking import Tracker, relative_to, unanchored
+from coview_stream.tracking import Tracker
 
-_LEAST_POINTS = 10
-_LOOKED_AT = 2000  # of a frame's points, to see how far they lie
 _HURRIED = 3.0  # times as far apart are registrations in a hurry
-_FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
-_OTHER_WORLD = 1e7  # metres from the map's origin: no place on this planet
 
 
 @dataclass(frozen=True)
@@ -176,15 +173,7 @@ class Localizer:
         Raises:
             RunError: it is not a finite rigid transform, or no place on this planet.
         """
-        try:
-            T = np.asarray(T_map_body, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise RunError(f"T_map_body is not numeric ({error})") from error
-        if not is_pose(T):
-            raise RunError("T_map_body is not a finite rigid 4x4 transform")
-        local = orthonormal(pose_from(T[:3, :3], T[:3, 3] - self.base_map.origin))
-        if np.abs(local[:3, 3]).max() > _OTHER_WORLD:
-            raise RunError("T_map_body lies 10,000 km off the map; is it in the frame of the map's sources?")
+        local = checked_place(T_map_body, self.base_map.origin)
         if self.state is not State.TRACKING:
             self._suggestions.robot_at(local)
 
@@ -261,31 +250,7 @@ class Localizer:
 
     def _checked(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:
         """Finite float32 points, and the pose relative to the first one so that float32 stays exact."""
-        try:
-            with np.errstate(over="ignore"):
-                rows = np.asarray(cloud).astype(np.float32, copy=False)
-        except (TypeError, ValueError) as error:
-            raise CloudError(
-                f"cloud is not an array of numbers ({error}); expected (N, 3) float32"
-            ) from error
-        if rows.ndim != 2 or rows.shape[1] != 3:
-            raise CloudError(f"cloud has shape {rows.shape}; expected (N, 3)")
-        whole = np.isfinite(rows).all()
-        # a copy even so: the caller may write the next frame into the same array
-        finite = rows.copy(order="C") if whole else rows.compress(np.isfinite(rows).all(axis=1), axis=0)
-        if len(finite) < _LEAST_POINTS:
-            raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_LEAST_POINTS} or more")
-        if np.median(np.abs(finite[:: 1 + len(finite) // _LOOKED_AT])) > _FARTHEST:
-            raise CloudError("cloud lies kilometres from its origin; give it relative to the sensor")
-        try:
-            T = np.asarray(T_odom_body, dtype=np.float64)
-            known = bool(np.isfinite(stamp))
-        except (TypeError, ValueError) as error:
-            raise RunError(f"T_odom_body or stamp is not numeric ({error})") from error
-        if not known:
-            raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
-        if not is_pose(T):
-            raise RunError("T_odom_body is not a finite rigid 4x4 transform; check the odometry")
+        finite, T = checked_cloud(cloud), checked_odometry(T_odom_body, stamp)
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
-        return finite, relative_to(orthonormal(T), self._anchor)
+        return finite, relative_to(T, self._anchor)

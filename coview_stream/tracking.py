@@ -11,7 +11,7 @@ import numpy.typing as npt
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.fix import Cause
-from coview_stream.geometry import Points, Pose, inverse, pose_from, rotation_angle, transform
+from coview_stream.geometry import Points, Pose, inverse, rotation_angle, transform
 from coview_stream.place.keyframes import thinned
 from coview_stream.pose.attempt import Attempt, Scan, attempt
 from coview_stream.pose.chain import Estimate
@@ -32,7 +32,9 @@ from coview_stream.pose.tangent import Matrix6, difference
 _MOST_FRAMES = 40
 _LEAST_SOURCE = 100  # points to register
 _IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
-_OWN_NOISE = 0.4  # share of two neighbouring registrations' variances that their difference has; the rest they share
+_OWN_NOISE = (
+    0.4  # share of two neighbouring registrations' variances that their difference has; the rest they share
+)
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
 """What odometry may be off by where it contradicts the lidar: wheels that slip, a robot that is carried."""
@@ -298,14 +300,3 @@ class Tracker:
 
 def _rank(tried: Attempt) -> tuple[bool, float]:
     return tried.judgement.verified, tried.judgement.score
-
-
-def relative_to(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:
-    """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
-    return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
-
-
-def unanchored(T_map_local: Pose, anchor: npt.NDArray[np.float64], origin: npt.NDArray[np.float64]) -> Pose:
-    """Return ``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
-    shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
-    return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)
