@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass
-
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.fix import Cause
-from coview_stream.geometry import Points, Pose, inverse, rotation_angle, transform
+from coview_stream.geometry import Points, Pose, inverse, transform
+from coview_stream.odometer import Odometer
 from coview_stream.place.keyframes import thinned
 from coview_stream.pose.attempt import Attempt, Scan, attempt
 from coview_stream.pose.chain import Estimate
@@ -21,47 +18,20 @@ from coview_stream.pose.covariance import (
     registration_covariance,
     shared_covariance,
 )
-from coview_stream.pose.drift import Drift, DriftEstimator, worth_learning
+from coview_stream.pose.drift import Drift
 from coview_stream.pose.glance import Glance
 from coview_stream.pose.graph import Smoother, make_smoother
 from coview_stream.pose.judgement import Habit, Judgement
 from coview_stream.pose.registration import LocalMap, LocalMaps, Registration
 from coview_stream.pose.source import local_source
 from coview_stream.pose.tangent import Matrix6, difference
+from coview_stream.recent import MOST_FRAMES, RecentFrames
 
-_MOST_FRAMES = 40
 _LEAST_SOURCE = 100  # points to register
 _IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
-_OWN_NOISE = (
-    0.4  # share of two neighbouring registrations' variances that their difference has; the rest they share
-)
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
 """What odometry may be off by where it contradicts the lidar: wheels that slip, a robot that is carried."""
-
-
-@dataclass(frozen=True)
-class _Recent:
-    travelled: float
-    points: Points  # (N, 3) odometry frame
-
-
-@dataclass(frozen=True)
-class _Mark:
-    """Odometry at one moment: pose (4, 4), metres driven and radians turned so far."""
-
-    T_odom_body: Pose
-    travelled: float
-    turned: float
-
-
-@dataclass(frozen=True)
-class _Registered:
-    """A registration that was believed: the pose (4, 4) as the map alone has it, its variances (6,), and when."""
-
-    T_map_body: Pose
-    variances: npt.NDArray[np.float64]
-    mark: _Mark
 
 
 class Tracker:
@@ -69,7 +39,6 @@ class Tracker:
 
     Attributes:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
-        travelled: metres that odometry has driven.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
@@ -77,18 +46,18 @@ class Tracker:
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
-        self.travelled = 0.0
-        self._turned = 0.0
         self._graph: Smoother | None = None
-        self._rates = DriftEstimator(config.tracking)
+        self._odometer = Odometer(config.tracking)
         self._habit = Habit()
         self._glance = Glance()
-        self._recent: deque[_Recent] = deque(maxlen=_MOST_FRAMES)
+        self._recent = RecentFrames(config.tracking)
         self._unseen = 0  # frames since the last update
-        self._last: Pose | None = None
-        self._keyframe = _Mark(np.eye(4), 0.0, 0.0)
-        self._registered: _Registered | None = None
         self._newest: Matrix6 = np.zeros((6, 6))  # covariance of the newest registration that was believed
+
+    @property
+    def travelled(self) -> float:
+        """Metres that odometry has driven."""
+        return self._odometer.travelled
 
     # ---- frames
 
@@ -97,18 +66,15 @@ class Tracker:
 
         ``thin`` is what :func:`coview_stream.place.keyframes.thinned` makes of it, if that is known already.
         """
-        if self._last is not None:
-            self.travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self._last[:3, 3]))
-            self._turned += rotation_angle(inverse(self._last) @ T_odom_body)
-        self._last = T_odom_body
+        self._odometer.move(T_odom_body)
         points = thinned(cloud, T_odom_body, self.config.keyframe) if thin is None else thin
-        self._recent.append(_Recent(self.travelled, points))
+        self._recent.add(points, self.travelled)
         self._unseen += 1
 
     def forget(self) -> None:
         """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
         self.forget_points()
-        self._last = None
+        self._odometer.break_off()
 
     def forget_points(self) -> None:
         """Drop the points that the next registration would use beside the next frame's."""
@@ -123,22 +89,21 @@ class Tracker:
 
     def due(self, patience: float = 1.0) -> bool:
         """Whether the robot has driven or turned far enough for another registration; ``patience`` times as far."""
-        driven, turned = self._since_keyframe()
+        driven, turned = self._odometer.since_keyframe()
         settings = self.config.tracking
         if driven >= patience * settings.distance or turned >= patience * settings.turn:
             return True
         if driven < patience * settings.least_distance:
             return False
-        grown = self._rates.drift.variances(driven, turned)
+        grown = self.drift.variances(driven, turned)
         yaw, position = patience * settings.unsure_yaw, patience * settings.unsure_position
         return bool(grown[2] > yaw**2 or grown[3] > position**2)
 
     def alarmed(self, T_odom_body: Pose) -> bool:
         """Whether the newest frame lies on the map so much less than the ones before that it should be registered."""
-        target = self._target(T_odom_body)
-        if target is None or not self._recent:
+        target, points = self._target(T_odom_body), self._recent.newest
+        if target is None or points is None:
             return False
-        points = self._recent[-1].points
         return self._glance.alarming(points, T_odom_body[:3, 3], self.T_map_odom, target)
 
     # ---- the belief
@@ -151,7 +116,7 @@ class Tracker:
         self._habit.clear()
         self._glance.clear()
         own = self._newest = registration_covariance(registration.information, self.config.registration)
-        drifted = self._rates.drift.covariance(self.travelled - travelled, 0.0)
+        drifted = self.drift.covariance(self.travelled - travelled, 0.0)
         self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
 
     def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False, alone: bool = False) -> Judgement:
@@ -165,17 +130,17 @@ class Tracker:
             alone: use the newest frame alone: something is wrong with it, or with what came before.
         """
         graph = self._moved(T_odom_body, idle)
-        most = 1 if alone else max(1, self._unseen) if idle else _MOST_FRAMES
-        while len(self._recent) > most:
-            self._recent.popleft()
+        most = 1 if alone else max(1, self._unseen) if idle else MOST_FRAMES
+        self._recent.keep(most)
         self._unseen = 0
         target = self._target(T_odom_body)
         if target is None:
             return Judgement(Cause.OFF_MAP, "the map is empty here")
-        source = local_source(self._window(), T_odom_body[:3, 3], self.config.registration)
+        newest = self._recent.newest
+        source = local_source(self._recent.window(), T_odom_body[:3, 3], self.config.registration)
         # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
-        seen = min(len(source.points), len(self._recent[-1].points) if self._recent else 0)
-        if seen < _LEAST_SOURCE:
+        seen = 0 if newest is None else min(len(source.points), len(newest))
+        if newest is None or seen < _LEAST_SOURCE:
             return self._rejected(Judgement(Cause.BLIND, f"only {seen} points to register"))
         scan = Scan(source, cloud, T_odom_body)
         belief = graph.estimate
@@ -192,17 +157,18 @@ class Tracker:
         graph.correct(tried.T_map_body, tried.covariance)
         self._believe(T_odom_body)
         self._learn(tried)
-        self._glance.learn(self._recent[-1].points, T_odom_body[:3, 3], self.T_map_odom, target)
+        self._glance.learn(newest, T_odom_body[:3, 3], self.T_map_odom, target)
         return tried.judgement
 
     def predicted_covariance(self) -> Matrix6:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
-        if self._graph is None or self._last is None:
+        last = self._odometer.pose
+        if self._graph is None or last is None:
             return np.asarray(_START.copy())
         belief = self._graph.estimate
-        here = self.T_map_odom @ self._last
+        here = self.T_map_odom @ last
         carried = carried_along(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
-        return np.asarray(carried + self.drift.covariance(*self._since_keyframe()))
+        return np.asarray(carried + self.drift.covariance(*self._odometer.since_keyframe()))
 
     def reported_covariance(self) -> Matrix6:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
@@ -212,15 +178,9 @@ class Tracker:
     @property
     def drift(self) -> Drift:
         """How fast odometry seems to drift."""
-        return self._rates.drift
+        return self._odometer.drift
 
     # ---- inside
-
-    def _since_keyframe(self) -> tuple[float, float]:
-        return self.travelled - self._keyframe.travelled, self._turned - self._keyframe.turned
-
-    def _mark(self, T_odom_body: Pose) -> _Mark:
-        return _Mark(T_odom_body, self.travelled, self._turned)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
@@ -229,18 +189,18 @@ class Tracker:
         """Begin a new graph: nothing that was believed before counts."""
         self._graph = self._graph or make_smoother(self.config.graph)
         self._graph.start(T_map_body, covariance)
-        self._registered = None
-        self._keyframe = self._mark(T_odom_body)
+        self._odometer.unlearn()
+        self._odometer.mark(T_odom_body)
         self._believe(T_odom_body)
 
     def _moved(self, T_odom_body: Pose, idle: bool) -> Smoother:
         """Add a keyframe where odometry leads."""
         if self._graph is None:
             raise RuntimeError("no fix yet; call start first")
-        driven, turned = self._since_keyframe()
+        driven, turned = self._odometer.since_keyframe()
         spread = self.drift.covariance(driven + _IDLE_DRIVE * idle, turned)
-        self._graph.move(inverse(self._keyframe.T_odom_body) @ T_odom_body, spread)
-        self._keyframe = self._mark(T_odom_body)
+        self._graph.move(self._odometer.motion(T_odom_body), spread)
+        self._odometer.mark(T_odom_body)
         return self._graph
 
     def _attempt(self, scan: Scan, belief: Estimate, target: LocalMap, scales: tuple[float, ...]) -> Attempt:
@@ -253,20 +213,10 @@ class Tracker:
 
     def _learn(self, tried: Attempt) -> None:
         """Take note of what a registration says of odometry, and of what evidence is like here."""
-        before, now = self._registered, self._keyframe
-        variances = np.diag(tried.covariance)
         self._newest = tried.covariance
         assert tried.judgement.evidence is not None  # it was verified
         self._habit.learn(tried.judgement.evidence)
-        if before is not None:
-            driven, turned = now.travelled - before.mark.travelled, now.turned - before.mark.turned
-            if not worth_learning(driven, turned):
-                return
-            step = inverse(before.mark.T_odom_body) @ now.T_odom_body
-            gap = difference(tried.T_map_body, before.T_map_body @ step)
-            noise = _OWN_NOISE * (variances + before.variances)
-            self._rates.add(gap, noise, driven, turned)
-        self._registered = _Registered(tried.T_map_body, variances, now)
+        self._odometer.learn(tried.T_map_body, tried.covariance)
 
     def _rejected(self, judgement: Judgement) -> Judgement:
         """Believe nothing of it: bad frames among the newest must not spoil the next registration too."""
@@ -283,19 +233,6 @@ class Tracker:
         self._recent.clear()
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         return Judgement(Cause.ODOMETRY, reason, tried.judgement.evidence, tried.innovation)
-
-    def _window(self) -> Points:
-        """Points of the newest frames: of the last metres, more if they are too few."""
-        settings = self.config.tracking
-        parts: list[Points] = []
-        count = 0
-        for frame in reversed(self._recent):
-            old = self.travelled - frame.travelled > settings.window
-            if count >= settings.max_points or (old and count >= settings.min_points):
-                break
-            parts.append(frame.points)
-            count += len(frame.points)
-        return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
 
 def _rank(tried: Attempt) -> tuple[bool, float]:

@@ -314,7 +314,7 @@ def test_a_frame_is_thinned_once_and_kept_apart_from_the_callers_array(world_map
     np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
     T = pose_from(world_drive.T_odom_body[0][:3, :3], np.zeros(3))
     made = keyframes.thinned(world_drive.clouds[0], T, localizer.config.keyframe)
-    np.testing.assert_allclose(localizer._tracker._window(), made, atol=1e-6)
+    np.testing.assert_allclose(localizer._tracker._recent.window(), made, atol=1e-6)
 
 
 def standing(localizer, cloud, T_odom_body, seconds, start):

@@ -109,7 +109,7 @@ def test_the_window_is_the_last_metres_more_for_few_points_less_for_many(world_m
         for k in range(8):
             T = pose_from(np.eye(3), [0.5 * k, 0, 0])
             tracker.observe(NOTHING, T, np.full((points, 3), k, np.float32))
-        return sorted({int(k) for k in tracker._window()[:, 0]})
+        return sorted({int(k) for k in tracker._recent.window()[:, 0]})
 
     assert window(1000, window=2.0) == [3, 4, 5, 6, 7]
     assert window(300, window=2.0) == list(range(8))  # 2,500 points need more
@@ -123,7 +123,7 @@ def test_frames_that_lie_far_back_are_not_kept(world_map):
     tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(min_points=10**6)))
     for k in range(300):
         tracker.observe(NOTHING, pose_from(np.eye(3), [0.01 * k, 0, 0]), np.zeros((10, 3), np.float32))
-    assert len(tracker._window()) <= 400
+    assert len(tracker._recent.window()) <= 400
 
 
 # ---- how unsure
