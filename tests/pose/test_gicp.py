@@ -18,7 +18,7 @@ from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.fix import State
 from coview_stream.geometry import exp_se3, pose_from, rot_z, transform
 from coview_stream.localizer import Localizer
-from coview_stream.pose import gicp
+from coview_stream.pose import gicp, pivot
 from coview_stream.pose.covariance import registration_covariance, without_prior
 from coview_stream.pose.registration import LocalMap, LocalMaps, Prior, Source, register
 from coview_stream.pose.tangent import difference, shifted
@@ -85,8 +85,8 @@ def test_hessian_and_gradient_are_of_our_tangent():
 
     r = residuals(TILTED)
     theirs = slope(lambda d: TILTED @ exp_se3(d))
-    ours = slope(lambda d: gicp.moved(TILTED, d, PIVOT))
-    H, b = gicp.about_pivot(theirs.T @ theirs, theirs.T @ r, TILTED, PIVOT)
+    ours = slope(lambda d: pivot.moved(TILTED, d, PIVOT))
+    H, b = pivot.about_pivot(theirs.T @ theirs, theirs.T @ r, TILTED, PIVOT)
     np.testing.assert_allclose(H, ours.T @ ours, rtol=1e-6, atol=1e-5 * np.abs(H).max())
     np.testing.assert_allclose(b, ours.T @ r, rtol=1e-6, atol=1e-6 * np.abs(b).max())
 
@@ -98,17 +98,17 @@ def test_the_pull_of_pairs_is_that_of_their_gaps():
         return (transform(T, p) - q).ravel()
 
     h = 1e-6
-    moves = [(gicp.moved(TILTED, h * e, PIVOT), gicp.moved(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
+    moves = [(pivot.moved(TILTED, h * e, PIVOT), pivot.moved(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
     slope = np.column_stack([(gaps(a) - gaps(b)) / (2 * h) for a, b in moves])
     there = transform(TILTED, p)
-    H, b = gicp.pulls(there, there - q, transform(TILTED, PIVOT[None])[0])
+    H, b = pivot.pulls(there, there - q, transform(TILTED, PIVOT[None])[0])
     np.testing.assert_allclose(H, slope.T @ slope, rtol=1e-6, atol=1e-5)
     np.testing.assert_allclose(b, slope.T @ gaps(TILTED), rtol=1e-6, atol=1e-5)
 
 
 def test_a_move_turns_about_the_pivot_and_shifts_it_along_the_maps_axes():
     step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
-    there = gicp.moved(TILTED, step, PIVOT)
+    there = pivot.moved(TILTED, step, PIVOT)
     gap = transform(there, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
     np.testing.assert_allclose(gap, step[3:], atol=1e-12)
     np.testing.assert_allclose(difference(there, TILTED)[:3], step[:3], atol=1e-9)
@@ -119,13 +119,13 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
     rng = np.random.default_rng(4)
     A, B = (m @ m.T + 50 * np.eye(6) for m in 10 * rng.standard_normal((2, 6, 6)))
     gap = np.array([1e-6, -2e-6, 3e-6, 0.003, -0.002, 0.005])  # small: turns add up to first order only
-    measured = gicp.moved(TILTED, gap, PIVOT)
+    measured = pivot.moved(TILTED, gap, PIVOT)
     prior = Belief(TILTED, B)
     wanted = np.linalg.solve(A + B, A @ gap)
     for begin, gradient in ((TILTED, -A @ gap), (measured, np.zeros(6))):
-        step, information = gicp.fused_step(A, gradient, begin, PIVOT, prior)
+        step, information = pivot.fused_step(A, gradient, begin, PIVOT, prior)
         np.testing.assert_array_equal(information, A + B)
-        found = gicp.moved(begin, step, PIVOT)
+        found = pivot.moved(begin, step, PIVOT)
         away = transform(found, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
         np.testing.assert_allclose(away, wanted[3:], atol=1e-7)
         np.testing.assert_allclose(difference(found, TILTED)[:3], wanted[:3], atol=1e-7)
@@ -133,7 +133,7 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
 
 def test_without_a_prior_the_step_is_the_pairs():
     A = np.diag([4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
-    step, information = gicp.fused_step(A, np.ones(6), TILTED, PIVOT, None)
+    step, information = pivot.fused_step(A, np.ones(6), TILTED, PIVOT, None)
     np.testing.assert_allclose(step, -1.0 / np.diag(A), rtol=1e-6)
     np.testing.assert_array_equal(information, A)
 
