@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.config import TrackingConfig
-from coview_stream.geometry import Pose, inverse, rotation_angle
+from coview_stream.geometry import Pose, inverse, yaw_of
 from coview_stream.pose.drift import Drift, DriftEstimator, worth_learning
 from coview_stream.pose.tangent import Matrix6, difference
 
@@ -55,7 +55,8 @@ class Odometer:
         """Take in the pose (4, 4) of a frame."""
         if self.pose is not None:
             self.travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self.pose[:3, 3]))
-            self._turned += rotation_angle(inverse(self.pose) @ T_odom_body)
+            # about the vertical: a robot that shakes does not turn
+            self._turned += abs(yaw_of(inverse(self.pose) @ T_odom_body))
         self.pose = T_odom_body
 
     def break_off(self) -> None:

@@ -16,7 +16,6 @@ from coview_stream.pose.covariance import (
     angles_first,
     carried_along,
     registration_covariance,
-    shared_covariance,
 )
 from coview_stream.pose.drift import Drift
 from coview_stream.pose.glance import Glance
@@ -24,6 +23,7 @@ from coview_stream.pose.graph import Smoother, make_smoother
 from coview_stream.pose.judgement import Habit, Judgement
 from coview_stream.pose.registration import LocalMap, LocalMaps, Registration
 from coview_stream.pose.source import local_source
+from coview_stream.pose.spread import Shared
 from coview_stream.pose.tangent import Matrix6, difference
 from coview_stream.recent import MOST_FRAMES, RecentFrames
 
@@ -52,7 +52,7 @@ class Tracker:
         self._glance = Glance()
         self._recent = RecentFrames(config.tracking)
         self._unseen = 0  # frames since the last update
-        self._newest: Matrix6 = np.zeros((6, 6))  # covariance of the newest registration that was believed
+        self._shared = Shared(config.registration)
 
     @property
     def travelled(self) -> float:
@@ -115,7 +115,8 @@ class Tracker:
         """
         self._habit.clear()
         self._glance.clear()
-        own = self._newest = registration_covariance(registration.information, self.config.registration)
+        self._shared.clear()
+        own = registration_covariance(registration.information, self.config.registration)
         drifted = self.drift.covariance(self.travelled - travelled, 0.0)
         self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
 
@@ -157,6 +158,7 @@ class Tracker:
         graph.correct(tried.T_map_body, tried.covariance)
         self._believe(T_odom_body)
         self._learn(tried)
+        self._shared.learn(source, self.T_map_odom, target, T_odom_body[:3, 3])
         self._glance.learn(newest, T_odom_body[:3, 3], self.T_map_odom, target)
         return tried.judgement
 
@@ -172,8 +174,7 @@ class Tracker:
 
     def reported_covariance(self) -> Matrix6:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
-        shared = shared_covariance(self._newest, self.config.registration)
-        return angles_first(self.predicted_covariance() + shared)
+        return angles_first(self.predicted_covariance() + self._shared.covariance)
 
     @property
     def drift(self) -> Drift:
@@ -213,7 +214,6 @@ class Tracker:
 
     def _learn(self, tried: Attempt) -> None:
         """Take note of what a registration says of odometry, and of what evidence is like here."""
-        self._newest = tried.covariance
         assert tried.judgement.evidence is not None  # it was verified
         self._habit.learn(tried.judgement.evidence)
         self._odometer.learn(tried.T_map_body, tried.covariance)
@@ -227,9 +227,7 @@ class Tracker:
         """Go on where the lidar says, for the next frame to confirm: odometry says otherwise."""
         gap = difference(tried.T_map_body, belief.T_map_body)
         metres, degrees = float(np.linalg.norm(gap[3:])), np.degrees(float(np.linalg.norm(gap[:3])))
-        self._newest = tried.covariance
-        known = tried.covariance + shared_covariance(tried.covariance, self.config.registration)
-        self._restart(tried.T_map_body, known, T_odom_body)
+        self._restart(tried.T_map_body, tried.covariance + self._shared.covariance, T_odom_body)
         self._recent.clear()
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         return Judgement(Cause.ODOMETRY, reason, tried.judgement.evidence, tried.innovation)

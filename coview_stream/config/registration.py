@@ -25,7 +25,7 @@ class RegistrationConfig:
     what it moves at ``weak_lever`` metres) is one that the map hardly shows: its sigma is widened further, up to
     ``weak_sigma`` metres (see :func:`coview_stream.pose.covariance.registration_covariance`). The ``shared`` sigmas are
     of the error that neighbouring registrations have in common (see
-    :func:`coview_stream.pose.covariance.shared_covariance`): a scanned map's points lie off its surfaces. Inflation,
+    :class:`coview_stream.pose.spread.Shared`): a scanned map's points lie off its surfaces. Inflation,
     floors and shared sigmas are calibrated on simulated drives, seeds 5101 to 5110 of ``bench.tracking``; a real map's
     own error, against the ground truth that matters to you, comes on top.
     """
@@ -42,10 +42,10 @@ class RegistrationConfig:
     inflation: float = 3.0
     sigma_floor: float = 0.002
     sigma_floor_angle: float = math.radians(0.004)
-    shared: float = 1.45
-    shared_position: float = 0.005
+    shared: float = 1.3
+    shared_position: float = 0.001
     shared_height: float = 0.001
-    shared_tilt: float = math.radians(0.04)
+    shared_tilt: float = math.radians(0.03)
     shared_yaw: float = math.radians(0.001)
     gravity_sigma: float = math.radians(1.0)
     weak_lever: float = 10.0

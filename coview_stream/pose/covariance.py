@@ -112,24 +112,3 @@ def carried_along(covariance: Matrix6, shift: Vector6) -> Matrix6:
     J = np.eye(6)
     J[3:, :3] = -cross(shift)
     return np.asarray(J @ covariance @ J.T)
-
-
-def shared_covariance(registered: Matrix6, config: RegistrationConfig) -> Matrix6:
-    """Covariance (6, 6) of the error that neighbouring registrations share, and that does not average out over them.
-
-    The map's points lie a little off its surfaces, trees look different from above, and odometry's roll and pitch
-    tremble from frame to frame. In a direction that the map shows badly all of that is larger, so that most of it is
-    ``shared`` times the sigma of the registration itself; the other settings are what is left where it shows all well.
-
-    Args:
-        registered: (6, 6) of the newest registration, as :func:`registration_covariance` has it.
-        config: how much of it is shared, and the rest.
-    """
-    tilt, yaw, place, height = (
-        config.shared_tilt,
-        config.shared_yaw,
-        config.shared_position,
-        config.shared_height,
-    )
-    rest = np.diag(np.square([tilt, tilt, yaw, place, place, height]))
-    return np.asarray(config.shared**2 * registered + rest)

@@ -16,7 +16,10 @@ from coview_stream.config import TrackingConfig
 from coview_stream.pose.tangent import Matrix6, Vector6
 
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
-_LEAST_FACTOR, _MOST_FACTOR = 0.3, 20.0  # of the configured rate; a scale error is no random walk, and needs a pull
+_LEAST_FACTOR, _MOST_FACTOR = (
+    0.3,
+    20.0,
+)  # of the configured rate; a scale error is no random walk, and needs a pull
 _OUTLIER = 16.0  # variances; a slip beyond counts as one so large, so that rates grow step by step
 _LEAST_STEP, _LEAST_TURN = (
     0.2,
@@ -108,10 +111,12 @@ class DriftEstimator:
                 continue  # turning on the spot tells of the heading alone
             # a turn on the spot says of the heading what metres of driving do
             metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
-            fade = exp(-metres / self._config.drift_memory)
+            # by how much it can tell: a registration that hardly knows a direction says nothing of its drift
+            weight = metres * float((now[rows] / (now[rows] + noise[rows])).mean()) ** 2
+            fade = exp(-weight / self._config.drift_memory)
             ratio = float((seen[rows] / nominal[rows]).mean())
-            self._sums[group] = fade * self._sums[group] + metres * ratio
-            self._metres[group] = fade * self._metres[group] + metres
+            self._sums[group] = fade * self._sums[group] + weight * ratio
+            self._metres[group] = fade * self._metres[group] + weight
 
 
 def worth_learning(driven: float, turned: float) -> bool:

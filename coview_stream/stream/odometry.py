@@ -9,7 +9,7 @@ from enum import Enum
 
 import numpy as np
 
-from coview_stream.geometry import Pose, inverse, pose_from, rotation_angle
+from coview_stream.geometry import Pose, inverse, pose_from, rotation_angle, yaw_of
 from coview_stream.rotation import between
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.messages import OdometryMessage
@@ -95,7 +95,7 @@ class OdometryBuffer:
         elif self.newest is not None:
             step = inverse(self.newest.T_odom_body) @ sample.T_odom_body
             self.travelled += float(np.linalg.norm(step[:3, 3]))
-            self.turned += rotation_angle(step)
+            self.turned += abs(yaw_of(step))  # as the engine counts it
         self.newest, self.arrived = sample, now
         self._samples.append(_Entry(sample, self.travelled, self.turned))
         self._strange.clear()

@@ -13,7 +13,6 @@ from coview_stream.pose.covariance import (
     angles_first,
     carried_along,
     registration_covariance,
-    shared_covariance,
     without_prior,
 )
 from coview_stream.pose.registration import LocalMap, Prior, Source, register
@@ -52,20 +51,6 @@ def test_an_error_in_heading_becomes_one_in_place_further_on():
     assert np.sqrt(across @ expected @ across) == pytest.approx(sideways, rel=0.1)
     ahead = np.array([0.0, 0.0, 0.0, *shift[:2], 0.0]) / np.hypot(*shift[:2])
     assert np.sqrt(ahead @ expected @ ahead) < 0.2 * sideways
-
-
-def test_what_registrations_share_is_some_of_each_and_the_rest():
-    """Most of it where the map shows little."""
-    config = RegistrationConfig(
-        shared=0.5, shared_position=0.03, shared_height=0.02, shared_tilt=0.002, shared_yaw=0.001
-    )
-    rest = [0.002, 0.002, 0.001, 0.03, 0.03, 0.02]
-    sigma = np.sqrt(np.diag(shared_covariance(np.zeros((6, 6)), config)))
-    np.testing.assert_allclose(sigma, rest)
-    along = np.zeros((6, 6))
-    along[3, 3] = along[4, 4] = along[3, 4] = along[4, 3] = 0.2**2 / 2
-    found = shared_covariance(along, config)
-    np.testing.assert_allclose(found - np.diag(np.square(rest)), 0.25 * along)
 
 
 # ---- a registration's
