@@ -2,79 +2,86 @@
 
 from __future__ import annotations
 
-from coview_stream.config import AcceptanceConfig
+from coview_stream.config import AcceptanceConfig, TrackingConfig
 from coview_stream.fix import Cause
 from coview_stream.pose.judgement import Judgement
 
+_NEUTRAL = (Cause.BLIND, Cause.ODOMETRY)  # they begin a doubt, but do not speak against the place
+
 
 class Doubt:
-    """Counts what speaks against the place since the newest registration that spoke for it.
+    """Weighs what speaks against the place since the newest registration that spoke for it.
 
     Every frame may clear a doubt, but only driving on with a place that does not fit adds to it: a covered frame loses
-    nothing. Sight alone adds nothing either: while the sensor is blind there is no pose, but nothing speaks against the
-    place where odometry goes on to. After a long doubt one registration is not enough: the robot may stand elsewhere.
+    nothing. While the sensor is blind there is no pose, but nothing speaks against the place where odometry goes on to.
+    After a long doubt one registration is not enough, for the robot may stand elsewhere: it takes several, a metre or
+    a second apart.
 
     Attributes:
         active: whether there is a doubt, and so no pose.
         hopeless: whether the place must be given up.
     """
 
-    def __init__(self, rule: AcceptanceConfig, distance: float) -> None:
-        """Count by a rule what is at least ``distance`` metres apart."""
+    def __init__(self, rule: AcceptanceConfig, tracking: TrackingConfig) -> None:
+        """Weigh by a rule; ``tracking`` says how far apart registrations tell something new."""
         self._rule = rule
-        self._distance = distance
+        self._tracking = tracking
         self.clear()
 
     def clear(self) -> None:
         """Doubt nothing."""
-        self._count = self._confirmed = 0
-        self._since = self._seen_since = 0.0  # stamps of the first, and of the first that was not blind
-        self._at = self._confirmed_at = 0.0  # metres driven at the newest of either kind
-        self.hopeless = False
+        self.active = self.hopeless = False
+        self._since: float | None = None  # stamp of the first doubtful registration
+        self._seen_since = 0.0  # and of the first that was not blind
+        self._against = self._proofs = 0
+        self._against_at = 0.0  # metres driven at the newest that counts
+        self._proof_at = (0.0, 0.0)  # metres driven and stamp likewise
+        self._lasted = 0.0  # seconds, up to the first proof
 
-    @property
-    def active(self) -> bool:
-        """See the class."""
-        return self._count > 0
-
-    def begin(self, stamp: float, travelled: float) -> None:
-        """Doubt, because of something that no registration knows of; nothing new if there is a doubt already."""
-        if not self._count:
-            self._count, self._at, self._confirmed = 1, travelled, 0
-            self._since = self._seen_since = stamp
+    def begin(self) -> None:
+        """Doubt from the next registration on, because of something that none of them knows of."""
+        self.active = True
 
     def note(self, judgement: Judgement, stamp: float, travelled: float) -> str:
         """Take note of a registration, made ``travelled`` metres into the drive; one clause about what it came to."""
         if judgement.verified:
             return self._spoken_for(judgement, stamp, travelled)
-        self._confirmed = 0
-        if not self._count:
-            self.begin(stamp, travelled)
-        elif travelled - self._at >= self._distance and judgement.cause not in (Cause.BLIND, Cause.ODOMETRY):
-            self._count += 1
-            self._at = travelled
+        self.active = True
+        self._proofs = 0
+        if self._since is None:
+            self._since = self._seen_since = stamp
         blind = judgement.cause is Cause.BLIND
         if blind:
             self._seen_since = stamp
+        elif judgement.cause not in _NEUTRAL:
+            self._count(travelled)
         rule = self._rule
-        if self._count >= rule.patience:
+        if self._against >= rule.patience:
             self.hopeless = True
-            return f"{self._count} registrations rejected: {judgement.reason}"
-        if stamp - (self._since if blind else self._seen_since) >= (
-            rule.patience_blind if blind else rule.patience_seconds
-        ):
+            return f"{self._against} registrations rejected: {judgement.reason}"
+        began = self._since if blind else self._seen_since
+        if stamp - began >= (rule.patience_blind if blind else rule.patience_seconds):
             self.hopeless = True
             return f"in doubt for {stamp - self._since:.0f} s: {judgement.reason}"
         return judgement.reason
 
+    def _count(self, travelled: float) -> None:
+        """Count what speaks against the place, if it is not the same view again."""
+        if not self._against or travelled - self._against_at >= self._tracking.distance:
+            self._against += 1
+            self._against_at = travelled
+
     def _spoken_for(self, judgement: Judgement, stamp: float, travelled: float) -> str:
-        rule, lasted = self._rule, stamp - self._since
-        if self._count and lasted >= rule.patience_seconds:
-            if not self._confirmed or travelled - self._confirmed_at >= self._distance:
-                self._confirmed, self._confirmed_at = self._confirmed + 1, travelled
-            if self._confirmed < rule.confirmations:
-                return (
-                    f"verified {self._confirmed} of {rule.confirmations} times after {lasted:.0f} s of doubt"
-                )
+        if not self._proofs:
+            self._lasted = 0.0 if self._since is None else stamp - self._since
+        if self._lasted >= self._rule.patience_seconds:
+            driven, waited = travelled - self._proof_at[0], stamp - self._proof_at[1]
+            apart = driven >= self._tracking.distance or waited >= self._tracking.seconds
+            if not self._proofs or apart:
+                self._proofs += 1
+                self._proof_at = travelled, stamp
+            needed = self._rule.confirmations
+            if self._proofs < needed:
+                return f"verified {self._proofs} of {needed} times after {self._lasted:.0f} s of doubt"
         self.clear()
         return judgement.reason

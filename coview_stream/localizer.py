@@ -18,6 +18,7 @@ from coview_stream.inputs import checked_cloud, checked_odometry, checked_place
 from coview_stream.place.continuity import Continuity
 from coview_stream.place.descriptor import Descriptor
 from coview_stream.place.keyframes import KeyframeBuffer
+from coview_stream.pose.judgement import Judgement
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.query import Query
 from coview_stream.search import GlobalSearch
@@ -66,7 +67,7 @@ class Localizer:
         self._newest: _Frame | None = None
         self._suggestions = Suggestions()
         self._continuity = Continuity()
-        self._doubt = Doubt(self.config.acceptance, self.config.tracking.distance)
+        self._doubt = Doubt(self.config.acceptance, self.config.tracking)
         self._registered = 0.0  # stamp of the newest registration
         self._generation += 1
 
@@ -154,10 +155,8 @@ class Localizer:
             self.state = State.TRACKING
             self._doubt.clear()
             self._buffer.clear()
-            self._registered = newest.stamp
-            judgement = self._tracker.update(newest.cloud, newest.T_odom_body)
-            if not judgement.verified:
-                self.suspect()  # what it sees now does not fit: it may have driven on or been carried since
+            # it may have driven on or been carried since
+            self._note(self._tracker.update(newest.cloud, newest.T_odom_body), newest.stamp, verdict.evidence)
         elif self.state is not State.LOST:
             self.state = verdict.evidence.state
 
@@ -181,7 +180,7 @@ class Localizer:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
         self._tracker.forget_points()
         if self.state is State.TRACKING:
-            self._doubt.begin(self._newest.stamp if self._newest else 0.0, self._tracker.travelled)
+            self._doubt.begin()
 
     def fix(self) -> Fix:
         """Say what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
@@ -195,13 +194,19 @@ class Localizer:
         ``idle``: by its odometry the robot stands still. It may be carried, so what it saw before does not count.
         ``alone``: nor does it where there is a doubt.
         """
-        judgement = self._tracker.update(cloud, T_odom_body, idle, alone)
+        self._note(self._tracker.update(cloud, T_odom_body, idle, alone), stamp)
+
+    def _note(self, judgement: Judgement, stamp: float, found: KeyframeEvidence | None = None) -> None:
+        """Draw the consequences of a registration; one that confirms what the search has ``found`` adds nothing."""
         self._registered = stamp
         reason = self._doubt.note(judgement, stamp, self._tracker.travelled)
+        if found is not None and judgement.verified:
+            return
         if self._doubt.hopeless:
             self._lose()
+        doubtful = self.state is State.TRACKING and self._doubt.active
         self._evidence = KeyframeEvidence(
-            stamp, self.state, reason, judgement.score, 0.0, judgement.evidence,
+            stamp, State.AMBIGUOUS if doubtful else self.state, reason, judgement.score, 0.0, judgement.evidence,
             cause=judgement.cause, innovation=judgement.innovation,
         )  # fmt: skip
 

@@ -46,7 +46,7 @@ class Tracker:
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
-        self._graph: Smoother | None = None
+        self._graph: Smoother = make_smoother(config.graph)
         self._odometer = Odometer(config.tracking)
         self._habit = Habit()
         self._glance = Glance()
@@ -165,7 +165,7 @@ class Tracker:
     def predicted_covariance(self) -> Matrix6:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
         last = self._odometer.pose
-        if self._graph is None or last is None:
+        if not len(self._graph) or last is None:
             return np.asarray(_START.copy())
         belief = self._graph.estimate
         here = self.T_map_odom @ last
@@ -188,7 +188,6 @@ class Tracker:
 
     def _restart(self, T_map_body: Pose, covariance: Matrix6, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
-        self._graph = self._graph or make_smoother(self.config.graph)
         self._graph.start(T_map_body, covariance)
         self._odometer.unlearn()
         self._odometer.mark(T_odom_body)
@@ -196,8 +195,6 @@ class Tracker:
 
     def _moved(self, T_odom_body: Pose, idle: bool) -> Smoother:
         """Add a keyframe where odometry leads."""
-        if self._graph is None:
-            raise RuntimeError("no fix yet; call start first")
         driven, turned = self._odometer.since_keyframe()
         spread = self.drift.covariance(driven + _IDLE_DRIVE * idle, turned)
         self._graph.move(self._odometer.motion(T_odom_body), spread)
@@ -205,11 +202,9 @@ class Tracker:
         return self._graph
 
     def _attempt(self, scan: Scan, belief: Estimate, target: LocalMap, scales: tuple[float, ...]) -> Attempt:
-        assert self._graph is not None  # there is a belief
         return attempt(scan, belief, target, scales, self.base_map, self.config, self._habit, self._graph)
 
     def _believe(self, T_odom_body: Pose) -> None:
-        assert self._graph is not None  # who corrects it has one
         self.T_map_odom = self._graph.estimate.T_map_body @ inverse(T_odom_body)
 
     def _learn(self, tried: Attempt) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.config import AcceptanceConfig
+from coview_stream.config import AcceptanceConfig, TrackingConfig
 from coview_stream.doubt import Doubt
 from coview_stream.fix import Cause
 from coview_stream.pose.judgement import Judgement
@@ -17,7 +17,7 @@ AGAINST = [Cause.FITNESS, Cause.GROUND, Cause.FREE_SPACE, Cause.TILT, Cause.OFF_
 
 @pytest.fixture
 def doubt():
-    return Doubt(RULE, distance=2.0)
+    return Doubt(RULE, TrackingConfig(distance=2.0, seconds=5.0))
 
 
 def test_at_first_there_is_none(doubt):
@@ -52,6 +52,11 @@ def test_driving_on_adds_nothing_where_nothing_speaks_against_the_place(doubt, c
         doubt.note(Judgement(cause, "why"), 1.0 * k, 5.0 * k)
     assert doubt.active
     assert not doubt.hopeless
+    # and what does speak against it is counted from nothing
+    for k in range(2):
+        assert doubt.note(BAD, 9.0, 50.0 + 5.0 * k) == "nothing fits"
+        assert not doubt.hopeless
+    assert doubt.note(BAD, 9.0, 60.0) == "3 registrations rejected: nothing fits"
 
 
 def test_a_good_one_between_starts_the_count_anew(doubt):
@@ -72,15 +77,23 @@ def test_standing_still_time_is_too_much(doubt, cause, longest):
     assert doubt.hopeless
 
 
-def test_a_suspicion_is_a_doubt_and_does_not_make_an_older_one_younger(doubt):
-    doubt.begin(0.0, 0.0)
+def test_a_suspicion_is_a_doubt_that_lasts_from_the_next_registration_on(doubt):
+    doubt.begin()
     assert doubt.active
-    doubt.begin(9.0, 0.0)
-    doubt.note(BAD, 10.0, 0.0)
+    doubt.note(BAD, 1000.0, 0.0)
+    doubt.begin()
+    assert not doubt.hopeless
+    doubt.note(BAD, 1010.0, 0.0)
     assert doubt.hopeless
     doubt.clear()
     assert not doubt.active
     assert not doubt.hopeless
+
+
+def test_a_suspicion_is_cleared_by_the_first_registration(doubt):
+    doubt.begin()
+    assert doubt.note(GOOD, 5000.0, 0.0) == "verified"
+    assert not doubt.active
 
 
 def blinded(doubt, seconds):
@@ -99,6 +112,15 @@ def test_after_a_long_one_a_single_registration_is_not_enough(doubt):
     assert doubt.note(GOOD, 36.0, 4.0) == "verified"
     assert not doubt.active
     assert not doubt.hopeless
+
+
+def test_a_robot_that_stands_still_is_believed_after_some_seconds(doubt):
+    blinded(doubt, 30.0)
+    told = [doubt.note(GOOD, 31.0 + k, 0.0) for k in range(11)]
+    assert told[0] == told[4] == "verified 1 of 3 times after 31 s of doubt"
+    assert told[5] == told[9] == "verified 2 of 3 times after 31 s of doubt"
+    assert told[10] == "verified"
+    assert not doubt.active
 
 
 def test_one_against_it_undoes_the_proof(doubt):

@@ -261,3 +261,17 @@ def test_beyond_the_edge_of_the_map_there_is_no_pose_and_back_on_it_there_is(wor
     assert any(fix.evidence.cause is Cause.OFF_MAP for fix in fixes)
     assert any(fix.state is State.LOST for fix in fixes)
     assert fixes[-1].state is State.TRACKING
+
+
+def test_after_a_pause_the_first_frame_decides(world_map, world_drive):
+    """What came before the pause is no doubt that has lasted: one good frame is enough, one bad one is not too much."""
+    for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.AMBIGUOUS)):
+        localizer = Localizer(world_map)
+        for k in range(5):
+            fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        assert fix.state is State.TRACKING
+        localizer.suspect()
+        fix = localizer.step(cloud, world_drive.T_odom_body[5], 60.0)
+        assert fix.state is expected
+        assert fix.evidence.state is expected
+        assert fix.evidence.cause is not None
