@@ -10,7 +10,7 @@ from coview_stream.fix import Cause
 from coview_stream.geometry import Points, Pose, inverse, transform
 from coview_stream.odometer import Odometer
 from coview_stream.place.keyframes import thinned
-from coview_stream.pose.attempt import Attempt, Scan, attempt
+from coview_stream.pose.attempt import Attempt, Registrar, Scan
 from coview_stream.pose.chain import Estimate
 from coview_stream.pose.covariance import (
     angles_first,
@@ -202,7 +202,8 @@ class Tracker:
         return self._graph
 
     def _attempt(self, scan: Scan, belief: Estimate, target: LocalMap, scales: tuple[float, ...]) -> Attempt:
-        return attempt(scan, belief, target, scales, self.base_map, self.config, self._habit, self._graph)
+        registrar = Registrar(self.base_map, self.config)
+        return registrar.attempt(scan, belief, target, scales, self._habit, self._graph)
 
     def _believe(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self._graph.estimate.T_map_body @ inverse(T_odom_body)

@@ -9,6 +9,7 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.errors import InputError
 from coview_stream.fix import Cause
 from coview_stream.geometry import Points, Pose, inverse, tilt_of, transform
 from coview_stream.pose.chain import Estimate
@@ -18,7 +19,7 @@ from coview_stream.pose.judgement import Habit, Judgement
 from coview_stream.pose.rays import RangeImage
 from coview_stream.pose.registration import LocalMap, Prior, Source, register
 from coview_stream.pose.tangent import Matrix6
-from coview_stream.pose.verification import verify
+from coview_stream.pose.verification import Evidence, verify
 
 
 @dataclass(frozen=True)
@@ -52,46 +53,74 @@ class Attempt:
     innovation: float
 
 
-def attempt(
-    scan: Scan,
-    belief: Estimate,
-    target: LocalMap,
-    scales: tuple[float, ...],
-    base_map: BaseMap,
-    config: LocalizerConfig,
-    habit: Habit,
-    graph: Smoother,
-) -> Attempt:
-    """Register, verify and judge.
+@dataclass(frozen=True)
+class Registrar:
+    """Registers, verifies and judges scans on a base map.
 
-    Args:
-        scan: what to register.
-        belief: pose and covariance that it starts from, and that take part in it as a prior.
-        target: the map around it.
-        scales: largest correspondence distance of each scale, metres.
+    Attributes:
         base_map: knows where it has been surveyed.
         config: of registration and acceptance.
-        habit: what evidence has been like.
-        graph: predicts the pose.
     """
-    back = inverse(scan.T_odom_body)
-    T_start = belief.T_map_body @ back
-    prior = Prior(T_start, np.asarray(np.linalg.inv(belief.covariance)))
-    settings = config.registration
-    found = register(scan.source, T_start, target, settings, scales, prior, scan.T_odom_body[:3, 3])
-    T = T_start if found is None else found.T_map_source
-    surveyed = base_map.surveyed(transform(T, scan.source.points)[:, :2])
-    evidence = verify(scan.source, T, scan.seen, T @ scan.T_odom_body, target, surveyed)
-    cause, reason = habit.judge(evidence, config.acceptance)
-    if found is None:
-        if cause is Cause.VERIFIED:
-            cause, reason = Cause.FITNESS, "no hold: too few points have a partner in the map"
-        return Attempt(Judgement(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
-    if tilt_of(T) > config.acceptance.most_tilt:
-        cause, reason = Cause.TILT, f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity"
-    alone = without_prior(
-        T @ scan.T_odom_body, found.information, belief.T_map_body, prior.information, settings
-    )
-    covariance = registration_covariance(alone.information, settings)
-    innovation = graph.innovation(alone.T_map_body, covariance)
-    return Attempt(Judgement(cause, reason, evidence, innovation), alone.T_map_body, covariance, innovation)
+
+    base_map: BaseMap
+    config: LocalizerConfig
+
+    def attempt(
+        self,
+        scan: Scan,
+        belief: Estimate,
+        target: LocalMap,
+        scales: tuple[float, ...],
+        habit: Habit,
+        graph: Smoother,
+    ) -> Attempt:
+        """Register, verify and judge; where the numbers leave nothing to hold on to, the belief stays.
+
+        Args:
+            scan: what to register.
+            belief: pose and covariance that it starts from, and that take part in it as a prior.
+            target: the map around it.
+            scales: largest correspondence distance of each scale, metres.
+            habit: what evidence has been like.
+            graph: predicts the pose.
+        """
+        settings, acceptance = self.config.registration, self.config.acceptance
+        T_start = belief.T_map_body @ inverse(scan.T_odom_body)
+        information = _inverted(belief.covariance)
+        if information is None:
+            return _unheld(belief, "what is believed so far has a covariance without an inverse")
+        prior = Prior(T_start, information)
+        found = register(scan.source, T_start, target, settings, scales, prior, scan.T_odom_body[:3, 3])
+        T = T_start if found is None else found.T_map_source
+        surveyed = self.base_map.surveyed(transform(T, scan.source.points)[:, :2])
+        evidence = verify(scan.source, T, scan.seen, T @ scan.T_odom_body, target, surveyed)
+        cause, reason = habit.judge(evidence, acceptance)
+        if found is None:
+            if cause is Cause.VERIFIED:
+                return _unheld(belief, "too few points have a partner in the map", evidence)
+            return Attempt(Judgement(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
+        if tilt_of(T) > acceptance.most_tilt:
+            cause, reason = Cause.TILT, f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity"
+        try:
+            alone = without_prior(
+                T @ scan.T_odom_body, found.information, belief.T_map_body, information, settings
+            )
+            covariance = registration_covariance(alone.information, settings)
+            innovation = graph.innovation(alone.T_map_body, covariance)
+        except InputError as error:
+            return _unheld(belief, str(error), evidence)
+        judgement = Judgement(cause, reason, evidence, innovation)
+        return Attempt(judgement, alone.T_map_body, covariance, innovation)
+
+
+def _unheld(belief: Estimate, reason: str, evidence: Evidence | None = None) -> Attempt:
+    judgement = Judgement(Cause.FITNESS, f"no hold: {reason}", evidence)
+    return Attempt(judgement, belief.T_map_body, belief.covariance, 0.0)
+
+
+def _inverted(covariance: Matrix6) -> Matrix6 | None:
+    try:
+        inverted = np.asarray(np.linalg.inv(covariance))
+    except np.linalg.LinAlgError:
+        return None
+    return inverted if np.isfinite(inverted).all() else None

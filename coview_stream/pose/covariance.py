@@ -58,11 +58,19 @@ def without_prior(
 
     Returns:
         Pose and information of the measurement alone, to be given to :func:`registration_covariance`.
+
+    Raises:
+        InputError: ``information`` is not finite, or leaves a direction open in spite of the prior.
     """
     told = np.asarray(prior_information) * config.inflation**2
     alone = information - told
-    L = np.linalg.cholesky(0.5 * (information + information.T))
-    half = np.linalg.inv(L)
+    if not np.isfinite(information).all():
+        raise InputError("the registration's information is not finite")
+    try:
+        L = np.linalg.cholesky(0.5 * (information + information.T))
+        half = np.linalg.inv(L)
+    except np.linalg.LinAlgError as error:
+        raise InputError("the registration's information is not positive definite") from error
     # in units of what is known with the prior, what the pairs know of a direction is a share in [0, 1]
     share, directions = np.linalg.eigh(half @ (0.5 * (alone + alone.T)) @ half.T)
     share = np.clip(share, 0.0, 1.0)

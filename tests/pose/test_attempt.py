@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.fix import Cause
 from coview_stream.geometry import inverse, pose_from, rot_z
 from coview_stream.place.keyframes import thinned
-from coview_stream.pose.attempt import Attempt, Scan, attempt
+from coview_stream.pose import attempt
+from coview_stream.pose.attempt import Attempt, Registrar, Scan
 from coview_stream.pose.chain import Estimate
 from coview_stream.pose.graph import make_smoother
 from coview_stream.pose.judgement import Habit
@@ -40,7 +43,7 @@ def attempted(world_map, scan, belief: Estimate, graph: Estimate | None = None) 
     smoother.start(*(graph or belief))
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
     scales = CONFIG.registration.track
-    return attempt(scan, belief, target, scales, world_map, CONFIG, Habit(), smoother)
+    return Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), smoother)
 
 
 def off(found, truth):
@@ -84,9 +87,8 @@ def test_innovation_is_the_distance_from_what_the_graph_predicts(world_map, worl
     assert far.innovation == pytest.approx(expected, rel=1e-6)
     assert far.innovation > CONFIG.acceptance.keep_innovation
     assert far.judgement.innovation == far.innovation
-    assert (
-        far.judgement.cause is Cause.VERIFIED
-    )  # the place fits: what to think of odometry is another question
+    # the place fits: what to think of odometry is another question
+    assert far.judgement.cause is Cause.VERIFIED
 
 
 def test_where_there_is_nothing_to_hold_on_to_the_belief_stays(world_map, world_drive, scan):
@@ -101,6 +103,30 @@ def test_where_there_is_nothing_to_hold_on_to_the_belief_stays(world_map, world_
     np.testing.assert_array_equal(found.T_map_body, belief.T_map_body)
 
 
+@pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
+def test_a_belief_without_an_inverse_is_no_hold(world_map, world_drive, scan, bad):
+    truth = world_drive.T_map_body[4]
+    found = attempted(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
+    assert_unheld(found, truth)
+    assert found.judgement.evidence is None
+
+
+@pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
+def test_pairs_without_an_inverse_are_no_hold(world_map, world_drive, scan, bad, monkeypatch):
+    truth, whole = world_drive.T_map_body[4], register
+    monkeypatch.setattr(attempt, "register", lambda *given: replace(whole(*given), information=bad))
+    found = attempted(world_map, scan, Estimate(truth, TIGHT))
+    assert_unheld(found, truth)
+    assert found.judgement.evidence is not None  # it is as good as ever, and does not help
+
+
+def assert_unheld(found, truth):
+    assert found.judgement.cause is Cause.FITNESS
+    assert found.judgement.reason.startswith("no hold: ")
+    assert found.judgement.innovation is None
+    np.testing.assert_array_equal(found.T_map_body, truth)
+
+
 def test_beyond_what_was_surveyed_nothing_is_held_against_the_place(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
     edge = np.array([0.0, 0.0, 0.0, 60.0 - truth[0, 3], 0.0, 0.0])
@@ -109,7 +135,7 @@ def test_beyond_what_was_surveyed_nothing_is_held_against_the_place(world_map, w
     smoother.start(*belief)
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
     scales = CONFIG.registration.track
-    found = attempt(scan, belief, target, scales, world_map, CONFIG, Habit(), smoother)
+    found = Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), smoother)
     assert found.judgement.cause is Cause.OFF_MAP
 
 
