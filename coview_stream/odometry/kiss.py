@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.errors import DependencyError
+from coview_stream.extras import extra
 from coview_stream.geometry import Pose, inverse
 from coview_stream.odometry.config import LidarOdometryConfig
 
@@ -54,19 +54,14 @@ class KissRegistration:
 
 def _settings(config: LidarOdometryConfig) -> tuple[Any, Any]:
     """Return the class ``KissICP`` and its configuration; DependencyError where there is no kiss-icp."""
-    try:
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
-    except ImportError as error:
-        missing = "is not installed" if (error.name or "") == "kiss_icp" else f"cannot be loaded ({error})"
-        raise DependencyError(
-            f"lidar odometry: kiss-icp {missing}; pip install 'coview-stream[kiss-icp]'"
-        ) from error
-    settings = KISSConfig()
+    pipeline, configuration = (
+        extra(f"kiss_icp.{module}", "kiss-icp", "lidar odometry") for module in ("kiss_icp", "config")
+    )
+    settings = configuration.KISSConfig()
     settings.data.min_range, settings.data.max_range = config.min_range, config.max_range
     settings.data.deskew = False
     settings.mapping.voxel_size = config.voxel
     settings.registration.max_num_threads = config.threads
     settings.registration.convergence_criterion = config.convergence
     settings.registration.max_num_iterations = config.iterations
-    return KissICP, settings
+    return pipeline.KissICP, settings

@@ -22,18 +22,19 @@ imports small_gicp.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.errors import DependencyError
+from coview_stream.extras import extra
 from coview_stream.geometry import Points, Pose, orthonormal
 from coview_stream.pose.pivot import about_pivot, fused_step, moved, pulls
+from coview_stream.pose.registration import LEAST_PAIRS, Registration
 from coview_stream.pose.tangent import Matrix6, Vector6
 
-LEAST_PAIRS = 50
 _NEIGHBOURS = 10  # that a point's covariance is made of; small_gicp's own choice
 _LEAST_KIND = 20  # points: fewer of a kind have no surfaces
 _MOST_SHARE = 5.0  # as trimmed ICP: a handful of points must not outweigh thousands
@@ -41,10 +42,12 @@ _INFORMATION = 4.0
 """Times small_gicp's Hessian, so that the configuration's ``inflation`` suits both methods.
 
 Measured on simulated drives against the truth (worlds 5101 to 5109 of ``bench.tracking``, 30 places each, starts off by
-0.12 m and 0.3 degrees, no prior, no floors): with the inflation of 8 the mean squared Mahalanobis error per degree of
-freedom is, for trimmed ICP and for GICP with this factor, 0.14 to 0.17 and 0.05 to 0.08 in towns and on a campus, 0.35
-and 0.23 to 0.34 in a sparse forest, 0.39 and 0.08 in a town that has changed. So in no kind of world is GICP less
-honest than trimmed ICP. Its residual would be no better guide: 0.05 of what small_gicp expects, in all of them.
+0.12 m and 0.3 degrees, no prior, no floors) and restated for the inflation of 3: the mean squared Mahalanobis error per
+degree of freedom of trimmed ICP is 1.0 to 1.2 in towns and on a campus, 2.5 in a sparse forest, 2.8 in a town that has
+changed; GICP's, with this factor, 0.4 to 0.6, 1.6 to 2.4 and 0.6. So in no kind of world is GICP less honest than
+trimmed ICP. What is missing where it exceeds 1 is the error that neighbouring registrations share, which
+:mod:`coview_stream.pose.spread` adds. The residual would be no better guide: 0.05 of what small_gicp expects, in all of
+them.
 """
 _ALONG = 0.5
 """Times the identity, what every pair's weight holds in all directions, per square metre: see the module."""
@@ -59,27 +62,9 @@ class Surfaces(NamedTuple):
     tree: Any
 
 
-class Found(NamedTuple):
-    """The fields of :class:`coview_stream.pose.registration.Registration`."""
-
-    T_map_source: Pose
-    information: Matrix6
-    rmse: float
-    pairs: int
-    iterations: int
-    converged: bool
-
-
 def library() -> Any:
     """Return the module ``small_gicp``; DependencyError where it is missing."""
-    try:
-        import small_gicp
-    except ImportError as error:
-        missing = "is not installed" if (error.name or "") == "small_gicp" else f"cannot be loaded ({error})"
-        raise DependencyError(
-            f"registration by GICP: small-gicp {missing}; pip install 'coview-stream[gicp]'"
-        ) from error
-    return small_gicp
+    return extra("small_gicp", "gicp", "registration by GICP")
 
 
 def surfaces(points: Points) -> Surfaces | None:
@@ -107,7 +92,7 @@ def register_surfaces(
     keep: float,
     iterations: int,
     prior: kernels.Belief | None = None,
-) -> Found | None:
+) -> Registration | None:
     """Register the kinds of points of a scan.
 
     Args:
@@ -143,10 +128,10 @@ def register_surfaces(
             total += 1
             turn, shift = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             converged = bool(shift < scale.shift and turn < scale.turn)
-            answer = Found(T, information, pairs.rmse, pairs.kept, total, converged)
+            answer = Registration(T, information, pairs.rmse, pairs.kept, total, converged)
             if converged:
                 break
-    return None if answer is None else answer._replace(T_map_source=orthonormal(T))
+    return None if answer is None else replace(answer, T_map_source=orthonormal(T))
 
 
 class _Pairs(NamedTuple):

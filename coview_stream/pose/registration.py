@@ -14,12 +14,11 @@ import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig, RegistrationMethod
 from coview_stream.geometry import Points, Pose
 from coview_stream.pose.edges import EdgeRaster, edge_raster
+from coview_stream.pose.tangent import Matrix6
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.pose.gicp import Surfaces
-
-Matrix6 = npt.NDArray[np.float64]
 
 _CACHED_CROPS = 12
 _CROP_STEP = 16.0  # metres between the centres of cached crops
@@ -27,10 +26,8 @@ _STOP_SHIFT = 2e-3  # metres; below the map's own noise, and the next step would
 _STOP_TURN = 1e-4  # radians
 _COARSE_SHIFT = 0.06  # of a scale that another one follows; a finer stop there changes no error
 _COARSE_TURN = 3e-3  # radians per metre of such a scale
-_LEAST_PAIRS = 50
-_WIDTH_SHARE = (
-    0.33  # of a scale, width of its weights: narrow ones from the start would hold a wrong pose fast
-)
+LEAST_PAIRS = 50
+_WIDTH_SHARE = 0.33  # of a scale, width of its weights: narrow ones from the start hold a wrong pose fast
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ class LocalMaps:
         if key not in self._crops:
             centre = np.array([key[0], key[1]]) * _CROP_STEP
             points, normals = self._map.crop(centre, self._radius + 0.75 * _CROP_STEP)
-            enough = len(points) >= _LEAST_PAIRS
+            enough = len(points) >= LEAST_PAIRS
             self._crops[key] = LocalMap(points, normals) if enough else None
             if len(self._crops) > self._most:
                 self._crops.popitem(last=False)
@@ -195,7 +192,7 @@ def register(
         _stages(scales, config, thin),
         keep=config.keep,
         iterations=iterations or config.iterations,
-        least=_LEAST_PAIRS,
+        least=LEAST_PAIRS,
         prior=belief,
     )
     return None if found is None else Registration(*found)
@@ -216,7 +213,7 @@ def _by_gicp(
     if target.surfaces is None:
         return None
     thinned = {n: source if n == 1 else source.every(n) for n in {stage.every for stage in stages}}
-    found = register_surfaces(
+    return register_surfaces(
         [thinned[stage.every].surfaces for stage in stages],
         target.surfaces,
         target.grid,
@@ -228,7 +225,6 @@ def _by_gicp(
         iterations=iterations or config.iterations,
         prior=belief,
     )
-    return None if found is None else Registration(*found)
 
 
 def _stages(scales: tuple[float, ...], config: RegistrationConfig, thin: int) -> list[kernels.Scale]:

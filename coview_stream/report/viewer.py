@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
-
 import numpy as np
 
-from coview_stream.errors import DependencyError
+from coview_stream.extras import extra
 from coview_stream.geometry import pose_to_tum
 from coview_stream.stream.messages import PoseMessage
 
-_STRIP = (
-    50  # poses after which a new piece of the way starts: redrawing all of it each time would be quadratic
-)
+_STRIP = 50  # poses after which a new piece of the way starts: redrawing all of it each time is quadratic
 _COLOURS = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up
 
 
@@ -27,12 +22,7 @@ class PoseViewer:
     """
 
     def __init__(self, application: str = "coview_stream") -> None:
-        try:
-            self._rerun: Any = import_module("rerun")
-        except ImportError as error:
-            raise DependencyError(
-                "--rerun needs the rerun viewer, which is not installed; in a checkout: pip install '.[viz]'"
-            ) from error
+        self._rerun = extra("rerun", "viz", "--rerun")
         self._origin: np.ndarray | None = None
         self._strips: dict[str, list[np.ndarray]] = {}
         self._pieces: dict[str, int] = {}

@@ -1,0 +1,28 @@
+"""Libraries that only some installations have: imported when asked for, and named with their remedy when missing."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from coview_stream.errors import DependencyError
+
+
+def extra(module: str, name: str, purpose: str) -> Any:
+    """Import a module that comes with one of the package's extras.
+
+    Args:
+        module: its full name.
+        name: the extra's.
+        purpose: what needs it, for the message.
+
+    Raises:
+        DependencyError: it is not installed, or cannot be loaded.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        library = module.partition(".")[0]
+        missing = "is not installed" if error.name == library else f"cannot be loaded ({error})"
+        remedy = f"pip install 'coview-stream[{name}]'"
+        raise DependencyError(f"{purpose}: {library.replace('_', '-')} {missing}; {remedy}") from error
