@@ -12,9 +12,7 @@ from coview_stream.geometry import Pose, inverse, yaw_of
 from coview_stream.pose.drift import Drift, DriftEstimator, worth_learning
 from coview_stream.pose.tangent import Matrix6, difference
 
-_OWN_NOISE = (
-    0.4  # share of two neighbouring registrations' variances that their difference has; the rest they share
-)
+_OWN_NOISE = 0.4  # of two neighbouring registrations' variances, in their difference; the rest they share
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,15 @@ from math import exp
 import numpy as np
 
 from coview_stream.config import TrackingConfig
+from coview_stream.pose.covariance import angles_first
 from coview_stream.pose.tangent import Matrix6, Vector6
 
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
-_LEAST_FACTOR, _MOST_FACTOR = (
-    0.3,
-    20.0,
-)  # of the configured rate; a scale error is no random walk, and needs a pull
+# of the configured rate; a scale error is no random walk, and needs a pull
+_LEAST_FACTOR, _MOST_FACTOR = 0.3, 20.0
 _OUTLIER = 16.0  # variances; a slip beyond counts as one so large, so that rates grow step by step
-_LEAST_STEP, _LEAST_TURN = (
-    0.2,
-    np.radians(5.0),
-)  # over less, drift cannot be told from the registrations' noise
+# over less, drift cannot be told from the registrations' noise
+_LEAST_STEP, _LEAST_TURN = 0.2, np.radians(5.0)
 _LEAST_DRIVEN = 1e-3  # metres: standing still, a covariance of zero would be none
 
 
@@ -66,7 +63,7 @@ class Drift:
 
     def reported(self, driven: float, turned: float) -> Matrix6:
         """Return the same covariance over (x, y, z, roll, pitch, yaw)."""
-        return np.diag(np.roll(self.variances(driven, turned), 3))
+        return angles_first(self.covariance(driven, turned))
 
 
 class DriftEstimator:
@@ -75,11 +72,7 @@ class DriftEstimator:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         self._nominal = Drift.of(config)
-        self.clear()
-
-    def clear(self) -> None:
-        """Believe the configuration again: another odometry may have taken over."""
-        self._metres = np.full(len(_GROUPS), self._config.drift_trust)
+        self._metres = np.full(len(_GROUPS), config.drift_trust)
         self._sums = self._metres.copy()
 
     @property

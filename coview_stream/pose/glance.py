@@ -65,7 +65,10 @@ class Glance:
 
 
 def share_on_map(
-    points: Points, position: npt.NDArray[np.float64], T: Pose, target: LocalMap
+    points: Points,
+    position: npt.NDArray[np.float64],
+    T: Pose,
+    target: LocalMap,
 ) -> float | None:
     """Share of the points above the ground that have a map point near them; None if they are too few to tell.
 
@@ -77,9 +80,8 @@ def share_on_map(
     if len(near) < _LEAST_POINTS:
         return None
     floor = np.partition(near, len(near) // 20)[len(near) // 20]
-    wanted = np.flatnonzero(
-        (square > _NEAREST**2) & (square < _FARTHEST**2) & (points[:, 2] > floor + _HEIGHT)
-    )
+    between = (square > _NEAREST**2) & (square < _FARTHEST**2)
+    wanted = np.flatnonzero(between & (points[:, 2] > floor + _HEIGHT))
     if len(wanted) < _LEAST_POINTS:
         return None
     some = wanted[np.linspace(0, len(wanted) - 1, min(_POINTS, len(wanted))).astype(np.int64)]

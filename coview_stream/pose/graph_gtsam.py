@@ -42,9 +42,8 @@ class GtsamSmoother(Chain):
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(prior.T), self._noise(prior)))
         self._values.insert(0, gtsam.Pose3(self._keyframes[0].T))
-        for key, item in enumerate(
-            self._keyframes[1:], start=1
-        ):  # the prior has what was measured at the first
+        # the prior has what was measured at the first
+        for key, item in enumerate(self._keyframes[1:], start=1):
             self._add(key, item)
             for measured in item.corrections:
                 self._add_correction(key, measured)
