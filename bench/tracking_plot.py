@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -51,9 +52,9 @@ def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> 
         drawing.supxlabel(title, fontsize=8, color="#666666", family="DejaVu Sans Mono")
 
 
-def _curve(axes: object, squared: Floats, name: str, colour: str, nominal: Floats) -> None:
+def _curve(axes: Any, squared: Floats, name: str, colour: str, nominal: Floats) -> None:
     dof = len(AXES[name])
     observed = np.searchsorted(np.sort(squared), chi2.ppf(nominal, dof), side="right") / len(squared)
-    axes.plot(nominal, observed, color=colour, linewidth=1.8, label=name)  # type: ignore[attr-defined]
+    axes.plot(nominal, observed, color=colour, linewidth=1.8, label=name)
     marks = [(squared <= chi2.ppf(p, dof)).mean() for p in NOMINAL]
-    axes.plot(NOMINAL, marks, "o", color=colour, markersize=5)  # type: ignore[attr-defined]
+    axes.plot(NOMINAL, marks, "o", color=colour, markersize=5)

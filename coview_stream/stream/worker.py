@@ -24,7 +24,8 @@ def main(argv: list[str]) -> int:
     from coview_stream.stream.lane import attempt
 
     try:
-        config = LocalizerConfig(registration=RegistrationConfig(method=argv[5]))  # type: ignore[arg-type]
+        method = RegistrationConfig(method=argv[5])  # type: ignore[arg-type]  # any text; it checks
+        config = LocalizerConfig(registration=method)
         engine = open_engine(kind, map_path, sha256, config)
         if engine.kernels:
             warm_up(*engine.kernels)

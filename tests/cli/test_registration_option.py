@@ -30,7 +30,8 @@ def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
 
 def test_it_travels_to_a_lanes_process(world_file):
     """Which refuses what is no method."""
-    lane = ProcessLane("track", str(world_file), "0" * 64, registration="guesswork")  # type: ignore[arg-type]
+    wrong = {"registration": "guesswork"}
+    lane = ProcessLane("track", str(world_file), "0" * 64, **wrong)
     try:
         lane.start()
         with pytest.raises(CoViewError, match="'guesswork'"):
