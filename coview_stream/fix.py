@@ -128,3 +128,8 @@ class Fix:
     confidence: float = 0.0
     evidence: KeyframeEvidence | None = field(default=None)
     drift: Drift | None = None
+
+    @property
+    def doubted(self) -> bool:
+        """Whether AMBIGUOUS means that a place that was found is in doubt, not that a search has yet to decide."""
+        return self.state is State.AMBIGUOUS and self.evidence is not None and self.evidence.cause is not None

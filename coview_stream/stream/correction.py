@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from coview_stream.fix import Fix, State
 from coview_stream.geometry import Pose
+from coview_stream.pose.covariance import angles_first, carried_along
 from coview_stream.pose.drift import Drift
 from coview_stream.stream.messages import PoseMessage
 from coview_stream.stream.odometry import OdometryBuffer
@@ -22,7 +23,8 @@ class Correction:
 
     Attributes:
         T_map_odom: (4, 4) map <- odometry, source frame of the map.
-        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at the frame that it comes from.
+        T_map_body: (4, 4) map <- body at the frame that it comes from.
+        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at that frame.
         confidence: in [0, 1].
         verified_ns: stamp of the newest registration that spoke for it.
         travelled: metres that odometry had driven at the frame.
@@ -31,6 +33,7 @@ class Correction:
     """
 
     T_map_odom: Pose
+    T_map_body: Pose
     covariance: npt.NDArray[np.float64]
     confidence: float
     verified_ns: int
@@ -41,10 +44,12 @@ class Correction:
     @classmethod
     def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> Correction:
         """Take over a fix that has a pose; ``stamp_ns`` is its frame's."""
-        if fix.T_map_odom is None or fix.covariance is None or fix.drift is None:
+        if fix.T_map_odom is None or fix.T_map_body is None or fix.covariance is None or fix.drift is None:
             raise ValueError("a fix without a pose corrects nothing")
         verified = stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS))
-        return cls(fix.T_map_odom, fix.covariance, fix.confidence, verified, travelled, turned, fix.drift)
+        return cls(
+            fix.T_map_odom, fix.T_map_body, fix.covariance, fix.confidence, verified, travelled, turned, fix.drift
+        )  # fmt: skip
 
     def age(self, stamp_ns: int) -> float:
         """Seconds of sensor time from the newest registration to ``stamp_ns``."""
@@ -57,12 +62,15 @@ class Correction:
             return None
         driven = max(0.0, odometry.travelled - self.travelled)
         turned = max(0.0, odometry.turned - self.turned)
+        T_map_body = self.T_map_odom @ newest.T_odom_body
+        shift = T_map_body[:3, 3] - self.T_map_body[:3, 3]
+        carried = angles_first(carried_along(angles_first(self.covariance), shift))
         return PoseMessage(
             stamp_ns=newest.stamp_ns,
             robot=robot,
             state=State.TRACKING.value,
-            T_map_body=self.T_map_odom @ newest.T_odom_body,
-            covariance=self.covariance + self.drift.reported(driven, turned),
+            T_map_body=T_map_body,
+            covariance=carried + self.drift.reported(driven, turned),
             confidence=self.confidence,
             map_sha256=map_sha256,
             age=self.age(newest.stamp_ns),

@@ -151,7 +151,7 @@ class Session:
         """Let time pass: frames and odometry that do not come have consequences."""
         with self._lock:
             self._pair(now)
-            if not self.whereabouts.known:
+            if not self.whereabouts.at_stake:
                 return
             silent = now - self.odometry.arrived
             unseen = now - (now if self.work.processed_at is None else self.work.processed_at)
@@ -186,7 +186,7 @@ class Session:
             return self.work.desk.take_search()
 
     def hopeful(self) -> bool:
-        """Whether a place has been found that only needs confirmation."""
+        """Whether the search has come up with a place that only needs confirmation."""
         return self.whereabouts.hopeful
 
     def frame_done(self, job: FrameJob, result: FrameResult, now: float) -> None:

@@ -13,7 +13,7 @@ _KEPT = 5
 
 @dataclass(frozen=True)
 class Transition:
-    """One change of state.
+    """One change of state, or LOST for another reason than before: the robot is then searched for otherwise.
 
     Attributes:
         number: counted from 1 since the session began; a gap tells who listens what was missed.
@@ -48,18 +48,19 @@ class Transitions:
 
     def __init__(self) -> None:
         self._state = State.SEARCHING
+        self._reason = ""
         self._kept: deque[Transition] = deque(maxlen=_KEPT)
         self._count = 0
 
     def note(
         self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None
     ) -> None:
-        """Take note of the present state; a transition if it is another than before."""
-        if state is not self._state:
+        """Take note of the present state; a transition if it is another than before, or lost for another reason."""
+        if state is not self._state or (state is State.LOST and reason != self._reason):
             self._count += 1
             change = Transition(self._count, stamp_ns, self._state, state, reason, evidence)
             self._kept.append(change)
-            self._state = state
+            self._state, self._reason = state, reason
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the newest ones, oldest first."""

@@ -30,6 +30,7 @@ class Whereabouts:
         self._counters = counters
         self.last_frame_ns: int | None = None
         self._fix_state = State.SEARCHING
+        self._doubted = False  # whether the engine's AMBIGUOUS is a doubt of a place that it has found
         self._lost: str | None = None
         self._begun = ""  # why the search began anew
         self._forget_frame()
@@ -39,7 +40,7 @@ class Whereabouts:
         self._place.begin_anew()
         self.evidence: KeyframeEvidence | None = None
         self._correction: Correction | None = None
-        self.suspect = False
+        self.suspect = self._doubted = False
         self._trusted_from = -(1 << 63)
         self._published: PoseMessage | None = None
         if self._fix_state is not State.LOST:
@@ -53,12 +54,17 @@ class Whereabouts:
     @property
     def found(self) -> bool:
         """Whether the engine has found the place, even if there is no pose because it has to be verified."""
-        return self._correction is not None or self._fix_state is State.TRACKING
+        return self._correction is not None or self._fix_state is State.TRACKING or self._doubted
+
+    @property
+    def at_stake(self) -> bool:
+        """Whether there is a place that silence would lose."""
+        return self.found and self._lost is None
 
     @property
     def hopeful(self) -> bool:
-        """Whether a place has been found that only needs confirmation."""
-        return self._fix_state is State.AMBIGUOUS
+        """Whether the search has come up with a place that only needs confirmation."""
+        return self._fix_state is State.AMBIGUOUS and not self._doubted
 
     # ---- what happens to it
 
@@ -68,9 +74,9 @@ class Whereabouts:
         self.evidence = fix.evidence
         if suspected and stamp_ns >= self._trusted_from:
             self.suspect = False
-        was, self._fix_state = self._fix_state, fix.state
+        was, self._fix_state, self._doubted = self._fix_state, fix.state, fix.doubted
         if fix.T_map_odom is None:
-            if fix.state is State.LOST and was is not State.LOST and self._lost is None:
+            if fix.state is State.LOST and was is not State.LOST:
                 self._lose(fix.evidence.reason if fix.evidence else "evidence gone")
             self._correction = None
         elif not self.suspect and stamp_ns >= self._trusted_from:
@@ -100,6 +106,7 @@ class Whereabouts:
         self._lose(reason)
 
     def _lose(self, reason: str) -> None:
+        """Give the newest reason, but count once what is lost for two."""
         if self._lost is None:
             self._counters.losses += 1
         self._lost = reason

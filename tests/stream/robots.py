@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_stream.config import TrackingConfig
 from coview_stream.decision import Verdict
-from coview_stream.fix import Fix, KeyframeEvidence, State
+from coview_stream.fix import Cause, Fix, KeyframeEvidence, State
 from coview_stream.geometry import pose_from, rot_z
 from coview_stream.pose.drift import Drift
 from coview_stream.query import Query
@@ -71,10 +71,10 @@ def verdict(seconds=0.0, reason="two places fit", accepted=None):
     return Verdict(accepted, KeyframeEvidence(seconds, State.AMBIGUOUS, reason))
 
 
-def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT):
+def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT, covariance=None):
     """The engine's answer: here you are."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.TRACKING, "verified", 0.8)
-    covariance = np.eye(6) * sigma**2
+    covariance = np.eye(6) * sigma**2 if covariance is None else covariance
     stamp = job.stamp_ns * 1e-9
     T = T_map_odom @ job.T_odom_body
     fix = Fix(stamp, State.TRACKING, T, T_map_odom, covariance, 0.8, evidence, drift)
@@ -85,6 +85,12 @@ def unknown(job, state=State.SEARCHING, reason="no place fits", ask=None):
     """The engine's answer: no idea."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, state, reason)
     return FrameResult(Fix(job.stamp_ns * 1e-9, state, evidence=evidence), ask, 0.01)
+
+
+def doubted(job, cause=Cause.BLIND, reason="only 0 points to register"):
+    """The engine's answer: here you were, but what is seen now does not show it."""
+    evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.AMBIGUOUS, reason, cause=cause)
+    return FrameResult(Fix(job.stamp_ns * 1e-9, State.AMBIGUOUS, evidence=evidence), None, 0.01)
 
 
 class Robot:

@@ -41,21 +41,40 @@ def test_a_pose_is_the_newest_odometry_corrected(robot):
 
 def test_covariance_grows_with_what_was_driven_and_turned():
     drift = replace(DRIFT, position=0.2, height=0.2, turn=0.3)
+    known = np.diag([0.01, 0.01, 0.01, 0.0, 0.0, 0.0])
     robot = Robot()
-    robot.localized(0.0, drift=drift)
+    robot.localized(0.0, drift=drift, covariance=known)
     begin = robot.session.pose().covariance
     robot.moved(1.0)
     robot.moved(2.0)
-    robot.frame(2.1, drift=drift)
+    robot.frame(2.1, drift=drift, covariance=known)
     np.testing.assert_allclose(np.diag(robot.session.pose().covariance), np.diag(begin), atol=2e-3)
     robot.drive(2.2, 4.1)
     later = robot.session.pose().covariance
-    np.testing.assert_allclose(later, 0.01 * np.eye(6) + drift.reported(4.0, 0.0), rtol=0.03)
+    np.testing.assert_allclose(later, known + drift.reported(4.0, 0.0), rtol=0.03)
     for k in range(20):
         robot.moved(4.15 + 0.05 * k, x=8.2, yaw=0.05 * k)
     turned = robot.session.pose().covariance
     assert turned[5, 5] == pytest.approx(later[5, 5] + (0.3 * 0.95) ** 2, rel=0.05)
     assert turned[0, 0] == pytest.approx(later[0, 0], rel=0.05)
+
+
+def test_an_error_of_the_heading_is_one_of_the_place_further_on():
+    robot = Robot()
+    heading = np.zeros((6, 6))
+    heading[5, 5] = np.radians(1.0) ** 2
+    robot.localized(0.0, covariance=heading)
+    robot.drive(0.05, 2.0)
+    later = robot.session.pose()
+    gathered = DRIFT.reported(4.0, 0.0)
+    along = later.T_map_body[:3, 0]
+    across = later.T_map_body[:3, 1]
+    lever = later.covariance[:3, :3] - gathered[:3, :3]
+    assert np.sqrt(across @ lever @ across) == pytest.approx(4.0 * np.radians(1.0), rel=0.02)
+    assert abs(along @ lever @ along) < 1e-4
+    # who is off to the left (a positive yaw) lies to the left: both errors are one
+    assert across @ later.covariance[:3, 5] == pytest.approx(4.0 * np.radians(1.0) ** 2, rel=0.02)
+    np.testing.assert_allclose(later.covariance, later.covariance.T)
 
 
 def test_corrections_do_not_move_the_past(robot):

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.cli import build_parser
+from coview_stream.config import AcceptanceConfig
+from coview_stream.fix import State
 from coview_stream.stream import client
 from coview_stream.stream.codecs import decode_cloud, decode_odometry, decode_pose, encode_pose
 from coview_stream.stream.counters import Counters
@@ -16,6 +18,7 @@ from coview_stream.stream.fake import FakeTransport
 from coview_stream.stream.keys import PRESETS, robot_keys
 from coview_stream.stream.messages import PoseMessage, Sample
 from coview_stream.stream.records import pose_record
+from coview_stream.stream.transitions import Transition
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "streaming.md").read_text(encoding="utf-8")
 
@@ -40,6 +43,23 @@ def test_every_counter_and_no_other():
     counters = set(Counters().to_json())
     assert counters <= named
     assert named - counters == {"counters", "errors", "latency_ms"}
+
+
+def test_how_long_a_doubt_lasts_and_what_ends_it():
+    rule, words = AcceptanceConfig(), {2: "two", 3: "three", 10.0: "ten"}
+    rows = re.findall(r"^\|.*AMBIGUOUS.*\|$", section("How the node behaves"), re.MULTILINE)
+    rejected, blind, long = rows[:3]
+    assert f"{words[rule.patience]} rejected a metre apart" in rejected
+    assert f"{words[rule.patience_seconds]} seconds of doubt" in rejected
+    assert f"goes on for {rule.patience_blind:.0f} s without a pose" in blind
+    assert f"lasted {words[rule.patience_seconds]} seconds" in long
+    assert f"{words[rule.confirmations]} registrations" in long
+
+
+def test_every_field_of_a_transition():
+    told = re.search(r"^`transitions` in the status.*?\n\n", TEXT, re.MULTILINE | re.DOTALL)[0]
+    for name in Transition(1, None, State.TRACKING, State.LOST, "", None).to_json():
+        assert f"`{name}`" in told
 
 
 def test_the_layouts_as_documented():
