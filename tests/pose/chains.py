@@ -10,6 +10,7 @@ from coview_stream.geometry import exp_se3, inverse, pose_from
 from coview_stream.pose.tangent import shifted
 from coview_stream.rotation import exp_so3
 
+NO_GTSAM = "gtsam is not installed here; the graph runs on NumPy"
 START = pose_from(exp_so3([0.1, -0.2, 2.2]), [120.0, -40.0, 7.0])
 START_COVARIANCE = np.diag([0.01, 0.01, 0.03, 0.3, 0.3, 0.2]) ** 2
 ODOMETRY = np.diag([0.001, 0.001, 0.002, 0.02, 0.02, 0.02]) ** 2
@@ -66,3 +67,9 @@ def shift_errors(estimates, truth):
     return np.array(
         [np.linalg.norm(e.T_map_body[:3, 3] - T[:3, 3]) for e, T in zip(estimates, truth, strict=True)]
     )
+
+
+def relative(A, B):
+    """Largest difference of two covariances in units of the second's sigmas."""
+    sigma = np.sqrt(np.diag(B))
+    return float(np.abs((A - B) / np.outer(sigma, sigma)).max())

@@ -1,8 +1,11 @@
-"""Why the kernel is Huber's and the covariance inflated: the alternative locks the map out for good.
+"""Why the kernel is Huber's and the covariance inflated: a kernel that lets go, on the raw Hessian, locks the map out.
 
 The inverse Hessian of a registration is some six times too small in sigma. A kernel that lets go of what does not fit
 (Geman-McClure, DCS) takes honest registrations for outliers then, odometry goes on alone, and the further it drifts the
-less any registration fits. Only the product's kernel is in the package; the others are written out here.
+less any registration fits. It takes both, the kernel and the raw Hessian; Huber with the raw one is the control that
+tells them apart. Largest errors here, in metres, raw and inflated: Geman-McClure 6.27 and 0.24, DCS 6.27 and 0.51,
+Huber 0.44 and 0.26. So Huber is the kernel that bears a covariance which is too small. Only the product's kernel is in
+the package; the others are written out here.
 """
 
 from __future__ import annotations
@@ -47,10 +50,12 @@ def test_a_redescending_kernel_with_the_raw_hessian_locks_the_map_out(way, kerne
     assert worst(NumpySmoother(CONFIG, kernel), way, RAW) > 2.0
 
 
-@pytest.mark.parametrize("backend", ["numpy", "gtsam"])
+def test_huber_with_the_raw_hessian_is_worse_but_not_locked_out(way):
+    """The control: the covariances are as wrong as above, so that what locks out is the kernel on top of it."""
+    assert worst(NumpySmoother(CONFIG), way, RAW) < 0.6
+
+
 def test_huber_with_the_inflated_covariance_holds(way, backend):
-    if backend == "gtsam":
-        pytest.importorskip("gtsam", reason="gtsam is not installed here; the graph runs on NumPy")
     config = GraphConfig(backend=backend, window=CONFIG.window, restart=CONFIG.restart)
     assert worst(make_smoother(config), way, HONEST) < 0.35
 
