@@ -87,8 +87,13 @@ def cells(row: Row) -> list[str]:
     ]
 
 
-def verdicts(rows: Sequence[Row], found: dict[str, dict[str, Any]]) -> list[tuple[str, str, str, bool]]:
-    """Judge: (what, target, measured, met) per target. ``found`` is the coverage of all drives together."""
+def verdicts(
+    rows: Sequence[Row], found: dict[str, dict[str, Any]], quick: bool = False
+) -> list[tuple[str, str, str, bool]]:
+    """Judge: (what, target, measured, met) per target. ``found`` is the coverage of all drives together.
+
+    ``quick`` drives are too short to be found again on, and too few for a coverage.
+    """
     plain = [row for row in rows if row["plain"]]
     out = []
     for what, key, most in (
@@ -102,6 +107,8 @@ def verdicts(rows: Sequence[Row], found: dict[str, dict[str, Any]]) -> list[tupl
             out.append((what, f"<= {most}", text, mean <= most))
     false, seconds = sum(row["false_frames"] for row in rows), sum(row["false_s"] for row in rows)
     out.append(("false frames", "0", f"{false} ({seconds:.1f} s)", false == 0))
+    if quick:
+        return out
     events = [event for row in rows for event in row["events"]]
     if events:
         metres = [np.inf if e["recovery_m"] is None else e["recovery_m"] for e in events]
@@ -153,7 +160,7 @@ def _run(chosen: Sequence[Scenario], options: argparse.Namespace) -> int:
         print(line(cells(row), _WIDTHS), flush=True)
     together = pooled(parts)
     found = shares(together)
-    judged = verdicts(rows, found)
+    judged = verdicts(rows, found, options.quick)
     print(f"\n{coverage_table(found)}\n\n{_said(rows)}")
     print(
         table(
