@@ -8,12 +8,12 @@ from typing import Any
 from coview_stream.errors import DependencyError
 
 
-def extra(module: str, name: str, purpose: str) -> Any:
+def extra(module: str, requirement: str, purpose: str) -> Any:
     """Import a module that comes with one of the package's extras.
 
     Args:
         module: its full name.
-        name: the extra's.
+        requirement: the distribution that has it, with the least version, as the package's extra says.
         purpose: what needs it, for the message.
 
     Raises:
@@ -24,5 +24,6 @@ def extra(module: str, name: str, purpose: str) -> Any:
     except ImportError as error:
         library = module.partition(".")[0]
         missing = "is not installed" if error.name == library else f"cannot be loaded ({error})"
-        remedy = f"pip install 'coview-stream[{name}]'"
+        # not by our extra: pip would look for us in a registry, where a copy from elsewhere is not
+        remedy = f"pip install '{requirement}'"
         raise DependencyError(f"{purpose}: {library.replace('_', '-')} {missing}; {remedy}") from error

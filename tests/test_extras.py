@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 
@@ -11,18 +13,27 @@ from coview_stream.extras import extra
 
 
 def test_what_is_there_is_imported():
-    assert extra("math", "calculus", "sums") is math
+    assert extra("math", "fast-sums>=2.1", "sums") is math
 
 
 @pytest.mark.parametrize("module", ["fast_sums", "fast_sums.quick"])
-def test_what_is_missing_is_named_with_its_extra(module):
+def test_what_is_missing_is_named_with_what_installs_it(module):
     with pytest.raises(DependencyError) as caught:
-        extra(module, "calculus", "sums")
-    assert str(caught.value) == "sums: fast-sums is not installed; pip install 'coview-stream[calculus]'"
+        extra(module, "fast-sums>=2.1", "sums")
+    assert str(caught.value) == "sums: fast-sums is not installed; pip install 'fast-sums>=2.1'"
 
 
 def test_what_cannot_be_loaded_says_why(tmp_path, monkeypatch):
     (tmp_path / "broken_sums.py").write_text("raise ImportError('libsums.so.3: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(DependencyError, match=r"broken-sums cannot be loaded \(libsums.so.3: no such file\)"):
-        extra("broken_sums", "calculus", "sums")
+        extra("broken_sums", "broken-sums", "sums")
+
+
+def test_remedies_are_what_our_extras_ask_for():
+    root = Path(__file__).parents[1]
+    sources = "".join(path.read_text() for path in (root / "coview_stream").rglob("*.py"))
+    named = set(re.findall(r'extra\(f?"[^"]+", "([^"]+)"', sources))
+    assert {re.split("[><=]", name)[0] for name in named} == {"kiss-icp", "small-gicp", "rerun-sdk"}
+    project = (root / "pyproject.toml").read_text()
+    assert all(f'"{name}"' in project for name in named)

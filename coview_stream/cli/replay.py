@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from coview_stream.cli.odometry import KISS_ICP
+
 HELP = "feed a recorded run into zenoh as a live robot"
 
 _NONE = "none"
@@ -71,6 +73,11 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.wait >= 0:
         raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")
+    if args.odometry == KISS_ICP:
+        raise ConfigError(
+            f"--odometry {KISS_ICP}: the node makes it, by `serve --odometry {KISS_ICP}`; send clouds alone, "
+            "by `replay --odometry none`"
+        )
     bare = args.odometry == _NONE
     config = ReplayConfig(args.rate, args.speed, args.odometry_rate, clouds_only=bare, loop=args.loop)
     keys = robot_keys(args.preset, args.base, args.robot)

@@ -64,7 +64,7 @@ class Surfaces(NamedTuple):
 
 def library() -> Any:
     """Return the module ``small_gicp``; DependencyError where it is missing."""
-    return extra("small_gicp", "gicp", "registration by GICP")
+    return extra("small_gicp", "small-gicp>=1.0.1", "registration by GICP")
 
 
 def surfaces(points: Points) -> Surfaces | None:

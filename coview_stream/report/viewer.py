@@ -22,7 +22,7 @@ class PoseViewer:
     """
 
     def __init__(self, application: str = "coview_stream") -> None:
-        self._rerun = extra("rerun", "viz", "--rerun")
+        self._rerun = extra("rerun", "rerun-sdk>=0.20", "--rerun")
         self._origin: np.ndarray | None = None
         self._strips: dict[str, list[np.ndarray]] = {}
         self._pieces: dict[str, int] = {}

@@ -16,7 +16,7 @@ def test_locate_says_at_once_what_is_missing(world_file, tmp_path, monkeypatch, 
     run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
     assert main(["locate", str(world_file), str(run), "-o", str(out), "--registration", "gicp"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'coview-stream[gicp]'" in said
+    assert "pip install 'small-gicp>=1.0.1'" in said
     assert said.count("\n") == 1
 
 

@@ -167,6 +167,8 @@ def test_a_signal_ends_a_loop_cleanly(node, run_folder, number):
         (["--connect", "nonsense"], "nonsense"),
         (["--config", "none.json5"], "none.json5"),
         (["--odometry", "none.tum"], "none.tum"),
+        (["--odometry", "kiss-icp"], "`serve --odometry kiss-icp`"),
+        (["--odometry", "kiss-icp"], "`replay --odometry none`"),
         (["--odometry", "none", "--odometry-rate", "9"], "--odometry-rate"),
         (["--odometry", "none", "--odometry-topic", "/odom"], "--odometry-topic"),
         (["--robot", "a/b"], "--robot"),

@@ -246,7 +246,7 @@ def test_it_ends_when_the_time_is_over(node, capsys):
 def test_without_the_viewer_installed(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["watch", "--listen", free_endpoint(), "--rerun"]) == 2
-    assert "--rerun: rerun is not installed; pip install 'coview-stream[viz]'" in capsys.readouterr().err
+    assert "--rerun: rerun is not installed; pip install 'rerun-sdk>=0.20'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.odometry.lidar import LidarOdometry
 
 pytest.importorskip(
-    "kiss_icp.kiss_icp", reason="kiss-icp is not installed: pip install 'coview-stream[kiss-icp]'"
+    "kiss_icp.kiss_icp", reason="kiss-icp is not installed: pip install 'kiss-icp>=1.2'"
 )
 
 

@@ -41,7 +41,7 @@ def library(request, monkeypatch):
     if request.param == "stand-in":
         monkeypatch.setitem(sys.modules, "small_gicp", gicp_fake)
     elif find_spec("small_gicp") is None:
-        pytest.skip("small_gicp is not installed: pip install 'coview-stream[gicp]'")
+        pytest.skip("small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
     return request.param
 
 
@@ -298,7 +298,7 @@ def test_the_search_keeps_to_trimmed_icp(world_map):
 
 
 def test_a_drive_is_tracked(world_map, world_drive, monkeypatch):
-    pytest.importorskip("small_gicp", reason="small_gicp is not installed: pip install 'coview-stream[gicp]'")
+    pytest.importorskip("small_gicp", reason="small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
     inner, calls = gicp.register_surfaces, []
     monkeypatch.setattr(gicp, "register_surfaces", lambda *a, **k: calls.append(1) or inner(*a, **k))
     localizer = Localizer(world_map, replace(LocalizerConfig(), registration=CONFIG))
