@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if located.posed else 1
 
 
-def _lidar(odometry: str, gravity: list[str] | None) -> LidarOdometry | None:
+def _lidar(odometry: str, gravity: str | None) -> LidarOdometry | None:
     """Return what makes odometry of the clouds, if that is asked for; it may be missing, so ask before reading."""
     config = lidar_options(odometry, gravity)
     if config is None:

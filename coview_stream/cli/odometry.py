@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,15 +16,13 @@ def add_gravity(parser: argparse._ActionsContainer) -> None:
     """Declare ``--gravity``."""
     parser.add_argument(
         "--gravity",
-        nargs="+",
-        metavar=("ground|level|X", "Y Z"),
-        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame (ground)",
+        metavar="ground|level|X,Y,Z",
+        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame, as in "
+        "--gravity=-0.1,0,-9.8 (ground)",
     )
 
 
-def lidar_options(
-    odometry: str, gravity: Sequence[str] | None, max_speed: float = 50.0
-) -> LidarOdometryConfig | None:
+def lidar_options(odometry: str, gravity: str | None, max_speed: float = 50.0) -> LidarOdometryConfig | None:
     """Return how odometry is to be made; None if ``odometry`` is not kiss-icp. ConfigError for a wrong gravity."""
     from coview_stream.errors import ConfigError
     from coview_stream.odometry.config import LidarOdometryConfig, parse_gravity
@@ -34,4 +31,5 @@ def lidar_options(
         if gravity is not None:
             raise ConfigError(f"--gravity goes with --odometry {KISS_ICP}: other odometry is gravity aligned")
         return None
-    return LidarOdometryConfig(gravity=parse_gravity(gravity or ["ground"]), max_speed=max_speed)
+    down = parse_gravity("ground" if gravity is None else gravity)
+    return LidarOdometryConfig(gravity=down, max_speed=max_speed)

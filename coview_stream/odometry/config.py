@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -88,14 +87,13 @@ def down(gravity: Gravity) -> npt.NDArray[np.float64]:
     return g
 
 
-def parse_gravity(words: Sequence[str]) -> Gravity:
-    """Read the words of an option: ``ground``, ``level`` or three numbers; ConfigError for others."""
-    if len(words) == 1 and words[0] in ("ground", "level"):
-        return "ground" if words[0] == "ground" else "level"
+def parse_gravity(text: str) -> Gravity:
+    """Read the value of an option: ``ground``, ``level`` or ``X,Y,Z``; ConfigError for others."""
+    if text in ("ground", "level"):
+        return "ground" if text == "ground" else "level"
     try:
-        x, y, z = (float(word) for word in words)
+        x, y, z = (float(number) for number in text.split(","))
     except ValueError as error:
-        said = " ".join(words)
-        raise ConfigError(f"--gravity {said}: give ground, level, or three numbers X Y Z") from error
+        raise ConfigError(f"--gravity={text}: give ground, level, or three numbers X,Y,Z") from error
     down((x, y, z))
     return x, y, z

@@ -114,7 +114,7 @@ class LidarOdometry:
             if isinstance(found, str):
                 raise CloudError(
                     f"no ground to take gravity from: {found}; start where the ground is open, or give gravity "
-                    "(--gravity level, or X Y Z in the body frame)"
+                    "(--gravity level, or --gravity=X,Y,Z in the body frame)"
                 )
             self.ground, up = found, found.up
         else:

@@ -119,7 +119,7 @@ def test_what_goes_wrong_in_opening_is_the_callers(monkeypatch):
         (["--robot", "a", "--max-speed", "0"], "max_speed"),
         (["--robot", "a", "--max-outage", "-1"], "max_outage"),
         (["--robot", "a", "--gravity", "level"], "--gravity goes with --odometry kiss-icp"),
-        (["--robot", "a", "--odometry", "kiss-icp", "--gravity", "0", "0", "9.8"], "accelerometer"),
+        (["--robot", "a", "--odometry", "kiss-icp", "--gravity", "0,0,9.8"], "accelerometer"),
         (["--robot", "a", "--odometry", "kiss-icp", "--odometry-key", "k"], "reads no odometry"),
     ],
 )
@@ -135,7 +135,7 @@ def test_without_kiss_icp(tmp_path, monkeypatch, world_file, capsys):
     command = ["serve", str(world_file), "--robot", "r1", "--listen", free_endpoint(), "--quiet"]
     assert main([*command, "--odometry", "kiss-icp"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'coview-stream[kiss-icp]'" in said
+    assert "pip install 'kiss-icp>=1.2'" in said
     assert said.count("\n") == 1
 
 
@@ -160,7 +160,7 @@ def test_what_is_asked_for_arrives(monkeypatch, world_file):
 
     monkeypatch.setattr(serve, "open_node", open_node)
     options = ["--odometry-timeout", "1.5", "--max-speed", "9", "--max-outage", "7", "--max-payload", "99"]
-    options += ["--odometry", "kiss-icp", "--gravity", "0", "0.1", "-9.8"]
+    options += ["--odometry", "kiss-icp", "--gravity", "0,0.1,-9.8"]
     names = ["--preset", "rmw_zenoh", "--humble", "--robot", "r1"]
     assert main(["serve", str(world_file), *names, *options]) == 0
     node = asked[0].node

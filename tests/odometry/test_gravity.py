@@ -73,20 +73,21 @@ def test_alignment_turns_up_to_z_and_keeps_the_heading():
 
 
 def test_words_for_gravity():
-    assert parse_gravity(["ground"]) == "ground"
-    assert parse_gravity(["level"]) == "level"
-    assert parse_gravity(["0.5", "0", "-9.8"]) == (0.5, 0.0, -9.8)
+    assert parse_gravity("ground") == "ground"
+    assert parse_gravity("level") == "level"
+    assert parse_gravity("0.5,0,-9.8") == parse_gravity("0.5, 0, -9.8") == (0.5, 0.0, -9.8)
+    assert parse_gravity("-1e-3,0,-9.81") == (-1e-3, 0.0, -9.81)
     assert np.allclose(down((0.0, 0.0, -9.81)), [0, 0, -1])
     assert np.allclose(down("level"), [0, 0, -1])
 
 
 @pytest.mark.parametrize(
-    "words",
-    [["up"], ["1", "2"], ["0", "0", "0"], ["0", "0", "nan"], ["1", "0", "0"], ["0", "0", "x"], ["0"] * 4],
+    "text",
+    ["", "up", "0 0 -1", "1,2", "0,0,0", "0,0,nan", "1,0,0", "0,0,x", "0,0,-1,", "0,0,0,0"],
 )
-def test_what_is_no_gravity(words):
+def test_what_is_no_gravity(text):
     with pytest.raises(ConfigError, match="gravity"):
-        parse_gravity(words)
+        parse_gravity(text)
 
 
 def test_an_accelerometers_sign_is_explained():
