@@ -16,14 +16,16 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.config import LocalizerConfig, MapConfig
     from coview_stream.errors import CoViewError
-    from coview_stream.fix import Fix, State
+    from coview_stream.fix import Cause, Fix, KeyframeEvidence, State
     from coview_stream.localizer import Localizer
     from coview_stream.stream.client import RobotClient
 
 __all__ = [
     "BaseMap",
+    "Cause",
     "CoViewError",
     "Fix",
+    "KeyframeEvidence",
     "Localizer",
     "LocalizerConfig",
     "MapConfig",
@@ -36,8 +38,10 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "BaseMap": "basemap.basemap",
+    "Cause": "fix",
     "CoViewError": "errors",
     "Fix": "fix",
+    "KeyframeEvidence": "fix",
     "Localizer": "localizer",
     "LocalizerConfig": "config",
     "MapConfig": "config",

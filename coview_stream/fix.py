@@ -13,6 +13,8 @@ from coview_stream.geometry import Pose
 from coview_stream.pose.drift import Drift
 from coview_stream.pose.verification import Evidence
 
+_SHARES = tuple(f.name for f in fields(Evidence))
+
 
 class State(str, Enum):
     """What the localizer knows of its place."""
@@ -78,8 +80,9 @@ class KeyframeEvidence:
     innovation: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for ``result.json``."""
-        parts = {} if self.evidence is None else {k: round(v, 4) for k, v in vars(self.evidence).items()}
+        """Plain data for ``result.json`` and the status: always the same keys, None where a value is not known."""
+        shares = {} if self.evidence is None else vars(self.evidence)
+        parts = {n: round(shares[n], 4) if n in shares else None for n in _SHARES}
         return {
             "stamp": self.stamp,
             "state": self.state.value,
@@ -95,9 +98,12 @@ class KeyframeEvidence:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
-        """Read back what :meth:`to_json` wrote; KeyError or ValueError if it is something else."""
-        names = [f.name for f in fields(Evidence)]
-        parts = Evidence(**{n: float(data[n]) for n in names}) if names[0] in data else None
+        """Read back what :meth:`to_json` wrote; KeyError or ValueError if it is something else.
+
+        Earlier versions left out the shares that were not known, the cause and the innovation.
+        """
+        known = data.get(_SHARES[0]) is not None
+        parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if known else None
         return cls(
             float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
             float(data["rival"]), parts, data["station"], data["shift"],
@@ -114,7 +120,10 @@ class Fix:
         state: see :class:`State`.
         T_map_body: (4, 4) float64 in the frame of the map's sources; None unless TRACKING.
         T_map_odom: (4, 4) float64, the correction behind it; None unless TRACKING.
-        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map frame, m2 and rad2; None unless TRACKING.
+        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2; None unless TRACKING. The angles are small
+            rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
+            map, whose georeferencing is not in it, and calibrated on simulated drives: see docs/tracking.md. One sigma
+            of x, y and z, metres, is ``numpy.sqrt(numpy.diag(fix.covariance))[:3]``.
         confidence: in [0, 1]: the evidence score, less what the best rival has of it.
         evidence: of the newest keyframe, None before the first.
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import small_world
@@ -12,7 +9,7 @@ from small_world import pose_error
 from trackers import garbage
 
 from coview_stream.config import AcceptanceConfig
-from coview_stream.fix import Cause, KeyframeEvidence, State
+from coview_stream.fix import Cause, State
 from coview_stream.geometry import inverse, pose_from, rot_z
 from coview_stream.localizer import Localizer
 
@@ -84,28 +81,6 @@ def test_what_a_registration_says_is_told(found, world_drive):
 def test_a_search_has_no_cause_and_no_innovation(world_fixes):
     assert world_fixes[0].evidence.cause is None
     assert world_fixes[0].evidence.innovation is None
-
-
-@pytest.mark.parametrize("cause", [None, *Cause])
-def test_evidence_is_read_back_as_it_was_written(world_fixes, cause):
-    known = world_fixes[-1].evidence
-    rounded = replace(
-        known,
-        score=round(known.score, 4),
-        evidence=replace(known.evidence, **{k: round(v, 4) for k, v in vars(known.evidence).items()}),
-        cause=cause,
-        innovation=None if cause is None else 12.25,
-    )
-    assert KeyframeEvidence.from_json(json.loads(json.dumps(rounded.to_json()))) == rounded
-    blind = KeyframeEvidence(1.5, State.TRACKING, "only 3 points to register", cause=cause)
-    assert KeyframeEvidence.from_json(json.loads(json.dumps(blind.to_json()))) == blind
-
-
-def test_evidence_of_an_earlier_version_can_be_read(world_fixes):
-    """Results were written before there were causes."""
-    data = world_fixes[0].evidence.to_json()
-    del data["cause"], data["innovation"]
-    assert KeyframeEvidence.from_json(data).cause is None
 
 
 # ---- carried to another place

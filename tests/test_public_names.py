@@ -39,7 +39,7 @@ def test_all_is_sorted_and_resolvable():
     for name in names:
         assert getattr(coview_stream, name) is not None
     assert set(names) <= set(dir(coview_stream))
-    assert {"BaseMap", "Localizer", "LocalizerConfig"} <= set(names)
+    assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "Cause", "KeyframeEvidence"} <= set(names)
 
 
 def test_an_unknown_name_is_an_attribute_error():

@@ -10,7 +10,7 @@ import numpy as np
 
 from coview_stream.cli import build_parser
 from coview_stream.config import AcceptanceConfig
-from coview_stream.fix import State
+from coview_stream.fix import KeyframeEvidence, State
 from coview_stream.stream import client
 from coview_stream.stream.codecs import decode_cloud, decode_odometry, decode_pose, encode_pose
 from coview_stream.stream.counters import Counters
@@ -20,7 +20,8 @@ from coview_stream.stream.messages import PoseMessage, Sample
 from coview_stream.stream.records import pose_record
 from coview_stream.stream.transitions import Transition
 
-TEXT = (Path(__file__).resolve().parents[2] / "docs" / "streaming.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+TEXT = (DOCS / "streaming.md").read_text(encoding="utf-8")
 
 
 def section(title):
@@ -42,7 +43,7 @@ def test_every_counter_and_no_other():
     named = set(re.findall(r"`([a-z_]+)`", section("What the counters mean")))
     counters = set(Counters().to_json())
     assert counters <= named
-    assert named - counters == {"counters", "errors", "latency_ms"}
+    assert named - counters == {"counters", "errors", "latency_ms", "engine_ms", "longest_wait_s"}
 
 
 def test_how_long_a_doubt_lasts_and_what_ends_it():
@@ -60,6 +61,19 @@ def test_every_field_of_a_transition():
     told = re.search(r"^`transitions` in the status.*?\n\n", TEXT, re.MULTILINE | re.DOTALL)[0]
     for name in Transition(1, None, State.TRACKING, State.LOST, "", None).to_json():
         assert f"`{name}`" in told
+
+
+def test_every_field_of_the_evidence():
+    text = (DOCS / "method.md").read_text(encoding="utf-8")
+    table = text.split("### Fields of the evidence")[1].split("\n## ")[0]
+    named = [
+        name
+        for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+        for name in re.findall(r"`(\w+)`", row)
+    ]
+    assert sorted(named) == sorted(KeyframeEvidence(0.0, State.LOST, "").to_json())
+    assert f"above {AcceptanceConfig().keep_innovation:.0f} it is rejected" in table
+    assert "(method.md#fields-of-the-evidence)" in TEXT
 
 
 def test_the_layouts_as_documented():
