@@ -150,5 +150,5 @@ def open_engine(
         gicp.library()
     base_map = BaseMap.load(map_path)
     if base_map.sha256 != sha256:
-        raise MapError(f"{map_path}: has been replaced by another map; start the node again")
+        raise MapError(f"{map_path}: has been replaced by another map; start the node (serve) again")
     return TrackEngine(base_map, config) if kind == "track" else SearchEngine(base_map, config)

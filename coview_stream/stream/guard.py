@@ -47,16 +47,17 @@ class Guard:
             return RuntimeError(str(error))
         return None
 
-    def report(self, place: str, error: BaseException) -> None:
-        """Log ``error`` unless a line about ``place`` was logged less than the interval ago."""
+    def report(self, place: str, error: BaseException, kind: str = "") -> None:
+        """Log ``error`` unless a line about ``place``, and of this ``kind``, was logged less than the interval ago."""
+        about = f"{place}: {kind}"
         with self._lock:
             now = self._clock()
-            last = self._last.get(place)
+            last = self._last.get(about)
             if last is not None and now - last < self._interval:
-                self._silent[place] = self._silent.get(place, 0) + 1
+                self._silent[about] = self._silent.get(about, 0) + 1
                 return
-            self._last[place] = now
-            silent = self._silent.pop(place, 0)
+            self._last[about] = now
+            silent = self._silent.pop(about, 0)
         more = f" ({silent} more since the last line)" if silent else ""
         self._logger.error(
             "%s: %s: %s%s",

@@ -89,12 +89,12 @@ class LidarSession(Session):
             if not rejected and job.generation == self._generation:
                 self._odometry_anew("lidar odometry failed on a frame")
 
-    def engine_restarted(self, kind: str = "track") -> None:
+    def engine_restarted(self, kind: str = "track", why: str = "it died") -> None:
         """As of a session; that of ``odometry`` knew where odometry had come to."""
         with self._lock:
-            super().engine_restarted(kind)
+            super().engine_restarted(kind, why)
             if kind == "odometry":
-                self._odometry_anew("lidar odometry was started again")
+                self._odometry_anew(f"lidar odometry was started again: {why}")
 
     def _odometry_anew(self, reason: str) -> None:
         self._generation += 1

@@ -24,6 +24,7 @@ from coview_stream.stream.lane import DiedError, FailedError, Lane, RejectedErro
 from coview_stream.stream.messages import Encoded, Sample
 from coview_stream.stream.metronome import Metronome
 from coview_stream.stream.outcome import take_sweep, tell_done, tell_failed
+from coview_stream.stream.reception import last_line
 from coview_stream.stream.reporting import Reporter
 from coview_stream.stream.session import Session
 from coview_stream.stream.transport import Publisher, Transport
@@ -214,9 +215,10 @@ class Node:
         self._poke()  # a frame may have asked for a search
 
     def _died(self, name: str, error: DiedError) -> None:
-        self._guard.report(f"the {name} engine is started again", error)
+        why = last_line(str(error))
+        self._guard.report(f"the {name} engine is started again", error, kind=why)
         for each in self.sessions:
-            each.engine_restarted(name)
+            each.engine_restarted(name, why)
         self._reporter.changed.set()
 
     # ---- the pose clock

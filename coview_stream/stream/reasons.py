@@ -37,6 +37,8 @@ def why_nothing(keys: RobotKeys, counted: Counters, has_odometry: bool) -> str:
         return "not one odometry sample could be read; see errors"
     if not has_odometry:
         return f"waiting for odometry on {keys.odometry}"
+    if counted.engine_errors:
+        return f"frames at which the engine failed: {counted.engine_errors}; see errors"
     if counted.rejected:
         return f"{counted.rejected} frames were of no use; see errors"
     if counted.late or counted.no_odometry:

@@ -30,11 +30,11 @@ class Complaints:
         self.texts: deque[str] = deque(maxlen=_MOST_ERRORS)
         self._logged = 0
 
-    def add(self, text: str) -> None:
-        """Remember a complaint unless it is known."""
+    def add(self, text: str, logged: bool = True) -> None:
+        """Remember a complaint unless it is known; ``logged`` is whether it is this class that logs it."""
         if text not in self.texts:
             self.texts.append(text)
-            if self._logged < _MOST_LOGGED:
+            if logged and self._logged < _MOST_LOGGED:
                 self._logged += 1
                 log.warning("%s", text)
 

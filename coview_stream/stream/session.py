@@ -216,12 +216,16 @@ class Session:
         with self._lock:
             self.work.search_failed(job, reason)
 
-    def engine_restarted(self, kind: str = "track") -> None:
+    def engine_restarted(self, kind: str = "track", why: str = "it died") -> None:
         """Take note that an engine has forgotten all it knew; only that of ``track`` knew where the robot is."""
         with self._lock:
             self.counters.engine_restarts += 1
+            self.complaints.add(
+                f"the {kind} engine is started again: {why}", logged=False
+            )  # once for all robots
             if kind == "track":
-                self.begin_anew("the engine was started again")
+                self.whereabouts.explain(reason := f"the engine was started again: {why}")
+                self.begin_anew(reason)
 
     # ---- what goes out
 

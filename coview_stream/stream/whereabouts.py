@@ -105,6 +105,11 @@ class Whereabouts:
         self._trusted_from = newest_ns + 1
         self._lose(reason)
 
+    def explain(self, reason: str) -> None:
+        """Give a newer reason for a loss, if the place is lost: why it does not come back."""
+        if self._lost is not None:
+            self._lost = reason
+
     def _lose(self, reason: str) -> None:
         """Give the newest reason, but count once what is lost for two."""
         if self._lost is None:

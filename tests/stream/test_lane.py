@@ -130,6 +130,18 @@ def test_a_map_that_cannot_be_opened(tmp_path):
     assert lane.pid is None
 
 
+def test_a_map_that_was_replaced_is_named_each_time(world_file):
+    lane = ProcessLane("track", str(world_file), "0" * 64)
+    try:
+        for _ in range(2):
+            with pytest.raises(
+                DiedError, match=r"has been replaced by another map; start the node \(serve\) again"
+            ):
+                lane.run(job())
+    finally:
+        lane.close()
+
+
 def test_a_worker_that_stands_still_is_ended_even_with_a_frame_half_sent(world_file, world_drive):
     lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
     good = job(world_drive.clouds[0])

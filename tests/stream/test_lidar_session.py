@@ -161,7 +161,10 @@ def test_an_engine_that_forgot(kind):
     if kind == "restarted":
         robot.session.engine_restarted("odometry")
     robot.session.sweep_failed(job, "Traceback\nBoom", rejected=False)
-    said = {"failed": "lidar odometry failed on a frame", "restarted": "lidar odometry was started again"}
+    said = {
+        "failed": "lidar odometry failed on a frame",
+        "restarted": "lidar odometry was started again: it died",
+    }
     assert robot.session.state() == (State.LOST, said[kind])
     assert robot.counters.engine_errors == 1
     assert robot.session.odometry.newest is None

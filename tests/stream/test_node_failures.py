@@ -12,6 +12,7 @@ from sites import STEP, Site
 
 from coview_stream.errors import CloudError
 from coview_stream.stream.config import NodeConfig
+from coview_stream.stream.lane import DiedError
 from coview_stream.stream.messages import Sample
 
 
@@ -74,12 +75,50 @@ def test_an_engine_that_died_has_forgotten_all_robots(pair):
     pair.frame("r1", STEP)
     for name in ("r1", "r2"):
         status = pair.status(name)
-        assert (status["state"], status["reason"]) == ("LOST", "the engine was started again")
+        assert (status["state"], status["reason"]) == (
+            "LOST",
+            "the engine was started again: the track engine died",
+        )
         assert status["counters"]["engine_restarts"] == 1
         assert pair.poses(name) == []
     for name in ("r1", "r2"):
         pair.frame(name, 2 * STEP)
         assert pair.status(name)["state"] == "TRACKING"
+
+
+REPLACED = "site.coview: has been replaced by another map; start the node (serve) again"
+
+
+@pytest.mark.parametrize("lane", ["track", "search"])
+def test_why_an_engine_does_not_come_back_is_said(pair, lane, caplog):
+    def die(text):
+        def run(job):
+            raise DiedError(text)
+
+        return run
+
+    for name in ("r1", "r2"):
+        pair.frame(name, 0.0)
+    pair.engine.answer = lambda job: unknown(job, ask=query())
+    pair.node._stopping.wait = lambda seconds: True  # no pauses
+    for k, text in enumerate(["it died", REPLACED, REPLACED, REPLACED], 1):
+        getattr(pair, lane).run = die(text)
+        pair.frame("r1", STEP * k)
+    for name in ("r1", "r2"):
+        status = pair.status(name)
+        assert f"the {lane} engine is started again: {REPLACED}" in status["errors"]
+        assert (REPLACED in status["reason"]) == (lane == "track")
+        assert status["counters"]["losses"] == (lane == "track")
+    lines = [r.getMessage() for r in caplog.records if "is started again" in r.getMessage()]
+    assert len(lines) == 2  # each text once, for all robots
+    assert "it died" in lines[0]
+    assert REPLACED in lines[1]
+
+
+def test_a_robot_that_never_had_a_frame_hears_of_the_engine_too(site):
+    site.track.dead = True
+    site.frame("r1", 0.0)
+    assert site.status("r1")["reason"] == "frames at which the engine failed: 1; see errors"
 
 
 def test_a_search_engine_that_died_loses_no_place(pair):
