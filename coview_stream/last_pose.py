@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,17 @@ def save(folder: Path, last: LastPose) -> Path:
         os.fsync(file.fileno())  # else a power cut, the usual end of a robot's day, leaves an empty file
     temporary.replace(path)
     return path
+
+
+def try_out(folder: Path) -> None:
+    """Make a directory if it is not there, write a file into it and delete that.
+
+    Raises:
+        OSError: one of these cannot be done.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=".try-") as file:
+        file.write(b"x")
 
 
 def load(folder: Path, robot: str, map_sha256: str) -> LastPose | None:

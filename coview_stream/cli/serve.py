@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.odometry import KISS_ICP, ROBOT, add_gravity, lidar_options
-from coview_stream.cli.state import add_state, state_folder
+from coview_stream.cli.state import add_state, ready_state
 from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
-        args.registration, state_folder(args),
+        args.registration, ready_state(args),
     )  # fmt: skip
     with stop_on_signals() as stop:
         ended = _serve(options, stop)

@@ -12,7 +12,6 @@ def add_state(parser: argparse.ArgumentParser) -> None:
     either = group.add_mutually_exclusive_group()
     either.add_argument(
         "--state",
-        type=Path,
         metavar="DIR",
         help="keep each robot's last pose here, to be tried first at the next start, and verified like any other "
         "place (the user's state directory, such as ~/.local/state/coview-stream)",
@@ -21,7 +20,7 @@ def add_state(parser: argparse.ArgumentParser) -> None:
 
 
 def state_folder(args: argparse.Namespace) -> Path | None:
-    """Return where to keep it, None for nowhere."""
+    """Return where to keep it, None for nowhere; ConfigError for an empty ``--state``."""
     import logging
 
     from coview_stream.errors import ConfigError
@@ -30,10 +29,40 @@ def state_folder(args: argparse.Namespace) -> Path | None:
     if args.no_state:
         return None
     if args.state is not None:
-        folder: Path = args.state
-        return folder
+        if not args.state:
+            raise ConfigError("--state '': name a directory, or leave it out, or use --no-state")
+        return Path(args.state)
     try:
         return default_folder()
     except ConfigError as error:  # a service without a home has to run all the same
         logging.getLogger("coview_stream.node").warning("%s", error)
         return None
+
+
+def ready_state(args: argparse.Namespace) -> Path | None:
+    """Return what :func:`state_folder` does, tried out, and log it: a robot must not find out where it is first.
+
+    Raises:
+        InputError: ``--state`` names what cannot be used. ConfigError: it is empty.
+    """
+    import logging
+
+    from coview_stream.errors import InputError
+    from coview_stream.last_pose import try_out
+
+    log = logging.getLogger("coview_stream.node")
+    folder = state_folder(args)
+    if folder is None:
+        return None
+    try:
+        try_out(folder)
+    except OSError as error:
+        text = f"{folder}: the last poses cannot be kept here ({error.strerror or error})"
+        if args.state is not None:
+            raise InputError(
+                f"--state {text}; name a directory that can be written, or use --no-state"
+            ) from error
+        log.warning("%s; use --state DIR or --no-state", text)  # and go on: a disk may come later
+    else:
+        log.info("the last poses are kept in %s", folder)
+    return folder

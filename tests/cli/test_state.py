@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coview_stream.cli import serve, state
+from coview_stream.cli import main, serve, state
 from coview_stream.stream import serve as opening
 from coview_stream.stream import zenoh_transport
 from coview_stream.stream.fake import FakeTransport
@@ -45,6 +45,44 @@ def test_a_service_without_a_home_keeps_nothing(monkeypatch, caplog):
     assert folder() is None
     assert "--state DIR" in caplog.text
     assert folder("--state", "/var/lib/coview") == Path("/var/lib/coview")
+
+
+def ready(*args):
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    return state.ready_state(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+
+
+def test_the_directory_is_made_tried_and_named(tmp_path, caplog):
+    caplog.set_level("INFO")
+    place = tmp_path / "new" / "place"
+    assert ready("--state", str(place)) == place
+    assert list(place.iterdir()) == []
+    assert [r.getMessage() for r in caplog.records] == [f"the last poses are kept in {place}"]
+    assert ready("--no-state") is None
+
+
+def test_what_was_asked_for_and_cannot_be_used_is_refused_at_once(world_file, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for name, text in (
+        (str(tmp_path / "file"), "file"),
+        (str(tmp_path / "file" / "in"), "Not a directory"),
+        ("", "''"),
+    ):
+        assert main(["serve", str(world_file), "--robot", "r1", "--listen", "x", "--state", name]) == 2
+        said = capsys.readouterr().err
+        assert "--state" in said
+        assert text in said
+        assert said.count("\n") == 1
+
+
+def test_a_default_that_cannot_be_used_is_a_warning(monkeypatch, tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    assert ready() == tmp_path / "file" / "coview-stream"
+    (line,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert "cannot be kept" in line
+    assert "--state DIR or --no-state" in line
 
 
 @pytest.mark.parametrize("kept", [True, False])
