@@ -23,6 +23,7 @@ import importlib
 import importlib.util
 import os
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from types import ModuleType
@@ -76,9 +77,18 @@ _backend: str | None = None
 
 
 def _import(name: str) -> ModuleType:
+    _settle()
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
     return importlib.import_module(name)
+
+
+def _settle() -> None:
+    """Have a ``HOME``: Taichi ends the process where there is none, as a bare service environment has it."""
+    if os.name == "posix" and not os.environ.get("HOME"):
+        os.environ.pop("HOME", None)  # an empty one would hide what the password database says
+        home = os.path.expanduser("~")  # noqa: PTH111  # Path raises for a user who has none
+        os.environ["HOME"] = home if os.access(home, os.W_OK) else tempfile.gettempdir()
 
 
 def _program(library: Any) -> Any:

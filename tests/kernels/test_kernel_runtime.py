@@ -7,6 +7,7 @@ import sys
 import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,6 +48,22 @@ def test_public_names():
     assert all(callable(getattr(coview_kernels, name)) for name in coview_kernels.__all__)
     for name in reference.__all__:
         assert getattr(reference, name) is not getattr(coview_kernels, name)
+
+
+@needs_library
+@pytest.mark.skipif(os.name != "posix", reason="HOME is POSIX")
+@pytest.mark.parametrize("known", [True, False])
+def test_a_bare_environment_without_a_home(known, tmp_path):
+    begin = "import os, pwd\nos.environ.pop('HOME', None)\n"
+    if known:  # unless the password database names a directory that can be written
+        home = f"type('Entry', (), {{'pw_dir': {str(tmp_path)!r}}})"
+        begin += f"pwd.getpwuid = lambda user: {home}\n"
+    else:
+        begin += "def nobody(user): raise KeyError(user)\npwd.getpwuid = nobody\n"
+    said = succeeds(begin + "use(); print(ck.backend(), os.environ['HOME'])", TMPDIR=str(tmp_path / ".."))
+    name, home = said.split()
+    assert name in LIBRARIES
+    assert Path(home).samefile(tmp_path if known else tmp_path.parent)
 
 
 def test_only_runtime_imports_taichi():
