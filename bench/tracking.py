@@ -146,6 +146,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.list:
         print("\n".join(scenario.name for scenario in chosen))
         return 0
+    for option, path in (("--json", options.json), ("--plot", options.plot)):
+        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+            print(f"bench.tracking: {option} {path}: no file of a directory that is there", file=sys.stderr)
+            return 2
     return _run(chosen, options)
 
 

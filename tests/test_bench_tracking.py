@@ -88,6 +88,16 @@ def test_names_pick_scenarios(capsys):
     assert tracking.main(["nothing"]) == 2
 
 
+@pytest.mark.parametrize("option", ["--json", "--plot"])
+def test_a_file_that_cannot_be_written_is_noticed_before_the_run(option, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tracking, "_run", None)
+    for path in (tmp_path / "nowhere" / "file", tmp_path):
+        assert tracking.main(["--quick", option, str(path)]) == 2
+        said = capsys.readouterr().err
+        assert f"{option} {path}" in said
+        assert said.count("\n") == 1
+
+
 def test_a_picture_without_poses_says_so(tmp_path):
     draw(pooled([]), tmp_path / "empty.png", "nothing")
     assert (tmp_path / "empty.png").stat().st_size > 5000
