@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     for option, path in (("--json", options.json), ("--plot", options.plot)):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
-            print(f"bench.tracking: {option} {path}: no file of a directory that is there", file=sys.stderr)
+            print(f"bench.tracking: {option} {path}: name a file in a directory that exists", file=sys.stderr)
             return 2
     return _run(chosen, options)
 
