@@ -61,7 +61,7 @@ def test_a_small_world_is_measured_from_end_to_end(tmp_path, monkeypatch, capsys
         assert np.load(site.with_suffix(".npy")).shape[1] == 3
         assert len(recorded.read(0)) > 1000
         poses = drive.truth.copy()
-        poses[:, 0, 3] += 0.05
+        poses[:, 0, 3] += 0.15
         return replace(
             told(["TRACKING"] * len(drive), poses, covariance=0.01 * np.eye(6)), stamps=drive.stamps
         )
@@ -69,9 +69,9 @@ def test_a_small_world_is_measured_from_end_to_end(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(tracking_run, "follow", follow)
     picture, file = tmp_path / "coverage.png", tmp_path / "rows.json"
     arguments = ["--quick", "--worlds", str(tmp_path), "--plot", str(picture), "--json", str(file)]
-    assert tracking.main(arguments) == 1  # a constant error is not what a covariance promises
+    assert tracking.main(arguments) == 1  # 0.15 m is more than a drive may be off
     written = json.loads(file.read_text())
-    assert written["rows"][0]["metres"]["rmse"] == pytest.approx(0.05)
+    assert written["rows"][0]["metres"]["rmse"] == pytest.approx(0.15)
     assert picture.stat().st_size > 10_000
     assert "plain/small" in capsys.readouterr().out
     monkeypatch.setattr(tracking_run, "follow", None)  # an unchanged engine is not asked twice
