@@ -217,9 +217,9 @@ def test_a_localizer_goes_by_it(world_map, world_drive):
     assert small_world.pose_error(fix.T_map_body, world_drive.T_map_body[-1])[0] < 0.1
 
 
-def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
-    with pytest.raises(DependencyError, match=r"pip install 'coview-stream\[kiss-icp\]'") as caught:
+    with pytest.raises(DependencyError, match="pip install 'kiss-icp>=") as caught:
         LidarOdometry()
     assert "\n" not in str(caught.value)
