@@ -14,9 +14,7 @@ from coview_stream.geometry import inverse, pose_from, rot_z, transform
 from coview_stream.odometry.config import LidarOdometryConfig
 from coview_stream.odometry.lidar import LidarOdometry
 
-pytest.importorskip(
-    "kiss_icp.kiss_icp", reason="kiss-icp is not installed: pip install 'kiss-icp>=1.2'"
-)
+pytest.importorskip("kiss_icp.kiss_icp", reason="kiss-icp is not installed: pip install 'kiss-icp>=1.2'")
 
 
 @pytest.fixture(scope="module")
