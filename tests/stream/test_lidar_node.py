@@ -125,7 +125,8 @@ def test_an_odometry_engine_that_died_costs_the_place_not_the_node(quiet):
     net.publish(cloud(0.1))
     worked(node, "odometry", "track")
     said = status(node, net)
-    assert (said["state"], said["reason"]) == ("LOST", "lidar odometry was started again")
+    why = "lidar odometry was started again: the odometry engine died"
+    assert (said["state"], said["reason"]) == ("LOST", why)
     assert said["counters"]["engine_restarts"] == 1
     assert said["errors"] == ["r1: frames that lidar odometry failed at; the first: the odometry engine died"]
     net.publish(cloud(0.2))
@@ -184,7 +185,7 @@ def test_a_node_survives_its_odometry_engine(stand_in):
     finally:
         node.close()
     said = [json.loads(s.payload)["reason"] for s in net.samples(KEYS.status)]
-    assert "lidar odometry was started again" in said
+    assert "lidar odometry was started again: the odometry engine died" in said
     assert net.raised == []
     assert not [t for t in threading.enumerate() if t.name == "coview-odometry"]
 
@@ -196,7 +197,7 @@ def test_without_kiss_icp_it_says_so_in_a_line(tmp_path, monkeypatch):
     lane = ProcessLane("odometry", "unused", "")
     try:
         lane.start()
-        with pytest.raises(CoViewError, match=r"pip install 'coview-stream\[kiss-icp\]'") as caught:
+        with pytest.raises(CoViewError, match="pip install 'kiss-icp>=") as caught:
             lane.wait_ready()
     finally:
         lane.close()
