@@ -128,7 +128,10 @@ def test_an_odometry_engine_that_died_costs_the_place_not_the_node(quiet):
     why = "lidar odometry was started again: the odometry engine died"
     assert (said["state"], said["reason"]) == ("LOST", why)
     assert said["counters"]["engine_restarts"] == 1
-    assert said["errors"] == ["r1: frames that lidar odometry failed at; the first: the odometry engine died"]
+    assert said["errors"] == [
+        "the odometry engine is started again: the odometry engine died",
+        "r1: frames that lidar odometry failed at; the first: the odometry engine died",
+    ]
     net.publish(cloud(0.2))
     worked(node, "odometry", "track")
     assert status(node, net)["state"] == "TRACKING"
