@@ -276,7 +276,7 @@ def test_the_method_is_one_of_two():
 def test_a_missing_library_is_named(monkeypatch, world_file):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     target = local_map(*courtyard())
-    with pytest.raises(DependencyError, match="small-gicp .*pip install 'small-gicp>="):
+    with pytest.raises(DependencyError, match=r"small-gicp .*pip install 'small-gicp>="):
         register(scan_of(target), TRUTH, target, CONFIG, CONFIG.track)
     with pytest.raises(DependencyError, match="pip install"):
         open_engine("track", world_file, "0" * 64, LocalizerConfig(registration=CONFIG))
