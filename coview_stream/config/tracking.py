@@ -20,8 +20,8 @@ class TrackingConfig:
     has become uncertain by ``unsure_position`` metres or ``unsure_yaw`` radians, but not before ``least_distance``
     metres. Registered is the newest frame, and as many before it as it takes to ``min_points``, but none from before
     the last ``window`` metres once there are that many, and none once there are ``max_points``: older ones are smeared
-    by the drift (with odometry that drifts by 3 % the heading came out ten times as well from one frame as from the
-    last two metres').
+    by the drift. (With odometry that drifts by 3 % the heading came out nearly ten times as well from one frame as from
+    the last two metres'; seen once on worlds 5103 and 5106, no command prints it.)
 
     Drifts are random-walk sigmas per square root of a metre driven; ``turn_drift`` is yaw error per radian turned.
     They are where :class:`coview_stream.pose.drift.DriftEstimator` begins: it believes them like ``drift_trust`` metres
