@@ -3,8 +3,8 @@
 A registration is due once a metre. A robot that is lifted and put down elsewhere, or carried with its wheels in the
 air, would be at a wrong place until then. The glance asks of a few hundred of the frame's points above the ground how
 many have a map point near them, and compares with what has been usual. Below 0.7 of the usual share were fewer than one
-frame in 100 at the right pose, more than half of them half a metre off it, and more than 98 in 100 anywhere else (seen
-once while this was made, on simulated worlds 5101, 5103, 5106 and 5108; no command prints it). So it decides nothing, it
+frame in 100 at the right pose, more than half of them half a metre off it, and more than 98 in 100 anywhere else; that
+was seen once, on the simulated worlds 5101, 5103, 5106 and 5108, and no command prints it. So it decides nothing, it
 only asks for a registration now.
 """
 
