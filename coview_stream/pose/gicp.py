@@ -41,8 +41,9 @@ _MOST_SHARE = 5.0  # as trimmed ICP: a handful of points must not outweigh thous
 _INFORMATION = 4.0
 """Times small_gicp's Hessian, so that the configuration's ``inflation`` suits both methods.
 
-Measured once, by no command of this repository, on simulated drives (worlds 5101 to 5109 of ``bench.tracking``, 30 places each, starts off by
-0.12 m and 0.3 degrees, no prior, no floors) and restated for the inflation of 3: the mean squared Mahalanobis error per
+Measured once, by no command of this repository, on simulated drives against the truth (worlds 5101 to 5109 of
+``bench.tracking``, 30 places each, starts off by 0.12 m and 0.3 degrees, no prior, no floors) and restated for the
+inflation of 3: the mean squared Mahalanobis error per
 degree of freedom of trimmed ICP is 1.0 to 1.2 in towns and on a campus, 2.5 in a sparse forest, 2.8 in a town that has
 changed; GICP's, with this factor, 0.4 to 0.6, 1.6 to 2.4 and 0.6. So in no kind of world is GICP less honest than
 trimmed ICP. What is missing where it exceeds 1 is the error that neighbouring registrations share, which
