@@ -29,15 +29,16 @@ class Hits(NamedTuple):
 
 
 class Caster:
-    """Casts rays into one epoch of a scene.
+    """Casts rays into one epoch of a scene, on ``threads`` cores.
 
     Raises:
         DependencyError: Open3D cannot be loaded.
     """
 
-    def __init__(self, epoch: Epoch) -> None:
+    def __init__(self, epoch: Epoch, threads: int = _THREADS) -> None:
         self._o3d: Any = open3d()
-        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=_THREADS)
+        self._threads = threads
+        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._foliage = -1
         for name in ("solid", "foliage"):
             mesh = getattr(epoch, name)
@@ -84,7 +85,7 @@ class Caster:
 
     def _query(self, origins: Floats32, rays: Floats32) -> tuple[Floats32, Floats32, npt.NDArray[np.bool_]]:
         packed = np.ascontiguousarray(np.concatenate([origins, rays], axis=1), dtype=np.float32)
-        answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=_THREADS)
+        answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=self._threads)
         cosine = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), rays))
         # copies, for the arrays belong to the tensors of the answer
         return answer["t_hit"].numpy().copy(), cosine, answer["geometry_ids"].numpy() == self._foliage

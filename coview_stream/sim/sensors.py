@@ -44,14 +44,23 @@ class Sensor:
     min_range: float
     max_range: float
 
-    def scan(self, caster: Caster, T_scene_body: Pose, frame: int, rng: np.random.Generator) -> Points:
-        """One deskewed frame (N, 3) in the sensor frame, float32 metres."""
+    def scan(
+        self,
+        caster: Caster,
+        T_scene_body: Pose,
+        frame: int,
+        rng: np.random.Generator,
+        *,
+        porosity: float = POROSITY,
+        noise: float = RANGE_NOISE,
+    ) -> Points:
+        """One deskewed frame (N, 3) in the sensor frame, float32 metres; ``noise`` is that of the range."""
         rays = self.beams(frame)
         origins = np.broadcast_to(T_scene_body[:3, 3].astype(np.float32), rays.shape)
         turned = (rays @ T_scene_body[:3, :3].T).astype(np.float32)
-        hits = caster.cast(origins, turned, rng, POROSITY)
+        hits = caster.cast(origins, turned, rng, porosity)
         t = hits.distance.astype(np.float64)
-        noisy = t + rng.normal(0, RANGE_NOISE, len(t))
+        noisy = t + rng.normal(0, noise, len(t))
         luck = rng.random(len(t))
         with np.errstate(invalid="ignore"):
             # a Lambertian surface returns cos / r^2; below the threshold a pulse is lost more and more often
