@@ -1,0 +1,91 @@
+"""Keypoints: the cells of which the network is least uncertain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """``xy`` (N, 2) metres, ``descriptors`` (N, C), ``sigma`` (N,); ``z`` (N,) metres where heights are known."""
+
+    xy: npt.NDArray[np.float64]
+    descriptors: F32
+    sigma: F32
+    z: npt.NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.xy)
+        others = [self.descriptors, self.sigma] + ([] if self.z is None else [self.z])
+        if self.xy.shape != (count, 2) or any(len(each) != count for each in others):
+            shapes = ", ".join(str(each.shape) for each in (self.xy, *others))
+            raise ValueError(f"keypoints of different numbers: {shapes}; xy has to be (N, 2)")
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.xy)
+
+    def where(self, chosen: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Keypoints:
+        """Return those chosen by a mask (N,) or by indices."""
+        z = None if self.z is None else self.z[chosen]
+        return Keypoints(self.xy[chosen], self.descriptors[chosen], self.sigma[chosen], z)
+
+    def around(self, xy: npt.ArrayLike, radius: float) -> Keypoints:
+        """Return those within ``radius`` metres of ``xy`` (2,)."""
+        step = self.xy - np.asarray(xy, dtype=np.float64)
+        return self.where(np.hypot(step[:, 0], step[:, 1]) <= radius)
+
+
+def keypoints(
+    local: npt.NDArray[np.floating],
+    sigma: F32,
+    corner: npt.ArrayLike,
+    *,
+    mask: npt.NDArray[np.bool_] | None = None,
+    height: npt.NDArray[np.floating] | None = None,
+    count: int | None = 200,
+    cell: float = 1.0,
+) -> Keypoints:
+    """Take the ``count`` least uncertain of the cells that are so among their eight neighbours, best first.
+
+    Args:
+        local: (C, H, W) descriptors; row along y, column along x.
+        sigma: (H, W) uncertainty.
+        corner: (2,) x and y of the lower corner of cell (0, 0), metres; the keypoints are in its frame.
+        mask: (H, W) cells that may be keypoints, and be compared with (all).
+        height: (H, W) metres, to become the keypoints' z.
+        count: None for all.
+        cell: edge of a cell, metres.
+
+    Raises:
+        ValueError: the shapes do not belong to one image.
+    """
+    for name, image in (("sigma", sigma), ("mask", mask), ("height", height)):
+        if image is not None and image.shape != local.shape[1:]:
+            raise ValueError(f"{name} is {image.shape}, the descriptors are {local.shape}")
+    row, col = np.nonzero(local_minima(sigma if mask is None else np.where(mask, sigma, np.inf)))
+    order = np.argsort(sigma[row, col], kind="stable")[:count]
+    row, col = row[order], col[order]
+    xy = np.stack([col + 0.5, row + 0.5], axis=1) * cell + np.asarray(corner, dtype=np.float64)
+    z = None if height is None else height[row, col].astype(np.float64)
+    return Keypoints(xy, np.ascontiguousarray(local[:, row, col].T, dtype=np.float32), sigma[row, col], z)
+
+
+def local_minima(values: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    """Mask (H, W) of finite values that no neighbour of eight undercuts; of equal ones the first counts."""
+    height, width = values.shape
+    padded = np.pad(values, 1, constant_values=np.inf)
+    lowest = np.isfinite(values)
+    for down in (0, 1, 2):
+        for right in (0, 1, 2):
+            other = padded[down : down + height, right : right + width]
+            if (down, right) < (1, 1):
+                lowest &= values < other
+            elif (down, right) > (1, 1):
+                lowest &= values <= other
+    return np.asarray(lowest)
