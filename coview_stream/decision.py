@@ -11,6 +11,9 @@ from coview_stream.query import Query, same_place
 from coview_stream.refinement import Candidate
 from coview_stream.suggestions import FROM_THERE
 
+BY_FEATURES = " (by learned features)"
+"""What an evidence's reason ends with where learned features have named the best hypothesis."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -63,11 +66,13 @@ class Decision:
             state, doubt = self._confirmation()
         if best.hypothesis.station is None:
             doubt += FROM_THERE
+        elif best.hypothesis.learned:
+            doubt += BY_FEATURES
         return Verdict(
             best if state is State.TRACKING else None,
             KeyframeEvidence(
                 query.stamp, state, doubt, best.evidence.score, rival, best.evidence,
-                best.hypothesis.station, best.hypothesis.shift,
+                best.hypothesis.station, None if best.hypothesis.learned else best.hypothesis.shift,
             ),
         )  # fmt: skip
 

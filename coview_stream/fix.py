@@ -62,7 +62,7 @@ class KeyframeEvidence:
         rival: score of the best distinct rival, 0 if there is none.
         evidence: its parts, if a hypothesis could be registered.
         station: winning station, if this keyframe searched.
-        shift: winning shift.
+        shift: winning shift of the co-view descriptors; None if the place was found by learned features.
         cause: what decided, while tracking; None from a search.
         innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
             from the ones before; None where nothing could be registered, and from a search.

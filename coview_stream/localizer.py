@@ -59,8 +59,7 @@ class Localizer:
         """Forget everything but the map."""
         self.state = State.SEARCHING
         self._buffer = KeyframeBuffer(self.config.keyframe)
-        self._search.clear()
-        self._search.last_query = {}
+        self._search.reset()
         self._tracker = Tracker(self.base_map, self.config, self._local_maps)
         self._anchor: npt.NDArray[np.float64] | None = None
         self._evidence: KeyframeEvidence | None = None
@@ -133,9 +132,8 @@ class Localizer:
             return None
         if keyframe is None:
             return None
-        scan = self.base_map.descriptor_config
-        travelled = self._tracker.travelled
-        return Query.of(self._buffer, keyframe, cloud, scan, travelled, self._generation, suggested)
+        needs, travelled = self._search.needs, self._tracker.travelled
+        return Query.of(self._buffer, keyframe, cloud, needs, travelled, self._generation, suggested)
 
     def _suggested(self, T_odom_body: Pose) -> tuple[Pose, ...]:
         return () if self._anchor is None else self._suggestions.about(self._anchor, T_odom_body)

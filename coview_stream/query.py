@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,18 @@ _SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close 
 _SAME_ANGLE = np.radians(5.0)
 
 
+def _nothing() -> Points:
+    return np.empty((0, 3), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What queries have to bring: a scan for ``descriptor``, surroundings up to ``reach`` metres; None for neither."""
+
+    descriptor: DescriptorConfig | None
+    reach: float | None = None
+
+
 @dataclass(frozen=True)
 class Query:
     """All that a search needs to know of one keyframe; whoever searches may do it later and elsewhere.
@@ -25,12 +37,14 @@ class Query:
     Attributes:
         stamp: seconds, of the keyframe.
         T_odom_body: (4, 4) of the keyframe.
-        scan: (N, 3) float32 virtual local scan, odometry frame, metres.
+        scan: (N, 3) float32 virtual local scan, odometry frame, metres; empty if no descriptor is made of it.
         submap: (N, 3) float32 points of the newest keyframes, odometry frame: what is registered.
         cloud: (N, 3) float32 newest frame, body frame.
         travelled: metres that odometry had driven.
         generation: of the localizer's memory; a query of another generation starts the search anew.
         suggested: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
+        surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
+            compared.
     """
 
     stamp: float
@@ -41,6 +55,7 @@ class Query:
     travelled: float = 0.0
     generation: int = 0
     suggested: tuple[Pose, ...] = ()
+    surroundings: Points = field(default_factory=_nothing)
 
     @property
     def position(self) -> npt.NDArray[np.float64]:
@@ -58,17 +73,23 @@ class Query:
         buffer: KeyframeBuffer,
         keyframe: Keyframe,
         cloud: Points,
-        descriptor: DescriptorConfig,
+        needs: Needs,
         travelled: float = 0.0,
         generation: int = 0,
         suggested: tuple[Pose, ...] = (),
     ) -> Query:
         """Ask about the newest keyframe of a buffer; ``cloud`` (N, 3) is its newest frame, body frame."""
-        scan = buffer.virtual_scan(keyframe.position, descriptor.radius, descriptor.voxel)
+        scan = surroundings = _nothing()
+        if needs.descriptor is not None:
+            radius, voxel = needs.descriptor.radius, needs.descriptor.voxel
+            scan = buffer.virtual_scan(keyframe.position, radius, voxel)
+        if needs.reach is not None:
+            surroundings = buffer.virtual_scan(keyframe.position, needs.reach, buffer.config.voxel)
         submap = buffer.recent(_SUBMAP_KEYFRAMES)
         return cls(
-            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation, suggested
-        )
+            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation, suggested,
+            surroundings,
+        )  # fmt: skip
 
 
 def same_place(

@@ -7,13 +7,13 @@ from dataclasses import replace
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.decision import Decision, Verdict
-from coview_stream.place.consensus import Consensus, Hypothesis
-from coview_stream.place.descriptor import Descriptor, describe, ground_below
-from coview_stream.place.retrieval import Retrieval
+from coview_stream.place.consensus import Hypothesis
+from coview_stream.place.descriptor import Descriptor
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.pose.source import local_source
-from coview_stream.query import Query, same_place
+from coview_stream.query import Needs, Query, same_place
 from coview_stream.refinement import Candidate, Refinement
+from coview_stream.sources import CoView, Knowledge, Learned, Source
 from coview_stream.suggestions import Trials, robot_in
 
 __all__ = ["Candidate", "GlobalSearch", "Query", "Verdict"]
@@ -22,40 +22,77 @@ _REMEMBERED = 2  # best candidates that the next keyframe tries again
 
 
 class GlobalSearch:
-    """Votes, registers the best hypotheses, verifies them, and accepts one only when it stands alone."""
+    """Votes, registers the best hypotheses, verifies them, and accepts one only when it stands alone.
 
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
+    Attributes:
+        coview: the source of hypotheses that the paper has; None if it is not used.
+        learned: the source by learned features; None if it is not used.
+    """
+
+    def __init__(
+        self,
+        base_map: BaseMap,
+        config: LocalizerConfig,
+        local_maps: LocalMaps,
+        knowledge: Knowledge | None = None,
+    ) -> None:
+        """Search a map; searches of one map may share ``knowledge``. Raises what :meth:`Knowledge.of` does."""
         self.base_map = base_map
         # eight places a keyframe: GICP would have to prepare the map at each, and tracking starts with it anyway
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
         self.local_maps = local_maps
-        self.retrieval = Retrieval(base_map, config.retrieval)
-        self.consensus = Consensus(base_map.stations, base_map.config.block, config.consensus)
+        known = knowledge or Knowledge.of(base_map, config)
+        self.learned = None if known.learned is None else Learned(base_map, config, known.learned)
+        # together they name no more than can be registered in time
+        peaks = config.consensus.peaks
+        peaks = peaks if known.learned is None else min(peaks, config.learned.peaks)
+        self.coview = None if known.retrieval is None else CoView(base_map, config, known.retrieval, peaks)
+        self._sources: list[Source] = [s for s in (self.coview, self.learned) if s is not None]
         self._refinement = Refinement(base_map, self.config, local_maps)
         self._decision = Decision(self.config)
-        self.last_query: dict[Channel, Descriptor] = {}
         self._remembered: list[Hypothesis] = []
         self._trials = Trials()
         self._generation = 0
 
+    @property
+    def needs(self) -> Needs:
+        """What its queries have to have."""
+        return Needs(
+            None if self.coview is None else self.base_map.descriptor_config,
+            None if self.learned is None else self.config.learned.reach,
+        )
+
+    @property
+    def last_query(self) -> dict[Channel, Descriptor]:
+        """Descriptors (R, S) of the newest keyframe that voted by them, by channel."""
+        return {} if self.coview is None else self.coview.last_query
+
     def clear(self) -> None:
         """Forget all votes and confirmations."""
-        self.consensus.clear()
+        for source in self._sources:
+            source.clear()
         self._remembered = []
         self._trials = Trials()
         self._decision.clear()
+
+    def reset(self) -> None:
+        """Forget the newest descriptors as well."""
+        self.clear()
+        if self.coview is not None:
+            self.coview.last_query = {}
 
     def update(self, query: Query) -> Verdict:
         """Take in one keyframe and judge; once a place is accepted, the next query starts the search anew."""
         if query.generation != self._generation:
             self.clear()
             self._generation = query.generation
-        self._vote(query)
+        for source in self._sources:
+            source.vote(query)
         # what was good at the last keyframe is tried again, whatever the votes say now
-        hypotheses = [*self.consensus.hypotheses(), *self._remembered]
+        hypotheses = [*self._voted(query), *self._remembered]
         suggested = self._suggested(query)
-        source = local_source(query.submap, query.position, self.config.registration)
-        candidates = self._refinement.refine([*hypotheses, *suggested], source, query)
+        moving = local_source(query.submap, query.position, self.config.registration)
+        candidates = self._refinement.refine([*hypotheses, *suggested], moving, query)
         if suggested:
             self._trials.tried(self._refuted(suggested, candidates, query))
         self._remembered = [
@@ -63,23 +100,20 @@ class GlobalSearch:
             for c in candidates[:_REMEMBERED]
             if c.evidence.score >= self.config.acceptance.score
         ]
-        verdict = self._decision.judge(candidates, query, len(self.consensus))
+        verdict = self._decision.judge(candidates, query, max(map(len, self._sources)))
         if verdict.accepted is not None:
             self.clear()
         return replace(verdict, travelled=query.travelled, generation=query.generation)
 
-    def _vote(self, query: Query) -> None:
-        descriptor = self.base_map.descriptor_config
-        if len(query.scan) < self.config.keyframe.min_points:
-            return
-        centre = query.position.copy()
-        if descriptor.ground_zero:
-            centre[2] = ground_below(query.scan, query.position)
-        self.last_query = describe(query.scan, centre, descriptor)
-        if self.config.consensus.mode == "single":
-            self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
-        else:
-            self.consensus.vote(centre, self.retrieval.distances(self.last_query))
+    def _voted(self, query: Query) -> list[Hypothesis]:
+        """Return what the sources name, and only once what both do: the exact one."""
+        learned = [] if self.learned is None else self.learned.hypotheses()
+        coview = [] if self.coview is None else self.coview.hypotheses()
+        return [
+            each
+            for each in coview
+            if not any(same_place(each.T_map_odom, other.T_map_odom, query) for other in learned)
+        ] + learned
 
     def _suggested(self, query: Query) -> list[Hypothesis]:
         """Return the suggestions to try now, but none that is remembered from the last keyframe."""

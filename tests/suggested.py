@@ -24,5 +24,5 @@ def first_fix(fixes):
 
 def voteless(localizer, monkeypatch):
     """The keyframes vote, but nothing comes of it."""
-    monkeypatch.setattr(localizer._search.consensus, "hypotheses", list)
+    monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
     return localizer

@@ -24,7 +24,7 @@ from coview_stream.place.consensus import Hypothesis
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.pose.registration import LocalMaps, Registration
 from coview_stream.pose.verification import Evidence
-from coview_stream.query import Query
+from coview_stream.query import Needs, Query
 from coview_stream.refinement import Candidate, gravity_information
 from coview_stream.search import GlobalSearch
 
@@ -62,7 +62,7 @@ def stationary(world_map):
 
 def judged(search, *keyframes):
     """Verdicts on one list of candidates (best first) per keyframe."""
-    votes = len(search.consensus)
+    votes = len(search.coview.consensus)
     return [search._decision.judge(candidates, KEYFRAME, votes) for candidates in keyframes]
 
 
@@ -241,13 +241,13 @@ def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM):
     for k in range(frames):
         T = inverse(T_map_odom) @ world_drive.T_map_body[k]
         cloud = world_drive.clouds[k]
-        yield Query.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, descriptor)
+        yield Query.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, Needs(descriptor))
 
 
 def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive, monkeypatch):
     frames = run_of(world_drive, 3)
     assert search.update(next(frames)).evidence.score > 0.8
-    monkeypatch.setattr(search.consensus, "hypotheses", list)
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", list)
     again = search.update(next(frames))
     assert again.evidence.score > 0.8
     assert "confirmed by 2 keyframes" in again.evidence.reason
@@ -258,16 +258,16 @@ def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive
 def test_the_papers_rule_asks_for_the_nearest_stations_only(search, world_drive, monkeypatch):
     single = replace(search.config, consensus=ConsensusConfig(mode="single"))
     paper = GlobalSearch(search.base_map, single, search.local_maps)
-    monkeypatch.setattr(paper.retrieval, "distances", None)
+    monkeypatch.setattr(paper.coview.retrieval, "distances", None)
     assert paper.update(next(run_of(world_drive, 1))).evidence.score > 0.8
 
 
 def test_what_was_bad_is_not_tried_again(search, world_drive, monkeypatch):
     frames = run_of(world_drive, 2)
     wrong = Hypothesis(T_MAP_ODOM @ pose_from(rot_z(2.0), [9.0, -14.0, 0.0]), 0, 0, 0.0)
-    monkeypatch.setattr(search.consensus, "hypotheses", lambda: [wrong])
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [wrong])
     assert search.update(next(frames)).evidence.score < RULE.score
-    monkeypatch.setattr(search.consensus, "hypotheses", list)
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", list)
     assert search.update(next(frames)).evidence.score == 0.0
 
 
@@ -289,7 +289,7 @@ def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, mo
     leaning = robot @ exp_se3(np.array([TILT, 0.0, 0.0, 0.0, 0.0, 0.0]))
     search = GlobalSearch(world_map, config, LocalMaps(world_map, 50.0))
     upright = Hypothesis(robot, 0, 0, 0.0)
-    monkeypatch.setattr(search.consensus, "hypotheses", lambda: [upright])
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [upright])
     return search.update(next(run_of(world_drive, 1, leaning)))
 
 

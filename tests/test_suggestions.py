@@ -140,7 +140,7 @@ def test_a_lookalike_is_not_believed_before_the_votes_can_name_the_right_place(
 ):
     """The right place comes up with the fourth keyframe's votes; by itself the wrong one would have won before."""
     localizer = Localizer(lookalike_map)
-    consensus = localizer._search.consensus
+    consensus = localizer._search.coview.consensus
     found = consensus.hypotheses
     monkeypatch.setattr(
         consensus, "hypotheses", lambda: found() if len(consensus) > RULE.confirmations else []

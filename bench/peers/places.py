@@ -19,7 +19,7 @@ from coview_stream.clouds.runs import Run
 from coview_stream.config import DescriptorConfig, KeyframeConfig
 from coview_stream.geometry import Points, Pose, inverse, pose_from
 from coview_stream.place.keyframes import KeyframeBuffer
-from coview_stream.query import Query
+from coview_stream.query import Needs, Query
 from coview_stream.sim import SimulationConfig
 
 KEYFRAMES = 5
@@ -97,7 +97,7 @@ def _place(
         T_odom_body[:3, 3] -= run.poses[start][:3, 3]
         keyframe = buffer.add(frame.points, T_odom_body, frame.stamp)
         if keyframe is not None:
-            queries.append(Query.of(buffer, keyframe, frame.points, descriptor))
+            queries.append(Query.of(buffer, keyframe, frame.points, Needs(descriptor)))
         if len(queries) == KEYFRAMES:
             break
     position = queries[-1].position

@@ -17,6 +17,7 @@ from coview_stream.basemap import store, tiles
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, map_preset
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry import Points
+from coview_stream.place.learned.feature_map import FeatureMap
 
 _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
 
@@ -40,6 +41,7 @@ class BaseMap:
             raise MapError(f"the map lacks {', '.join(missing)}; build it again")
         try:
             fields = dict(parameters["config"])
+            fields.setdefault("learned", False)  # maps from before it
             descriptor = dict(fields.pop("descriptor"))
             descriptor["channels"] = tuple(descriptor["channels"])
             self.config = MapConfig(descriptor=DescriptorConfig(**descriptor), **fields)
@@ -76,6 +78,7 @@ class BaseMap:
         Raises:
             CloudError: a source cannot be read. ConfigError: an option is unknown or out of range.
             MapError: there is no ground to stand on.
+            DependencyError, InputError: ``learned=True`` without onnxruntime or weights.
         """
         from coview_stream.basemap.build import build_arrays
 
@@ -118,6 +121,12 @@ class BaseMap:
     def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
         """Descriptors (M, R, S) of one channel."""
         return self._arrays[f"descriptor.{name}"]
+
+    @cached_property
+    def learned(self) -> FeatureMap | None:
+        """Learned features, if it was built with them; raises :class:`MapError` if they cannot be read."""
+        parameters = self.parameters.get("learned")
+        return None if parameters is None else FeatureMap(self._arrays, parameters)
 
     def crop(self, centre: npt.NDArray[np.float64], radius: float) -> tuple[Points, Points]:
         """Points and unit normals (K, 3) within ``radius`` metres of ``centre``, both relative to :attr:`origin`."""

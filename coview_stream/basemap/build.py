@@ -35,6 +35,7 @@ def build_arrays(
     Raises:
         CloudError: a source cannot be read.
         MapError: no sources, too few points, or no ground to put stations on.
+        DependencyError, InputError: learned features are asked for, and there is no onnxruntime or no weights.
     """
     if not paths:
         raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
@@ -75,6 +76,12 @@ def build_arrays(
     with _bar(progress, "describing stations") as step:
         described = describe_storeys(points, stations, config.block, config.descriptor, step)
 
+    learned: tuple[Arrays, dict[str, Any] | None] = ({}, None)
+    if config.learned:
+        from coview_stream.place.learned.feature_build import feature_arrays
+
+        with _bar(progress, "learned features") as step:
+            learned = feature_arrays(points, step)
     sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
     arrays: Arrays = {
@@ -86,12 +93,14 @@ def build_arrays(
         "surveyed": surveyed,
         "surveyed_corner": surveyed_corner,
         **{f"descriptor.{name}": values for name, values in described.items()},
+        **learned[0],
     }
     parameters = {
         "crs": crs,
         "sources": {_label(path, paths): _sha256(path) for path in paths},
         "source_points": source_points,
         "stations_below_another": int(below_another(stations, config.block).sum()),
+        "learned": learned[1],
     }
     return arrays, parameters
 

@@ -31,6 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--channels", metavar="A,B", help="descriptor channels that vote (scan_context,coview)"
     )
+    parser.add_argument(
+        "--learned",
+        action=argparse.BooleanOptionalAction,
+        help="store features for learned re-localization, 35 MB per km2 (see locate --reloc)",
+    )
     parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
 
 
@@ -48,6 +53,12 @@ def run(args: argparse.Namespace) -> int:
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
+    if args.learned is not None:
+        options["learned"] = args.learned
+    if args.learned:
+        from coview_stream.place.learned.network import network
+
+        network("aerial")  # it may be missing, so ask before reading
     begin = time.perf_counter()
     base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
     base_map.save(args.output)

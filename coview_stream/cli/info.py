@@ -55,10 +55,20 @@ def describe(base_map: BaseMap) -> dict[str, object]:
         "to": [round(float(v), 2) for v in high],
         "origin": base_map.origin.tolist(),
         "crs": base_map.crs,
+        "learned": _learned(base_map),
         "sources": base_map.sources,
         "sha256": base_map.sha256,
         "parameters": asdict(base_map.config),
     }
+
+
+def _learned(base_map: BaseMap) -> str:
+    """Return what there is for learned re-localization."""
+    features = base_map.learned
+    if features is None:
+        return "no features"
+    size = features.bytes / 1e6
+    return f"features of {features.area:.0f} m2, {size:.1f} MB, weights {features.weights[:12]}"
 
 
 def _text(value: object) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.odometry import add_gravity, lidar_options
+from coview_stream.cli.reloc import add_reloc
 
 if TYPE_CHECKING:
     from coview_stream.odometry.lidar import LidarOdometry
@@ -40,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="trimmed-icp",
         help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
     )
+    add_reloc(parser)
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
 
@@ -55,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.fix import Fix
     from coview_stream.offline import locate, summary, write
     from coview_stream.pose.gicp import library
+    from coview_stream.sources import check_reloc
 
     lidar = _lidar(args.odometry, args.gravity)
     if args.registration == "gicp":
@@ -62,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     base_map = BaseMap.load(args.map)
+    check_reloc(base_map, args.reloc)
     quiet = not (args.progress or sys.stderr.isatty())
     with tqdm(desc="odometry", unit="frame", disable=quiet or lidar is None, leave=False) as bar:
 
@@ -77,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     config = LocalizerConfig(
         retrieval=RetrievalConfig(mode=args.retrieval),
         registration=RegistrationConfig(method=args.registration),
+        reloc=args.reloc,
     )
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.odometry import KISS_ICP, ROBOT, add_gravity, lidar_options
+from coview_stream.cli.reloc import add_reloc
 from coview_stream.cli.state import add_state, ready_state
 from coview_stream.errors import ConfigError
 
@@ -85,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="trimmed-icp",
         help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
     )
+    add_reloc(parser)
     add_state(parser)
     parser.add_argument("--quiet", action="store_true", help="log errors only")
 
@@ -125,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
-        args.registration, ready_state(args),
+        args.registration, ready_state(args), args.reloc,
     )  # fmt: skip
     with stop_on_signals() as stop:
         ended = _serve(options, stop)

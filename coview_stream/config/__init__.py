@@ -7,6 +7,7 @@ the map and read back from it, so that the two can never drift apart; the rest b
 from __future__ import annotations
 
 from coview_stream.config.acceptance import AcceptanceConfig
+from coview_stream.config.learned import LearnedConfig, Reloc
 from coview_stream.config.localizer import LocalizerConfig
 from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, Visibility, map_preset
 from coview_stream.config.place import ConsensusConfig, KeyframeConfig, RetrievalConfig
@@ -21,11 +22,13 @@ __all__ = [
     "GraphBackend",
     "GraphConfig",
     "KeyframeConfig",
+    "LearnedConfig",
     "LocalizerConfig",
     "MapConfig",
     "Preset",
     "RegistrationConfig",
     "RegistrationMethod",
+    "Reloc",
     "RetrievalConfig",
     "TrackingConfig",
     "Visibility",

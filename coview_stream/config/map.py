@@ -12,6 +12,9 @@ Channel = Literal["scan_context", "coview", "coview_strict", "density"]
 Visibility = Literal["paper", "eye", "off"]
 Preset = Literal["slam", "tls"]
 
+LEARNED_BY_DEFAULT = False
+"""Whether a new map gets learned features if nobody says."""
+
 
 @dataclass(frozen=True)
 class DescriptorConfig:
@@ -46,7 +49,7 @@ class DescriptorConfig:
 
 @dataclass(frozen=True)
 class MapConfig:
-    """How a base map is built (paper, section 3.1)."""
+    """How a base map is built (paper, section 3.1); ``learned`` maps also hold what learned re-localization needs."""
 
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
     block: float = 2.0
@@ -57,6 +60,7 @@ class MapConfig:
     normal_radius: float = 1.0
     normal_neighbours: int = 20
     levels: bool = True
+    learned: bool = LEARNED_BY_DEFAULT
 
     def __post_init__(self) -> None:
         positive(self, "block", "voxel", "tile", "outlier_std_ratio", "normal_radius")

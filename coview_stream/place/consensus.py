@@ -9,6 +9,7 @@ by a top-k before it could be confirmed.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,13 +30,15 @@ _SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
 class Hypothesis:
     """A coarse ``T_map_odom`` (4 x 4), with its station, shift and summed score (lower is better).
 
-    Station and shift are None where no vote stands behind it: somebody suggested it.
+    Station and shift are None where no vote stands behind it: somebody suggested it. ``learned`` says that the votes
+    are those of learned features.
     """
 
     T_map_odom: Pose
     station: int | None
     shift: int | None
     score: float
+    learned: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,9 @@ class Consensus:
         """Forget all votes."""
         self._ballots.clear()
 
-    def vote(self, centre: npt.NDArray[np.float64], distances: dict[Channel, Volume]) -> None:
+    def vote(
+        self, centre: npt.NDArray[np.float64], distances: Mapping[Channel, Volume] | Mapping[str, Volume]
+    ) -> None:
         """Add one keyframe's distances (M, S) per channel; ``centre`` (3,) is its descriptor's zero, odometry frame.
 
         Channels are standardised (median and MAD over all hypotheses) before they are averaged: how far a

@@ -20,6 +20,7 @@ from coview_stream.pose import gicp
 from coview_stream.pose.graph import make_smoother
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch
+from coview_stream.sources import Knowledge
 from coview_stream.stream.deskew import deskew
 from coview_stream.stream.jobs import FrameJob, FrameResult, Job, Result, SearchJob
 
@@ -100,7 +101,7 @@ class TrackEngine:
 
 
 class SearchEngine:
-    """Searches the whole map for keyframes; all robots share the map's spectra."""
+    """Searches the whole map for keyframes; all robots share the map's spectra and networks."""
 
     kernels = ("transform_unique", "describe_points", "nearest", "align_planes")
 
@@ -109,7 +110,7 @@ class SearchEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, GlobalSearch]] = {}
-        self._retrieval = GlobalSearch(base_map, self.config, self._local_maps).retrieval
+        self._knowledge = Knowledge.of(base_map, self.config)
 
     def run(self, job: Job) -> Verdict:
         """Search for one keyframe."""
@@ -117,8 +118,7 @@ class SearchEngine:
             raise TypeError(f"{type(job).__name__} is no search")
         epoch, search = self._robots.get(job.robot, (None, None))
         if search is None:
-            search = GlobalSearch(self.base_map, self.config, self._local_maps)
-            search.retrieval = self._retrieval
+            search = GlobalSearch(self.base_map, self.config, self._local_maps, self._knowledge)
         elif epoch != job.epoch:
             search.clear()
         self._robots[job.robot] = job.epoch, search
@@ -129,8 +129,8 @@ class SearchEngine:
         self._robots.pop(robot, None)
 
     def prepare(self) -> None:
-        """Make the stations' spectra."""
-        self._retrieval.prepare()
+        """Make the stations' spectra, and those of the map's learned features."""
+        self._knowledge.prepare()
 
 
 def open_engine(

@@ -22,7 +22,7 @@ from coview_stream.errors import CoViewError
 from coview_stream.stream.watchdog import Watchdog
 
 if TYPE_CHECKING:  # the child imports them; that a node opens should not wait for it here too
-    from coview_stream.config import RegistrationMethod
+    from coview_stream.config import RegistrationMethod, Reloc
     from coview_stream.stream.engine import Engine
     from coview_stream.stream.jobs import Job, Result
 
@@ -81,6 +81,7 @@ class ProcessLane:
         sha256: what the map has to be; if the file was replaced meanwhile, poses would be of another map than is said.
         nice: how far the child stands back from us, so that the clock here is never late.
         registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
+        reloc: who names the places that a search looks at.
         patience: seconds after which a job counts as hung.
         opening: seconds after which opening the map, or preparing for the first job, does.
     """
@@ -94,6 +95,7 @@ class ProcessLane:
         patience: float = 30.0,
         opening: float = 120.0,
         registration: RegistrationMethod = "trimmed-icp",
+        reloc: Reloc = "auto",
     ) -> None:
         self.kind = kind
         self.map_path = map_path
@@ -102,6 +104,7 @@ class ProcessLane:
         self.patience = patience
         self.opening = opening
         self.registration = registration
+        self.reloc = reloc
         self._closed = False
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
@@ -123,7 +126,8 @@ class ProcessLane:
             with theirs:
                 self._child = subprocess.Popen(
                     [sys.executable, "-m", "coview_stream.stream.worker", str(theirs.fileno()), self.kind,
-                     self.map_path, self.sha256, str(self.nice), self.registration],
+                     self.map_path, self.sha256, str(self.nice), self.registration,
+                     self.reloc],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     env=_environment(),

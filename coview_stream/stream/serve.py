@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import RegistrationMethod
+from coview_stream.config import RegistrationMethod, Reloc
 from coview_stream.errors import MapError, TransportError
 from coview_stream.odometry.config import LidarOdometryConfig
+from coview_stream.sources import check_reloc
 from coview_stream.stream.apart import check_apart
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.keys import RobotKeys
@@ -47,6 +48,7 @@ class ServeOptions:
         lidar: how odometry is made of the clouds; None if the robots send theirs.
         registration: how scans are registered to the map.
         state: directory that keeps where robots were last known to be; None for none.
+        reloc: who names the places that a search looks at.
     """
 
     map_path: Path
@@ -61,6 +63,7 @@ class ServeOptions:
     lidar: LidarOdometryConfig | None = None
     registration: RegistrationMethod = "trimmed-icp"
     state: Path | None = None
+    reloc: Reloc = "auto"
 
 
 def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
@@ -78,10 +81,13 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     names = [k.robot for k in options.keys]
     begin = time.monotonic()
     base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
-    path, method = str(options.map_path), options.registration
+    check_reloc(base_map, options.reloc)
+    path, method, reloc = str(options.map_path), options.registration, options.reloc
     lanes = [
-        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE, registration=method),
-        search := ProcessLane("search", path, base_map.sha256, _SEARCH_NICE, registration=method),
+        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
+        search := ProcessLane(
+            "search", path, base_map.sha256, _SEARCH_NICE, registration=method, reloc=reloc
+        ),
     ]
     odometry = None
     if options.lidar is not None:

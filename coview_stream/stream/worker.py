@@ -1,6 +1,7 @@
 """The child process of a lane; not for people.
 
-``python -m coview_stream.stream.worker FD KIND MAP SHA256 NICE METHOD``, the last being that of registration.
+``python -m coview_stream.stream.worker FD KIND MAP SHA256 NICE METHOD RELOC``, the last two being those of
+registration and of the search.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def main(argv: list[str]) -> int:
 
     try:
         method = RegistrationConfig(method=argv[5])  # type: ignore[arg-type]  # any text; it checks
-        config = LocalizerConfig(registration=method)
+        config = LocalizerConfig(registration=method, reloc=argv[6])  # type: ignore[arg-type]
         engine = open_engine(kind, map_path, sha256, config)
         if engine.kernels:
             warm_up(*engine.kernels)

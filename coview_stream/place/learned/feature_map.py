@@ -1,0 +1,132 @@
+"""A base map's learned features: what the aerial network saw, looked up around a place or coarsely all over."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import MapError
+from coview_stream.place.learned.feature_tiles import TILE, TileIndex, unpacked, unpacked_sigma
+from coview_stream.place.learned.network import LOCAL_CELL, shipped, weights_name
+
+Vectors = npt.NDArray[np.float32]
+"""(C, H, W): row along y."""
+
+_NAMES = ("local", "sigma", "tiles", "place", "place_at")
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A map's features around a place.
+
+    Attributes:
+        local: (C, h, w) float32 of unit norm, zero where the map has nothing; cells of 1 m.
+        sigma: (h, w) float32, uncertainty of each cell as a keypoint; of no meaning where ``local`` is zero.
+        corner: (2,) x and y of the lower corner of cell (0, 0), metres, map frame.
+    """
+
+    local: Vectors
+    sigma: npt.NDArray[np.float32]
+    corner: npt.NDArray[np.float64]
+
+
+class FeatureMap:
+    """Reads the arrays ``learned.*`` of a base map, which may be memory-mapped.
+
+    Attributes:
+        weights: sha256 of the network that made them.
+        place: (K, P) int8 global descriptors times 127.
+        place_at: (K, 2) float32 where they were made, metres, map frame.
+
+    Raises:
+        MapError: some of the arrays are missing or do not fit together.
+    """
+
+    def __init__(self, arrays: dict[str, npt.NDArray[Any]], parameters: dict[str, Any]) -> None:
+        try:
+            local, sigma, tiles, place, place_at = (arrays[f"learned.{name}"] for name in _NAMES)
+            self.weights = str(parameters["weights"])
+            fits = local.shape[:3] == sigma.shape == (len(tiles), TILE, TILE) and len(place) == len(place_at)
+            if not fits or float(parameters["cell"]) != LOCAL_CELL:
+                raise ValueError("their shapes do not fit together")
+        except (KeyError, TypeError, ValueError) as error:
+            raise MapError(f"the map's learned features cannot be read ({error}); build it again") from error
+        self._local, self._sigma, self.place, self.place_at = local, sigma, place, np.array(place_at)
+        self.index = TileIndex(tiles)
+
+    @property
+    def channels(self) -> int:
+        """Numbers C in a local descriptor."""
+        return int(self._local.shape[3])
+
+    @property
+    def bytes(self) -> int:
+        """Size of all arrays."""
+        return sum(int(a.nbytes) for a in (self._local, self._sigma, self.place, self.place_at))
+
+    @cached_property
+    def area(self) -> float:
+        """Square metres that have features; reads all of them once."""
+        return float(sum(int(tile.any(axis=-1).sum()) for tile in self._local) * LOCAL_CELL**2)
+
+    @property
+    def tile_centres(self) -> npt.NDArray[np.float64]:
+        """(T, 2) middles of the tiles, metres, map frame."""
+        return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)
+
+    def patch(self, centre: npt.NDArray[np.floating], reach: float) -> Patch:
+        """Return all within ``reach`` metres of ``centre`` (x and y, map frame), rounded outwards to whole cells."""
+        low = np.floor((np.asarray(centre, dtype=np.float64)[:2] - reach) / LOCAL_CELL).astype(np.int64)
+        high = np.ceil((np.asarray(centre, dtype=np.float64)[:2] + reach) / LOCAL_CELL).astype(np.int64)
+        width, height = (int(n) for n in high - low)
+        local = np.zeros((height, width, self.channels), dtype=np.int8)
+        sigma = np.full((height, width), 255, dtype=np.uint8)
+        self.index.gather(self._local, low, local)
+        self.index.gather(self._sigma, low, sigma)
+        vectors = np.ascontiguousarray(unpacked(local).transpose(2, 0, 1))
+        return Patch(vectors, unpacked_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
+
+    def coarse(self, cell: float = 2.0) -> tuple[Vectors, npt.NDArray[np.float64]]:
+        """Return means (C, H, W) over cells of ``cell`` metres, a divisor of 32, and their lower corner (2,), metres.
+
+        What the map does not have counts as zero.
+        """
+        ratio, side = round(cell / LOCAL_CELL), round(TILE * LOCAL_CELL / cell)
+        shape = (self.channels, self.index.rows * side, self.index.columns * side)
+        whole = np.zeros(shape, dtype=np.float32)
+        for (column, row), tile in zip(self.index.tiles - self.index.low, self._local, strict=True):
+            rows, columns = (slice(n * side, (n + 1) * side) for n in (int(row), int(column)))
+            whole[:, rows, columns] = means(np.asarray(tile), ratio)
+        return whole, np.asarray(self.index.low * (TILE * LOCAL_CELL), dtype=np.float64)
+
+    def check(self, directory: Path | None = None) -> None:
+        """Refuse to compare these features with those of another network.
+
+        Raises:
+            MapError: they were made by other weights than those in ``directory``, which are the package's.
+        """
+        if weights_sha256(directory) != self.weights:
+            raise MapError(
+                "the map's learned features are of other weights than the installed ones: build it again with "
+                "'coview-stream build --learned', or go without them (--reloc coview)"
+            )
+
+
+def means(tile: npt.NDArray[np.int8], ratio: int) -> Vectors:
+    """Means (C, h, w) of stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells."""
+    height, width, channels = (tile.shape[0] // ratio, tile.shape[1] // ratio, tile.shape[2])
+    blocks = tile.reshape(height, ratio, width, ratio, channels).astype(np.float32)
+    return np.ascontiguousarray(blocks.mean(axis=(1, 3)).transpose(2, 0, 1) * np.float32(1.0 / 127.0))
+
+
+@lru_cache(maxsize=4)
+def weights_sha256(directory: Path | None = None) -> str:
+    """Return the sha256 of the aerial network's weights; empty if there are none."""
+    path = (directory or shipped()) / weights_name("aerial")
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""

@@ -1,0 +1,175 @@
+"""Where a search's hypotheses come from: each source lets keyframes vote for places, in its own way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Protocol
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import Channel, LocalizerConfig, Reloc
+from coview_stream.errors import MapError
+from coview_stream.place.consensus import Consensus, Hypothesis
+from coview_stream.place.descriptor import Descriptor, describe, ground_below
+from coview_stream.place.learned.network import Network
+from coview_stream.place.learned.votes import LearnedMap, View
+from coview_stream.place.retrieval import Retrieval
+from coview_stream.query import Query
+
+
+class Source(Protocol):
+    """Takes in keyframes and names the places they speak for."""
+
+    def vote(self, query: Query) -> None:
+        """Take in one keyframe; one with too few points says nothing."""
+        ...
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the best places, best first; none before the first vote."""
+        ...
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        ...
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        ...
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What all searches of one map share; None for what is not used.
+
+    Attributes:
+        retrieval: the stations' co-view descriptors.
+        learned: the map's learned features.
+    """
+
+    retrieval: Retrieval | None
+    learned: LearnedMap | None
+
+    @classmethod
+    def of(cls, base_map: BaseMap, config: LocalizerConfig) -> Knowledge:
+        """Choose by ``config.reloc``; nothing is loaded yet.
+
+        Raises:
+            MapError: learned features are asked for, and the map has none, or some of other weights.
+        """
+        features = base_map.learned if uses_learned(base_map, config.reloc) else None
+        learned = None if features is None else LearnedMap(features, base_map.stations, config.learned)
+        retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
+        return cls(retrieval, learned)
+
+    def prepare(self) -> None:
+        """Make now what would make the first query slow; raises :class:`CoViewError` if something is missing."""
+        if self.retrieval is not None:
+            self.retrieval.prepare()
+        if self.learned is not None:
+            self.learned.prepare()
+
+
+def uses_learned(base_map: BaseMap, reloc: Reloc) -> bool:
+    """Whether learned features say where to look.
+
+    Raises:
+        MapError: they are asked for, and the map has none, or some that cannot be read.
+    """
+    if reloc == "learned" and base_map.learned is None:
+        raise MapError(
+            "the map has no learned features: build it again with 'coview-stream build --learned', or go without "
+            "them (--reloc coview)"
+        )
+    there = reloc != "coview" and base_map.learned is not None
+    return there and (reloc == "learned" or find_spec("onnxruntime") is not None)
+
+
+def check_reloc(base_map: BaseMap, reloc: Reloc) -> None:
+    """Say now what the first query would stumble on.
+
+    Raises:
+        MapError: the map has no learned features, or some of other weights. DependencyError: there is no onnxruntime.
+        InputError: there are no weights.
+    """
+    if uses_learned(base_map, reloc) and base_map.learned is not None:
+        base_map.learned.check()
+        Network("ground", threads=1)
+
+
+class CoView:
+    """Votes by the paper's descriptors (eqs 1-12).
+
+    Attributes:
+        last_query: descriptors (R, S) of the newest keyframe that voted, by channel.
+    """
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, retrieval: Retrieval, peaks: int) -> None:
+        self.base_map = base_map
+        self.config = config
+        self.retrieval = retrieval
+        self.consensus = Consensus(
+            base_map.stations, base_map.config.block, replace(config.consensus, peaks=peaks)
+        )
+        self.last_query: dict[Channel, Descriptor] = {}
+
+    def vote(self, query: Query) -> None:
+        """Compare the virtual local scan with every station's."""
+        descriptor = self.base_map.descriptor_config
+        if len(query.scan) < self.config.keyframe.min_points:
+            return
+        centre = query.position.copy()
+        if descriptor.ground_zero:
+            centre[2] = ground_below(query.scan, query.position)
+        self.last_query = describe(query.scan, centre, descriptor)
+        if self.config.consensus.mode == "single":
+            self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
+        else:
+            self.consensus.vote(centre, self.retrieval.distances(self.last_query))
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the consensus' peaks."""
+        return self.consensus.hypotheses()
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        self.consensus.clear()
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        return len(self.consensus)
+
+
+class Learned:
+    """Votes by learned features; its peaks are made exact by keypoints of the newest keyframe that voted."""
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: LearnedMap) -> None:
+        self.config = config
+        self.learned = learned
+        peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
+        self.consensus = Consensus(base_map.stations, base_map.config.block, peaks)
+        self._view: View | None = None
+
+    def vote(self, query: Query) -> None:
+        """Compare what the ground network sees around the robot with the map's features."""
+        if len(query.surroundings) < self.config.keyframe.min_points:
+            return
+        centre = query.position.copy()
+        centre[2] = ground_below(query.surroundings, query.position)
+        self._view = self.learned.view(query.surroundings, centre)
+        self.consensus.vote(centre, {"learned": self.learned.distances(self._view)})
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the consensus' peaks, each moved to where keypoints agree."""
+        found = [replace(each, learned=True) for each in self.consensus.hypotheses()]
+        if self._view is None or not self.config.learned.sharpen:
+            return found
+        return self.learned.sharpened(found, self._view)
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        self.consensus.clear()
+        self._view = None
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        return len(self.consensus)
