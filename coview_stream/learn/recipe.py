@@ -35,6 +35,7 @@ _BOUNDS: dict[str, Range] = {
     "wind": (0.0, 1.0),
     "aerial_porosity": (0.0, 0.95),
     "ground_porosity": (0.0, 0.95),
+    "leaf_depth": (0.0, 2.0),
     "pulses": (1.0, 200.0),
     "altitude": (150.0, 1000.0),
     "swath": (5.0, 45.0),
@@ -73,6 +74,7 @@ class Recipe:
         slope: steepest slopes of a world, degrees; roughness: of its ground, metres.
         wind: shift of each crown between the epochs, metres, one sigma.
         aerial_porosity, ground_porosity: probability that a pulse passes a surface of leaves.
+        leaf_depth: how far below a crown's surface leaves are hit on average, metres.
         pulses, altitude, swath, aerial_noise: airborne pulses per square metre, metres, degrees, metres.
         strip_shift, strip_lift: errors of a strip's position, metres, one sigma.
         ground_noise: of the robot's ranges, metres.
@@ -107,6 +109,7 @@ class Recipe:
     wind: Range = (0.0, 0.3)
     aerial_porosity: Range = (0.2, 0.7)
     ground_porosity: Range = (0.1, 0.6)
+    leaf_depth: Range = (0.05, 0.6)
     pulses: Range = (5.0, 60.0)
     altitude: Range = (180.0, 400.0)
     swath: Range = (12.0, 30.0)

@@ -44,7 +44,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     slope = low + (high - low) * rng.uniform(*land)
     terrain = Terrain(rng, half + 10.0, slope, recipe.draw(rng, "roughness"))
     pattern = str(rng.choice(PATTERNS))
-    density = float(np.exp(rng.uniform(*np.log(recipe.stems))))
+    density = float(rng.uniform(*np.sqrt(recipe.stems)) ** 2)
     xy = draw_stems(rng, pattern, density, half)
     xy = xy[opened(rng, xy, half)]
     species = draw_species(rng, recipe)

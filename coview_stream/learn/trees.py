@@ -76,10 +76,7 @@ def draw_trees(
     kind = _mixed(rng, xy, len(species))
     height = _heights(rng, recipe, xy)
     pick = {name: np.array([getattr(each, name) for each in species])[kind] for name in Species._fields}
-    crown = np.clip(pick["width"] * rng.lognormal(0, 0.15, count), *recipe.crown_width) * height / 2
-    # where trees are dense their crowns stay narrow, and clear of branches below
-    room = rng.uniform(0.8, 1.8) * np.sqrt((2 * terrain.half) ** 2 / max(count, 1)) / 2
-    crown = np.minimum(crown, np.maximum(room, 0.6) * rng.uniform(0.85, 1.15, count))
+    crown = _crowns(rng, recipe, pick["width"], height, (2 * terrain.half) ** 2)
     base = np.clip(pick["base"] + rng.normal(0, 0.06, count), *recipe.crown_base) * height
     radius = np.clip(pick["thick"] * height * rng.lognormal(0, 0.25, count), *recipe.stem_radius)
     far = recipe.draw(rng, "crown_offset") * np.sqrt(rng.random(count)) * np.minimum(1, crown / 1.5)
@@ -98,6 +95,17 @@ def draw_trees(
         evergreen=pick["evergreen"].astype(bool),
         dead=rng.random(count) < recipe.draw(rng, "dead"),
     )
+
+
+def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Floats, area: float) -> Floats:
+    """Radii (N,) of crowns, metres, from their usual ``share`` of the height; half of the stands are closed."""
+    low, high = (each * height / 2 for each in recipe.crown_width)
+    wide = share * rng.lognormal(0, 0.15, len(height)) * height / 2
+    if rng.random() < 0.5:
+        wide = wide * np.sqrt(rng.uniform(0.7, 2.0) * area / max(float((np.pi * wide**2).sum()), 1.0))
+    # where trees are dense their crowns stay narrow
+    room = max(0.6, rng.uniform(0.8, 1.8) * float(np.sqrt(area / max(len(height), 1))) / 2)
+    return np.minimum(np.clip(wide, low, high), room * rng.uniform(0.85, 1.15, len(height)))
 
 
 def _mixed(rng: np.random.Generator, xy: Floats, kinds: int) -> npt.NDArray[np.intp]:

@@ -91,7 +91,16 @@ def _built(rng: np.random.Generator, seed: int, recipe: Recipe, size: float) -> 
 def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str, float]]:
     """Scan the map from the air: (N, 3) float32 metres, thinned, and what was drawn for the flight."""
     rng = np.random.default_rng([seed, _FLIGHT])
-    names = ("pulses", "altitude", "swath", "aerial_noise", "aerial_porosity", "strip_shift", "strip_lift")
+    names = (
+        "pulses",
+        "altitude",
+        "swath",
+        "aerial_noise",
+        "aerial_porosity",
+        "leaf_depth",
+        "strip_shift",
+        "strip_lift",
+    )
     drawn = {name: recipe.draw(rng, name) for name in names}
     swath = float(np.radians(drawn["swath"]))
     relief = max(abs(end) for end in world.span) + 30.0
@@ -102,7 +111,7 @@ def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str
         porosity=drawn["aerial_porosity"],
         margin=max(5.0, float(relief * np.tan(swath))),
     )
-    caster = Caster(world.mapped, threads=1)
+    caster = Caster(world.mapped, threads=1, leaf_depth=drawn["leaf_depth"])
     strips = []
     for _, strip in airborne_scan(caster, world.size, drawn["pulses"], rng, flight):
         bias = rng.normal(size=3) * (drawn["strip_shift"], drawn["strip_shift"], drawn["strip_lift"])
@@ -113,7 +122,7 @@ def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str
 def submaps(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Submap]]:
     """Drive through the world ``recipe.submaps`` times; yields the sensor's name and what it gathered."""
     rng = np.random.default_rng([seed, _DRIVES])
-    caster = Caster(world.now, threads=1)
+    caster = Caster(world.now, threads=1, leaf_depth=recipe.draw(rng, "leaf_depth"))
     porosity = recipe.draw(rng, "ground_porosity")
     extent = world.size / 2 - RADIUS
     scanned = partial(gather, rng, recipe, caster, world.ground, porosity=porosity)

@@ -31,13 +31,15 @@ class Hits(NamedTuple):
 class Caster:
     """Casts rays into one epoch of a scene, on ``threads`` cores.
 
+    Leaves are hit ``leaf_depth`` metres on average below the surface of their foliage.
+
     Raises:
         DependencyError: Open3D cannot be loaded.
     """
 
-    def __init__(self, epoch: Epoch, threads: int = _THREADS) -> None:
+    def __init__(self, epoch: Epoch, threads: int = _THREADS, leaf_depth: float = _LEAF_DEPTH) -> None:
         self._o3d: Any = open3d()
-        self._threads = threads
+        self._threads, self._leaf_depth = threads, leaf_depth
         self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._foliage = -1
         for name in ("solid", "foliage"):
@@ -72,7 +74,7 @@ class Caster:
             from_here = origins[alive] + rays[alive] * start[alive, None]
             t, cosine, leaf = self._query(from_here, rays[alive])
             t += start[alive]
-            depth = (rng.exponential(_LEAF_DEPTH, len(t)) * leaf).astype(np.float32)
+            depth = (rng.exponential(self._leaf_depth, len(t)) * leaf).astype(np.float32)
             distance[alive], incidence[alive] = t + depth, np.where(leaf, 1.0, cosine)
             if layer + 1 == _MAX_LAYERS:
                 break
