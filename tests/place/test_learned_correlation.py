@@ -76,14 +76,17 @@ def by_loops(query, weight, known, surveyed, yaws, covered):
 
 @pytest.mark.parametrize("covered", [None, 0.6, 0.3])
 @pytest.mark.parametrize("most_bytes", [0, 1 << 30])
-def test_it_equals_direct_sums(covered, most_bytes):
+@pytest.mark.parametrize(
+    "headings", [(0.0, 0.3, 2.0, -1.2), (0.4, 1.7, 0.4 - np.pi, 1.7 + np.pi)], ids=["any", "opposite"]
+)
+def test_it_equals_direct_sums(covered, most_bytes, headings):
     rng = np.random.default_rng(1)
     known = features(rng, 3, 11, 17)
     known[:, :5, :9] = 0.0
     surveyed = (known != 0).any(axis=0)
     local, weights = features(rng, 3, 12, 12), rng.uniform(0.1, 1.0, (12, 12)).astype(np.float32)
     query, weight = coarser(local, weights)
-    yaws = np.array([0.0, 0.3, 2.0, -1.2])
+    yaws = np.asarray(headings)
     made = CoarseMap(known, (0.0, 0.0), block=15, margin=4, most_bytes=most_bytes)
     assert len(made) == 2 * 3
     assert (made.nbytes > 0) == (most_bytes > 0)

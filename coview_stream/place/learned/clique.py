@@ -17,8 +17,8 @@ F32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.int64]
 
-_OUTER, _INNER, _TRIES = 40, 60, 12
-_STILL = 1e-5  # change of the unit vector below which a climb has ended
+_OUTER, _INNER, _TRIES = 40, 25, 12
+_STILL = 1e-4  # change of the unit vector below which a climb has ended
 _FASTER, _SLOWER = 3.0, 0.25
 _LONGEST = 1e6  # step of a climb: beyond, only the slope's direction matters
 

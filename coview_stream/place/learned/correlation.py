@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
@@ -54,19 +56,42 @@ def correlate(
     """
     headings = np.asarray(yaws, dtype=np.float64)
     _check(query, weight, coarse_map, headings)
-    images = turned(np.concatenate([query, weight[None]]), headings)
+    waves = _waves(query, weight, coarse_map, headings)
+    chosen = np.arange(len(coarse_map)) if blocks is None else np.unique(blocks)
+    scores = np.full((coarse_map.height, coarse_map.width, len(headings)), -np.inf, dtype=np.float32)
+    per_block = 8 * len(waves[0].spectra) * len(headings)
+    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _AT_ONCE))):
+        if len(group):
+            for wave, part in zip(waves, np.split(scores, len(waves), axis=2), strict=True):
+                _score(part, group, coarse_map, wave, covered)
+    return np.asarray(scores.transpose(2, 0, 1))
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """Spectra (bins, K, C + 1) to multiply a map's with, and the row and column at which its margin's end is found."""
+
+    spectra: C64
+    first: int
+
+
+def _waves(
+    query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.float64]
+) -> tuple[_Wave] | tuple[_Wave, _Wave]:
+    """Spectra of a turned query, the weight's last, over the sum of the weights."""
+    half, size = len(weight) // 2, len(yaws) // 2
+    # a correlation with what is turned by half a turn is a convolution: the same spectra, not conjugate
+    twice = len(yaws) == 2 * size and np.allclose(
+        np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9
+    )
+    images = turned(np.concatenate([query, weight[None]]), yaws[:size] if twice else yaws)
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _LEAST).all():
         raise ValueError("no cell of the query has a weight")
     images *= (1.0 / total)[:, None]
-    spectra = _conjugate(transformed(images, coarse_map.block, coarse_map.workers))
-    chosen = np.arange(len(coarse_map)) if blocks is None else np.unique(blocks)
-    scores = np.full((coarse_map.height, coarse_map.width, len(headings)), -np.inf, dtype=np.float32)
-    per_block = 8 * len(spectra) * len(headings)
-    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _AT_ONCE))):
-        if len(group):
-            _score(scores, group, coarse_map, spectra, len(weight) // 2, covered)
-    return np.asarray(scores.transpose(2, 0, 1))
+    spectra = transformed(images, coarse_map.block, coarse_map.workers)
+    before = _Wave(np.conjugate(spectra), coarse_map.margin - half)
+    return (before, _Wave(spectra, coarse_map.margin + half)) if twice else (before,)
 
 
 def _check(query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.float64]) -> None:
@@ -82,21 +107,15 @@ def _check(query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.
         )
 
 
-def _conjugate(spectra: C64) -> C64:
-    np.conjugate(spectra, out=spectra)
-    return spectra
-
-
-def _score(
-    scores: F32, group: Indices, coarse_map: CoarseMap, spectra: C64, half: int, covered: float | None
-) -> None:
-    """Fill in the places (H, W, K) that some blocks answer for; ``spectra`` (bins, K, C + 1), the weight's last."""
-    mean = _back(np.matmul(coarse_map.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), coarse_map, half)
+def _score(scores: F32, group: Indices, coarse_map: CoarseMap, wave: _Wave, covered: float | None) -> None:
+    """Fill in the places (H, W, K) that some blocks answer for."""
+    spectra = wave.spectra
+    mean = _back(np.matmul(coarse_map.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), coarse_map, wave)
     if covered is not None:
         gaps = np.flatnonzero(~coarse_map.whole(group))
         if len(gaps):
             share = _back(
-                coarse_map.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], coarse_map, half
+                coarse_map.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], coarse_map, wave
             )
             # a share of just so much must not depend on how the transforms round
             enough = share >= max(covered - 1e-5, _LEAST)
@@ -106,13 +125,9 @@ def _score(
         scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
 
 
-def _back(product: C64, coarse_map: CoarseMap, half: int) -> F32:
-    """Correlations (places, places, blocks, K) from products of spectra (bins, blocks, K).
-
-    ``half``: cells from a query's first to its middle; a block's first place is its margin from the block's edge.
-    """
-    size, first = coarse_map.block, coarse_map.margin - half
-    last = first + coarse_map.places
+def _back(product: C64, coarse_map: CoarseMap, wave: _Wave) -> F32:
+    """Correlations (places, places, blocks, K) from products of spectra (bins, blocks, K)."""
+    size, last = coarse_map.block, wave.first + coarse_map.places
     grid = product.reshape(size, -1, *product.shape[1:])
-    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=coarse_map.workers)[first:last]
-    return np.asarray(fft.irfft(rows, size, axis=1, workers=coarse_map.workers)[:, first:last])
+    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=coarse_map.workers)[wave.first : last]
+    return np.asarray(fft.irfft(rows, size, axis=1, workers=coarse_map.workers)[:, wave.first : last])
