@@ -13,7 +13,7 @@ from coview_stream.pose.registration import LocalMaps
 from coview_stream.pose.source import local_source
 from coview_stream.query import Needs, Query, same_place
 from coview_stream.refinement import Candidate, Refinement
-from coview_stream.sources import CoView, Knowledge, Learned, Source
+from coview_stream.sources import CoView, Knowledge, Source
 from coview_stream.suggestions import Trials, robot_in
 
 __all__ = ["Candidate", "GlobalSearch", "Query", "Verdict"]
@@ -42,7 +42,11 @@ class GlobalSearch:
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
         self.local_maps = local_maps
         known = knowledge or Knowledge.of(base_map, config)
-        self.learned = None if known.learned is None else Learned(base_map, config, known.learned)
+        self.learned: Source | None = None
+        if known.learned is not None:
+            from coview_stream.learned_source import Learned
+
+            self.learned = Learned(base_map, config, known.learned)
         # together they name no more than can be registered in time
         peaks = config.consensus.peaks
         peaks = peaks if known.learned is None else min(peaks, config.learned.peaks)

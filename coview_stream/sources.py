@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig, Reloc
 from coview_stream.errors import MapError
+from coview_stream.extras import extra
 from coview_stream.place.consensus import Consensus, Hypothesis
 from coview_stream.place.descriptor import Descriptor, describe, ground_below
-from coview_stream.place.learned.network import Network
-from coview_stream.place.learned.votes import LearnedMap, View
 from coview_stream.place.retrieval import Retrieval
 from coview_stream.query import Query
+
+if TYPE_CHECKING:  # it brings half of SciPy along
+    from coview_stream.place.learned.votes import LearnedMap
 
 
 class Source(Protocol):
@@ -57,9 +59,12 @@ class Knowledge:
             MapError: learned features are asked for, and the map has none, or some of other weights.
         """
         features = base_map.learned if uses_learned(base_map, config.reloc) else None
-        learned = None if features is None else LearnedMap(features, base_map.stations, config.learned)
         retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
-        return cls(retrieval, learned)
+        if features is None:
+            return cls(retrieval, None)
+        from coview_stream.place.learned.votes import LearnedMap
+
+        return cls(retrieval, LearnedMap(features, base_map.stations, config.learned))
 
     def prepare(self) -> None:
         """Make now what would make the first query slow; raises :class:`CoViewError` if something is missing."""
@@ -89,11 +94,11 @@ def check_reloc(base_map: BaseMap, reloc: Reloc) -> None:
 
     Raises:
         MapError: the map has no learned features, or some of other weights. DependencyError: there is no onnxruntime.
-        InputError: there are no weights.
     """
     if uses_learned(base_map, reloc) and base_map.learned is not None:
         base_map.learned.check()
-        Network("ground", threads=1)
+        if find_spec("onnxruntime") is None:
+            extra("onnxruntime", "onnxruntime", "--reloc learned")  # its message
 
 
 class CoView:
@@ -133,42 +138,6 @@ class CoView:
     def clear(self) -> None:
         """Forget all votes."""
         self.consensus.clear()
-
-    def __len__(self) -> int:
-        """Return how many keyframes have voted."""
-        return len(self.consensus)
-
-
-class Learned:
-    """Votes by learned features; its peaks are made exact by keypoints of the newest keyframe that voted."""
-
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: LearnedMap) -> None:
-        self.config = config
-        self.learned = learned
-        peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
-        self.consensus = Consensus(base_map.stations, base_map.config.block, peaks)
-        self._view: View | None = None
-
-    def vote(self, query: Query) -> None:
-        """Compare what the ground network sees around the robot with the map's features."""
-        if len(query.surroundings) < self.config.keyframe.min_points:
-            return
-        centre = query.position.copy()
-        centre[2] = ground_below(query.surroundings, query.position)
-        self._view = self.learned.view(query.surroundings, centre)
-        self.consensus.vote(centre, {"learned": self.learned.distances(self._view)})
-
-    def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks, each moved to where keypoints agree."""
-        found = [replace(each, learned=True) for each in self.consensus.hypotheses()]
-        if self._view is None or not self.config.learned.sharpen:
-            return found
-        return self.learned.sharpened(found, self._view)
-
-    def clear(self) -> None:
-        """Forget all votes."""
-        self.consensus.clear()
-        self._view = None
 
     def __len__(self) -> int:
         """Return how many keyframes have voted."""

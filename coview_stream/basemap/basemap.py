@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,9 @@ from coview_stream.basemap import store, tiles
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, map_preset
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry import Points
-from coview_stream.place.learned.feature_map import FeatureMap
+
+if TYPE_CHECKING:  # it brings half of SciPy along
+    from coview_stream.place.learned.feature_map import FeatureMap
 
 _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
 
@@ -126,7 +128,11 @@ class BaseMap:
     def learned(self) -> FeatureMap | None:
         """Learned features, if it was built with them; raises :class:`MapError` if they cannot be read."""
         parameters = self.parameters.get("learned")
-        return None if parameters is None else FeatureMap(self._arrays, parameters)
+        if parameters is None:
+            return None
+        from coview_stream.place.learned.feature_map import FeatureMap
+
+        return FeatureMap(self._arrays, parameters)
 
     def crop(self, centre: npt.NDArray[np.float64], radius: float) -> tuple[Points, Points]:
         """Points and unit normals (K, 3) within ``radius`` metres of ``centre``, both relative to :attr:`origin`."""

@@ -136,8 +136,9 @@ class LearnedMap:
         sample = read[:: max(1, read.size // _SAMPLE)]
         sample = sample[np.isfinite(sample)]
         usual = np.median(sample) if len(sample) else np.float32(0.0)
-        read[~compared] = usual
-        return np.asarray(np.float32(1.0 + usual) - read, dtype=np.float32)
+        found: Volume = np.float32(1.0 + usual) - read
+        found[~compared] = 1.0
+        return found
 
     def sharpened(self, hypotheses: list[Hypothesis], view: View) -> list[Hypothesis]:
         """Move each hypothesis to where keypoints around it agree; where too few do, it stays."""

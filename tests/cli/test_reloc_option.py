@@ -1,0 +1,82 @@
+"""``--reloc`` of ``locate`` and ``serve``, and ``build --learned``, which it needs."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.store import load, save
+from coview_stream.cli import main, serve
+from coview_stream.errors import CoViewError
+from coview_stream.place.learned.network import network
+from coview_stream.stream.lane import ProcessLane
+
+
+def test_locate_names_the_remedy_on_a_map_without_features(world_file, tmp_path, capsys):
+    run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
+    assert main(["locate", str(world_file), str(run), "-o", str(out), "--reloc", "learned"]) == 2
+    said = capsys.readouterr().err
+    assert "'coview-stream build --learned'" in said
+    assert "--reloc coview" in said
+    assert said.count("\n") == 1
+
+
+def test_serve_does_so_too_before_it_opens_anything(world_file, capsys):
+    given = ["serve", str(world_file), "--robot", "r1", "--reloc", "learned", "--no-state", "--quiet"]
+    assert main(given) == 2
+    assert "'coview-stream build --learned'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("given", "wanted"), [([], "auto"), (["--reloc", "learned"], "learned")])
+def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
+    asked = []
+    monkeypatch.setattr(serve, "_serve", lambda options, stop: asked.append(options) or True)
+    assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
+    assert [options.reloc for options in asked] == [wanted]
+
+
+def test_it_travels_to_a_lanes_process(world_file):
+    """Which refuses what is none."""
+    lane = ProcessLane("search", str(world_file), "0" * 64, reloc="guesswork")
+    try:
+        lane.start()
+        with pytest.raises(CoViewError, match="'guesswork'"):
+            lane.wait_ready()
+    finally:
+        lane.close()
+
+
+def test_build_says_at_once_what_is_missing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    network.cache_clear()
+    scan = tmp_path / "not-even-looked-for.ply"
+    assert main(["build", str(scan), "-o", str(tmp_path / "site.coview"), "--learned"]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'onnxruntime'" in said
+    assert said.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def learned_file(map_cloud_file, tmp_path_factory):
+    path = tmp_path_factory.mktemp("learned") / "site.coview"
+    given = ["build", str(map_cloud_file), "-o", str(path), "--radius", "20", "--block-size", "4"]
+    assert main([*given, "--learned"]) == 0
+    return path
+
+
+def test_a_built_map_has_features_and_info_says_so(learned_file, capsys):
+    assert BaseMap.load(learned_file).learned is not None
+    assert main(["info", str(learned_file)]) == 0
+    assert "features of" in capsys.readouterr().out
+
+
+def test_of_other_weights_than_installed(learned_file, tmp_path, capsys):
+    arrays, parameters, _ = load(learned_file)
+    parameters["learned"]["weights"] = "0" * 64
+    save(tmp_path / "old.coview", arrays, parameters)
+    for reloc in ("auto", "learned"):
+        given = ["locate", str(tmp_path / "old.coview"), "run", "-o", str(tmp_path / "out"), "--reloc", reloc]
+        assert main(given) == 2
+        assert "build it again with 'coview-stream build --learned'" in capsys.readouterr().err
