@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from coview_stream.learn.net import VIEWS, OneView, PlaceNet
-from coview_stream.place.learned.bird_view import LAYERS
-from coview_stream.place.learned.network import CARD, OUTPUTS, weights_name
+from coview_stream.place.learned.bird_view import LAYERS, Image
+from coview_stream.place.learned.network import CARD, OUTPUTS, Features, weights_name
 
 _OPSET = 17
 _SAMPLE = 128  # cells of the image that is traced; all sizes that are multiples of 8 work
@@ -37,3 +38,16 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
     text = json.dumps(card, indent=1, sort_keys=True) + "\n"
     (directory / CARD).write_text(text)
     return written
+
+
+def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
+    """Return a network in training as what :class:`~.network.Network` is once it has been exported."""
+
+    def encode(image: Image) -> Features:
+        with torch.no_grad():
+            local, sigma, place = net(
+                torch.from_numpy(image[None].astype("float32") / 255.0), VIEWS.index(view)
+            )
+        return Features(local[0].numpy(), sigma[0, 0].numpy(), place[0].numpy())
+
+    return encode

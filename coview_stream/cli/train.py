@@ -1,0 +1,55 @@
+"""``coview-stream train``: train the encoders of learned re-localization anew, on simulated worlds."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+HELP = "train the networks of learned re-localization anew, on worlds that are simulated for it"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; the defaults are those of the weights in the package."""
+    parser.add_argument(
+        "out", type=Path, metavar="OUT", help="directory for the weights, card and training data"
+    )
+    parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (48)")
+    parser.add_argument(
+        "--first-world", type=int, default=10_000, metavar="SEED", help="their first seed (10000)"
+    )
+    parser.add_argument("--steps", type=int, metavar="N", help="batches of 24 queries (1200)")
+    parser.add_argument("--seed", type=int, default=0, help="of the weights' start and the batches (0)")
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes that simulate (2)")
+    parser.add_argument(
+        "--threads", type=int, default=0, metavar="N", help="threads that train (PyTorch's choice)"
+    )
+    parser.add_argument(
+        "--smoke",
+        action="store_true",
+        help="a minute's training of tiny networks, to see that all of it works",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate what is missing, train, write the weights and their card, and say how well they do."""
+    from coview_stream.learn.session import SMOKE, USUAL, train_session
+
+    plan = SMOKE if args.smoke else USUAL
+    card = train_session(
+        args.out,
+        plan.changed(args.worlds, args.steps, args.first_world, args.seed),
+        args.workers,
+        args.threads,
+        _say,
+    )
+    recall = card["validation"]
+    print(
+        f"{args.out}: right at once {recall['AR@1']:.2f}, among the best five {recall['AR@5']:.2f} of "
+        f"{recall['queries']} queries in {recall['worlds']} worlds of other seeds (chance {recall['chance']:.3f})"
+    )
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

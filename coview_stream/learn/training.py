@@ -1,0 +1,104 @@
+"""Training: batches through both encoders until the budget is spent; nothing here depends on what is in the worlds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from coview_stream.learn.batches import draw_batch
+from coview_stream.learn.dataset import WorldViews
+from coview_stream.learn.losses import Losses, losses
+from coview_stream.learn.net import VIEWS, PlaceNet
+from coview_stream.learn.training_config import TrainingConfig
+
+_WARM_UP = 30  # steps over which the learning rate rises
+_LAST = 0.01  # share of the learning rate at the end
+_GRADIENT = 5.0  # largest norm
+
+
+Report = Callable[[int, Losses], None]
+
+
+def train(
+    worlds: Sequence[WorldViews],
+    config: TrainingConfig,
+    report: Report | None = None,
+    checkpoint: Path | None = None,
+    every: int = 100,
+) -> PlaceNet:
+    """Train from scratch, or go on from ``checkpoint`` if that file is there; it is written ``every`` so many steps."""
+    torch.manual_seed(config.seed)
+    net: PlaceNet = PlaceNet(config.width)
+    net.to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(net.parameters(), config.rate, weight_decay=config.decay)
+    first = _restore(checkpoint, net, optimiser, config)
+    net.train()
+    for step in range(first, config.steps):
+        for group in optimiser.param_groups:
+            group["lr"] = config.rate * _schedule(step, config.steps)
+        found = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
+        optimiser.zero_grad()
+        found.total.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), _GRADIENT)
+        optimiser.step()
+        if report is not None:
+            report(step, found)
+        if checkpoint is not None and (step + 1) % every == 0:
+            _keep(checkpoint, net, optimiser, step + 1, config)
+    net.eval()
+    return net
+
+
+def _step(
+    net: PlaceNet, worlds: Sequence[WorldViews], config: TrainingConfig, rng: np.random.Generator
+) -> Losses:
+    batch = draw_batch(worlds, min(config.pieces, len(worlds)), config.each, rng)
+    encoded = [
+        net(_tensor(images), VIEWS.index(view))
+        for view, images in (("ground", batch.queries), ("aerial", batch.pieces))
+    ]
+    wrong = rng.uniform(math.radians(12), 2 * math.pi - math.radians(12), (len(batch.queries), config.wrong))
+    poses = torch.from_numpy(batch.poses).float()
+    wrong_yaws = torch.from_numpy(batch.poses[:, 2:] + wrong).float()
+    return losses(encoded[0], encoded[1], torch.from_numpy(batch.piece_of), poses, wrong_yaws)
+
+
+def _tensor(images: Any) -> torch.Tensor:
+    scaled = torch.from_numpy(images).float() / 255.0
+    return scaled.contiguous(memory_format=torch.channels_last)
+
+
+def _schedule(step: int, steps: int) -> float:
+    rise = min(1.0, (step + 1) / _WARM_UP)
+    return rise * (_LAST + (1 - _LAST) * 0.5 * (1 + math.cos(math.pi * step / steps)))
+
+
+def _keep(
+    path: Path, net: PlaceNet, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig
+) -> None:
+    partial = path.with_suffix(".part")
+    state = {
+        "net": net.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "step": step,
+        "config": asdict(config),
+    }
+    torch.save(state, partial)
+    partial.replace(path)
+
+
+def _restore(
+    path: Path | None, net: PlaceNet, optimiser: torch.optim.Optimizer, config: TrainingConfig
+) -> int:
+    if path is None or not path.is_file():
+        return 0
+    state = torch.load(path, weights_only=True)
+    net.load_state_dict(state["net"])
+    optimiser.load_state_dict(state["optimiser"])
+    return int(state["step"])

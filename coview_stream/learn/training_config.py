@@ -1,0 +1,30 @@
+"""How the encoders are trained, in numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coview_stream.config.checks import counts, positive
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How the encoders are trained.
+
+    ``steps`` batches of ``pieces`` maps (112 m) with ``each`` queries in every one; AdamW with a learning rate that
+    falls along a cosine from ``rate``. ``width`` is the encoder's channels at 1 m. ``wrong`` headings compete with each
+    query's true one.
+    """
+
+    steps: int = 1200
+    pieces: int = 8
+    each: int = 3
+    rate: float = 3e-3
+    decay: float = 1e-4
+    width: int = 24
+    wrong: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts(self, "steps", "pieces", "each", "width", "wrong")
+        positive(self, "rate", "decay")
