@@ -94,6 +94,15 @@ def test_the_relaxation_finds_what_was_planted(nodes, members, share):
     assert found.exact
 
 
+def test_the_relaxation_comes_near_the_largest_where_nothing_stands_out():
+    """The leading eigenvector alone, without the growing penalty, reaches 0.84 of it on average."""
+    reached = []
+    for seed in range(10):
+        weights = random_graph(60, 0.5, seed)
+        reached.append(len(relaxed(weights)) / len(maximum_clique(weights, 100_000)))
+    assert np.mean(reached) > 0.87
+
+
 def test_the_search_finds_what_was_planted_without_a_start():
     weights, chosen = planted(300, 25, 0.2, 5)
     found = largest(weights > 0, np.empty(0, dtype=np.int64), 20_000)

@@ -64,6 +64,9 @@ def test_consistency_is_what_it_says():
     assert weights[0, 1] == pytest.approx(np.exp(-(0.5**2) / (2 * CONFIG.spread**2)), rel=1e-5)
     assert weights[0, 2] == 0  # too close in the scan
     assert weights[0, 3] == 0  # 20 m against 25 m
+    close = np.array([[0.0, 0.0], [0.0, 2.5]]), np.array([[0.0, 0.0], [1.9, 0.0]])
+    assert not consistency(*close, CONFIG).any()  # too close in the map
+    assert not consistency(*close[::-1], CONFIG).any()  # in the scan
     z = np.array([0.0, 0.0, 0.0, 0.0])
     assert consistency(here, there, CONFIG, z, z + 7.0)[0, 1] == weights[0, 1]
     assert consistency(here, there, CONFIG, z, np.array([7.0, 8.5, 7.0, 7.0]))[0, 1] == 0
