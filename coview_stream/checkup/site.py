@@ -13,6 +13,9 @@ from coview_stream.errors import MapError
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
 
+_NETWORK = 0.1 * GB  # onnxruntime and what else is imported
+_SPECTRA = 100.0  # bytes per square metre, coarse features included
+
 
 def open_site(path: Path) -> tuple[BaseMap | None, Finding]:
     """Open a map, which reads all of it and compares its checksum; None if it cannot be used."""
@@ -58,4 +61,16 @@ def node_memory(base_map: BaseMap) -> float:
     volumes = (
         len(base_map) * config.sectors * 4 * (channels + 1)
     )  # one is held twice while it is put together
-    return LEAST_MEMORY + min(spectra, _CACHE_BYTES) + volumes
+    return LEAST_MEMORY + min(spectra, _CACHE_BYTES) + volumes + _learned_memory(base_map)
+
+
+def _learned_memory(base_map: BaseMap) -> float:
+    """Bytes that searching by learned features adds: libraries, the map's spectra as far as they are kept, volumes."""
+    features = base_map.learned
+    if features is None:
+        return 0.0
+    from coview_stream.config import LearnedConfig
+    from coview_stream.place.learned.coarse_map import KEPT_BYTES
+
+    spectra = min(features.tile_area * _SPECTRA, KEPT_BYTES)
+    return _NETWORK + spectra + 3 * len(base_map) * LearnedConfig().yaws * 4

@@ -9,8 +9,12 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.store import load, save
 from coview_stream.cli import main, serve
+from coview_stream.config import LocalizerConfig
+from coview_stream.decision import BY_FEATURES
 from coview_stream.errors import CoViewError
+from coview_stream.localizer import Localizer
 from coview_stream.place.learned.network import network
+from coview_stream.stream.jobs import SearchJob
 from coview_stream.stream.lane import ProcessLane
 
 
@@ -44,6 +48,19 @@ def test_it_travels_to_a_lanes_process(world_file):
         lane.start()
         with pytest.raises(CoViewError, match="'guesswork'"):
             lane.wait_ready()
+    finally:
+        lane.close()
+
+
+def test_a_search_in_its_own_process_uses_them(learned_file, world_drive):
+    base_map = BaseMap.load(learned_file)
+    localizer = Localizer(base_map, LocalizerConfig(reloc="learned"))
+    query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    lane = ProcessLane("search", str(learned_file), base_map.sha256, reloc="learned")
+    try:
+        lane.start()
+        lane.wait_ready()
+        assert lane.run(SearchJob("r1", 0, query)).evidence.reason.endswith(BY_FEATURES)
     finally:
         lane.close()
 

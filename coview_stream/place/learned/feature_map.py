@@ -76,6 +76,11 @@ class FeatureMap:
         return float(sum(int(tile.any(axis=-1).sum()) for tile in self._local) * LOCAL_CELL**2)
 
     @property
+    def tile_area(self) -> float:
+        """Square metres of all tiles."""
+        return len(self.index.tiles) * (TILE * LOCAL_CELL) ** 2
+
+    @property
     def tile_centres(self) -> npt.NDArray[np.float64]:
         """(T, 2) middles of the tiles, metres, map frame."""
         return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)

@@ -103,7 +103,7 @@ class LearnedMap:
     @property
     def dense(self) -> bool:
         """Whether the map is small enough to be searched all over."""
-        return len(self.features.index.tiles) * (TILE * LOCAL_CELL) ** 2 <= self.config.dense_area
+        return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
         """Load the network and make the map's spectra now, rather than at the first query."""
