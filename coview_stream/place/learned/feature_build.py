@@ -69,24 +69,25 @@ def _drawn(points: Points, low: npt.NDArray[np.int64], high: npt.NDArray[np.int6
     columns, rows = (-(-(high - low) // window)).tolist()
     views: Windows = {}
     for row in range(rows):
-        band = points[_within(points[:, 1], low[1] + row * window, window)]
+        band = points[_within(points[:, 1], low[1] + row * window, window, _DRAW_MARGIN)]
         for column in range(columns):
-            part = band[_within(band[:, 0], low[0] + column * window, window)]
+            part = band[_within(band[:, 0], low[0] + column * window, window, _DRAW_MARGIN)]
             corner = low + np.array([column, row]) * window
-            width, height = np.minimum(window, high - corner).tolist()
-            inside = ((part[:, :2] >= corner) & (part[:, :2] < corner + np.array([width, height]))).all(
-                axis=1
-            )
+            inside = _within(part[:, 0], corner[0], window) & _within(part[:, 1], corner[1], window)
             if inside.any():
-                shape = tuple((n + 2 * _DRAW_MARGIN) * _CELLS for n in (height, width))
-                whole = bird_view(part, corner - float(_DRAW_MARGIN), (shape[0], shape[1]))
+                width, height = np.minimum(window, high - corner).tolist()
+                shape = ((height + 2 * _DRAW_MARGIN) * _CELLS, (width + 2 * _DRAW_MARGIN) * _CELLS)
+                whole = bird_view(part, (corner - _DRAW_MARGIN).astype(np.float32), shape)
                 edge = _DRAW_MARGIN * _CELLS
                 views[column, row] = whole[:, edge:-edge, edge:-edge].copy()
     return views
 
 
-def _within(values: npt.NDArray[np.float32], begin: float, size: float) -> npt.NDArray[np.bool_]:
-    return np.asarray((values >= begin - _DRAW_MARGIN) & (values < begin + size + _DRAW_MARGIN))
+def _within(
+    values: npt.NDArray[np.float32], begin: np.int64, size: int, margin: int = 0
+) -> npt.NDArray[np.bool_]:
+    low, high = float(begin - margin), float(begin + size + margin)
+    return np.asarray((values >= low) & (values < high))
 
 
 def _with_margin(views: Windows, column: int, row: int, width: int, height: int, window: int) -> Image:
