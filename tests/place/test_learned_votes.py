@@ -9,8 +9,9 @@ import pytest
 from scipy import ndimage
 
 from coview_stream.config import ConsensusConfig, LearnedConfig
-from coview_stream.geometry import pose_from, rot_z, transform, wrap_angle, yaw_of
+from coview_stream.geometry import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.place.consensus import Consensus, Hypothesis
+from coview_stream.place.learned.feature_build import feature_arrays
 from coview_stream.place.learned.feature_map import FeatureMap, weights_sha256
 from coview_stream.place.learned.feature_tiles import TILE, packed, packed_sigma
 from coview_stream.place.learned.network import Features
@@ -176,6 +177,49 @@ def test_where_keypoints_do_not_agree_a_hypothesis_stays(planted, known):
     wrong = Hypothesis(at((-50.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
     beyond = Hypothesis(at((950.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
     assert known.sharpened([wrong, beyond], view) == [wrong, beyond]
+
+
+def pointwise(image):
+    """Stands in for both networks: descriptors are what is seen around a cell, the same at every heading."""
+    height, width = (n // 2 for n in image.shape[1:])
+    shown = image.reshape(len(image), height, 2, width, 2).mean(axis=(2, 4), dtype=np.float32)
+    local = ndimage.gaussian_filter(shown, (0, 1.0, 1.0)) - 30.0
+    local /= np.linalg.norm(local, axis=0)
+    edges = ndimage.gaussian_laplace(shown[-3], 1.0)
+    sigma = (0.2 + 2.0 * np.exp(-np.abs(edges) / 5.0)).astype(np.float32)
+    return Features(local, sigma, np.ones((8, height // 4, width // 4), dtype=np.float32))
+
+
+@pytest.mark.parametrize(
+    ("xy", "degrees"), [((5.6, -8.8), 100.0), ((5.6, -8.8), -57.0), ((6.0, -9.0), 90.0), ((6.0, -9.0), 0.0)]
+)
+def test_from_clouds_to_a_pose(map_points, monkeypatch, xy, degrees):
+    """Drawing, features, correlation, stations and keypoints mean the same by x, y and heading."""
+    monkeypatch.setattr("coview_stream.place.learned.feature_build.network", lambda *_: pointwise)
+    cloud, place, yaw = map_points.astype(np.float32), np.array([*xy, 0.0]), np.radians(degrees)
+    axis = np.arange(-31.0, 32.0, 2.0)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    stations = np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32)
+    known = LearnedMap(FeatureMap(*feature_arrays(cloud)), stations, LearnedConfig())
+    known.network = pointwise
+    centre = np.array([50.0, -8.0, 3.0])
+    near = cloud[np.hypot(*(cloud[:, :2] - place[:2]).T) < 29.0]
+    view = known.view(transform(inverse(at(xy, yaw, centre)), near).astype(np.float32), centre)
+
+    def errors(hypothesis):
+        gap = transform(hypothesis.T_map_odom, centre[None])[0] - place
+        return np.hypot(*gap[:2]), np.degrees(abs(wrap_angle(yaw_of(hypothesis.T_map_odom) - yaw)))
+
+    consensus = Consensus(stations, 2.0, ConsensusConfig())
+    consensus.vote(centre, {"learned": known.distances(view)})
+    metres, turn = errors(consensus.hypotheses()[0])
+    assert metres < 2.0
+    assert turn < 8.0
+    if degrees % 90 == 0:  # then cells lie on cells, and such simple descriptors are alike enough
+        rough = Hypothesis(at(place[:2] + np.array([1.5, -1.0]), yaw + np.radians(6), centre), 3, 4, -3.0)
+        metres, turn = errors(*known.sharpened([rough], view))
+        assert metres < 0.2
+        assert turn < 0.5
 
 
 def test_a_cloud_becomes_a_view(known):
