@@ -1,4 +1,4 @@
-"""Batches: pieces of maps, and what robots saw in them, turned and mirrored at random."""
+"""Batches: pieces of maps, and what robots saw in them, turned, mirrored and spoilt at random."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.learn.augment import augmented
 from coview_stream.learn.dataset import QUERY_CELLS, WorldViews
 from coview_stream.place.learned.bird_view import CELL, Image
 
 Floats = npt.NDArray[np.float64]
 
-PIECE = 224
-"""Cells of a piece of the map: 112 m."""
+PIECE = 272
+"""Cells of a piece of the map: 136 m."""
 
-_REACH = 24.0  # metres from a piece's middle at which queries may stand: their 30 m must lie on it
+_REACH = 36.0  # metres from a piece's middle at which queries may stand: their 30 m must lie on it
 _TURNED = 0.5  # share of the pieces that are turned by any angle, not only by quarters
 _NARROWED = 0.4  # share of the queries that lose what is beyond a random radius
 _CUT = 0.25  # share that lose a sector
@@ -41,15 +42,18 @@ class Batch:
     poses: Floats
 
 
-def draw_batch(worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator) -> Batch:
-    """Draw ``pieces`` maps of as many worlds, with ``each`` queries in every one."""
+def draw_batch(
+    worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator, spoil: bool = True
+) -> Batch:
+    """Draw ``pieces`` maps of as many worlds, with ``each`` queries in every one; ``spoil`` augments the images."""
     images, queries, owners, poses = [], [], [], []
     for owner, k in enumerate(rng.choice(len(worlds), pieces, replace=False)):
         world = worlds[int(k)]
         centre, chosen = _somewhere(world, each, rng)
         turn = rng.uniform(-np.pi, np.pi) if rng.random() < _TURNED else 0.5 * np.pi * rng.integers(4)
         mirrored = bool(rng.random() < 0.5)
-        images.append(_piece(world, centre, turn, mirrored))
+        piece = _piece(world, centre, turn, mirrored)
+        images.append(augmented(piece, True, rng) if spoil else piece)
         for index in chosen:
             x, y, yaw = world.poses[index]
             at = _rotated(np.array([x, y]) - centre, -turn)
@@ -58,7 +62,7 @@ def draw_batch(worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.ran
             if mirrored:
                 at, heading = at * (1.0, -1.0), -heading
             poses.append([*at, heading + quarter])
-            queries.append(image)
+            queries.append(augmented(image, False, rng) if spoil else image)
             owners.append(owner)
     return Batch(np.stack(images), np.stack(queries), np.array(owners), np.array(poses))
 

@@ -96,9 +96,9 @@ class PlaceNet(nn.Module):
     def _place(self, at4: Tensor) -> Tensor:
         """Generalised mean (GeM) under a round window about every cell, then a linear layer."""
         raised = at4.clamp(min=_LEAST).pow(self.power)
-        down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=len(self.window))
+        down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
         across = self.window.transpose(2, 3)
-        raised = functional.conv2d(down, across, padding=(0, PLACE_REACH), groups=len(self.window))
+        raised = functional.conv2d(down, across, padding=(0, PLACE_REACH), groups=4 * self.width)
         return functional.normalize(self.place(raised.clamp(min=1e-12).pow(1.0 / self.power)), dim=1)
 
 

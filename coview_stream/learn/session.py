@@ -71,8 +71,18 @@ SMOKE = Plan(
     worlds=3,
     validation=1,
     most=16,
-    recipe=Recipe(built=0.0, size=(120.0, 120.0), submaps=16, sensors=("os64",), slope=(0.0, 10.0)),
-    training=TrainingConfig(steps=40, pieces=3, each=4, width=8, wrong=1),
+    recipe=Recipe(
+        built=0.0,
+        size=(120.0, 120.0),
+        submaps=16,
+        sensors=("os64",),
+        stems=(150.0, 400.0),
+        pulses=(5.0, 10.0),
+        slope=(0.0, 10.0),
+        travel=(3.0, 8.0),
+        rays=60_000,
+    ),
+    training=TrainingConfig(steps=100, pieces=3, each=4, width=8, wrong=1),
 )
 """A minute on two cores: whether everything works and something is learnt, not how well it can be."""
 

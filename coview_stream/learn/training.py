@@ -17,7 +17,7 @@ from coview_stream.learn.losses import Losses, losses
 from coview_stream.learn.net import VIEWS, PlaceNet
 from coview_stream.learn.training_config import TrainingConfig
 
-_WARM_UP = 30  # steps over which the learning rate rises
+_WARM_UP = 0.03  # share of the steps over which the learning rate rises
 _LAST = 0.01  # share of the learning rate at the end
 _GRADIENT = 5.0  # largest norm
 
@@ -75,7 +75,7 @@ def _tensor(images: Any) -> torch.Tensor:
 
 
 def _schedule(step: int, steps: int) -> float:
-    rise = min(1.0, (step + 1) / _WARM_UP)
+    rise = min(1.0, (step + 1) / max(1.0, _WARM_UP * steps))
     return rise * (_LAST + (1 - _LAST) * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
 
