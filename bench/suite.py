@@ -36,6 +36,7 @@ class Entry:
 SUITE = (
     Entry("kernels", "each kernel beside its NumPy twin"),
     Entry("match", "one query against all stations at all shifts, top-K"),
+    Entry("learned_match", "dense correlation and cliques of learned re-localization"),
     Entry("intake", "a frame: transform, filter, voxels, polar bins"),
     Entry("describe", "descriptor and co-visibility of a keyframe"),
     Entry("map_build", "descriptors of 10,000 stations", threads=(None,)),
@@ -55,6 +56,7 @@ OWN = {
     "accuracy": "errors, share localised and false fixes in held-out worlds",
     "ablation": "what each choice of the method is worth",
     "build_map": "seconds and memory of building a map",
+    "forest": "learned re-localization beside descriptors and canopy heights",
     "ground": "the ground filter on labelled LAS files",
     "tracking": "errors, covariance, loss and recovery while tracked",
     "stream": "robots over zenoh: rates, delays, attacks",
