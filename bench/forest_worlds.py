@@ -209,7 +209,7 @@ def frames_behind(way: Floats, end: int) -> list[int]:
     """Return frames of the last twelve metres, a quarter of a metre apart or more; the last one is ``end``."""
     chosen = [end]
     for k in range(end - 1, -1, -1):
-        if way[end] - way[k] > BEHIND:
+        if way[end] - way[k] > BEHIND + 1e-3:
             break
         if way[chosen[-1]] - way[k] >= _SPACING:
             chosen.append(k)
