@@ -22,7 +22,10 @@ def query_of(drive: Drive, config: LocalizerConfig) -> tuple[Query, Pose]:
     """
     told, truth = in_odometry(drive)
     keyframe = config.keyframe
-    parts = [thinned(cloud, T, keyframe) for cloud, T in zip(drive.clouds, told, strict=True)]
+    parts = [
+        thinned(cloud, T, keyframe) if len(cloud) else np.empty((0, 3), dtype=np.float32)
+        for cloud, T in zip(drive.clouds, told, strict=True)
+    ]
     steps = np.linalg.norm(np.diff(told[:, :3, 3], axis=0), axis=1)
     left = np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])  # metres still to drive from each frame on
     recent = [part for part, metres in zip(parts, left, strict=True) if metres < _SUBMAP]

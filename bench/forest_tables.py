@@ -31,6 +31,8 @@ STEPS = {
     "keypoints": "learned: keypoints and cliques at five places",
     "registration": "registration and verification of five places",
 }
+LEARNED = ("network", "correlation", "keypoints", "registration")
+"""What a search by learned features alone takes."""
 
 
 def right(answer: Answer, method: str, best: int) -> bool:
@@ -131,6 +133,8 @@ def times_table(answers: Sequence[Answer]) -> str:
     for step, words in STEPS.items():
         values = [answer["ms"][step] for answer in warm if step in answer["ms"]]
         rows.append([words, f"{np.median(values):.0f}" if values else NOTHING])
+    totals = [sum(answer["ms"][step] for step in LEARNED) for answer in warm]
+    rows.append(["learned, from the query's points to verified poses", f"{np.median(totals):.0f}"])
     return table(("median of a query", "ms"), rows)
 
 

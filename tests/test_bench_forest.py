@@ -94,6 +94,7 @@ def test_times_leave_a_maps_first_query_out():
     text = times_table([slow, answer([1.0]), answer([1.0])])
     assert "1000" not in text
     assert text.count(" 10 |") == len(forest_tables.STEPS)
+    assert cells(text, "learned, from")[1] == "40"
     assert " 1000 |" in times_table([slow])
 
 
