@@ -109,6 +109,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def command(options: argparse.Namespace) -> str:
+    """Say what was asked for, without the paths of a machine."""
+    if options.plot:
+        asked_for = "--plot DATA"
+    elif options.runs:
+        asked_for = "--runs" + " --quick" * options.quick
+    else:
+        asked_for = f"--seeds {options.seeds} --worlds {options.worlds} --queries {options.queries}"
+    return (
+        f"python -m bench.forest {asked_for}" + " --world" * bool(options.world) + " DIR" * len(options.world)
+    )
+
+
 def _measured(
     folder: Path, options: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], dict[str, str], list[str]]:
@@ -143,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = Path(kept) if kept else Path(tempfile.mkdtemp(prefix="coview-bench-"))
     say(f"worlds and answers are kept in {folder}")
     found, shown, troubles = _measured(folder / "forest", options)
-    note = f"Weights {weights()}, code {code()}, {time.strftime('%Y-%m-%d')}."
+    note = f"`{command(options)}`. Weights {weights()}, code {code()}, {time.strftime('%Y-%m-%d')}."
     for name, text in shown.items():
         print(f"\n{name}\n\n{text}")
     print(f"\n{note}")

@@ -124,12 +124,12 @@ def test_the_command_puts_its_tables_between_the_markers(tmp_path, capsys, plant
         f"<!-- table: forest {n} -->\nold\n<!-- end -->\n" for n in ("recall", "metric", "times")
     )
     page.write_text(f"before\n{places}<!-- table: forest runs -->\nkept\n<!-- end -->\nafter\n")
-    assert forest.main(["--work", str(tmp_path), "--write", str(page)]) == 0
+    assert forest.main(["--work", str(tmp_path), "--write", str(page), "--quick"]) == 0
     text = page.read_text()
     assert text.startswith("before\n<!-- table: forest recall -->\n| AR@1 / AR@5, %")
     assert text.endswith("<!-- table: forest runs -->\nkept\n<!-- end -->\nafter\n")
     assert "old" not in text
-    assert text.count("Weights ") == 3
+    assert text.count("`python -m bench.forest --seeds 20000 --worlds 4 --queries 4`. Weights ") == 3
     assert "100 / 100" in capsys.readouterr().out
 
 
