@@ -99,9 +99,10 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
 
 
 def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
-    """Corresponding cells are alike and others are not, as far as sigma says that they can be told apart.
+    """Corresponding cells are alike and others are not; sigma learns how far they can be told apart.
 
-    A symmetric cross-entropy e over corresponding points, weighted e / s + log s with the points' mean sigma s.
+    A cross-entropy e over corresponding points, each way, and e / sigma + log sigma, in which e is given: it must not
+    get cheaper to call a cell uncertain than to describe it well.
     """
     count = len(poses)
     radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
@@ -114,10 +115,11 @@ def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) 
     near = (torch.cdist(here, here) < _TOO_NEAR) & ~torch.eye(_SAMPLES, dtype=torch.bool)
     similar = similar.masked_fill(near, _NO)
     wanted = torch.arange(_SAMPLES).expand(count, -1)
-    error = functional.cross_entropy(similar.transpose(1, 2), wanted, reduction="none")
-    error = 0.5 * (error + functional.cross_entropy(similar, wanted, reduction="none"))
-    sigma = 0.5 * (sigma_q + sigma_p)
-    return (error / sigma + sigma.log()).mean()
+    loss = torch.zeros(())
+    for logits, sigma in ((similar, sigma_q), (similar.transpose(1, 2), sigma_p)):
+        error = functional.cross_entropy(logits.transpose(1, 2), wanted, reduction="none")
+        loss = loss + 0.5 * (error + error.detach() / sigma + sigma.log()).mean()
+    return loss
 
 
 def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
