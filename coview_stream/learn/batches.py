@@ -21,6 +21,7 @@ _REACH = 36.0  # metres from a piece's middle at which queries may stand: their 
 _TURNED = 0.5  # share of the pieces that are turned by any angle, not only by quarters
 _NARROWED = 0.4  # share of the queries that lose what is beyond a random radius
 _CUT = 0.25  # share that lose a sector
+_WHOLE = 0.1  # share that are cut from the map: who was carried all around saw crowns whole as well
 _RADIUS = 30.0
 _TRIES = 50
 
@@ -57,7 +58,10 @@ def draw_batch(
         for index in chosen:
             x, y, yaw = world.poses[index]
             at = _rotated(np.array([x, y]) - centre, -turn)
-            image, quarter = _query(world.queries[index], mirrored, rng)
+            seen = world.queries[index]
+            if rng.random() < _WHOLE:
+                seen = _piece(world, world.poses[index, :2], yaw, False, QUERY_CELLS)
+            image, quarter = _query(seen, mirrored, rng)
             heading = yaw - turn
             if mirrored:
                 at, heading = at * (1.0, -1.0), -heading
@@ -87,9 +91,9 @@ def _somewhere(
     return centre, rng.choice(near, count, replace=len(near) < count)
 
 
-def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool) -> Image:
+def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size: int = PIECE) -> Image:
     """Cut a piece whose frame stands at ``centre``, turned: ``p_world = R(turn) p_piece + centre``."""
-    at = (np.arange(PIECE) + 0.5 - PIECE / 2) * CELL
+    at = (np.arange(size) + 0.5 - size / 2) * CELL
     x, y = np.meshgrid(at, -at if mirrored else at, indexing="xy")
     column = (np.cos(turn) * x - np.sin(turn) * y + centre[0] - world.corner[0]) / CELL
     row = (np.sin(turn) * x + np.cos(turn) * y + centre[1] - world.corner[1]) / CELL
@@ -109,7 +113,7 @@ def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Imag
     image = np.rot90(image, quarters, axes=(1, 2)).copy()
     at = (np.arange(QUERY_CELLS) + 0.5 - QUERY_CELLS / 2) * CELL
     distance = np.hypot(at[:, None], at[None])
-    hidden = distance > (rng.uniform(16.0, _RADIUS) if rng.random() < _NARROWED else _RADIUS)
+    hidden = distance > (rng.uniform(12.0, _RADIUS) if rng.random() < _NARROWED else _RADIUS)
     if rng.random() < _CUT:
         direction = np.arctan2(at[:, None], at[None]) - rng.uniform(-np.pi, np.pi)
         hidden |= np.abs((direction + np.pi) % (2 * np.pi) - np.pi) < rng.uniform(0.2, 1.0)
