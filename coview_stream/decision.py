@@ -63,6 +63,7 @@ class Decision:
             self._favourite = best
             self._confirmed += 1
             self._proof += max(0.0, best.evidence.score - self.config.acceptance.proof_floor)
+            self._proof += self._support(best, candidates, query)
             state, doubt = self._confirmation()
         if best.hypothesis.station is None:
             doubt += FROM_THERE
@@ -99,6 +100,13 @@ class Decision:
             for c in candidates
         )
         return voted or votes >= self.config.acceptance.confirmations
+
+    def _support(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
+        """Proof that the learned features add if they favour the same place, which they do not owe to its fit."""
+        rule = self.config.acceptance
+        here = (c for c in candidates if same_place(c.T_map_odom, best.T_map_odom, query))
+        lead = max((c.hypothesis.lead for c in here), default=0.0)
+        return rule.support * min(max(0.0, lead - rule.support_floor), rule.support_most)
 
     def _confirmation(self) -> tuple[State, str]:
         rule = self.config.acceptance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from coview_stream.basemap.basemap import BaseMap
@@ -34,6 +35,9 @@ class Learned:
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks, each moved to where keypoints agree."""
         found = [replace(each, learned=True) for each in self.consensus.hypotheses()]
+        if len(found) > 1:
+            lead = (found[1].score - found[0].score) / math.sqrt(len(self.consensus))
+            found[0] = replace(found[0], lead=lead)
         if self._view is None or not self.config.learned.sharpen:
             return found
         return self.learned.sharpened(found, self._view)

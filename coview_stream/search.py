@@ -100,7 +100,7 @@ class GlobalSearch:
         if suggested:
             self._trials.tried(self._refuted(suggested, candidates, query))
         self._remembered = [
-            replace(c.hypothesis, T_map_odom=c.T_map_odom)
+            replace(c.hypothesis, T_map_odom=c.T_map_odom, lead=0.0)
             for c in candidates[:_REMEMBERED]
             if c.evidence.score >= self.config.acceptance.score
         ]

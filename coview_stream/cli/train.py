@@ -14,11 +14,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="directory for the weights, card and training data"
     )
-    parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (48)")
+    parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (62)")
     parser.add_argument(
         "--first-world", type=int, default=10_000, metavar="SEED", help="their first seed (10000)"
     )
-    parser.add_argument("--steps", type=int, metavar="N", help="batches of 20 queries (900)")
+    parser.add_argument("--steps", type=int, metavar="N", help="batches of 20 queries (600)")
     parser.add_argument("--seed", type=int, default=0, help="of the weights' start and the batches (0)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes that simulate (2)")
     parser.add_argument(

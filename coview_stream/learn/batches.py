@@ -78,7 +78,7 @@ def _somewhere(
     best: tuple[Floats, npt.NDArray[np.intp]] | None = None
     for _ in range(_TRIES):
         centre = world.poses[rng.integers(len(world.poses)), :2] + rng.uniform(-0.7, 0.7, 2) * _REACH
-        near = np.flatnonzero(np.abs(world.poses[:, :2] - centre).max(axis=1) < _REACH)
+        near = np.flatnonzero(np.linalg.norm(world.poses[:, :2] - centre, axis=1) < _REACH)
         if best is None or len(near) > len(best[1]):
             best = centre, near
         if len(near) >= count:

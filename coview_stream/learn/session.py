@@ -36,7 +36,7 @@ class Plan:
         training: how the encoders are trained.
     """
 
-    worlds: int = 48
+    worlds: int = 62
     first: int = 10_000
     validation: int = 8
     most: int = 60

@@ -16,7 +16,7 @@ class TrainingConfig:
     query's true one.
     """
 
-    steps: int = 900
+    steps: int = 600
     pieces: int = 4
     each: int = 5
     rate: float = 3e-3

@@ -1,0 +1,75 @@
+"""What learned features that favour the same place add to a weak proof, and what they cannot do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coview_stream.config import AcceptanceConfig, LocalizerConfig
+from coview_stream.decision import Decision
+from coview_stream.fix import State
+from coview_stream.geometry import pose_from, rot_z
+from coview_stream.place.consensus import Hypothesis
+from coview_stream.pose.registration import Registration
+from coview_stream.pose.verification import Evidence
+from coview_stream.query import Query
+from coview_stream.refinement import Candidate
+
+RULE = AcceptanceConfig()
+NOTHING = np.empty((0, 3), dtype=np.float32)
+QUERY = Query(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
+HERE, ELSEWHERE = (pose_from(rot_z(-0.8), [x, 9.0, 0.5]) for x in (3.0, 40.0))
+WEAK = RULE.score + 0.03
+CLEAR = RULE.support_floor + RULE.support_most
+
+
+def candidate(score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0) -> Candidate:
+    hypothesis = Hypothesis(T_map_odom, 5, 2, -3.0, learned=True, lead=lead)
+    found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
+    return Candidate(hypothesis, found, Evidence(score, score, 1.0, 1.0, 0.9))
+
+
+def keyframes_needed(*candidates: Candidate) -> int | None:
+    """Keyframes of the same candidates, best first, until the first is accepted; None if 40 are not enough."""
+    decision = Decision(LocalizerConfig())
+    for count in range(1, 41):
+        if decision.judge(list(candidates), QUERY, count).accepted is not None:
+            return count
+    return None
+
+
+def test_clear_votes_shorten_a_weak_proof_but_not_the_confirmations() -> None:
+    alone = keyframes_needed(candidate(WEAK))
+    supported = keyframes_needed(candidate(WEAK, lead=CLEAR))
+    assert alone is not None
+    assert supported is not None
+    assert RULE.confirmations <= supported < 0.6 * alone
+    assert keyframes_needed(candidate(0.9, lead=100.0)) == RULE.confirmations
+
+
+@pytest.mark.parametrize("lead", [0.0, -1.0, RULE.support_floor])
+def test_votes_that_hardly_lead_add_nothing(lead: float) -> None:
+    assert keyframes_needed(candidate(WEAK, lead=lead)) == keyframes_needed(candidate(WEAK))
+
+
+def test_votes_for_another_place_add_nothing() -> None:
+    other = candidate(0.1, ELSEWHERE, lead=CLEAR)
+    assert keyframes_needed(candidate(WEAK), other) == keyframes_needed(candidate(WEAK))
+
+
+def test_votes_for_this_place_count_whoever_named_it_first() -> None:
+    twin = candidate(WEAK - 0.01, lead=CLEAR)
+    assert keyframes_needed(candidate(WEAK), twin) == keyframes_needed(candidate(WEAK, lead=CLEAR))
+
+
+def test_votes_never_make_a_place_true_that_does_not_fit() -> None:
+    assert keyframes_needed(candidate(RULE.score - 0.02, lead=100.0)) is None
+    assert keyframes_needed(candidate(WEAK, lead=100.0), candidate(WEAK - 0.05, ELSEWHERE)) is None
+
+
+def test_one_scan_alone_gains_nothing_by_votes() -> None:
+    decision = Decision(replace(LocalizerConfig(), stationary=True))
+    verdict = decision.judge([candidate(RULE.single_score - 0.02, lead=100.0)], QUERY, 1)
+    assert verdict.evidence.state is State.SEARCHING
