@@ -37,6 +37,7 @@ class Decision:
         self._favourite: Candidate | None = None
         self._confirmed = 0
         self._proof = 0.0
+        self._support = 0.0  # once: the votes of successive keyframes are largely the same
 
     def judge(self, candidates: list[Candidate], query: Query, votes: int) -> Verdict:
         """Take in a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
@@ -63,7 +64,7 @@ class Decision:
             self._favourite = best
             self._confirmed += 1
             self._proof += max(0.0, best.evidence.score - self.config.acceptance.proof_floor)
-            self._proof += self._support(best, candidates, query)
+            self._support = max(self._support, self._supported(best, candidates, query))
             state, doubt = self._confirmation()
         if best.hypothesis.station is None:
             doubt += FROM_THERE
@@ -101,8 +102,8 @@ class Decision:
         )
         return voted or votes >= self.config.acceptance.confirmations
 
-    def _support(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
-        """Proof that the learned features add if they favour the same place, which they do not owe to its fit."""
+    def _supported(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
+        """Return the proof that learned features add if they favour the same place, which they do not owe to its fit."""
         rule = self.config.acceptance
         here = (c for c in candidates if same_place(c.T_map_odom, best.T_map_odom, query))
         lead = max((c.hypothesis.lead for c in here), default=0.0)
@@ -112,8 +113,9 @@ class Decision:
         rule = self.config.acceptance
         if self.config.stationary:
             return State.TRACKING, "one scan, and it stands alone"
-        reason = f"confirmed by {self._confirmed} keyframes, proof {self._proof:.2f} of {rule.proof:.2f}"
-        enough = self._confirmed >= rule.confirmations and self._proof >= rule.proof
+        proof = self._proof + self._support
+        reason = f"confirmed by {self._confirmed} keyframes, proof {proof:.2f} of {rule.proof:.2f}"
+        enough = self._confirmed >= rule.confirmations and proof >= rule.proof
         return State.TRACKING if enough else State.AMBIGUOUS, reason
 
     def _agrees(self, best: Candidate, query: Query) -> bool:

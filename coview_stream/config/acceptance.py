@@ -17,9 +17,8 @@ class AcceptanceConfig:
     keyframes that agree within ``agree_distance`` and ``agree_angle``, none between them having found another place,
     and what its scores exceed ``proof_floor`` by adds up to ``proof``: weak evidence needs more driving. One frame
     alone (``stationary``) must reach ``single_score`` and ``single_lead``. Learned features that favour the same place
-    clearly add to its proof: ``support`` for each robust standard deviation (per square root of the keyframes) by which
-    their votes for it lead beyond ``support_floor``, up to ``support_most``. Seen by hand on seven runs of another
-    simulator: right places led by 1.3-2.8 once they came first, wrong ones by less than 0.8 but for one, 1.6.
+    clearly add to its proof, once: ``support`` for each robust standard deviation by which the mean keyframe's votes for
+    it have led, beyond ``support_floor`` and up to ``support_most``.
 
     Set by hand on few scans, with earlier forms of the score, and no command prints these figures: single scans of
     three real and two simulated sensors, where 86 right places led by 0.04-0.8, four wrong ones by 0.07 at most and
@@ -42,7 +41,7 @@ class AcceptanceConfig:
     confirmations: int = 3
     proof: float = 1.2
     proof_floor: float = 0.2
-    support: float = 0.1
+    support: float = 0.25
     support_floor: float = 0.8
     support_most: float = 2.0
     single_score: float = 0.45

@@ -31,8 +31,8 @@ class Hypothesis:
     """A coarse ``T_map_odom`` (4 x 4), with its station, shift and summed score (lower is better).
 
     Station and shift are None where no vote stands behind it: somebody suggested it. ``learned`` says that the votes
-    are those of learned features, and ``lead`` by how much they favour it over the next place, in robust standard
-    deviations per square root of the keyframes that voted; 0 where it is not the first.
+    are those of learned features, and ``lead`` by how much the mean keyframe's votes favour it over the next place, in
+    robust standard deviations; 0 where it is not the first.
     """
 
     T_map_odom: Pose
