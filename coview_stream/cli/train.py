@@ -1,4 +1,7 @@
-"""``coview-stream train``: train the encoders of learned re-localization anew, on simulated worlds."""
+"""``coview-stream train``: train the encoders of learned re-localization anew, on simulated worlds.
+
+Two cores take about an hour: a third to simulate, the rest to train, and 2 GB. One that was interrupted goes on.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,9 @@ import argparse
 import sys
 from pathlib import Path
 
-HELP = "train the networks of learned re-localization anew, on worlds that are simulated for it"
+HELP = (
+    "train the networks of learned re-localization anew, on worlds that are simulated for it; about an hour"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,11 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="directory for the weights, card and training data"
     )
-    parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (62)")
+    parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (62; smoke: 3)")
     parser.add_argument(
         "--first-world", type=int, default=10_000, metavar="SEED", help="their first seed (10000)"
     )
-    parser.add_argument("--steps", type=int, metavar="N", help="batches of 20 queries (600)")
+    parser.add_argument("--steps", type=int, metavar="N", help="batches to train on (600; smoke: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the weights' start and the batches (0)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes that simulate (2)")
     parser.add_argument(

@@ -18,6 +18,7 @@ _PLACE_TEMPERATURE = 0.08
 _SAMPLES = 128  # corresponding points of a query and its map
 _TOO_NEAR = 2.5  # metres: other points within are neither right nor wrong
 _SAME_PLACE = 12.0  # metres: likewise for global descriptors
+_LEAST_SIGMA = 0.05
 _NO = -1e4
 
 
@@ -39,7 +40,14 @@ class Losses:
 Encoded = tuple[Tensor, Tensor, Tensor]
 
 
-def losses(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, wrong_yaws: Tensor) -> Losses:
+def losses(
+    query: Encoded,
+    piece: Encoded,
+    piece_of: Tensor,
+    poses: Tensor,
+    wrong_yaws: Tensor,
+    seen: tuple[Tensor, Tensor],
+) -> Losses:
     """Compare Q encoded queries with G encoded pieces.
 
     Args:
@@ -48,11 +56,11 @@ def losses(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, wron
         piece_of: (Q,) the piece of each query.
         poses: (Q, 3) x, y (metres), heading (radians) in the piece's frame about its middle.
         wrong_yaws: (Q, N) headings that are wrong, radians: they compete too.
+        seen: (Q, 1, h, h) and (G, 1, H, H), 1 for local cells in which anything was seen, else 0.
     """
     dense, recall = dense_loss(query, piece, piece_of, poses, wrong_yaws)
-    return Losses(
-        dense, local_loss(query, piece, piece_of, poses), place_loss(query, piece, piece_of, poses), recall
-    )
+    local = local_loss(query, piece, piece_of, poses, seen)
+    return Losses(dense, local, place_loss(query, piece, piece_of, poses), recall)
 
 
 def dense_loss(
@@ -98,11 +106,13 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
     return target
 
 
-def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
+def local_loss(
+    query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]
+) -> Tensor:
     """Corresponding cells are alike and others are not; sigma learns how far they can be told apart.
 
     A cross-entropy e over corresponding points, each way, and e / sigma + log sigma, in which e is given: it must not
-    get cheaper to call a cell uncertain than to describe it well.
+    get cheaper to call a cell uncertain than to describe it well. Only points count that both have seen.
     """
     count = len(poses)
     radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
@@ -115,10 +125,13 @@ def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) 
     near = (torch.cdist(here, here) < _TOO_NEAR) & ~torch.eye(_SAMPLES, dtype=torch.bool)
     similar = similar.masked_fill(near, _NO)
     wanted = torch.arange(_SAMPLES).expand(count, -1)
+    both = (_at(seen[0], there)[..., 0] > 0.5) & (_at(seen[1][piece_of], here)[..., 0] > 0.5)
+    weight = both.float() / both.sum().clamp(min=1)
     loss = torch.zeros(())
     for logits, sigma in ((similar, sigma_q), (similar.transpose(1, 2), sigma_p)):
         error = functional.cross_entropy(logits.transpose(1, 2), wanted, reduction="none")
-        loss = loss + 0.5 * (error + error.detach() / sigma + sigma.log()).mean()
+        sigma = sigma.clamp(min=_LEAST_SIGMA)  # beyond the images it is 0
+        loss = loss + 0.5 * (weight * (error + error.detach() / sigma + sigma.log())).sum()
     return loss
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from coview_stream import __version__
 from coview_stream.config.checks import counts
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, InputError
 from coview_stream.extras import extra
 from coview_stream.learn.dataset import WorldViews, read_world, write_dataset
 from coview_stream.learn.recipe import Recipe
@@ -45,8 +46,11 @@ class Plan:
 
     def __post_init__(self) -> None:
         counts(self, "worlds", "validation", "most")
-        if self.first < 0 or set(self.seeds) & set(self.held_out):
-            raise ConfigError(f"first: worlds {self.first} to {self.seeds[-1]} are among those held out")
+        if self.first < 0 or self.seeds[-1] >= _HELD_OUT:
+            raise ConfigError(
+                f"worlds {self.first} to {self.seeds[-1]}: seeds from 0 to {_HELD_OUT - 1} may be trained on, those "
+                "beyond are held out"
+            )
 
     @property
     def seeds(self) -> range:
@@ -60,8 +64,8 @@ class Plan:
 
     def changed(self, worlds: int | None, steps: int | None, first: int, seed: int) -> Plan:
         """Return the plan with other numbers; None leaves one as it is."""
-        training = replace(self.training, steps=steps or self.training.steps, seed=seed)
-        return replace(self, worlds=worlds or self.worlds, first=first, training=training)
+        training = replace(self.training, steps=self.training.steps if steps is None else steps, seed=seed)
+        return replace(self, worlds=self.worlds if worlds is None else worlds, first=first, training=training)
 
 
 USUAL = Plan()
@@ -95,7 +99,8 @@ def train_session(
     Worlds that are in ``out / worlds`` already are not simulated again, and a training that was interrupted goes on.
 
     Raises:
-        ConfigError: a number is out of range. InputError: something cannot be written.
+        ConfigError: a number is out of range. InputError: something cannot be written, or what is there is of
+            another recipe or another training.
         DependencyError: PyTorch, ONNX or Open3D is not installed.
     """
     torch = extra("torch", "torch==2.13.0", "training")
@@ -113,6 +118,9 @@ def train_session(
         lambda seed, s: say(f"world {seed}: {s:.0f} s"),
     )
     worlds = [read_world(path) for path in paths]
+    for path, world in zip(paths, worlds, strict=True):
+        if world.recipe["recipe"] != json.loads(json.dumps(plan.recipe.to_dict())):
+            raise InputError(f"{path}: a world of another recipe; choose another folder, or delete it")
     history: list[list[float]] = []
 
     def report(step: int, found: Any) -> None:
@@ -131,6 +139,7 @@ def train_session(
         "torch": str(torch.__version__),
         "plan": asdict(plan),
         "data_sha256": _digest(paths[: plan.worlds]),
+        "threads": int(torch.get_num_threads()),
         "parameters": sum(p.numel() for p in net.parameters()),
         "loss": {"first": history[0][0], "last": float(np.mean([row[0] for row in history[-_EVERY:]]))}
         if history

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from coview_stream.errors import InputError
 from coview_stream.learn.batches import draw_batch
 from coview_stream.learn.dataset import WorldViews
 from coview_stream.learn.losses import Losses, losses
@@ -32,7 +34,11 @@ def train(
     checkpoint: Path | None = None,
     every: int = 100,
 ) -> PlaceNet:
-    """Train from scratch, or go on from ``checkpoint`` if that file is there; it is written ``every`` so many steps."""
+    """Train from scratch, or go on from ``checkpoint`` if that file is there; it is written ``every`` so many steps.
+
+    Raises:
+        InputError: the loss is not finite any more, or the checkpoint is none, or one of another configuration.
+    """
     torch.manual_seed(config.seed)
     net: PlaceNet = PlaceNet(config.width)
     net.to(memory_format=torch.channels_last)
@@ -42,7 +48,10 @@ def train(
     for step in range(first, config.steps):
         for group in optimiser.param_groups:
             group["lr"] = config.rate * _schedule(step, config.steps)
+        torch.manual_seed(config.seed + step)  # a training that is resumed goes on as if it had not stopped
         found = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
+        if not torch.isfinite(found.total):
+            raise InputError(f"step {step}: the loss is not finite; train with a lower rate")
         optimiser.zero_grad()
         found.total.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), _GRADIENT)
@@ -66,7 +75,14 @@ def _step(
     wrong = rng.uniform(math.radians(12), 2 * math.pi - math.radians(12), (len(batch.queries), config.wrong))
     poses = torch.from_numpy(batch.poses).float()
     wrong_yaws = torch.from_numpy(batch.poses[:, 2:] + wrong).float()
-    return losses(encoded[0], encoded[1], torch.from_numpy(batch.piece_of), poses, wrong_yaws)
+    seen = _seen(batch.queries), _seen(batch.pieces)
+    return losses(encoded[0], encoded[1], torch.from_numpy(batch.piece_of), poses, wrong_yaws, seen)
+
+
+def _seen(images: Any) -> torch.Tensor:
+    """Local cells (B, 1, H / 2, W / 2) in which anything but relief, which is filled in, was seen."""
+    anything = torch.from_numpy(images[:, :-1].any(axis=1, keepdims=True)).float()
+    return torch.nn.functional.max_pool2d(anything, 2)
 
 
 def _tensor(images: Any) -> torch.Tensor:
@@ -98,7 +114,15 @@ def _restore(
 ) -> int:
     if path is None or not path.is_file():
         return 0
-    state = torch.load(path, weights_only=True)
+    try:
+        state = torch.load(path, weights_only=True)
+        same = state["config"] == asdict(config)
+    except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        raise InputError(f"{path}: not the state of a training ({error}); delete it to start anew") from error
+    if not same:
+        raise InputError(
+            f"{path}: a training of other numbers; delete it to start anew, or choose another folder"
+        )
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     return int(state["step"])

@@ -27,4 +27,5 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         counts(self, "steps", "pieces", "each", "width", "wrong")
+        counts(self, "seed", least=0)
         positive(self, "rate", "decay")

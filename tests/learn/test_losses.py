@@ -12,6 +12,9 @@ from coview_stream.learn.losses import dense_loss, local_loss, place_loss, turn 
 CHANNELS, QUERY, PIECE = 8, 64, 112
 
 
+SEEN = torch.ones(4, 1, QUERY, QUERY), torch.ones(2, 1, PIECE, PIECE)
+
+
 def scene(seed: int) -> tuple[tuple, tuple, object, object]:
     """Two smooth random maps and four exact, turned looks at them."""
     torch.manual_seed(seed)
@@ -43,13 +46,29 @@ def test_true_poses_cost_least(error: tuple[float, float, float]) -> None:
     assert recall == 1.0
     assert lost < 0.5
     assert right < wrong
-    assert local_loss(query, piece, piece_of, poses) < local_loss(query, piece, piece_of, shifted)
+    assert local_loss(query, piece, piece_of, poses, SEEN) < local_loss(query, piece, piece_of, shifted, SEEN)
 
 
 def test_other_map_costs_more() -> None:
     query, piece, piece_of, poses = scene(1)
-    for loss in (place_loss, local_loss):
-        assert loss(query, piece, piece_of, poses) < loss(query, piece, 1 - piece_of, poses)
+    other = 1 - piece_of
+    assert place_loss(query, piece, piece_of, poses) < place_loss(query, piece, other, poses)
+    assert local_loss(query, piece, piece_of, poses, SEEN) < local_loss(query, piece, other, poses, SEEN)
+
+
+def test_what_was_not_seen_costs_nothing() -> None:
+    query, piece, piece_of, poses = scene(2)
+    local = query[0].clone()
+    local[..., : QUERY // 2] = 0.0
+    spoilt = (local, *query[1:])
+    half = SEEN[0].clone()
+    half[..., : QUERY // 2 + 2] = 0.0
+    torch.manual_seed(0)
+    masked = local_loss(spoilt, piece, piece_of, poses, (half, SEEN[1]))
+    torch.manual_seed(0)
+    assert masked < 0.8 * local_loss(spoilt, piece, piece_of, poses, SEEN)
+    nothing = torch.zeros_like(half)
+    assert float(local_loss(query, piece, piece_of, poses, (nothing, SEEN[1]))) == 0.0
 
 
 def test_turning_is_counter_clockwise_from_columns_to_rows() -> None:
