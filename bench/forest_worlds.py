@@ -10,14 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.worlds import fingerprint, remembered
 from coview_stream.errors import InputError
-from coview_stream.geometry import Points, Pose, inverse, pose_from, transform
+from coview_stream.geometry import Points, Pose, inverse, pose_from
 from coview_stream.learn.recipe import Recipe
 from coview_stream.rotation import exp_so3
 
@@ -98,37 +97,14 @@ def _simulate(out: Path, seed: int, recipe: Recipe) -> dict[str, Any]:
     return {"kind": world.kind}
 
 
-class _Recorder:
-    """Notes what the making of a submap passes on: true poses, odometry, and each frame's points."""
-
-    def __init__(self) -> None:
-        self.true: Floats = np.empty((0, 4, 4))
-        self.told: Floats = self.true
-        self.clouds: list[Points] = []
-
-    def odometry(self, T_map_body: Floats, *rest: Any) -> Floats:
-        from coview_stream.sim.odometry import drifting_odometry
-
-        self.true, self.told = T_map_body, drifting_odometry(T_map_body, *rest)
-        self.clouds = []
-        return self.told
-
-    def transform(self, T: Pose, points: Points) -> Points:
-        self.clouds.append(points)
-        return transform(T, points)
-
-
 def _drives(world: Any, seed: int, recipe: Recipe) -> Iterator[Drive]:
-    from coview_stream.learn.worlds import submaps
+    from coview_stream.learn.worlds import drives
 
-    noted, rng = _Recorder(), np.random.default_rng([seed, _LEANING])
-    hooks: dict[str, Any] = {"drifting_odometry": noted.odometry, "transform": noted.transform}
-    with patch.multiple("coview_stream.learn.submaps", **hooks):
-        for sensor, submap in submaps(world, seed, recipe):
-            lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
-            leaning = pose_from(exp_so3(np.array([*lean, 0.0])), np.zeros(3))
-            odometry = leaning @ noted.told
-            yield Drive(sensor, submap.travelled, odometry, tuple(noted.clouds), noted.true[-1])
+    rng = np.random.default_rng([seed, _LEANING])
+    for sensor, frames in drives(world, seed, recipe):
+        lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
+        leaning = pose_from(exp_so3(np.array([*lean, 0.0])), np.zeros(3))
+        yield Drive(sensor, frames.travelled, leaning @ frames.odometry, frames.clouds, frames.truth[-1])
 
 
 def _write(file: Path, drives: list[Drive]) -> None:

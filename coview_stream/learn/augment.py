@@ -9,7 +9,7 @@ from coview_stream.place.learned.bird_view import CELL, LAYERS, Image
 _HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
 _TOP, _SEEN, _RELIEF = LAYERS - 3, LAYERS - 2, LAYERS - 1
 _CHANCE = 0.5  # of each change
-_FALLEN = 0.004  # disks per square metre at most: about every fifth tree of a dense stand
+_FALLEN = 0.004  # disks per square metre at most: 40 a hectare
 _RADII = (1.0, 2.5)  # metres
 
 
@@ -32,7 +32,7 @@ def augmented(image: Image, aerial: bool, rng: np.random.Generator) -> Image:
 
 
 def _fell(image: Image, rng: np.random.Generator) -> None:
-    """Clear disks as if trees were gone; the ground below is seen."""
+    """Clear disks of all that stands, as if trees were gone; where the ground was seen, and its relief, stay."""
     height, width = image.shape[1:]
     count = rng.poisson(rng.uniform(0.0, _FALLEN) * height * width * CELL**2)
     for row, column, radius in zip(

@@ -151,8 +151,12 @@ def write_dataset(
         # a forked Open3D may hang on the threads of its parent
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             jobs = {pool.submit(write, seed): seed for seed in missing}
-            for job in as_completed(jobs):
-                report(jobs[job], job.result())
+            try:
+                for job in as_completed(jobs):
+                    report(jobs[job], job.result())
+            except BaseException:  # Ctrl-C too: or all that wait would still be made before it counts
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
     return list(paths.values())
 
 

@@ -47,7 +47,25 @@ class Submap(NamedTuple):
     travelled: float
 
 
-def gather(
+class Frames(NamedTuple):
+    """What a robot saw along a drive, oldest first.
+
+    Attributes:
+        truth: (F, 4, 4) map <- sensor.
+        odometry: (F, 4, 4) odometry <- sensor, drifting.
+        clouds: (N, 3) of each frame, the sensor's axes, metres.
+        lean: (2,) roll and pitch by which the odometry's gravity is off, radians.
+        travelled: metres driven.
+    """
+
+    truth: Floats
+    odometry: Floats
+    clouds: tuple[Points, ...]
+    lean: Floats
+    travelled: float
+
+
+def scanned(
     rng: np.random.Generator,
     recipe: Recipe,
     caster: Caster,
@@ -55,7 +73,7 @@ def gather(
     path: Floats,
     sensor: str,
     porosity: float,
-) -> Submap:
+) -> Frames:
     """Drive a path (N, 2) over the ``ground`` with a sensor, to its end."""
     along, frames = _moments(rng, recipe, path, sensor)
     T = _poses(rng, recipe, path[along], _headings(path, rng)[along], ground)
@@ -68,17 +86,27 @@ def gather(
         offset=0.0,
     )
     odometry = drifting_odometry(T, config, rng)
-    newest = odometry[-1, :3, 3]
+    clouds = tuple(
+        lidar.scan(caster, true, int(frame), rng, porosity=porosity, noise=noise)
+        for frame, true in zip(frames, T, strict=True)
+    )
+    lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
+    return Frames(T, odometry, clouds, lean, (len(path) - 1) * STEP)
+
+
+def gathered(frames: Frames) -> Submap:
+    """Put a drive's frames together by its odometry."""
+    newest = frames.odometry[-1, :3, 3]
     parts = []
-    for frame, true, told in zip(frames, T, odometry, strict=True):
-        points = lidar.scan(caster, true, int(frame), rng, porosity=porosity, noise=noise)
-        points = transform(told, points) - newest.astype(np.float32)
+    for told, cloud in zip(frames.odometry, frames.clouds, strict=True):
+        points = transform(told, cloud) - newest.astype(np.float32)
         parts.append(points[(points[:, :2] ** 2).sum(axis=1) < RADIUS**2])
-    leaning = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
-    cloud = np.concatenate(parts) @ Rotation.from_rotvec([*leaning, 0.0]).as_matrix().T.astype(np.float32)
-    yaw = Rotation.from_matrix(T[-1, :3, :3] @ odometry[-1, :3, :3].T).as_euler("ZYX")[0]
-    x, y = T[-1, :2, 3]
-    return Submap(voxel_grid(cloud, VOXEL), np.array([x, y, yaw]), (len(path) - 1) * STEP)
+    leaning = Rotation.from_rotvec([*frames.lean, 0.0]).as_matrix()
+    cloud = np.concatenate(parts) @ leaning.T.astype(np.float32)
+    last = frames.truth[-1]
+    yaw = Rotation.from_matrix(last[:3, :3] @ frames.odometry[-1, :3, :3].T).as_euler("ZYX")[0]
+    x, y = last[:2, 3]
+    return Submap(voxel_grid(cloud, VOXEL), np.array([x, y, yaw]), frames.travelled)
 
 
 def _moments(

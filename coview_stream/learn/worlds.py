@@ -14,7 +14,7 @@ from coview_stream.geometry import Points
 from coview_stream.learn.paths import along_streets, between_trees
 from coview_stream.learn.recipe import Recipe
 from coview_stream.learn.stands import draw_stand, tags
-from coview_stream.learn.submaps import RADIUS, VOXEL, Submap, gather
+from coview_stream.learn.submaps import RADIUS, VOXEL, Frames, Submap, gathered, scanned
 from coview_stream.sim.airborne import Flight, airborne_scan
 from coview_stream.sim.caster import Caster
 from coview_stream.sim.mesh import Floats
@@ -119,16 +119,22 @@ def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str
     return voxel_grid(np.concatenate(strips), VOXEL), drawn
 
 
-def submaps(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Submap]]:
-    """Drive through the world ``recipe.submaps`` times; yields the sensor's name and what it gathered."""
+def drives(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Frames]]:
+    """Drive through the world ``recipe.submaps`` times; yields the sensor's name and its frames."""
     rng = np.random.default_rng([seed, _DRIVES])
     caster = Caster(world.now, threads=1, leaf_depth=recipe.draw(rng, "leaf_depth"))
     porosity = recipe.draw(rng, "ground_porosity")
     extent = world.size / 2 - RADIUS
-    scanned = partial(gather, rng, recipe, caster, world.ground, porosity=porosity)
+    drive = partial(scanned, rng, recipe, caster, world.ground, porosity=porosity)
     for k in range(recipe.submaps):
         sensor = recipe.sensors[k % len(recipe.sensors)]
         short = rng.random() < recipe.standing
         length = rng.uniform(0, min(3.0, recipe.travel[1])) if short else recipe.draw(rng, "travel")
         length = 0.0 if short and rng.random() < 0.5 else length
-        yield sensor, scanned(path=world.path(rng, extent, length), sensor=sensor)
+        yield sensor, drive(path=world.path(rng, extent, length), sensor=sensor)
+
+
+def submaps(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Submap]]:
+    """Yield what the frames of :func:`drives` are together."""
+    for sensor, frames in drives(world, seed, recipe):
+        yield sensor, gathered(frames)
