@@ -21,9 +21,10 @@ def extra(module: str, requirement: str, purpose: str) -> Any:
     """
     try:
         return import_module(module)
-    except ImportError as error:
+    except Exception as error:  # what is installed and does not fit raises what it likes
         library = module.partition(".")[0]
-        missing = "is not installed" if error.name == library else f"cannot be loaded ({error})"
+        absent = isinstance(error, ImportError) and error.name == library
+        missing = "is not installed" if absent else f"cannot be loaded ({error})"
         # not by our extra: pip would look for us in a registry, where a copy from elsewhere is not
         remedy = f"pip install '{requirement}'"
         raise DependencyError(f"{purpose}: {library.replace('_', '-')} {missing}; {remedy}") from error

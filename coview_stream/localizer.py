@@ -22,6 +22,7 @@ from coview_stream.pose.judgement import Judgement
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.query import Query
 from coview_stream.search import GlobalSearch
+from coview_stream.sources import Knowledge
 from coview_stream.suggestions import Suggestions
 from coview_stream.tracking import Tracker
 
@@ -45,13 +46,21 @@ class Localizer:
     """
 
     def __init__(
-        self, base_map: BaseMap, config: LocalizerConfig | None = None, local_maps: LocalMaps | None = None
+        self,
+        base_map: BaseMap,
+        config: LocalizerConfig | None = None,
+        local_maps: LocalMaps | None = None,
+        knowledge: Knowledge | None = None,
     ) -> None:
-        """Localize on a map; localizers of one thread may share ``local_maps``, its cache of crops."""
+        """Localize on a map; those of one thread may share ``local_maps``, its cache of crops, and ``knowledge``.
+
+        Raises:
+            MapError, InputError, DependencyError: ``config.reloc`` is ``learned``, and that cannot be used here.
+        """
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
-        self._search = GlobalSearch(base_map, self.config, self._local_maps)
+        self._search = GlobalSearch(base_map, self.config, self._local_maps, knowledge)
         self._generation = 0
         self.reset()
 

@@ -110,13 +110,13 @@ class GlobalSearch:
         return replace(verdict, travelled=query.travelled, generation=query.generation)
 
     def _voted(self, query: Query) -> list[Hypothesis]:
-        """Return what the sources name, and only once what both do: the exact one."""
+        """Return what the sources name, and only once what both do, if one of the two is exact: that one."""
         learned = [] if self.learned is None else self.learned.hypotheses()
         coview = [] if self.coview is None else self.coview.hypotheses()
         return [
             each
             for each in coview
-            if not any(same_place(each.T_map_odom, other.T_map_odom, query) for other in learned)
+            if not any(o.exact and same_place(each.T_map_odom, o.T_map_odom, query) for o in learned)
         ] + learned
 
     def _suggested(self, query: Query) -> list[Hypothesis]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Protocol
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import Channel, LocalizerConfig, Reloc
-from coview_stream.errors import MapError
-from coview_stream.extras import extra
+from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.place.consensus import Consensus, Hypothesis
-from coview_stream.place.descriptor import Descriptor, describe, ground_below
+from coview_stream.place.descriptor import Descriptor, describe, on_ground
 from coview_stream.place.retrieval import Retrieval
 from coview_stream.query import Query
+from coview_stream.reloc import check_reloc
 
 if TYPE_CHECKING:  # it brings half of SciPy along
     from coview_stream.place.learned.votes import LearnedMap
@@ -53,18 +52,23 @@ class Knowledge:
 
     @classmethod
     def of(cls, base_map: BaseMap, config: LocalizerConfig) -> Knowledge:
-        """Choose by ``config.reloc``; nothing is loaded yet.
+        """Choose by ``config.reloc``; the map's spectra are not made yet.
+
+        ``auto`` warns if the map has learned features that cannot be used, and goes without them.
 
         Raises:
-            MapError: learned features are asked for, and the map has none, or some of other weights.
+            MapError, InputError, DependencyError: as :func:`~coview_stream.reloc.check_reloc`.
         """
-        features = base_map.learned if uses_learned(base_map, config.reloc) else None
         retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
-        if features is None:
+        missing = check_reloc(base_map, config.reloc)
+        if missing is not None:
+            warnings.warn(missing, stacklevel=2)
+        if missing is not None or config.reloc == "coview" or base_map.learned is None:
             return cls(retrieval, None)
         from coview_stream.place.learned.votes import LearnedMap
 
-        return cls(retrieval, LearnedMap(features, base_map.stations, config.learned))
+        block = base_map.config.block
+        return cls(retrieval, LearnedMap(base_map.learned, base_map.stations, config.learned, block=block))
 
     def prepare(self) -> None:
         """Make now what would make the first query slow; raises :class:`CoViewError` if something is missing."""
@@ -72,33 +76,6 @@ class Knowledge:
             self.retrieval.prepare()
         if self.learned is not None:
             self.learned.prepare()
-
-
-def uses_learned(base_map: BaseMap, reloc: Reloc) -> bool:
-    """Whether learned features say where to look.
-
-    Raises:
-        MapError: they are asked for, and the map has none, or some that cannot be read.
-    """
-    if reloc == "learned" and base_map.learned is None:
-        raise MapError(
-            "the map has no learned features: build it again with 'coview-stream build --learned', or go without "
-            "them (--reloc coview)"
-        )
-    there = reloc != "coview" and base_map.learned is not None
-    return there and (reloc == "learned" or find_spec("onnxruntime") is not None)
-
-
-def check_reloc(base_map: BaseMap, reloc: Reloc) -> None:
-    """Say now what the first query would stumble on.
-
-    Raises:
-        MapError: the map has no learned features, or some of other weights. DependencyError: there is no onnxruntime.
-    """
-    if uses_learned(base_map, reloc) and base_map.learned is not None:
-        base_map.learned.check()
-        if find_spec("onnxruntime") is None:
-            extra("onnxruntime", "onnxruntime", "--reloc learned")  # its message
 
 
 class CoView:
@@ -122,9 +99,7 @@ class CoView:
         descriptor = self.base_map.descriptor_config
         if len(query.scan) < self.config.keyframe.min_points:
             return
-        centre = query.position.copy()
-        if descriptor.ground_zero:
-            centre[2] = ground_below(query.scan, query.position)
+        centre = on_ground(query.scan, query.position) if descriptor.ground_zero else query.position
         self.last_query = describe(query.scan, centre, descriptor)
         if self.config.consensus.mode == "single":
             self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)

@@ -47,6 +47,15 @@ def world_map(map_cloud_file):
 
 
 @pytest.fixture(scope="session")
+def learned_map(world_map):
+    """The same with features of the network in the package, whatever they are worth."""
+    from coview_stream.place.learned.feature_build import feature_arrays
+
+    arrays, parameters = feature_arrays(np.array(world_map.points))
+    return BaseMap({**world_map._arrays, **arrays}, {**world_map.parameters, "learned": parameters})
+
+
+@pytest.fixture(scope="session")
 def world_file(world_map, tmp_path_factory):
     """The same, saved; read only."""
     path = tmp_path_factory.mktemp("maps") / "site.coview"

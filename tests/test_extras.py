@@ -30,10 +30,18 @@ def test_what_cannot_be_loaded_says_why(tmp_path, monkeypatch):
         extra("broken_sums", "broken-sums", "sums")
 
 
+def test_what_does_not_fit_may_raise_what_it_likes(tmp_path, monkeypatch):
+    (tmp_path / "odd_sums.py").write_text("raise AttributeError('_ARRAY_API not found')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(DependencyError, match=r"odd-sums cannot be loaded \(_ARRAY_API not found\)"):
+        extra("odd_sums", "odd-sums", "sums")
+
+
 def test_remedies_are_what_our_extras_ask_for():
     root = Path(__file__).parents[1]
     sources = "".join(path.read_text() for path in (root / "coview_stream").rglob("*.py"))
     named = set(re.findall(r'extra\(f?"[^"]+", "([^"]+)"', sources))
-    assert {re.split("[><=]", name)[0] for name in named} == {"kiss-icp", "small-gicp", "rerun-sdk"}
+    libraries = {"kiss-icp", "small-gicp", "rerun-sdk", "onnxruntime", "onnx", "torch"}
+    assert {re.split("[><=]", name)[0] for name in named} == libraries
     project = (root / "pyproject.toml").read_text()
     assert all(f'"{name}"' in project for name in named)

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import small_world
 
-from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.decision import BY_FEATURES
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.fix import State
 from coview_stream.geometry import inverse, pose_from, transform, yaw_of
 from coview_stream.localizer import Localizer
-from coview_stream.place.learned.feature_build import feature_arrays
 from coview_stream.place.learned.votes import LearnedMap
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch
 from coview_stream.stream.engine import SearchEngine
 from coview_stream.stream.jobs import SearchJob
-
-
-@pytest.fixture(scope="module")
-def learned_map(world_map):
-    """The small world's map with features of the network in the package, whatever they are worth."""
-    arrays, parameters = feature_arrays(np.array(world_map.points))
-    return BaseMap({**world_map._arrays, **arrays}, {**world_map.parameters, "learned": parameters})
 
 
 def search_of(base_map, reloc="auto", **settings):
@@ -40,7 +33,7 @@ def knowing(monkeypatch, world_drive):
     local = pose_from(np.eye(3), -first[:3, 3]) @ first  # as the localizer has it, about its anchor
     T_map_local = world_drive.T_map_body[0] @ inverse(local)
 
-    def distances(self, view):
+    def distances(self, view, suggested):
         rng = np.random.default_rng(0)
         found = rng.normal(1.0, 0.1, (len(self.stations), self.config.yaws)).astype(np.float32)
         there = transform(T_map_local, view.centre[None])[0, :2]
@@ -74,12 +67,6 @@ def test_auto_asks_both_where_the_map_has_features(world_map, learned_map):
     assert (both.needs.descriptor, both.needs.reach) == (learned_map.descriptor_config, 30.0)
     assert coview_only.learned is None
     assert coview_only.needs.reach is None
-
-
-def test_auto_asks_for_no_features_without_onnxruntime(learned_map, monkeypatch):
-    monkeypatch.setattr("coview_stream.sources.find_spec", lambda name: None)
-    assert search_of(learned_map).learned is None
-    assert search_of(learned_map, "learned").learned is not None  # who asks for it is told what is missing
 
 
 def test_each_can_be_asked_alone(learned_map):
@@ -124,10 +111,22 @@ def test_what_the_descriptors_miss_features_find(learned_map, world_drive, knowi
     assert right(follow(localizer, world_drive), world_drive)
 
 
-def test_what_features_miss_the_descriptors_find(learned_map, world_drive, world_fixes):
-    """With networks that mean nothing: wrong places are named, registered and refused."""
+def test_what_features_miss_the_descriptors_find(learned_map, world_drive, world_fixes, monkeypatch):
+    """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
+    named = []
+
+    def distances(self, view, suggested):
+        found = np.random.default_rng(0).normal(1.0, 0.1, (len(self.stations), self.config.yaws))
+        away = np.hypot(*(self.stations[:, :2] - self.stations[:, :2].mean(axis=0)).T)
+        wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
+        found[wrong, np.arange(5) * 7] = -1.0
+        named.append(wrong)
+        return found.astype(np.float32)
+
+    monkeypatch.setattr(LearnedMap, "distances", distances)
     fixes = follow(Localizer(learned_map), world_drive)
     assert right(fixes, world_drive)
+    assert named
     states = [f.state for f in fixes]
     assert states.index(State.TRACKING) <= [f.state for f in world_fixes].index(State.TRACKING) + 2
 
@@ -137,10 +136,13 @@ def test_what_both_name_is_registered_once(learned_map, world_drive, knowing, mo
     search = localizer._search
     query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
     search.update(query)
-    best = search.learned.hypotheses()[0]
-    monkeypatch.setattr(search.learned, "hypotheses", lambda: [best])
-    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [best])
-    assert search._voted(query) == [best]
+    rough = search.learned.hypotheses()[0]
+    exact = replace(rough, exact=True)
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [rough])
+    monkeypatch.setattr(search.learned, "hypotheses", lambda: [exact])
+    assert search._voted(query) == [exact]
+    monkeypatch.setattr(search.learned, "hypotheses", lambda: [rough])
+    assert search._voted(query) == [rough, rough]  # neither is better, so neither makes way
 
 
 def test_too_few_points_are_no_vote(learned_map, world_drive):

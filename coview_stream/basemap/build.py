@@ -37,6 +37,11 @@ def build_arrays(
         MapError: no sources, too few points, or no ground to put stations on.
         DependencyError, InputError: learned features are asked for, and there is no onnxruntime or no weights.
     """
+    if config.learned:
+        from coview_stream.place.learned.network import VIEW_NAMES, network
+
+        for view in VIEW_NAMES:  # they may be missing, so ask before reading
+            network(view)
     if not paths:
         raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
     places = [path.resolve() for path in paths]

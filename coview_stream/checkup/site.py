@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.checkup.finding import Finding, from_error
 from coview_stream.checkup.machine import GB, LEAST_MEMORY
 from coview_stream.errors import MapError
+from coview_stream.reloc import check_reloc
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
 
 _NETWORK = 0.1 * GB  # onnxruntime and what else is imported
-_SPECTRA = 100.0  # bytes per square metre, coarse features included
+_SPECTRA = 80.0  # bytes per square metre
 
 
 def open_site(path: Path) -> tuple[BaseMap | None, Finding]:
@@ -39,6 +41,7 @@ def site_findings(base_map: BaseMap, size: int, available: int | None) -> Iterat
         yield Finding(
             "FAIL", "map stations", "none: nowhere to search", "build it again, from ground and walls"
         )
+    yield _features_finding(base_map)
     needed = node_memory(base_map)
     text = f"a node needs about {needed / GB:.1f} GB, and {size / GB:.2f} GB of page cache for the file"
     if available is not None and needed > available:
@@ -49,6 +52,15 @@ def site_findings(base_map: BaseMap, size: int, available: int | None) -> Iterat
         yield Finding("warn", "map memory", text, remedy)
     else:
         yield Finding("ok", "map memory", text)
+
+
+def _features_finding(base_map: BaseMap) -> Finding:
+    missing = check_reloc(base_map, "auto")
+    if missing is not None:
+        return replace(from_error("map features", missing), verdict="warn")
+    if base_map.learned is None:
+        return Finding("ok", "map features", "none: searches go by co-view descriptors")
+    return Finding("ok", "map features", f"{base_map.learned.bytes / 1e6:.1f} MB, of the installed networks")
 
 
 def node_memory(base_map: BaseMap) -> float:
@@ -65,12 +77,16 @@ def node_memory(base_map: BaseMap) -> float:
 
 
 def _learned_memory(base_map: BaseMap) -> float:
-    """Bytes that searching by learned features adds: libraries, the map's spectra as far as they are kept, volumes."""
-    features = base_map.learned
-    if features is None:
+    """Bytes that searching by learned features adds: libraries, the map's spectra as far as they are kept, volumes.
+
+    Coarse features and a query's scores fill the rectangle around the map, however little of it has points.
+    """
+    if check_reloc(base_map, "auto") is not None or base_map.learned is None:
         return 0.0
     from coview_stream.config import LearnedConfig
     from coview_stream.place.learned.coarse_map import KEPT_BYTES
 
-    spectra = min(features.tile_area * _SPECTRA, KEPT_BYTES)
-    return _NETWORK + spectra + 3 * len(base_map) * LearnedConfig().yaws * 4
+    features, config = base_map.learned, LearnedConfig()
+    spectra = min(features.box_area * _SPECTRA, KEPT_BYTES)
+    coarse = features.box_area / config.cell**2 * (2 * features.channels + 4 * config.yaws)
+    return _NETWORK + spectra + coarse + 3 * len(base_map) * config.yaws * 4

@@ -55,10 +55,6 @@ def run(args: argparse.Namespace) -> int:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     if args.learned is not None:
         options["learned"] = args.learned
-    if args.learned:
-        from coview_stream.place.learned.network import network
-
-        network("aerial")  # it may be missing, so ask before reading
     begin = time.perf_counter()
     base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
     base_map.save(args.output)

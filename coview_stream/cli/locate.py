@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.fix import Fix
     from coview_stream.offline import locate, summary, write
     from coview_stream.pose.gicp import library
-    from coview_stream.sources import check_reloc
+    from coview_stream.reloc import check_reloc
 
     lidar = _lidar(args.odometry, args.gravity)
     if args.registration == "gicp":
@@ -65,7 +65,9 @@ def run(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     base_map = BaseMap.load(args.map)
-    check_reloc(base_map, args.reloc)
+    missing = check_reloc(base_map, args.reloc)
+    if missing is not None:
+        print(f"{args.map}: {missing}", file=sys.stderr)
     quiet = not (args.progress or sys.stderr.isatty())
     with tqdm(desc="odometry", unit="frame", disable=quiet or lidar is None, leave=False) as bar:
 
@@ -81,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     config = LocalizerConfig(
         retrieval=RetrievalConfig(mode=args.retrieval),
         registration=RegistrationConfig(method=args.registration),
-        reloc=args.reloc,
+        reloc=args.reloc if missing is None else "coview",
     )
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
 

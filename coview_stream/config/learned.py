@@ -31,8 +31,9 @@ class LearnedConfig:
     sharpen: bool = True
 
     def __post_init__(self) -> None:
-        positive(self, "reach", "dense_area")
+        positive(self, "dense_area")
         require(5.0 <= self.reach <= 32.0, self, "reach", "5 to 32 m, half a query's image")
         require(self.cell in (1.0, 2.0, 4.0), self, "cell", "1, 2 or 4 m")
         counts(self, "yaws", least=4)
+        require(self.yaws <= 360, self, "yaws", "360 at most: memory and time grow with it")
         counts(self, "shortlist", "peaks")

@@ -12,14 +12,17 @@ import torch
 
 from coview_stream.learn.net import VIEWS, OneView, PlaceNet
 from coview_stream.place.learned.bird_view import LAYERS, Image
-from coview_stream.place.learned.network import CARD, OUTPUTS, Features, weights_name
+from coview_stream.place.learned.network import CARD, OUTPUTS, Features, file_sha256, weights_name
 
 _OPSET = 17
 _SAMPLE = 128  # cells of the image that is traced; all sizes that are multiples of 8 work
 
 
 def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
-    """Write one ONNX file per view and the card that says how they were made; a file is complete or not there."""
+    """Write one ONNX file per view and the card that says how they were made; a file is complete or not there.
+
+    The card also names the files' hashes, by which one view's weights are told from the other's.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     written = []
     for view, name in enumerate(VIEWS):
@@ -35,6 +38,7 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
         )  # fmt: skip
         partial.replace(path)
         written.append(path)
+    card = card | {"sha256": {path.name: file_sha256(path) for path in written}}
     text = json.dumps(card, indent=1, sort_keys=True) + "\n"
     (directory / CARD).write_text(text)
     return written

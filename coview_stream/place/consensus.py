@@ -32,7 +32,7 @@ class Hypothesis:
 
     Station and shift are None where no vote stands behind it: somebody suggested it. ``learned`` says that the votes
     are those of learned features, and ``lead`` by how much the mean keyframe's votes favour it over the next place, in
-    robust standard deviations; 0 where it is not the first.
+    robust standard deviations; 0 where it is not the first. ``exact`` says that keypoints have agreed on it.
     """
 
     T_map_odom: Pose
@@ -41,6 +41,7 @@ class Hypothesis:
     score: float
     learned: bool = False
     lead: float = 0.0
+    exact: bool = False
 
 
 @dataclass(frozen=True)

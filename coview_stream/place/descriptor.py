@@ -87,3 +87,8 @@ def ground_below(points: Points, position: npt.NDArray[np.float64]) -> float:
     order = np.lexsort((near[:, 2], key))
     _, first = np.unique(key[order], return_index=True)
     return float(np.median(near[order[first], 2]))
+
+
+def on_ground(points: Points, position: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return ``position`` (3,), but at the height of the ground below it: see :func:`ground_below`."""
+    return np.array([position[0], position[1], ground_below(points, position)])

@@ -58,6 +58,7 @@ class TrackEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, Localizer]] = {}
+        self._knowledge = Knowledge.of(base_map, self.config)  # once, however many robots
 
     def run(self, job: Job) -> FrameResult:
         """Take in one frame.
@@ -93,7 +94,7 @@ class TrackEngine:
     def _localizer(self, job: FrameJob) -> Localizer:
         epoch, localizer = self._robots.get(job.robot, (None, None))
         if localizer is None:
-            localizer = Localizer(self.base_map, self.config, self._local_maps)
+            localizer = Localizer(self.base_map, self.config, self._local_maps, self._knowledge)
         elif epoch != job.epoch:
             localizer.reset()
         self._robots[job.robot] = job.epoch, localizer
@@ -140,7 +141,7 @@ def open_engine(
 
     Raises:
         MapError: an unusable map, or another one than ``sha256`` says. DependencyError: no kiss-icp, or no small_gicp
-            where ``config`` wants it.
+            where ``config`` wants it. InputError, DependencyError: it wants learned features, which cannot be used.
     """
     if kind == "odometry":
         from coview_stream.odometry.engine import OdometryEngine

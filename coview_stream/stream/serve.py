@@ -13,7 +13,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import RegistrationMethod, Reloc
 from coview_stream.errors import MapError, TransportError
 from coview_stream.odometry.config import LidarOdometryConfig
-from coview_stream.sources import check_reloc
+from coview_stream.reloc import check_reloc
 from coview_stream.stream.apart import check_apart
 from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.keys import RobotKeys
@@ -81,8 +81,11 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     names = [k.robot for k in options.keys]
     begin = time.monotonic()
     base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
-    check_reloc(base_map, options.reloc)
-    path, method, reloc = str(options.map_path), options.registration, options.reloc
+    missing = check_reloc(base_map, options.reloc)
+    if missing is not None:
+        log.warning("%s: %s", options.map_path, missing)
+    path, method = str(options.map_path), options.registration
+    reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
     lanes = [
         track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
         search := ProcessLane(

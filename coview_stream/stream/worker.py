@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
 
     try:
         method = RegistrationConfig(method=argv[5])  # type: ignore[arg-type]  # any text; it checks
-        config = LocalizerConfig(registration=method, reloc=argv[6])  # type: ignore[arg-type]
+        config = LocalizerConfig(registration=method, reloc=argv[6])  # type: ignore[arg-type]  # likewise
         engine = open_engine(kind, map_path, sha256, config)
         if engine.kernels:
             warm_up(*engine.kernels)
@@ -35,7 +35,11 @@ def main(argv: list[str]) -> int:
         return 1
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
         pipe.send(("ready", None))
-        engine.prepare()
+        try:
+            engine.prepare()
+        except CoViewError as error:
+            pipe.send(("error", str(error)))
+            return 1
         pipe.send(("prepared", None))
         while True:
             pipe.send(attempt(engine, pipe.recv()))

@@ -125,5 +125,10 @@ def test_a_map(world_file, world_map, tmp_path):
         available: [f.verdict for f in site_findings(base_map, int(1e8), available)]
         for available in (None, int(1e6), int(node_memory(base_map) + 1e6), int(64e9))
     }
-    assert list(verdicts.values()) == [["ok", "ok"], ["ok", "FAIL"], ["ok", "warn"], ["ok", "ok"]]
+    assert list(verdicts.values()) == [
+        ["ok", "ok", "ok"],
+        ["ok", "ok", "FAIL"],
+        ["ok", "ok", "warn"],
+        ["ok", "ok", "ok"],
+    ]
     assert open_site(tmp_path / "none.coview")[1].verdict == "FAIL"

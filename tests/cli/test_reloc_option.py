@@ -71,7 +71,7 @@ def test_build_says_at_once_what_is_missing(tmp_path, monkeypatch, capsys):
     scan = tmp_path / "not-even-looked-for.ply"
     assert main(["build", str(scan), "-o", str(tmp_path / "site.coview"), "--learned"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'onnxruntime'" in said
+    assert "pip install 'onnxruntime>=1.18'" in said
     assert said.count("\n") == 1
 
 
@@ -93,7 +93,16 @@ def test_of_other_weights_than_installed(learned_file, tmp_path, capsys):
     arrays, parameters, _ = load(learned_file)
     parameters["learned"]["weights"] = "0" * 64
     save(tmp_path / "old.coview", arrays, parameters)
-    for reloc in ("auto", "learned"):
-        given = ["locate", str(tmp_path / "old.coview"), "run", "-o", str(tmp_path / "out"), "--reloc", reloc]
-        assert main(given) == 2
-        assert "build it again with 'coview-stream build --learned'" in capsys.readouterr().err
+    given = ["locate", str(tmp_path / "old.coview"), "run", "-o", str(tmp_path / "out"), "--reloc"]
+    assert main([*given, "learned"]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert "build it again with 'coview-stream build --learned'" in said[0]
+    assert main([*given, "auto"]) == 2  # there is no such run
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2
+    assert "going without learned features" in said[0]
+    assert "build it again with 'coview-stream build --learned'" in said[0]
+    assert "error: run" in said[1]
+    assert main([*given, "coview"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1

@@ -16,8 +16,9 @@ from live import until
 from robots import tracking
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.errors import CloudError, CoViewError
+from coview_stream.errors import CloudError, CoViewError, InputError
 from coview_stream.fix import State
+from coview_stream.stream import worker
 from coview_stream.stream.jobs import FrameJob
 from coview_stream.stream.lane import (
     CancelledError,
@@ -128,6 +129,33 @@ def test_a_map_that_cannot_be_opened(tmp_path):
     finally:
         lane.close()
     assert lane.pid is None
+
+
+def test_an_engine_that_cannot_prepare_says_why_each_time(monkeypatch):
+    """And the child ends: the next job starts another, which may do better."""
+
+    class Unprepared(Engine):
+        kernels = ()
+
+        def prepare(self):
+            raise InputError("ground.onnx: no weights of the ground network; train them")
+
+    monkeypatch.setattr("coview_stream.stream.engine.open_engine", lambda *given: Unprepared())
+    ended = []
+
+    def start(lane):
+        ours, theirs = socket.socketpair()
+        given = [str(theirs.detach()), "search", "unused", "0" * 64, "0", "trimmed-icp", "auto"]
+        threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
+        lane._pipe, lane._awaited = Connection(ours.detach()), ["ready", "prepared"]
+
+    monkeypatch.setattr(ProcessLane, "start", start)
+    lane = ProcessLane("search", "unused", "0" * 64)
+    for times in (1, 2):
+        with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):
+            lane.run(job())
+        until(lambda times=times: ended == [1] * times, 5.0)
+    lane.close()
 
 
 def test_a_map_that_was_replaced_is_named_each_time(world_file):

@@ -1,1 +1,1 @@
-"""Learned place recognition between a map seen from above and a robot's scan from below; NumPy and onnxruntime."""
+"""Learned place recognition, of a scan from below on a map from above, by NumPy, SciPy and onnxruntime."""

@@ -23,6 +23,9 @@ SLABS = (0.5, 1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 40.0)
 LAYERS = len(SLABS) + 2
 """One for each pair of bounds, then the greatest height, whether the ground was seen, and the ground's own relief."""
 
+BIRD_VIEW_VERSION = 1
+"""Raised when the same cloud is drawn differently: features of a map are of no use to queries drawn another way."""
+
 _LEVEL = 0.25  # metres: a layer counts how many of its levels are occupied, not points: those say how dense a scan is
 _GROUND_CELL = 2.0
 _SEEN = 0.4  # metres above the ground: what lies lower has been ground

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.errors import MapError
+from coview_stream.errors import InputError, MapError
+from coview_stream.place.learned.bird_view import BIRD_VIEW_VERSION
 from coview_stream.place.learned.feature_tiles import TILE, TileIndex, unpacked, unpacked_sigma
-from coview_stream.place.learned.network import LOCAL_CELL, shipped, weights_name
+from coview_stream.place.learned.network import LOCAL_CELL, VIEW_NAMES, file_sha256, weights_file
 
 Vectors = npt.NDArray[np.float32]
 """(C, H, W): row along y."""
@@ -40,7 +41,7 @@ class FeatureMap:
     """Reads the arrays ``learned.*`` of a base map, which may be memory-mapped.
 
     Attributes:
-        weights: sha256 of the network that made them.
+        weights: what :func:`weights_sha256` was of the networks that made them.
         place: (K, P) int8 global descriptors times 127.
         place_at: (K, 2) float32 where they were made, metres, map frame.
 
@@ -52,13 +53,17 @@ class FeatureMap:
         try:
             local, sigma, tiles, place, place_at = (arrays[f"learned.{name}"] for name in _NAMES)
             self.weights = str(parameters["weights"])
-            fits = local.shape[:3] == sigma.shape == (len(tiles), TILE, TILE) and len(place) == len(place_at)
+            fits = local.ndim == 4 and local.shape[:3] == sigma.shape == (len(tiles), TILE, TILE)
+            fits &= tiles.shape[1:] == (2,) and place.ndim == 2 and place_at.shape == (len(place), 2)
             if not fits or float(parameters["cell"]) != LOCAL_CELL:
                 raise ValueError("their shapes do not fit together")
-        except (KeyError, TypeError, ValueError) as error:
-            raise MapError(f"the map's learned features cannot be read ({error}); build it again") from error
+            self.index = TileIndex(tiles)
+        except (KeyError, TypeError, ValueError, IndexError, MemoryError) as error:
+            raise MapError(
+                f"the map's learned features cannot be read ({error}); build it again with "
+                "'coview-stream build --learned'"
+            ) from error
         self._local, self._sigma, self.place, self.place_at = local, sigma, place, np.array(place_at)
-        self.index = TileIndex(tiles)
 
     @property
     def channels(self) -> int:
@@ -79,6 +84,11 @@ class FeatureMap:
     def tile_area(self) -> float:
         """Square metres of all tiles."""
         return len(self.index.tiles) * (TILE * LOCAL_CELL) ** 2
+
+    @property
+    def box_area(self) -> float:
+        """Square metres of the rectangle around all tiles, which coarse features fill."""
+        return self.index.columns * self.index.rows * (TILE * LOCAL_CELL) ** 2
 
     @property
     def tile_centres(self) -> npt.NDArray[np.float64]:
@@ -114,11 +124,14 @@ class FeatureMap:
         """Refuse to compare these features with those of another network.
 
         Raises:
-            MapError: they were made by other weights than those in ``directory``, which are the package's.
+            MapError: they were made by other weights than those in ``directory`` (the package's), or of views that were
+                drawn another way. InputError: there are no weights.
         """
+        for view in VIEW_NAMES:
+            weights_file(view, directory)
         if weights_sha256(directory) != self.weights:
             raise MapError(
-                "the map's learned features are of other weights than the installed ones: build it again with "
+                "the map's learned features are of other weights than the installed ones; build it again with "
                 "'coview-stream build --learned', or go without them (--reloc coview)"
             )
 
@@ -132,6 +145,9 @@ def means(tile: npt.NDArray[np.int8], ratio: int) -> Vectors:
 
 @lru_cache(maxsize=4)
 def weights_sha256(directory: Path | None = None) -> str:
-    """Return the sha256 of the aerial network's weights; empty if there are none."""
-    path = (directory or shipped()) / weights_name("aerial")
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+    """Return the sha256 of both networks' weights and of how clouds are drawn; empty if a network has no weights."""
+    try:
+        parts = [file_sha256(weights_file(view, directory)) for view in VIEW_NAMES]
+    except InputError:
+        return ""
+    return hashlib.sha256("\n".join([*parts, str(BIRD_VIEW_VERSION)]).encode()).hexdigest()

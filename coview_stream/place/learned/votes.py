@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from coview_stream.place.learned.feature_map import FeatureMap
 from coview_stream.place.learned.feature_tiles import TILE
 from coview_stream.place.learned.keypoints import Keypoints, keypoints
 from coview_stream.place.learned.match_config import LearnedMatchConfig
-from coview_stream.place.learned.network import LOCAL_CELL, Features, Network
+from coview_stream.place.learned.network import LOCAL_CELL, Features, network
 from coview_stream.place.learned.sharpen import sharpen
 from coview_stream.place.learned.turning import coarser
 from coview_stream.place.retrieval import Volume
@@ -27,6 +28,9 @@ from coview_stream.place.retrieval import Volume
 _SIZE = 64.0
 """Metres along the edge of a query's image."""
 
+_STEEPEST = 1.0  # metres per metre that the ground rises along a storey
+_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away
+_ROUNDING = 1e-6  # cells
 _SAMPLE = 200_000  # numbers are enough for a median
 _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # what a tile's blocks have to reach from its middle, corners and all
 
@@ -61,10 +65,10 @@ class View:
 class LearnedMap:
     """All that searches of one map share: the map's features, ready to be searched, and the ground network.
 
-    Nothing is loaded before the first query, or :meth:`prepare`.
+    The features' spectra are not made before the first query, or :meth:`prepare`.
 
-    Raises:
-        MapError: the map's features were made by other weights than those in ``directory`` (the package's).
+    Attributes:
+        network: the ground encoder.
     """
 
     def __init__(
@@ -73,18 +77,22 @@ class LearnedMap:
         stations: npt.NDArray[np.float32],
         config: LearnedConfig,
         directory: Path | None = None,
+        *,
+        block: float = 2.0,
     ) -> None:
+        """Search the features of a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
+
+        Raises:
+            MapError: they were made by other weights than those in ``directory`` (the package's).
+            InputError: there are no weights, or some that cannot be loaded. DependencyError: no onnxruntime.
+        """
         features.check(directory)
         self.features = features
         self.stations = stations
         self.config = config
         self.match = LearnedMatchConfig(reach=config.reach)
-        self._directory = directory
-
-    @cached_property
-    def network(self) -> Network:
-        """The ground encoder; one thread is enough for 64 m."""
-        return Network("ground", self._directory, threads=1)
+        self._block = block
+        self.network = network("ground", directory, 1)  # one thread is enough for 64 m
 
     @cached_property
     def coarse(self) -> CoarseMap:
@@ -106,8 +114,8 @@ class LearnedMap:
         return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
-        """Load the network and make the map's spectra now, rather than at the first query."""
-        _ = self.network, self._everywhere
+        """Make the map's spectra now, rather than at the first query."""
+        _ = self._everywhere if self.dense else self.coarse
 
     def view(self, points: Points, centre: npt.NDArray[np.float64]) -> View:
         """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot."""
@@ -118,20 +126,17 @@ class LearnedMap:
         weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
         return View(features, weight, centre)
 
-    def distances(self, view: View) -> Volume:
+    def distances(self, view: View, suggested: npt.ArrayLike = ()) -> Volume:
         """(M, S) of all stations and headings, lower is more alike; shift n means yaw -2 pi n / S.
 
+        Where the map is too large to be searched all over, it is searched around ``suggested`` (N, 2) as well, metres.
         Their median is 1, which is also the distance where nothing was compared: it speaks neither for nor against.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
         query, weight = coarser(view.features.local, view.weight, ratio)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
-        blocks = self._everywhere if self.dense else self._alike(view)
-        scores = correlate(query, weight, self.coarse, yaws, blocks)
-        row, column = self.coarse.cell_of(self.stations[:, :2])
-        inside = (row >= 0) & (row < self.coarse.height) & (column >= 0) & (column < self.coarse.width)
-        read = np.full((len(self.stations), len(yaws)), -np.inf, dtype=np.float32)
-        read[inside] = scores.transpose(1, 2, 0)[row[inside], column[inside]]
+        blocks = self._everywhere if self.dense else self._alike(view, suggested)
+        read = self._at_stations(correlate(query, weight, self.coarse, yaws, blocks))
         compared = np.isfinite(read)
         sample = read[:: max(1, read.size // _SAMPLE)]
         sample = sample[np.isfinite(sample)]
@@ -139,6 +144,25 @@ class LearnedMap:
         found: Volume = np.float32(1.0 + usual) - read
         found[~compared] = 1.0
         return found
+
+    def _at_stations(self, scores: npt.NDArray[np.float32]) -> Volume:
+        """Best (M, K) of the scores (K, H, W) whose cells have their middle in a station's block, -inf off the map.
+
+        A block smaller than a cell has the score of the cell around its station.
+        """
+        grid = scores.transpose(1, 2, 0)
+        xy = (self.stations[:, :2].astype(np.float64) - self.coarse.corner) / self.coarse.cell
+        half = 0.5 * self._block / self.coarse.cell
+        first, last = (np.ceil(xy + side - 0.5 - _ROUNDING).astype(np.int64) for side in (-half, half))
+        first = np.where(last > first, first, np.floor(xy).astype(np.int64))
+        size = np.maximum(last - first, 1)
+        read = np.full((len(xy), grid.shape[2]), -np.inf, dtype=np.float32)
+        for right, down in product(*(range(int(n)) for n in size.max(axis=0, initial=0))):
+            column, row = (first + np.array([right, down])).T
+            inside = ((right, down) < size).all(axis=1) & (row >= 0) & (row < grid.shape[0])
+            inside &= (column >= 0) & (column < grid.shape[1])
+            read[inside] = np.maximum(read[inside], grid[row[inside], column[inside]])
+        return read
 
     def sharpened(self, hypotheses: list[Hypothesis], view: View) -> list[Hypothesis]:
         """Move each hypothesis to where keypoints around it agree; where too few do, it stays."""
@@ -157,15 +181,29 @@ class LearnedMap:
         found = sharpen(ours, theirs, (x, y, yaw_of(T)), self.match)
         if found is None:
             return hypothesis
+        z = self._ground(np.array([found.x, found.y]), np.array([x, y, z]))
         there = pose_from(rot_z(found.yaw), np.array([found.x, found.y, z]))
-        return replace(hypothesis, T_map_odom=there @ pose_from(np.eye(3), -centre))
+        return replace(hypothesis, T_map_odom=there @ pose_from(np.eye(3), -centre), exact=True)
 
-    def _alike(self, view: View) -> npt.NDArray[np.int64]:
-        """Blocks of the coarse map around the tiles whose global descriptors are most like the view's."""
+    def _ground(self, xy: npt.NDArray[np.float64], before: npt.NDArray[np.float64]) -> float:
+        """Height at ``xy`` (2,) of the storey that was at ``before`` (3,), metres; unchanged where it has none."""
+        away = np.hypot(*(self.stations[:, :2] - xy).T)
+        rise = np.abs(self.stations[:, 2] - before[2])
+        moved = float(np.hypot(*(xy - before[:2])))
+        same = np.flatnonzero((away <= 1.5 * self._block) & (rise <= _STEP + _STEEPEST * moved))
+        if not len(same):
+            return float(before[2])
+        nearest = same[np.lexsort((rise[same], np.round(away[same], 2)))[0]]
+        return float(self.stations[nearest, 2])
+
+    def _alike(self, view: View, suggested: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Blocks of the coarse map around suggestions, and around the tiles that look most like the view."""
         likeness = self.features.place.astype(np.float32) @ view.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
         found, number = np.unique(tile, axis=0, return_inverse=True)
         best = np.full(len(found), -np.inf, dtype=np.float32)
         np.maximum.at(best, number.reshape(-1), likeness)
         chosen = found[np.argsort(-best, kind="stable")[: self.config.shortlist]]
-        return self.coarse.blocks_near((chosen + 0.5) * (TILE * LOCAL_CELL), _TILE_RADIUS)
+        tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
+        near = np.vstack([tiles, np.asarray(suggested, dtype=np.float64).reshape(-1, 2)])
+        return self.coarse.blocks_near(near, _TILE_RADIUS)
