@@ -34,12 +34,10 @@ def test_keypoints_lie_in_the_middle_of_their_cells_best_first():
     sigma = np.ones((6, 8), np.float32)
     sigma[4, 2], sigma[1, 6] = 0.3, 0.2
     local = np.arange(2 * 6 * 8, dtype=np.float32).reshape(2, 6, 8)
-    height = np.arange(48.0).reshape(6, 8)
-    found = keypoints(local, sigma, (-32.0, 100.0), height=height, count=2)
+    found = keypoints(local, sigma, (-32.0, 100.0), count=2)
     np.testing.assert_allclose(found.xy, [[-32 + 6.5, 101.5], [-32 + 2.5, 104.5]])
     np.testing.assert_array_equal(found.sigma, sigma[[1, 4], [6, 2]])
     np.testing.assert_array_equal(found.descriptors, local[:, [1, 4], [6, 2]].T)
-    np.testing.assert_array_equal(found.z, [14, 34])
     assert len(keypoints(local, sigma, (0, 0), count=1)) == 1
     np.testing.assert_allclose(keypoints(local, sigma, (0, 0), count=1, cell=2.0).xy, [[13.0, 3.0]])
 
@@ -58,7 +56,6 @@ def test_keypoints_around_a_place():
     xy = np.array([[0.0, 0.0], [3.0, 4.0], [6.0, 8.0]])
     found = Keypoints(xy, np.zeros((3, 2), np.float32), np.ones(3, np.float32)).around((0, 0), 5.0)
     np.testing.assert_array_equal(found.xy, xy[:2])
-    assert found.z is None
 
 
 def test_shapes_that_do_not_belong_together_are_refused():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.geometry import wrap_angle
-from coview_stream.place.learned.alignment import align, weighted_median
+from coview_stream.place.learned.alignment import align
 from coview_stream.place.learned.clique import maximum_clique
 from coview_stream.place.learned.consistency import consistency
 from coview_stream.place.learned.keypoints import Keypoints
@@ -21,37 +21,28 @@ def turn(yaw):
 
 
 def paired(rng, count, share, noise=0.3):
-    """Pairs of points of which ``share`` are right; the pose (x, y, yaw, z), and which are."""
-    here, z = rng.uniform(-30, 30, (count, 2)), rng.uniform(-3, 3, count)
-    pose = (*rng.uniform(-500, 500, 2), rng.uniform(-np.pi, np.pi), rng.uniform(-5, 5))
+    """Pairs of points of which ``share`` are right; the pose (x, y, yaw), and which are."""
+    here = rng.uniform(-30, 30, (count, 2))
+    pose = (*rng.uniform(-500, 500, 2), rng.uniform(-np.pi, np.pi))
     right = np.arange(count) < round(share * count)
     there = here @ turn(pose[2]).T + rng.normal(0, noise, here.shape)
     there[~right] = rng.uniform(-30, 30, ((~right).sum(), 2))
-    above = np.where(right, z + rng.normal(0, 0.1, count), rng.uniform(-3, 3, count)) + pose[3]
-    return here, there + pose[:2], z, above, pose, right
+    return here, there + pose[:2], pose, right
 
 
 @pytest.mark.parametrize(("count", "share"), [(200, 0.1), (200, 0.2), (300, 0.05), (400, 0.05), (400, 0.2)])
-@pytest.mark.parametrize("heights", [True, False])
-def test_a_planted_pose_is_recovered_among_wrong_pairs(count, share, heights):
+def test_a_planted_pose_is_recovered_among_wrong_pairs(count, share):
     for seed in range(3):
-        here, there, z, above, pose, right = paired(np.random.default_rng(seed), count, share)
-        zs = (z, above) if heights else (None, None)
-        clique = maximum_clique(consistency(here, there, CONFIG, *zs), CONFIG.nodes)
+        here, there, pose, right = paired(np.random.default_rng(seed), count, share)
+        clique = maximum_clique(consistency(here, there, CONFIG), CONFIG.nodes)
         chosen = clique.members
         assert clique.exact
         assert right[chosen].mean() >= 0.9
         assert right[chosen].sum() >= 0.7 * right.sum()
-        found = align(
-            here[chosen], there[chosen], None, *(each if each is None else each[chosen] for each in zs)
-        )
+        found = align(here[chosen], there[chosen])
         assert np.hypot(found.x - pose[0], found.y - pose[1]) < 0.3
         assert abs(wrap_angle(found.yaw - pose[2])) < np.radians(1.0)
         assert found.rms < 0.8
-        if heights:
-            assert found.z == pytest.approx(pose[3], abs=0.1)
-        else:
-            assert found.z is None
 
 
 def test_consistency_is_what_it_says():
@@ -67,9 +58,6 @@ def test_consistency_is_what_it_says():
     close = np.array([[0.0, 0.0], [0.0, 2.5]]), np.array([[0.0, 0.0], [1.9, 0.0]])
     assert not consistency(*close, CONFIG).any()  # too close in the map
     assert not consistency(*close[::-1], CONFIG).any()  # in the scan
-    z = np.array([0.0, 0.0, 0.0, 0.0])
-    assert consistency(here, there, CONFIG, z, z + 7.0)[0, 1] == weights[0, 1]
-    assert consistency(here, there, CONFIG, z, np.array([7.0, 8.5, 7.0, 7.0]))[0, 1] == 0
     assert consistency(here[:0], there[:0], CONFIG).shape == (0, 0)
     with pytest.raises(ValueError, match="pairs of points"):
         consistency(here, there[1:], CONFIG)
@@ -77,10 +65,10 @@ def test_consistency_is_what_it_says():
 
 def test_alignment_is_exact_without_noise_and_follows_weights():
     rng = np.random.default_rng(0)
-    here, z = rng.uniform(-20, 20, (30, 2)), rng.uniform(-2, 2, 30)
+    here = rng.uniform(-20, 20, (30, 2))
     there = here @ turn(-2.5).T + (700.0, -90.0)
-    found = align(here, there, None, z, z - 4.0)
-    assert (found.x, found.y, found.yaw, found.z) == pytest.approx((700.0, -90.0, -2.5, -4.0))
+    found = align(here, there)
+    assert (found.x, found.y, found.yaw) == pytest.approx((700.0, -90.0, -2.5))
     assert found.residuals.max() < 1e-9
     there[:5] += 30.0
     weights = np.ones(30)
@@ -105,12 +93,6 @@ def test_too_little_to_align_is_refused():
             wrong()
 
 
-def test_the_weighted_median():
-    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.ones(3)) == 2.0
-    assert weighted_median(np.array([4.0, 1.0, 2.0, 3.0]), np.ones(4)) == 2.5
-    assert weighted_median(np.array([1.0, 2.0, 9.0]), np.array([1.0, 1.0, 5.0])) == 9.0
-
-
 def views(rng, pose, shared=40, own=160, alike=0.35, noise=0.3):
     """A query's and a map's keypoints: ``shared`` points with similar descriptors, ``own`` of each view alone."""
 
@@ -122,8 +104,8 @@ def views(rng, pose, shared=40, own=160, alike=0.35, noise=0.3):
     there[:shared] = here[:shared] @ turn(pose[2]).T + pose[:2] + rng.normal(0, noise, (shared, 2))
     one, other = unit(rng.normal(size=(len(here), 32))), unit(rng.normal(size=(len(there), 32)))
     other[:shared] = unit(one[:shared] + alike * rng.normal(size=(shared, 32)))
-    query = Keypoints(here, one, np.full(len(here), 0.5, np.float32), np.zeros(len(here)))
-    return query, Keypoints(there, other, np.full(len(there), 0.5, np.float32), np.full(len(there), 12.0))
+    query = Keypoints(here, one, np.full(len(here), 0.5, np.float32))
+    return query, Keypoints(there, other, np.full(len(there), 0.5, np.float32))
 
 
 @pytest.mark.parametrize("gated", [True, False])
@@ -140,7 +122,6 @@ def test_a_place_becomes_a_pose(seed, gated):
     assert found.inliers >= (20 if gated else 10)
     assert found.exact
     assert found.rms < 0.7
-    assert found.z == pytest.approx(12.0)
     assert found == sharpen(query, known, start, LearnedMatchConfig(gated=gated))
 
 
@@ -158,7 +139,7 @@ def test_a_mirror_image_is_no_match():
     pose = (0.0, 0.0, 0.0)
     query, known = views(np.random.default_rng(2), pose, own=0)
     assert sharpen(query, known, pose) is not None
-    mirrored = Keypoints(known.xy * (1.0, -1.0), known.descriptors, known.sigma, known.z)
+    mirrored = Keypoints(known.xy * (1.0, -1.0), known.descriptors, known.sigma)
     config = LearnedMatchConfig(gated=False, least_inliers=12, most_shift=50.0, most_turn=4.0)
     assert sharpen(query, known, pose, config) is not None
     assert sharpen(query, mirrored, pose, config) is None

@@ -13,13 +13,12 @@ F64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Alignment:
-    """``p_map = R(yaw) p_query + (x, y)``; ``z`` to add to the query's heights, None where heights are unknown."""
+    """``p_map = R(yaw) p_query + (x, y)``."""
 
     x: float
     y: float
     yaw: float
     """Radians in (-pi, pi]."""
-    z: float | None
     residuals: F64
     """(N,) metres, in the plane."""
 
@@ -29,21 +28,13 @@ class Alignment:
         return float(np.sqrt(np.mean(self.residuals**2)))
 
 
-def align(
-    query: F64,
-    known: F64,
-    weights: F64 | None = None,
-    query_z: F64 | None = None,
-    known_z: F64 | None = None,
-) -> Alignment:
-    """Weighted least squares in the plane; the height is the weighted median of the differences.
+def align(query: F64, known: F64, weights: F64 | None = None) -> Alignment:
+    """Weighted least squares in the plane.
 
     Args:
         query: (N, 2) metres.
         known: (N, 2) metres, the partners.
         weights: (N,) not negative, not all zero (all 1).
-        query_z: (N,) metres; without it or its partner, ``z`` is None.
-        known_z: (N,) metres.
 
     Raises:
         ValueError: fewer than 2 points, the sides differ in number, or no weight is left.
@@ -62,17 +53,4 @@ def align(
     turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
     x, y = other - turn @ middle
     missed = b - a @ turn.T
-    z = None
-    if query_z is not None and known_z is not None:
-        z = weighted_median(known_z - query_z, share)
-    return Alignment(float(x), float(y), yaw, z, np.hypot(missed[:, 0], missed[:, 1]))
-
-
-def weighted_median(values: F64, weights: F64) -> float:
-    """Return the value (N >= 1) below and above which lies half the weight; the mean of two where it falls between."""
-    order = np.argsort(values, kind="stable")
-    ordered, total = values[order], np.cumsum(weights[order])
-    half = 0.5 * total[-1]
-    low = int(np.searchsorted(total, half * (1 - 1e-12)))
-    high = int(np.searchsorted(total, half * (1 + 1e-12)))
-    return float(0.5 * (ordered[low] + ordered[min(high, len(ordered) - 1)]))
+    return Alignment(float(x), float(y), yaw, np.hypot(missed[:, 0], missed[:, 1]))

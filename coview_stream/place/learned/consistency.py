@@ -11,21 +11,13 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 
 
-def consistency(
-    query: F64,
-    known: F64,
-    config: LearnedMatchConfig,
-    query_z: F64 | None = None,
-    known_z: F64 | None = None,
-) -> F32:
+def consistency(query: F64, known: F64, config: LearnedMatchConfig) -> F32:
     """Weigh how well every two pairs of points agree: a turn about the vertical and a shift keep distances.
 
     Args:
         query: (N, 2) metres, the pairs' points in the scan.
         known: (N, 2) metres, the same pairs' points in the map.
         config: tolerances.
-        query_z: (N,) metres; heights are compared where both sides have them.
-        known_z: (N,) metres.
 
     Returns:
         (N, N) symmetric, 0 where two pairs contradict each other, lie too close together or are the same one, else
@@ -41,9 +33,6 @@ def consistency(
     apart = np.minimum(here, there) >= config.least_apart
     here -= there
     fits = apart & (np.abs(here) < config.tolerance)
-    if query_z is not None and known_z is not None:
-        rise = (query_z - known_z).astype(np.float32)
-        fits &= np.abs(rise[:, None] - rise[None]) < config.height_tolerance
     np.fill_diagonal(fits, False)
     here *= here
     here *= np.float32(-0.5 / config.spread**2)

@@ -12,18 +12,16 @@ F32 = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Keypoints:
-    """``xy`` (N, 2) metres, ``descriptors`` (N, C), ``sigma`` (N,); ``z`` (N,) metres where heights are known."""
+    """``xy`` (N, 2) metres, ``descriptors`` (N, C), ``sigma`` (N,)."""
 
     xy: npt.NDArray[np.float64]
     descriptors: F32
     sigma: F32
-    z: npt.NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.xy)
-        others = [self.descriptors, self.sigma] + ([] if self.z is None else [self.z])
-        if self.xy.shape != (count, 2) or any(len(each) != count for each in others):
-            shapes = ", ".join(str(each.shape) for each in (self.xy, *others))
+        shapes = [self.xy.shape, self.descriptors.shape, self.sigma.shape]
+        if shapes[0] != (count, 2) or any(shape[0] != count for shape in shapes):
             raise ValueError(f"keypoints of different numbers: {shapes}; xy has to be (N, 2)")
 
     def __len__(self) -> int:
@@ -32,8 +30,7 @@ class Keypoints:
 
     def where(self, chosen: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Keypoints:
         """Return those chosen by a mask (N,) or by indices."""
-        z = None if self.z is None else self.z[chosen]
-        return Keypoints(self.xy[chosen], self.descriptors[chosen], self.sigma[chosen], z)
+        return Keypoints(self.xy[chosen], self.descriptors[chosen], self.sigma[chosen])
 
     def around(self, xy: npt.ArrayLike, radius: float) -> Keypoints:
         """Return those within ``radius`` metres of ``xy`` (2,)."""
@@ -47,7 +44,6 @@ def keypoints(
     corner: npt.ArrayLike,
     *,
     mask: npt.NDArray[np.bool_] | None = None,
-    height: npt.NDArray[np.floating] | None = None,
     count: int | None = 200,
     cell: float = 1.0,
 ) -> Keypoints:
@@ -58,22 +54,20 @@ def keypoints(
         sigma: (H, W) uncertainty.
         corner: (2,) x and y of the lower corner of cell (0, 0), metres; the keypoints are in its frame.
         mask: (H, W) cells that may be keypoints, and be compared with (all).
-        height: (H, W) metres, to become the keypoints' z.
         count: None for all.
         cell: edge of a cell, metres.
 
     Raises:
         ValueError: the shapes do not belong to one image.
     """
-    for name, image in (("sigma", sigma), ("mask", mask), ("height", height)):
+    for name, image in (("sigma", sigma), ("mask", mask)):
         if image is not None and image.shape != local.shape[1:]:
             raise ValueError(f"{name} is {image.shape}, the descriptors are {local.shape}")
     row, col = np.nonzero(local_minima(sigma if mask is None else np.where(mask, sigma, np.inf)))
     order = np.argsort(sigma[row, col], kind="stable")[:count]
     row, col = row[order], col[order]
     xy = np.stack([col + 0.5, row + 0.5], axis=1) * cell + np.asarray(corner, dtype=np.float64)
-    z = None if height is None else height[row, col].astype(np.float64)
-    return Keypoints(xy, np.ascontiguousarray(local[:, row, col].T, dtype=np.float32), sigma[row, col], z)
+    return Keypoints(xy, np.ascontiguousarray(local[:, row, col].T, dtype=np.float32), sigma[row, col])
 
 
 def local_minima(values: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:

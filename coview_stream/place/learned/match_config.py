@@ -14,8 +14,8 @@ class LearnedMatchConfig:
 
     ``keypoints`` of least uncertainty describe a query; a pair is kept where each is among the other's ``nearest``
     (``mutual``) or one is among the other's, the ``pairs`` most similar of them. Two pairs agree where the distance
-    between their points differs by less than ``tolerance`` between the views (weight: a bell of width ``spread``) and
-    their heights, if known, by less than ``height_tolerance``; pairs less than ``least_apart`` away from each other
+    between their points differs by less than ``tolerance`` between the views (weight: a bell of width ``spread``);
+    pairs less than ``least_apart`` away from each other
     say nothing about the heading and do not count. The search for the largest consistent set gives up being exact
     after ``nodes`` branches. A match has at least ``least_inliers`` and lies within ``most_shift`` (metres) and
     ``most_turn`` (radians) of where it was sought; the query reaches ``reach`` metres around its middle.
@@ -30,7 +30,6 @@ class LearnedMatchConfig:
     pairs: int = 300
     tolerance: float = 1.0
     spread: float = 0.4
-    height_tolerance: float = 1.0
     least_apart: float = 2.0
     nodes: int = 2000
     least_inliers: int = 8
@@ -44,6 +43,4 @@ class LearnedMatchConfig:
         counts(self, "least_inliers", least=2)
         counts(self, "pairs", least=2)
         require(self.pairs <= 400, self, "pairs", "400 at most: the time grows with their square")
-        positive(
-            self, "tolerance", "spread", "height_tolerance", "least_apart", "most_shift", "most_turn", "reach"
-        )
+        positive(self, "tolerance", "spread", "least_apart", "most_shift", "most_turn", "reach")

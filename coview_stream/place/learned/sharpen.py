@@ -28,8 +28,6 @@ class Match:
     y: float
     yaw: float
     """Radians in (-pi, pi]."""
-    z: float | None
-    """To add to the query's heights, metres; None where heights are unknown."""
     inliers: int
     """Pairs of keypoints that agree with the pose."""
     exact: bool
@@ -66,7 +64,7 @@ def sharpen(
     if len(pairs) < config.least_inliers:
         return None
     left, right = query.where(pairs[:, 0]), near.where(pairs[:, 1])
-    clique = maximum_clique(consistency(left.xy, right.xy, config, left.z, right.z), config.nodes)
+    clique = maximum_clique(consistency(left.xy, right.xy, config), config.nodes)
     members = pairs[clique.members]
     while len(members) >= config.least_inliers:
         found = _aligned(query, near, members)
@@ -93,7 +91,7 @@ def _aligned(query: Keypoints, known: Keypoints, members: Pairs) -> Alignment:
     """Lay the members (P, 2) on each other, the certain ones more firmly."""
     left, right = query.where(members[:, 0]), known.where(members[:, 1])
     weights = 1.0 / (left.sigma.astype(np.float64) ** 2 + right.sigma.astype(np.float64) ** 2)
-    return align(left.xy, right.xy, weights, left.z, right.z)
+    return align(left.xy, right.xy, weights)
 
 
 def _close(found: Alignment, start: Start, config: LearnedMatchConfig) -> bool:
@@ -102,4 +100,4 @@ def _close(found: Alignment, start: Start, config: LearnedMatchConfig) -> bool:
 
 
 def _match(found: Alignment, inliers: int, exact: bool) -> Match:
-    return Match(found.x, found.y, found.yaw, found.z, inliers, exact, found.rms)
+    return Match(found.x, found.y, found.yaw, inliers, exact, found.rms)
