@@ -5,7 +5,8 @@ Without more words: worlds of the training simulator whose seeds were never trai
 query is asked of Scan Context, co-view context, both together, the correlation of canopy heights, the learned global
 descriptor, dense correlation, keypoints with cliques, and registration with verification (docs/forest.md says what the
 columns mean). ``--runs`` localizes whole runs, and runs on the map of another place. ``--plot`` asks for a real plot
-among real tiles. What is done stays in ``--work``: an interrupted benchmark goes on.
+among real tiles. ``--scale`` times a query on maps of 0.1 and 1 km2. What is done stays in ``--work``: an interrupted
+benchmark goes on.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.forest_common import say, weights
-from bench.worlds import fingerprint, remembered
+from bench.forest_common import code, on_disk, say, weights
+from bench.worlds import remembered
+from coview_stream.errors import CoViewError
 
 FIRST_SEED = 20_000
 """Nobody trains or tunes on the seeds from here on."""
@@ -31,22 +33,15 @@ RADIUS = 30.0
 
 PAGE = Path("docs/forest.md")
 
-_CODE = (
-    "coview_stream/place", "coview_stream/pose", "coview_stream/basemap", "coview_stream/config",
-    "coview_stream/refinement.py", "coview_stream/decision.py", "coview_stream/query.py", "coview_kernels",
-    "bench/forest_methods.py", "bench/forest_canopy.py", "bench/forest_query.py", "bench/forest_worlds.py",
-)  # fmt: skip
 _QUICK = 4  # queries of a world, and worlds
 
 
-def code() -> str:
-    """Hash of all that answers depend on but the weights."""
-    return fingerprint(*_CODE)
+def asked(folder: Path, name: str, place: Any, about: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+    """Answers to all queries of a place (a function that opens it), now or when the same was asked before.
 
-
-def asked(folder: Path, name: str, place: Any) -> list[dict[str, Any]]:
-    """Answers to all queries of a place (a function that opens it), now or when the same was asked before."""
-    spec = {"name": name, "weights": weights(), "code": code()}
+    ``about`` says what else they depend on: what lies in a folder, say.
+    """
+    spec = {"name": name, "weights": weights(), "code": code(), "radius": RADIUS, **(about or {})}
 
     def work() -> dict[str, Any]:
         from bench.forest_methods import Methods
@@ -71,19 +66,18 @@ def all_answers(folder: Path, options: argparse.Namespace) -> tuple[list[dict[st
     """Answers of all worlds, and what went wrong in which."""
     from bench.forest_worlds import drawn, recorded
 
-    jobs: list[tuple[str, Any]] = [
-        (f"drawn-{seed}-{options.queries}", lambda seed=seed: drawn(folder, seed, options.queries))
+    jobs: list[tuple[str, Any, dict[str, Any]]] = [
+        (f"drawn-{seed}-{options.queries}", lambda seed=seed: drawn(folder, seed, options.queries), {})
         for seed in range(options.seeds, options.seeds + options.worlds)
     ]
     for path in options.world:
-        # the name of a folder alone is not unique, and what lies in it may be made anew
-        stamp = int((path / "truth.tum").stat().st_mtime) if (path / "truth.tum").is_file() else 0
-        key = f"disk-{path.resolve().parent.name}-{path.name}-{stamp}-{options.queries}"
-        jobs.append((key, lambda path=path: recorded(path, options.queries)))
+        # the name of a folder alone is not unique
+        key = f"disk-{path.resolve().parent.name}-{path.name}-{options.queries}"
+        jobs.append((key, lambda path=path: recorded(path, options.queries), on_disk(path)))
     answers, troubles = [], []
-    for name, place in jobs:
+    for name, place, about in jobs:
         try:
-            answers += asked(folder, name, place)
+            answers += asked(folder, name, place, about)
         except Exception as error:  # the other worlds are still worth having; the exit code tells
             troubles.append(f"{name}: {type(error).__name__}: {error}")
             say(troubles[-1])
@@ -103,6 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--quick", action="store_true", help="four worlds, four queries each; one run")
     parser.add_argument("--runs", action="store_true", help="whole runs instead, and runs outside the map")
+    parser.add_argument("--scale", action="store_true", help="time one query on 0.1 and 1 km2 instead")
     parser.add_argument("--plot", type=Path, metavar="DATA", help="the real plot in DATA/forest_plot instead")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all answers")
     parser.add_argument("--write", type=Path, metavar="PAGE", help=f"put the tables into a page ({PAGE})")
@@ -113,6 +108,8 @@ def command(options: argparse.Namespace) -> str:
     """Say what was asked for, without the paths of a machine."""
     if options.plot:
         asked_for = "--plot DATA"
+    elif options.scale:
+        asked_for = "--scale"
     elif options.runs:
         asked_for = "--runs" + " --quick" * options.quick
     else:
@@ -131,6 +128,11 @@ def _measured(
 
         rows = measured(options.plot)
         return rows, {"forest plot": plot_table(rows)}, []
+    if options.scale:
+        from bench.forest_scale import scale_table, scaled
+
+        rows = list(scaled(folder))
+        return rows, {"forest scale": scale_table(rows)}, []
     if options.runs:
         from bench.forest_runs import all_runs, runs_table
 
@@ -143,7 +145,7 @@ def _measured(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, and write; exit code 1 if a world could not be asked."""
+    """Measure, print, and write; exit code 1 if a world could not be asked, 2 if nothing could be measured."""
     from bench.publish import filled
 
     options = _parser().parse_args(arguments)
@@ -155,7 +157,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     kept = options.work or os.environ.get("COVIEW_BENCH")
     folder = Path(kept) if kept else Path(tempfile.mkdtemp(prefix="coview-bench-"))
     say(f"worlds and answers are kept in {folder}")
-    found, shown, troubles = _measured(folder / "forest", options)
+    try:
+        found, shown, troubles = _measured(folder / "forest", options)
+    except CoViewError as error:
+        print(f"bench.forest: {error}", file=sys.stderr)
+        return 2
     note = f"`{command(options)}`. Weights {weights()}, code {code()}, {time.strftime('%Y-%m-%d')}."
     for name, text in shown.items():
         print(f"\n{name}\n\n{text}")

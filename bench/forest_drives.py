@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.forest_common import WORLDS
 from bench.worlds import fingerprint, remembered
 from coview_stream.learn.recipe import Recipe
 from coview_stream.sim import SimulationConfig
@@ -22,8 +23,6 @@ Floats = npt.NDArray[np.float64]
 
 _STAND = Recipe(built=0.0, size=(200.0, 200.0), slope=(0.0, 15.0), stems=(200.0, 600.0))
 _SPEED, _EVERY = 1.2, 2  # metres per second; of the sensor's frames
-_CODE = ("coview_stream/sim", "coview_stream/learn/worlds.py", "coview_stream/learn/stands.py",
-         "coview_stream/learn/paths.py", "coview_stream/learn/trees.py", "bench/forest_drives.py")  # fmt: skip
 _PATH = 7  # random stream
 
 
@@ -62,7 +61,7 @@ def world_of(folder: Path, run: Through) -> Path:
         DependencyError: Open3D cannot be loaded.
     """
     out = folder / run.name
-    spec = {"run": asdict(run), "code": fingerprint(*_CODE)}
+    spec = {"run": asdict(run), "code": fingerprint(*WORLDS)}
 
     def make() -> dict[str, Any]:
         from coview_stream.sim import simulate

@@ -12,41 +12,27 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.forest_canopy import Canopy, seen_from
+from bench.forest_chains import APART, Chain, distinct, of_places, of_volume
 from bench.forest_query import errors, local, query_of
 from bench.forest_worlds import Drive
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.decision import Decision
-from coview_stream.geometry import Pose, transform
+from coview_stream.geometry import Points, Pose, transform
 from coview_stream.place.consensus import Consensus, Hypothesis, standardised
 from coview_stream.place.descriptor import describe, ground_below
-from coview_stream.place.learned.votes import LearnedMap, View
-from coview_stream.place.retrieval import Retrieval
-from coview_stream.pose.registration import LocalMaps
-from coview_stream.pose.source import local_source
+from coview_stream.place.learned.votes import View
 from coview_stream.query import Query
-from coview_stream.refinement import Refinement
+from coview_stream.sources import Knowledge
 
 Floats = npt.NDArray[np.float64]
 
 METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "keypoints", "verified")
 """In the tables' order."""
 
-BEST = 5
-"""Places that each method names."""
-APART = 10.0
-"""Metres between two of them."""
+BASELINES = ("scan context", "co-view", "both", "canopy")
+"""Whose places are registered as well."""
 
-
-def distinct(xy: npt.NDArray[np.floating], score: npt.NDArray[np.floating], count: int = BEST) -> Floats:
-    """Return the best places (K, 2) of (N, 2), higher scores (N,) being better, 10 m or more apart, best first."""
-    at, left = np.asarray(xy, dtype=np.float64), np.array(score, dtype=np.float64)
-    found: list[Floats] = []
-    while len(found) < count and np.isfinite(left).any():
-        k = int(np.argmax(left))
-        found.append(at[k])
-        left[np.hypot(*(at - at[k]).T) < APART] = -np.inf
-    return np.array(found).reshape(-1, 2)
+Named = dict[str, list[Hypothesis]]
 
 
 class Methods:
@@ -58,20 +44,18 @@ class Methods:
         Raises:
             MapError: the map has no learned features, or some of other weights.
         """
-        usual = LocalizerConfig(reloc="learned")
-        alone = replace(usual.acceptance, confirmations=1, proof=1e-9)
+        usual = LocalizerConfig(reloc="auto")
         self.config = usual
         self.base_map = base_map
-        self._retrieval = Retrieval(base_map, usual.retrieval)
+        known = Knowledge.of(base_map, replace(usual, reloc="learned"))
+        retrieval = Knowledge.of(base_map, replace(usual, reloc="coview")).retrieval
+        if known.learned is None or retrieval is None:
+            raise ValueError("the map has no learned features")
+        self._learned, self._retrieval = known.learned, retrieval
+        self._learned.prepare()
         self._retrieval.prepare()
         self._canopy = Canopy(base_map.points)
-        features = base_map.learned
-        if features is None:
-            raise ValueError("the map has no learned features")
-        self._learned = LearnedMap(features, base_map.stations, usual.learned)
-        self._learned.prepare()
-        self._refinement = Refinement(base_map, usual, LocalMaps(base_map, usual.registration.source_range))
-        self._decision = Decision(replace(usual, acceptance=alone))
+        self._chain = Chain(base_map, usual)
 
     @property
     def chance(self) -> float:
@@ -85,34 +69,35 @@ class Methods:
         truth = local(truth, self.base_map.origin)
         robot = (truth @ query.T_odom_body)[:2, 3]
         clock = _Clock()
-        found = {**self._by_descriptors(query, clock), "canopy": self._by_canopy(query, clock)}
+        named = {**self._by_descriptors(query, clock), "canopy": self._by_canopy(query, clock)}
+        found = {name: _in_turn(hypotheses, query) for name, hypotheses in named.items()}
         answer: dict[str, Any] = {"sensor": drive.sensor, "travelled": drive.travelled, "chance": self.chance}
         more, metric = self._by_features(query, truth, clock)
         apart = {name: np.hypot(*(at - robot).T) for name, at in (found | more).items()}
         answer["off"] = {name: np.round(values, 2).tolist() for name, values in apart.items()}
+        moving = self._chain.source(query)
+        answer["chains"] = {name: self._chain.ask(named[name], moving, truth, query) for name in BASELINES}
         return answer | metric | {"ms": {name: round(1e3 * s, 1) for name, s in clock.seconds.items()}}
 
-    def _by_descriptors(self, query: Query, clock: _Clock) -> dict[str, Floats]:
-        stations = self.base_map.stations[:, :2]
+    def _by_descriptors(self, query: Query, clock: _Clock) -> Named:
         with clock("descriptors"):
-            centre = query.position.copy()
-            centre[2] = ground_below(query.scan, query.position)
+            centre = _on_ground(query.scan, query)
             volumes = self._retrieval.distances(describe(query.scan, centre, self.base_map.descriptor_config))
             both = standardised(volumes["scan_context"]) + standardised(volumes["coview"])
         named = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
-        return {name: distinct(stations, -volume.min(axis=1)) for name, volume in named.items()}
+        return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in named.items()}
 
-    def _by_canopy(self, query: Query, clock: _Clock) -> Floats:
+    def _by_canopy(self, query: Query, clock: _Clock) -> list[Hypothesis]:
         with clock("canopy"):
             xy, top = seen_from(query.surroundings, query.position)
-            score, _ = self._canopy.search(xy, top)
-        return distinct(self._canopy.places, score.ravel())
+            score, heading = self._canopy.search(xy, top)
+        centre = _on_ground(query.surroundings, query)
+        return of_places(self._canopy.places, score.ravel(), heading.ravel(), self.base_map.stations, centre)
 
     def _by_features(
         self, query: Query, truth: Pose, clock: _Clock
     ) -> tuple[dict[str, Floats], dict[str, Any]]:
-        centre = query.position.copy()
-        centre[2] = ground_below(query.surroundings, query.position)
+        centre = _on_ground(query.surroundings, query)
         with clock("network"):
             view = self._learned.view(query.surroundings, centre)
         with clock("correlation"):
@@ -127,10 +112,7 @@ class Methods:
         with clock("keypoints"):
             sharpened = self._learned.sharpened(voted, view)
         with clock("registration"):
-            moving = local_source(query.submap, query.position, self.config.registration)
-            candidates = self._refinement.refine(sharpened, moving, query)
-        self._decision.clear()
-        accepted = self._decision.judge(candidates, query, 1).accepted is not None
+            candidates = self._chain.register(sharpened, self._chain.source(query), query)
         verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in candidates]
         places = {
             "global": self._by_global_descriptor(view),
@@ -138,19 +120,20 @@ class Methods:
             "keypoints": _in_turn(sharpened, query),
             "verified": _in_turn(verified, query),
         }
-        metric: dict[str, Any] = {
-            "dense": errors(voted[0].T_map_odom, truth, query)[:2],
-            "before": errors(sharpened[0].T_map_odom, truth, query)[:2],
-            "after": errors(verified[0].T_map_odom, truth, query)[2:] if verified else None,
-            "score": candidates[0].evidence.score if candidates else 0.0,
-            "passes": bool(candidates) and candidates[0].evidence.score >= self.config.acceptance.score,
-            "accepted": accepted,
-        }
-        return places, metric
+        moved = not np.array_equal(sharpened[0].T_map_odom, voted[0].T_map_odom)
+        metric: dict[str, Any] = {"dense": errors(voted[0].T_map_odom, truth, query)[:2], "moved": moved}
+        return places, {**metric, **self._chain.metric(sharpened, candidates, truth, query)}
 
     def _by_global_descriptor(self, view: View) -> Floats:
         features = self._learned.features
-        return distinct(features.place_at, features.place.astype(np.float32) @ view.place)
+        likeness = features.place.astype(np.float32) @ view.place
+        return distinct(features.place_at, likeness)
+
+
+def _on_ground(points: Points, query: Query) -> Floats:
+    """Return the robot's position (3,), but on the ground that the points (N, 3) show below it; odometry frame."""
+    x, y, _ = query.position
+    return np.array([x, y, ground_below(points, query.position)])
 
 
 def _in_turn(hypotheses: list[Hypothesis], query: Query) -> Floats:

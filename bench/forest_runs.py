@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.forest_common import say, weights
+from bench.forest_common import WORLDS, code, on_disk, say, weights
 from bench.forest_drives import RUNS, shortened, world_of
 from bench.forest_tables import NEAR_DEGREES, NEAR_METRES
 from bench.forest_worlds import base_of
@@ -24,8 +24,6 @@ Floats = npt.NDArray[np.float64]
 Row = dict[str, Any]
 
 MODES: tuple[Reloc, ...] = ("coview", "learned", "auto")
-_SELF = ("bench/forest_runs.py", "bench/forest_drives.py")
-_MAPPER = ("coview_stream/basemap", "coview_stream/clouds", "coview_stream/place", "coview_kernels")
 _HEAD = (
     "run", "reloc", "driven m", "first fix m", "posed %", "after first %", "RMSE m", "RMSE deg", "false",
     "searching ms",
@@ -38,7 +36,7 @@ def map_of(world: Path) -> Path:
 
     out = world.with_name(f"{world.name}.coview")
     base = base_of(world)
-    spec = {"code": fingerprint(*_MAPPER), "weights": weights(), "bytes": base.stat().st_size}
+    spec = {"code": code(), "weights": weights(), **on_disk(world)}
 
     def make() -> dict[str, Any]:
         BaseMap.build(base, learned=True).save(out)
@@ -106,7 +104,7 @@ def all_runs(folder: Path, quick: bool, worlds: Sequence[Path]) -> tuple[list[Ro
         lambda run=run: world_of(folder, run) for run in few
     ]
     names = [path.name for path in worlds] or [run.name for run in few]
-    specs: list[Any] = [str(path) for path in worlds] or [asdict(run) for run in few]
+    specs: list[Any] = [on_disk(path) for path in worlds] or [asdict(run) for run in few]
     rows, troubles = [], []
     for k, name in enumerate(names):
         other = (k + 1) % len(names)
@@ -137,7 +135,7 @@ def _row(folder: Path, label: str, reloc: Reloc, world: Any, site: Any, outside:
         "reloc": reloc,
         "weights": weights(),
         "code": fingerprint(),
-        "bench": fingerprint(*_SELF),
+        "bench": fingerprint(*WORLDS, "bench/forest_runs.py", "bench/tracking_scores.py"),
     }
     row = remembered(folder / "runs" / f"{label.replace(' ', '-')}-{reloc}.json", wanted, make)
     say(

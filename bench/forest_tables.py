@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.forest_methods import METHODS
+from bench.forest_methods import BASELINES, METHODS
 from bench.tables import NOTHING, number, table
 
 Answer = dict[str, Any]
@@ -22,6 +22,7 @@ NEAR_METRES, NEAR_DEGREES = 2.0, 5.0
 EXACT_METRES, EXACT_DEGREES = 0.3, 1.0
 """... and within these it is a success."""
 
+_BROAD = ("all", "forest", "built", "on disk")
 WORDS = ("sparse", "medium", "dense", "flat", "hilly", "steep", "leaf-on", "leaf-off")
 STEPS = {
     "descriptors": "Scan Context and co-view: describing, all stations and shifts",
@@ -94,14 +95,16 @@ def recall_table(answers: Sequence[Answer]) -> str:
 def metric_table(answers: Sequence[Answer]) -> str:
     """Poses of the best hypothesis before registration, and of the best verified one after it."""
     head = (
-        "", "n", "dense: m", "deg", "keypoints: m", "deg", "2 m, 5 deg, %", "registered: m", "deg",
+        "", "n", "dense: m", "deg", "moved by keypoints, %", "keypoints: m", "deg", "2 m, 5 deg, %",
+        "registered: m", "deg",
         "0.3 m, 1 deg, %", "2 m, 5 deg, %", "passes, false", "accepted", "accepted, false",
     )  # fmt: skip
     rows = []
     for name, some in groups(answers):
         dense, before, after = (_medians(some, stage) for stage in ("dense", "before", "after"))
         rows.append([
-            name, str(len(some)), number(dense[0], 2), number(dense[1], 1), number(before[0], 2),
+            name, str(len(some)), number(dense[0], 2), number(dense[1], 1),
+            _percent(float(np.mean([answer["moved"] for answer in some]))), number(before[0], 2),
             number(before[1], 1), _percent(success(some, "before", NEAR_METRES, NEAR_DEGREES)),
             number(after[0], 3), number(after[1], 2),
             _percent(success(some, "after", EXACT_METRES, EXACT_DEGREES)),
@@ -111,6 +114,39 @@ def metric_table(answers: Sequence[Answer]) -> str:
             str(sum(false(answer, "accepted") for answer in some)),
         ])  # fmt: skip
     return table(head, rows)
+
+
+def compared_table(answers: Sequence[Answer]) -> str:
+    """Poses from the five best places of each method, before and after the same registration and decision."""
+    head = (
+        "", "n", "places of", "named: m", "deg", "2 m, 5 deg, %", "registered: m", "deg", "0.3 m, 1 deg, %",
+        "2 m, 5 deg, %", "passes, false", "accepted", "accepted, false", "ms",
+    )  # fmt: skip
+    rows = []
+    for name, some in groups(answers):
+        if name not in _BROAD:
+            continue
+        for method in (*BASELINES, "learned"):
+            chains = [_chain(answer, method) for answer in some]
+            before, after = (_medians(chains, stage) for stage in ("before", "after"))
+            rows.append([
+                name, str(len(some)), method, number(before[0], 2), number(before[1], 1),
+                _percent(success(chains, "before", NEAR_METRES, NEAR_DEGREES)),
+                number(after[0], 3), number(after[1], 2),
+                _percent(success(chains, "after", EXACT_METRES, EXACT_DEGREES)),
+                _percent(success(chains, "after", NEAR_METRES, NEAR_DEGREES)),
+                str(sum(false(chain, "passes") for chain in chains)),
+                str(sum(chain["accepted"] for chain in chains)),
+                str(sum(false(chain, "accepted") for chain in chains)),
+                f"{np.median([chain['ms'] for chain in chains]):.0f}",
+            ])  # fmt: skip
+    return table(head, rows)
+
+
+def _chain(answer: Answer, method: str) -> Answer:
+    if method != "learned":
+        return dict(answer["chains"][method])
+    return answer | {"ms": answer["ms"]["registration"]}
 
 
 def _medians(answers: Sequence[Answer], stage: str) -> tuple[float | None, float | None]:
@@ -139,9 +175,16 @@ def times_table(answers: Sequence[Answer]) -> str:
 
 
 def tables(answers: Sequence[Answer]) -> dict[str, str]:
-    """All tables by the names of their places in docs/forest.md."""
+    """All tables by the names of their places in docs/forest.md; worlds on disk alone have places of their own."""
+    if all(answer["kind"] == "on disk" for answer in answers):
+        return {
+            "forest disk recall": recall_table(answers),
+            "forest disk metric": metric_table(answers),
+            "forest disk compared": compared_table(answers),
+        }
     return {
         "forest recall": recall_table(answers),
         "forest metric": metric_table(answers),
+        "forest compared": compared_table(answers),
         "forest times": times_table(answers),
     }

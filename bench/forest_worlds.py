@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.forest_common import WORLDS
 from bench.worlds import fingerprint, remembered
 from coview_stream.errors import InputError
 from coview_stream.geometry import Points, Pose, inverse, pose_from
@@ -29,13 +30,6 @@ EVERY = 10.0
 
 _SPACING = 0.25  # metres between the frames of a recorded run that are read
 _LEANING = 3  # random stream
-_PARTS = ("recipe", "worlds", "submaps", "stands", "trees", "crowns", "wood", "parts", "patterns", "paths", "terrain",
-          "rotating")  # fmt: skip
-_MAKERS = (
-    "coview_stream/sim",
-    *(f"coview_stream/learn/{part}.py" for part in _PARTS),
-    "bench/forest_worlds.py",
-)
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,7 @@ def drawn(folder: Path, seed: int, queries: int, recipe: Recipe | None = None) -
     """
     recipe = replace(recipe or Recipe(), submaps=queries)
     out = folder / f"drawn-{seed}-{queries}"
-    spec = {"seed": seed, "recipe": recipe.to_dict(), "code": fingerprint(*_MAKERS)}
+    spec = {"seed": seed, "recipe": recipe.to_dict(), "code": fingerprint(*WORLDS)}
     kind = str(remembered(out / "drawn.json", spec, lambda: _simulate(out, seed, recipe))["kind"])
     return Place(f"seed {seed}", kind, out / "base.npy", _read(out / "drives.npz"))
 

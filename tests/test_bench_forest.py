@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 
 from bench import forest, forest_tables
-from bench.forest_methods import METHODS, distinct
-from bench.forest_tables import false, groups, metric_table, recall, recall_table, success, times_table
+from bench.forest_chains import distinct
+from bench.forest_methods import BASELINES, METHODS
+from bench.forest_tables import (
+    compared_table,
+    false,
+    groups,
+    metric_table,
+    recall,
+    recall_table,
+    success,
+    tables,
+    times_table,
+)
 from bench.suite import OWN
 
 ROOT = Path(__file__).parents[1]
@@ -23,6 +34,8 @@ def answer(off, kind="forest rows dense steep leaf-off column", sensor="vlp16", 
         "chance": 0.01,
         "off": dict.fromkeys(METHODS, off),
         "dense": [1.0, 3.0],
+        "moved": True,
+        "chains": dict.fromkeys(BASELINES, chain([6.0, 2.0], [4.0, 3.0])),
         "before": [0.5, 1.0],
         "after": [0.1, 0.2],
         "passes": True,
@@ -30,6 +43,18 @@ def answer(off, kind="forest rows dense steep leaf-off column", sensor="vlp16", 
         "ms": dict.fromkeys(forest_tables.STEPS, 10.0),
         "first": False,
         **more,
+    }
+
+
+def chain(before, after, believed=True):
+    """What one method's places were registered to."""
+    return {
+        "before": before,
+        "after": after,
+        "score": 0.5,
+        "passes": believed,
+        "accepted": believed,
+        "ms": 80.0,
     }
 
 
@@ -67,14 +92,39 @@ def test_metric_success_needs_both_metres_and_degrees():
         answer([1.0], after=[0.3, 1.0]),
         answer([1.0], after=[0.31, 0.1]),
         answer([1.0], after=[0.1, 1.1]),
-        answer([1.0], after=None, passes=False, accepted=False),
+        answer([1.0], after=None, passes=False, accepted=False, moved=False),
     ]
     assert success(answers, "after", 0.3, 1.0) == 0.25
     assert success(answers, "after", 2.0, 5.0) == 0.75
     row = cells(metric_table(answers), "all")
     assert row[1:] == [
-        "4", "1.00", "3.0", "0.50", "1.0", "100", "0.300", "1.00", "25", "75", "0", "3", "0",
+        "4", "1.00", "3.0", "75", "0.50", "1.0", "100", "0.300", "1.00", "25", "75", "0", "3", "0",
     ]  # fmt: skip
+
+
+def test_every_methods_places_are_registered_and_judged_alike():
+    poor = {name: chain([9.0, 20.0], None, believed=False) for name in BASELINES}
+    poor["both"] = chain([1.0, 2.0], [0.2, 0.9])
+    answers = [answer([1.0]), answer([1.0], chains=poor), answer([1.0], kind="town", chains=poor)]
+    lines = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in compared_table(answers).splitlines()[2:]
+    ]
+    assert [line[:3] for line in lines[:5]] == [["all", "3", name] for name in (*BASELINES, "learned")]
+    assert {line[0] for line in lines} == {"all", "forest", "built"}
+    of = {line[2]: line[3:] for line in lines[:5]}
+    # one pose only, believed and 4 m off; two queries without any
+    assert of["canopy"] == ["9.00", "20.0", "0", "4.000", "3.00", "0", "0", "1", "1", "1", "80"]
+    assert of["both"] == ["1.00", "2.0", "67", "0.200", "0.90", "67", "67", "1", "3", "1", "80"]
+    assert of["learned"] == ["0.50", "1.0", "100", "0.100", "0.20", "100", "100", "0", "3", "0", "10"]
+
+
+def test_worlds_on_disk_alone_have_tables_of_their_own():
+    planted = answer([3.0], kind="on disk")
+    assert set(tables([planted])) == {f"forest disk {name}" for name in ("recall", "metric", "compared")}
+    assert set(tables([planted, answer([3.0])])) == {
+        "forest recall", "forest metric", "forest compared", "forest times",
+    }  # fmt: skip
 
 
 def test_what_is_believed_and_wrong_is_false():
@@ -121,7 +171,7 @@ def planted(monkeypatch):
 def test_the_command_puts_its_tables_between_the_markers(tmp_path, capsys, planted):
     page = tmp_path / "page.md"
     places = "".join(
-        f"<!-- table: forest {n} -->\nold\n<!-- end -->\n" for n in ("recall", "metric", "times")
+        f"<!-- table: forest {n} -->\nold\n<!-- end -->\n" for n in ("recall", "metric", "compared", "times")
     )
     page.write_text(f"before\n{places}<!-- table: forest runs -->\nkept\n<!-- end -->\nafter\n")
     assert forest.main(["--work", str(tmp_path), "--write", str(page), "--quick"]) == 0
@@ -129,7 +179,7 @@ def test_the_command_puts_its_tables_between_the_markers(tmp_path, capsys, plant
     assert text.startswith("before\n<!-- table: forest recall -->\n| AR@1 / AR@5, %")
     assert text.endswith("<!-- table: forest runs -->\nkept\n<!-- end -->\nafter\n")
     assert "old" not in text
-    assert text.count("`python -m bench.forest --seeds 20000 --worlds 4 --queries 4`. Weights ") == 3
+    assert text.count("`python -m bench.forest --seeds 20000 --worlds 4 --queries 4`. Weights ") == 4
     assert "100 / 100" in capsys.readouterr().out
 
 
@@ -158,19 +208,32 @@ def test_answers_are_kept_per_world_until_weights_or_code_change(tmp_path, monke
     monkeypatch.setattr(forest, "weights", lambda: "a")
     monkeypatch.setattr(forest, "code", lambda: "b")
     kept.write_text(
-        '{"spec": {"name": "w", "weights": "a", "code": "b"}, "result": {"answers": [1], "seconds": 2}}'
+        '{"spec": {"name": "w", "weights": "a", "code": "b", "radius": 30.0, "files": "x"},'
+        ' "result": {"answers": [1], "seconds": 2}}'
     )
-    assert forest.asked(tmp_path, "w", place) == [1]
+    assert forest.asked(tmp_path, "w", place, {"files": "x"}) == [1]
     assert not opened
+    with pytest.raises(RuntimeError, match="asked anew"):
+        forest.asked(tmp_path, "w", place, {"files": "y"})
     monkeypatch.setattr(forest, "weights", lambda: "c")
     with pytest.raises(RuntimeError, match="asked anew"):
-        forest.asked(tmp_path, "w", place)
+        forest.asked(tmp_path, "w", place, {"files": "x"})
+
+
+def test_scans_that_are_not_there_are_named_in_one_line(tmp_path, capsys):
+    assert forest.main(["--plot", str(tmp_path), "--work", str(tmp_path)]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("bench.forest: ")
+    assert "ALS_Clip.laz" in error
 
 
 def test_the_page_has_a_place_for_every_table_and_the_suite_knows_the_command():
     from bench.publish import filled
 
     page = (ROOT / forest.PAGE).read_text()
-    names = ("recall", "metric", "times", "runs", "plot")
+    names = (
+        "recall", "metric", "compared", "times", "scale", "runs", "plot", "disk recall", "disk metric",
+        "disk compared",
+    )  # fmt: skip
     assert filled(page, {f"forest {name}": "" for name in names}) != page
     assert "forest" in OWN

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.forest_methods import BEST, METHODS, Methods
+from bench.forest_chains import BEST
+from bench.forest_methods import BASELINES, METHODS, Methods
 from bench.forest_tables import STEPS, recall, tables
 from bench.forest_worlds import drawn
 from coview_stream.basemap.basemap import BaseMap
@@ -33,7 +34,24 @@ def test_every_method_names_distinct_places_and_some_find_the_stand(asked):
     assert recall(answers, "canopy", 1) == 1.0
     assert recall(answers, "both", 1) == 1.0
     assert methods.chance == pytest.approx(np.pi * 100.0 / (4.0 * len(methods.base_map)))
-    assert set(tables(answers)) == {"forest recall", "forest metric", "forest times"}
+    assert set(tables(answers)) == {"forest recall", "forest metric", "forest compared", "forest times"}
+
+
+def test_every_methods_places_become_poses(asked):
+    _, answers = asked
+    for answer in answers:
+        assert tuple(answer["chains"]) == BASELINES
+        for method, chain in answer["chains"].items():
+            assert chain["before"][0] == pytest.approx(answer["off"][method][0], abs=0.02)
+            assert chain["passes"] or not chain["accepted"]
+            assert chain["ms"] > 0
+        # the right place, at the right heading: registration makes it exact
+        for method in ("both", "canopy"):
+            before, after = answer["chains"][method]["before"], answer["chains"][method]["after"]
+            assert before[0] < 3.0
+            assert before[1] < 12.0
+            assert after[0] < 0.3
+            assert after[1] < 1.0
 
 
 def test_errors_and_places_tell_the_same(asked):
