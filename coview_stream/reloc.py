@@ -7,8 +7,13 @@ from coview_stream.config import Reloc
 from coview_stream.errors import CoViewError, MapError
 
 
-def check_reloc(base_map: BaseMap, reloc: Reloc) -> str | None:
+def check_reloc(base_map: BaseMap, reloc: Reloc, load: bool = True) -> str | None:
     """Try what the first query would stumble on: features, weights and onnxruntime.
+
+    Args:
+        base_map: the map.
+        reloc: what is asked for.
+        load: also load the network, which takes 0.3 s and 60 MB; whoever does not search need not.
 
     Returns:
         Why ``auto`` goes without the features that the map has, with the remedy; None if it does not have to.
@@ -22,10 +27,11 @@ def check_reloc(base_map: BaseMap, reloc: Reloc) -> str | None:
         return None
     try:
         if base_map.learned is not None:
-            from coview_stream.place.learned.network import network
-
             base_map.learned.check()
-            network("ground", None, 1)
+            if load:
+                from coview_stream.place.learned.network import network
+
+                network("ground", None, 1)
         elif reloc == "learned":
             raise MapError(
                 "the map has no learned features; build it again with 'coview-stream build --learned', or go without "

@@ -51,8 +51,8 @@ class Knowledge:
     learned: LearnedMap | None
 
     @classmethod
-    def of(cls, base_map: BaseMap, config: LocalizerConfig) -> Knowledge:
-        """Choose by ``config.reloc``; the map's spectra are not made yet.
+    def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> Knowledge:
+        """Choose by ``config.reloc``; the network is loaded if ``load``, the map's spectra are not made yet.
 
         ``auto`` warns if the map has learned features that cannot be used, and goes without them.
 
@@ -60,7 +60,7 @@ class Knowledge:
             MapError, InputError, DependencyError: as :func:`~coview_stream.reloc.check_reloc`.
         """
         retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
-        missing = check_reloc(base_map, config.reloc)
+        missing = check_reloc(base_map, config.reloc, load)
         if missing is not None:
             warnings.warn(missing, stacklevel=2)
         if missing is not None or config.reloc == "coview" or base_map.learned is None:

@@ -22,6 +22,7 @@ from coview_stream.place.learned.network import CARD, VIEW_NAMES, Network, file_
 from coview_stream.reloc import check_reloc
 from coview_stream.sources import Knowledge
 from coview_stream.stream import serve
+from coview_stream.stream.engine import SearchEngine, TrackEngine
 from coview_stream.stream.keys import robot_keys
 
 RELEARN = "build it again with 'coview-stream build --learned'"
@@ -128,6 +129,14 @@ def test_all_is_well(learned_map, world_map, weights):
         (finding,) = [f for f in site_findings(base_map, int(1e6), None) if f.what == "map features"]
         assert finding.verdict == "ok"
         assert text in finding.found
+
+
+def test_who_only_tracks_loads_no_network(learned_map, weights):
+    engine = TrackEngine(learned_map)
+    assert engine._knowledge.learned is not None
+    assert network.network.cache_info().currsize == 0
+    assert SearchEngine(learned_map)._knowledge.learned is not None
+    assert network.network.cache_info().currsize == 1
 
 
 def test_serve_says_so_once_and_its_engines_go_without(learned_map, tmp_path, monkeypatch, caplog):

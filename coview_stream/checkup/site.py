@@ -15,7 +15,7 @@ from coview_stream.reloc import check_reloc
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
 
-_NETWORK = 0.1 * GB  # onnxruntime and what else is imported
+_NETWORK = 0.2 * GB  # onnxruntime and the network in two processes, and what else is imported
 _SPECTRA = 80.0  # bytes per square metre
 
 

@@ -58,7 +58,9 @@ class TrackEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, Localizer]] = {}
-        self._knowledge = Knowledge.of(base_map, self.config)  # once, however many robots
+        self._knowledge = Knowledge.of(
+            base_map, self.config, load=False
+        )  # what queries have to bring: others search
 
     def run(self, job: Job) -> FrameResult:
         """Take in one frame.

@@ -6,85 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planted import LOW, SECTORS, TILES, Planted
 from scipy import ndimage
 
 from coview_stream.config import ConsensusConfig, LearnedConfig
 from coview_stream.geometry import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.place.consensus import Consensus, Hypothesis
 from coview_stream.place.learned.feature_build import feature_arrays
-from coview_stream.place.learned.feature_map import FeatureMap, weights_sha256
-from coview_stream.place.learned.feature_tiles import TILE, packed, packed_sigma
+from coview_stream.place.learned.feature_map import FeatureMap
+from coview_stream.place.learned.feature_tiles import TILE
 from coview_stream.place.learned.network import Features
-from coview_stream.place.learned.votes import LearnedMap, View
-
-CHANNELS = 16
-TILES = 6  # along an edge: 192 m
-LOW = np.array([-3, -2])  # tile at the lower corner
-SECTORS = 36
-
-
-def field(seed, shape, smooth):
-    """Unit vectors (C, H, W) that change over ``smooth`` cells."""
-    rng = np.random.default_rng(seed)
-    values = rng.normal(size=(CHANNELS, *shape)).astype(np.float32)
-    values = ndimage.gaussian_filter(values, (0, smooth, smooth))
-    return values / np.linalg.norm(values, axis=0)
-
-
-def in_tiles(values):
-    """(H, W, ...) as tiles, row by row."""
-    size, *rest = values.shape[0] // TILE, *values.shape[2:]
-    blocks = values.reshape(size, TILE, size, TILE, *rest).swapaxes(1, 2)
-    return blocks.reshape(size * size, TILE, TILE, *rest)
-
-
-class Planted:
-    """A map of random features, and what a perfect ground network would see anywhere in it."""
-
-    def __init__(self, seed=1):
-        size = TILES * TILE
-        self.local = field(seed, (size, size), 2.5)
-        rng = np.random.default_rng(seed)
-        self.marks = rng.uniform(0, size, (1200, 2))  # keypoints: x and y in cells
-        self.sigma = np.full((size, size), 3.0, dtype=np.float32)
-        column, row = self.marks.astype(int).T
-        self.sigma[row, column] = rng.uniform(0.2, 0.4, len(self.marks)).astype(np.float32)
-        row, column = np.divmod(np.arange(TILES**2), TILES)
-        tiles = (np.column_stack([column, row]) + LOW).astype(np.int32)
-        at = (np.stack(np.meshgrid(np.arange(size // 8), np.arange(size // 8)), -1).reshape(-1, 2) + 0.5) * 8
-        place = rng.normal(size=(len(at), 24)).astype(np.float32)
-        self.place = place / np.linalg.norm(place, axis=1, keepdims=True)
-        self.place_at = at + LOW * TILE
-        arrays = {
-            "learned.local": in_tiles(packed(self.local.transpose(1, 2, 0))),
-            "learned.sigma": in_tiles(packed_sigma(self.sigma)),
-            "learned.tiles": tiles,
-            "learned.place": packed(self.place),
-            "learned.place_at": self.place_at.astype(np.float32),
-        }
-        self.features = FeatureMap(arrays, {"weights": weights_sha256(), "cell": 1.0})
-
-    def seen(self, xy, yaw, centre, noise=0.5, seed=0):
-        """What the network makes of a robot at ``xy`` whose odometry frame is turned by ``yaw`` in the map."""
-        axis = np.arange(64) + 0.5 - 32.0
-        u, v = np.meshgrid(axis, axis)
-        c, s = np.cos(yaw), np.sin(yaw)
-        at = np.stack([c * u - s * v + xy[0], s * u + c * v + xy[1]]) - (LOW * TILE)[:, None, None]
-        where = at[::-1] - 0.5
-        local = np.stack([ndimage.map_coordinates(k, where, order=1, mode="nearest") for k in self.local])
-        local += noise * field(100 + seed, (64, 64), 1.0)
-        local /= np.linalg.norm(local, axis=0)
-        sigma = np.full((64, 64), 3.0, dtype=np.float32)
-        there = self.marks + LOW * TILE - xy
-        mine = np.column_stack([c * there[:, 0] + s * there[:, 1], -s * there[:, 0] + c * there[:, 1]]) + 32.0
-        near = ((mine > 0) & (mine < 64)).all(axis=1)
-        column, row = mine[near].astype(int).T
-        sigma[row, column] = 0.3
-        nearest = np.hypot(*(self.place_at - xy).T).argmin()
-        place = np.repeat(self.place[nearest][:, None], 256, axis=1).reshape(-1, 16, 16)
-        inside = np.hypot(u, v) <= 30.0
-        weight = np.where(inside, 1.0 / sigma, 0.0).astype(np.float32)
-        return View(Features(local.astype(np.float32), sigma, place.astype(np.float32)), weight, centre)
+from coview_stream.place.learned.votes import LearnedMap
 
 
 @pytest.fixture(scope="module")
@@ -167,55 +99,6 @@ def test_only_small_maps_are_prepared_to_be_searched_all_over(planted, stations)
     for known, prepared in ((large, {"coarse"}), (small, {"coarse", "_everywhere"})):
         known.prepare()
         assert {"coarse", "_everywhere"} & set(vars(known)) == prepared
-
-
-@pytest.mark.parametrize("block", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
-@pytest.mark.parametrize("cell", [2.0, 4.0])
-def test_a_station_has_the_best_score_of_its_block(planted, block, cell):
-    count = int(TILES * TILE / block)
-    xy = np.stack(np.meshgrid(*[(np.arange(count) + 0.5) * block + low * TILE for low in LOW]), -1)
-    places = np.column_stack([xy.reshape(-1, 2), np.zeros(count**2)]).astype(np.float32)
-    known = LearnedMap(planted.features, places, LearnedConfig(cell=cell), block=block)
-    side = int(TILES * TILE / cell)
-    scores = np.random.default_rng(0).normal(size=(3, side, side)).astype(np.float32)
-    found = known._at_stations(scores)
-    middles = (np.arange(side) + 0.5) * cell
-    for k in np.random.default_rng(1).permutation(len(places))[:200]:
-        low = places[k, :2] - LOW * TILE - 0.5 * block
-        columns, rows = (np.flatnonzero((middles >= m) & (middles < m + block)) for m in low)
-        if not len(rows) or not len(columns):  # a block smaller than cells
-            x, y = ((low + 0.5 * block) // cell).astype(int)
-            columns = columns if len(columns) else [x]
-            rows = rows if len(rows) else [y]
-        np.testing.assert_array_equal(found[k], scores[:, rows][:, :, columns].max(axis=(1, 2)))
-
-
-def test_blocks_of_four_metres_find_a_place_anywhere_in_them(planted):
-    axis = np.arange(2.0, TILES * TILE, 4.0)
-    xy = np.stack(np.meshgrid(axis + LOW[0] * TILE, axis + LOW[1] * TILE), axis=-1).reshape(-1, 2)
-    places = np.column_stack([xy, np.zeros(len(xy))]).astype(np.float32)
-    known = LearnedMap(planted.features, places, LearnedConfig(), block=4.0)
-    for place in ((21.0, 33.0), (23.0, 33.0), (21.0, 35.0), (23.0, 35.0)):
-        distances = known.distances(planted.seen(place, 0.0, np.zeros(3)))
-        np.testing.assert_allclose(places[distances.min(axis=1).argmin(), :2], (22.0, 34.0))
-
-
-def test_a_place_that_keypoints_have_moved_stands_on_its_own_storey(planted):
-    """Two storeys 3 m apart on a slope, the upper one with a hole; beyond, no stations at all."""
-    axis = np.arange(-19.0, 20.0, 2.0)
-    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    lower = np.column_stack([xy, 0.2 * xy[:, 0]])
-    upper = lower[np.hypot(*xy.T) > 5.0] + (0.0, 0.0, 3.0)
-    known = LearnedMap(planted.features, np.vstack([lower, upper]).astype(np.float32), LearnedConfig())
-
-    def ground(xy, before):
-        return known._ground(np.array(xy), np.array(before))
-
-    assert ground((13.0, 9.0), (9.0, 9.0, 1.8)) == pytest.approx(2.6)
-    assert ground((13.0, 9.0), (9.0, 9.0, 4.8)) == pytest.approx(5.6)
-    assert ground((13.2, 9.4), (13.0, 9.0, 5.6)) == pytest.approx(5.6)
-    assert ground((1.0, 1.0), (1.5, 1.0, 3.3)) == 3.3  # nothing there on this storey
-    assert ground((60.0, 1.0), (56.0, 1.0, 7.0)) == 7.0
 
 
 def at(xy, yaw, centre, z=0.0):

@@ -20,7 +20,7 @@ from coview_stream.place.learned.feature_map import FeatureMap
 from coview_stream.place.learned.feature_tiles import TILE
 from coview_stream.place.learned.keypoints import Keypoints, keypoints
 from coview_stream.place.learned.match_config import LearnedMatchConfig
-from coview_stream.place.learned.network import LOCAL_CELL, Features, network
+from coview_stream.place.learned.network import LOCAL_CELL, Features, Network, network
 from coview_stream.place.learned.sharpen import sharpen
 from coview_stream.place.learned.turning import coarser
 from coview_stream.place.retrieval import Volume
@@ -65,10 +65,7 @@ class View:
 class LearnedMap:
     """All that searches of one map share: the map's features, ready to be searched, and the ground network.
 
-    The features' spectra are not made before the first query, or :meth:`prepare`.
-
-    Attributes:
-        network: the ground encoder.
+    Nothing is loaded or made before the first query, or :meth:`prepare`.
     """
 
     def __init__(
@@ -84,7 +81,7 @@ class LearnedMap:
 
         Raises:
             MapError: they were made by other weights than those in ``directory`` (the package's).
-            InputError: there are no weights, or some that cannot be loaded. DependencyError: no onnxruntime.
+            InputError: there are no weights.
         """
         features.check(directory)
         self.features = features
@@ -92,7 +89,12 @@ class LearnedMap:
         self.config = config
         self.match = LearnedMatchConfig(reach=config.reach)
         self._block = block
-        self.network = network("ground", directory, 1)  # one thread is enough for 64 m
+        self._directory = directory
+
+    @cached_property
+    def network(self) -> Network:
+        """The ground encoder; one thread is enough for 64 m."""
+        return network("ground", self._directory, 1)
 
     @cached_property
     def coarse(self) -> CoarseMap:
@@ -114,11 +116,19 @@ class LearnedMap:
         return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
-        """Make the map's spectra now, rather than at the first query."""
-        _ = self._everywhere if self.dense else self.coarse
+        """Load the network and make the map's spectra now, rather than at the first query.
+
+        Raises:
+            InputError: the weights cannot be loaded. DependencyError: there is no onnxruntime, or a broken one.
+        """
+        _ = self.network, self._everywhere if self.dense else self.coarse
 
     def view(self, points: Points, centre: npt.NDArray[np.float64]) -> View:
-        """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot."""
+        """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot.
+
+        Raises:
+            InputError, DependencyError: as :meth:`prepare`.
+        """
         size = round(_SIZE / CELL)
         features = self.network(bird_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
         axis = (np.arange(features.sigma.shape[0]) + 0.5) * LOCAL_CELL - 0.5 * _SIZE
