@@ -120,7 +120,7 @@ def test_the_machine_alone_and_a_map(world_file, tmp_path, capsys):
     assert main(["doctor"]) == 0
     assert capsys.readouterr().out == "ok    machine                 fine\n"
     code, found = findings_of(capsys, str(world_file))
-    assert [f["what"] for f in found] == ["machine", "map", "map sha256", "map memory"]
+    assert [f["what"] for f in found] == ["machine", "map", "map sha256", "map features", "map memory"]
     assert code == (found[-1]["verdict"] == "FAIL")
     assert main(["doctor", str(tmp_path / "none.coview")]) == 1
 
