@@ -103,7 +103,7 @@ class Decision:
         return voted or votes >= self.config.acceptance.confirmations
 
     def _supported(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
-        """Return the proof that learned features add if they favour the same place, which they do not owe to its fit."""
+        """Return the proof that learned features add if they favour the same place: they know nothing of its fit."""
         rule = self.config.acceptance
         here = (c for c in candidates if same_place(c.T_map_odom, best.T_map_odom, query))
         lead = max((c.hypothesis.lead for c in here), default=0.0)

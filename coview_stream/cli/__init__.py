@@ -24,7 +24,19 @@ from coview_stream.errors import ConfigError, CoViewError
 
 PROGRAM = "coview-stream"
 
-COMMANDS = ("demo", "build", "info", "locate", "eval", "simulate", "serve", "replay", "watch", "doctor", "train")
+COMMANDS = (
+    "demo",
+    "build",
+    "info",
+    "locate",
+    "eval",
+    "simulate",
+    "serve",
+    "replay",
+    "watch",
+    "doctor",
+    "train",
+)
 """Names in the order of ``--help``; a command whose module does not exist is left out."""
 
 _MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin wherever it is imported

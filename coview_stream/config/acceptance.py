@@ -17,8 +17,8 @@ class AcceptanceConfig:
     keyframes that agree within ``agree_distance`` and ``agree_angle``, none between them having found another place,
     and what its scores exceed ``proof_floor`` by adds up to ``proof``: weak evidence needs more driving. One frame
     alone (``stationary``) must reach ``single_score`` and ``single_lead``. Learned features that favour the same place
-    clearly add to its proof, once: ``support`` for each robust standard deviation by which the mean keyframe's votes for
-    it have led, beyond ``support_floor`` and up to ``support_most``.
+    clearly add to its proof, once: ``support`` for each robust standard deviation by which the mean keyframe's votes
+    for it have led, beyond ``support_floor`` and up to ``support_most``.
 
     Set by hand on few scans, with earlier forms of the score, and no command prints these figures: single scans of
     three real and two simulated sensors, where 86 right places led by 0.04-0.8, four wrong ones by 0.07 at most and
