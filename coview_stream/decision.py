@@ -37,7 +37,6 @@ class Decision:
         self._favourite: Candidate | None = None
         self._confirmed = 0
         self._proof = 0.0
-        self._support = 0.0  # once: the votes of successive keyframes are largely the same
 
     def judge(self, candidates: list[Candidate], query: Query, votes: int) -> Verdict:
         """Take in a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
@@ -63,8 +62,7 @@ class Decision:
         if doubt is None:
             self._favourite = best
             self._confirmed += 1
-            self._proof += max(0.0, best.evidence.score - self.config.acceptance.proof_floor)
-            self._support = max(self._support, self._supported(best, candidates, query))
+            self._proof += self._increment(best, candidates, query)
             state, doubt = self._confirmation()
         if best.hypothesis.station is None:
             doubt += FROM_THERE
@@ -102,20 +100,24 @@ class Decision:
         )
         return voted or votes >= self.config.acceptance.confirmations
 
-    def _supported(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
-        """Return the proof that learned features add if they favour the same place: they know nothing of its fit."""
+    def _increment(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
+        """Return what a keyframe that counts adds to the proof: less if much of what it saw is not on the map.
+
+        More if the place is also the one that learned features favour most, for they know nothing of its fit.
+        """
         rule = self.config.acceptance
-        here = (c for c in candidates if same_place(c.T_map_odom, best.T_map_odom, query))
-        lead = max((c.hypothesis.lead for c in here), default=0.0)
-        return rule.support * min(max(0.0, lead - rule.support_floor), rule.support_most)
+        favoured = any(
+            c.hypothesis.lead > 0 and same_place(c.T_map_odom, best.T_map_odom, query) for c in candidates
+        )
+        beyond = best.evidence.score - (rule.favoured_floor if favoured else rule.proof_floor)
+        return max(0.0, beyond) * min(1.0, best.evidence.inside / rule.inside_fully)
 
     def _confirmation(self) -> tuple[State, str]:
         rule = self.config.acceptance
         if self.config.stationary:
             return State.TRACKING, "one scan, and it stands alone"
-        proof = self._proof + self._support
-        reason = f"confirmed by {self._confirmed} keyframes, proof {proof:.2f} of {rule.proof:.2f}"
-        enough = self._confirmed >= rule.confirmations and proof >= rule.proof
+        reason = f"confirmed by {self._confirmed} keyframes, proof {self._proof:.2f} of {rule.proof:.2f}"
+        enough = self._confirmed >= rule.confirmations and self._proof >= rule.proof
         return State.TRACKING if enough else State.AMBIGUOUS, reason
 
     def _agrees(self, best: Candidate, query: Query) -> bool:

@@ -22,13 +22,14 @@ NOTHING = np.empty((0, 3), dtype=np.float32)
 QUERY = Query(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
 HERE, ELSEWHERE = (pose_from(rot_z(-0.8), [x, 9.0, 0.5]) for x in (3.0, 40.0))
 WEAK = RULE.score + 0.03
-CLEAR = RULE.support_floor + RULE.support_most
 
 
-def candidate(score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0) -> Candidate:
+def candidate(
+    score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0, inside: float = 0.9
+) -> Candidate:
     hypothesis = Hypothesis(T_map_odom, 5, 2, -3.0, learned=True, lead=lead)
     found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return Candidate(hypothesis, found, Evidence(score, score, 1.0, 1.0, 0.9))
+    return Candidate(hypothesis, found, Evidence(score, score, 1.0, 1.0, inside))
 
 
 def keyframes_needed(*candidates: Candidate) -> int | None:
@@ -40,28 +41,37 @@ def keyframes_needed(*candidates: Candidate) -> int | None:
     return None
 
 
-def test_clear_votes_shorten_a_weak_proof_but_not_the_confirmations() -> None:
+def test_a_place_that_features_favour_needs_less_proof_but_all_confirmations() -> None:
     alone = keyframes_needed(candidate(WEAK))
-    supported = keyframes_needed(candidate(WEAK, lead=CLEAR))
+    favoured = keyframes_needed(candidate(WEAK, lead=1.0))
     assert alone is not None
-    assert supported is not None
-    assert RULE.confirmations <= supported < 0.6 * alone
+    assert favoured is not None
+    assert RULE.confirmations <= favoured < 0.6 * alone
     assert keyframes_needed(candidate(0.9, lead=100.0)) == RULE.confirmations
 
 
-@pytest.mark.parametrize("lead", [0.0, -1.0, RULE.support_floor])
-def test_votes_that_hardly_lead_add_nothing(lead: float) -> None:
+def test_what_lies_off_the_map_proves_nothing() -> None:
+    """At the map's edge a few points may fit anywhere: the fewer lie on it, the more keyframes are needed."""
+    shares = [RULE.inside_fully, 0.75 * RULE.inside_fully, RULE.inside]
+    needed = [keyframes_needed(candidate(0.45, inside=share)) for share in shares]
+    assert None not in needed
+    assert needed == sorted(set(needed))
+    assert keyframes_needed(candidate(0.45, inside=0.95)) == needed[0]
+
+
+@pytest.mark.parametrize("lead", [0.0, -1.0])
+def test_votes_that_do_not_lead_add_nothing(lead: float) -> None:
     assert keyframes_needed(candidate(WEAK, lead=lead)) == keyframes_needed(candidate(WEAK))
 
 
 def test_votes_for_another_place_add_nothing() -> None:
-    other = candidate(0.1, ELSEWHERE, lead=CLEAR)
+    other = candidate(0.1, ELSEWHERE, lead=1.0)
     assert keyframes_needed(candidate(WEAK), other) == keyframes_needed(candidate(WEAK))
 
 
 def test_votes_for_this_place_count_whoever_named_it_first() -> None:
-    twin = candidate(WEAK - 0.01, lead=CLEAR)
-    assert keyframes_needed(candidate(WEAK), twin) == keyframes_needed(candidate(WEAK, lead=CLEAR))
+    twin = candidate(WEAK - 0.01, lead=1.0)
+    assert keyframes_needed(candidate(WEAK), twin) == keyframes_needed(candidate(WEAK, lead=1.0))
 
 
 def test_votes_never_make_a_place_true_that_does_not_fit() -> None:

@@ -121,7 +121,7 @@ def test_refused_however_often_it_is_seen(search, case):
 ACCEPTED = {
     "just good enough": [candidate(RULE.score + 0.02)],
     "just enough ground": [candidate(0.65, ground=RULE.ground + 0.05)],
-    "just inside": [candidate(0.7, inside=RULE.inside + 0.05)],
+    "just inside": [candidate(0.95, inside=RULE.inside + 0.05)],
     "rival far enough below": [candidate(0.7), candidate(0.7 - 1.5 * RULE.lead, moved(20))],
     "the same place twice is no rival": [candidate(0.7), candidate(0.69, moved(0.5, 1.0))],
 }

@@ -16,9 +16,9 @@ class AcceptanceConfig:
     ``ground`` of the robot's ground lies on the map's. It is accepted when it has counted for ``confirmations``
     keyframes that agree within ``agree_distance`` and ``agree_angle``, none between them having found another place,
     and what its scores exceed ``proof_floor`` by adds up to ``proof``: weak evidence needs more driving. One frame
-    alone (``stationary``) must reach ``single_score`` and ``single_lead``. Learned features that favour the same place
-    clearly add to its proof, once: ``support`` for each robust standard deviation by which the mean keyframe's votes
-    for it have led, beyond ``support_floor`` and up to ``support_most``.
+    alone (``stationary``) must reach ``single_score`` and ``single_lead``. Where learned features favour the same place
+    above all others, what exceeds ``favoured_floor`` counts; where less than ``inside_fully`` of the points lie on the
+    map, it counts by that share: a few walls at the map's edge fit many a place.
 
     Set by hand on few scans, with earlier forms of the score, and no command prints these figures: single scans of
     three real and two simulated sensors, where 86 right places led by 0.04-0.8, four wrong ones by 0.07 at most and
@@ -41,9 +41,8 @@ class AcceptanceConfig:
     confirmations: int = 3
     proof: float = 1.2
     proof_floor: float = 0.2
-    support: float = 0.25
-    support_floor: float = 0.8
-    support_most: float = 2.0
+    favoured_floor: float = 0.1
+    inside_fully: float = 0.6
     single_score: float = 0.45
     single_lead: float = 0.2
     agree_distance: float = 1.5
@@ -74,6 +73,6 @@ class AcceptanceConfig:
         counts(self, "confirmations", "patience")
         positive(self, "agree_distance", "agree_angle", "most_tilt", "proof", "keep_innovation")
         positive(self, "patience_seconds", "patience_blind")
-        require(self.support >= 0, self, "support", "zero or more")
-        positive(self, "support_floor", "support_most")
+        fraction(self, "inside_fully")
+        require(0 <= self.favoured_floor < 1, self, "favoured_floor", "in [0, 1)")
         require(0 <= self.proof_floor < 1, self, "proof_floor", "in [0, 1)")
