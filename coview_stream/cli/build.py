@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learned",
         action=argparse.BooleanOptionalAction,
-        help="store features for learned re-localization, 35 MB per km2 (see locate --reloc)",
+        help="store features for learned re-localization, 35 MB per km2 (they are, where onnxruntime can be loaded)",
     )
     parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
 
@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> int:
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
-    if args.learned is not None:
-        options["learned"] = args.learned
+    options["learned"] = _can_be_learned() if args.learned is None else args.learned
     begin = time.perf_counter()
     base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
     base_map.save(args.output)
@@ -63,3 +62,17 @@ def run(args: argparse.Namespace) -> int:
         f"{len(base_map)} stations, {time.perf_counter() - begin:.1f} s, {args.output.stat().st_size} bytes"
     )
     return 0
+
+
+def _can_be_learned() -> bool:
+    """Whether features can be made; says so if not, for somebody may rely on them."""
+    from coview_stream.errors import CoViewError
+    from coview_stream.place.learned.network import VIEW_NAMES, network
+
+    try:
+        for view in VIEW_NAMES:
+            network(view)
+    except CoViewError as error:
+        print(f"without learned features: {error}", file=sys.stderr)
+        return False
+    return True

@@ -12,9 +12,6 @@ Channel = Literal["scan_context", "coview", "coview_strict", "density"]
 Visibility = Literal["paper", "eye", "off"]
 Preset = Literal["slam", "tls"]
 
-LEARNED_BY_DEFAULT = False
-"""Whether a new map gets learned features if nobody says."""
-
 
 @dataclass(frozen=True)
 class DescriptorConfig:
@@ -60,7 +57,7 @@ class MapConfig:
     normal_radius: float = 1.0
     normal_neighbours: int = 20
     levels: bool = True
-    learned: bool = LEARNED_BY_DEFAULT
+    learned: bool = False
 
     def __post_init__(self) -> None:
         positive(self, "block", "voxel", "tile", "outlier_std_ratio", "normal_radius")
