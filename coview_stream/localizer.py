@@ -80,6 +80,11 @@ class Localizer:
         self._generation += 1
 
     @property
+    def sources(self) -> tuple[str, ...]:
+        """Who names places to look at: "coview", "learned" or both."""
+        return self._search.names
+
+    @property
     def last_query(self) -> dict[Channel, Descriptor]:
         """Descriptors (R, S) of the newest keyframe that searched, by channel; empty before the first."""
         return self._search.last_query

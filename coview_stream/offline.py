@@ -39,6 +39,7 @@ class Located:
         keyframes: evidence of every keyframe.
         skipped: file and reason of every frame that could not be used.
         seconds: time each step took; empty if that is not known.
+        sources: who named places to look at: "coview", "learned"; empty if that is not known.
         query: descriptors of the keyframe that won the first fix, if there was one.
         winner: its evidence: station and shift.
     """
@@ -50,6 +51,7 @@ class Located:
     seconds: list[float] = field(default_factory=list)
     query: dict[Channel, Descriptor] = field(default_factory=dict)
     winner: KeyframeEvidence | None = None
+    sources: tuple[str, ...] = ()
 
     @property
     def posed(self) -> list[Fix]:
@@ -79,6 +81,7 @@ class Located:
             "frames": self.frames,
             "posed": len(self.posed),
             "skipped": self.skipped,
+            "sources": list(self.sources),
             "map_sha256": base_map.sha256,
             "timings_s": dict(zip(("p50", "p95", "p99"), latency, strict=True)),
             "keyframes": [keyframe.to_json() for keyframe in self.keyframes],
@@ -99,7 +102,7 @@ def locate(
     if len(run) == 1:
         config = replace(config, stationary=True)
     localizer = Localizer(base_map, config)
-    located = Located(len(run))
+    located = Located(len(run), sources=localizer.sources)
     for index in range(len(run)):
         try:
             frame = run.read(index)

@@ -34,7 +34,7 @@ def check_reloc(base_map: BaseMap, reloc: Reloc, load: bool = True) -> str | Non
                 network("ground", None, 1)
         elif reloc == "learned":
             raise MapError(
-                "the map has no learned features; build it again with 'coview-stream build --learned', or go without "
+                "the map has no learned features; build it again without --no-learned, or go without "
                 "them (--reloc coview)"
             )
     except CoViewError as error:

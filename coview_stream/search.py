@@ -59,6 +59,11 @@ class GlobalSearch:
         self._generation = 0
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its sources of hypotheses."""
+        return tuple(n for n, s in (("coview", self.coview), ("learned", self.learned)) if s is not None)
+
+    @property
     def needs(self) -> Needs:
         """What its queries have to have."""
         return Needs(

@@ -73,6 +73,6 @@ def _can_be_learned() -> bool:
         for view in VIEW_NAMES:
             network(view)
     except CoViewError as error:
-        print(f"without learned features: {error}", file=sys.stderr)
+        print(f"without learned features: {' '.join(str(error).split())}", file=sys.stderr)
         return False
     return True

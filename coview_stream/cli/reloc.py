@@ -11,6 +11,6 @@ def add_reloc(parser: argparse._ActionsContainer) -> None:
         "--reloc",
         choices=("auto", "coview", "learned"),
         default="auto",
-        help="who names places to look at: co-view descriptors, learned features (of maps built --learned), or both "
-        "where there are such (auto)",
+        help="who names places to look at: co-view descriptors, learned features, or both on maps that have "
+        "features (auto)",
     )

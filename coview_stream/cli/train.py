@@ -9,9 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-HELP = (
-    "train the networks of learned re-localization anew, on worlds that are simulated for it; about an hour"
-)
+HELP = "train the networks of learned re-localization on simulated worlds: an hour, and the extra learn-train"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

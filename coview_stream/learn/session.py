@@ -103,8 +103,8 @@ def train_session(
             another recipe or another training.
         DependencyError: PyTorch, ONNX or Open3D is not installed.
     """
-    torch = extra("torch", "torch==2.13.0", "training")
-    extra("onnx", "onnx>=1.16", "training")
+    torch = extra("torch", "torch==2.13.0", "training (extra learn-train)")
+    extra("onnx", "onnx>=1.16", "training (extra learn-train)")
     from coview_stream.learn.export import encoder, export
     from coview_stream.learn.training import train
 

@@ -129,10 +129,11 @@ class FeatureMap:
         """
         for view in VIEW_NAMES:
             weights_file(view, directory)
-        if weights_sha256(directory) != self.weights:
+        here = weights_sha256(directory)
+        if here != self.weights:
             raise MapError(
-                "the map's learned features are of other weights than the installed ones; build it again with "
-                "'coview-stream build --learned', or go without them (--reloc coview)"
+                f"the map's learned features are of other weights ({self.weights[:12]}) than the installed ones "
+                f"({here[:12]}); build it again, or go without them (--reloc coview)"
             )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -35,7 +36,7 @@ PLACE_CELL = 4.0
 
 _MULTIPLE = 8  # image cells
 _INPUT = "image"
-_REMEDY = "install the package again, or train them with 'coview-stream train'"
+_REMEDY = "install the package again, or name your own weights' folder in COVIEW_WEIGHTS"
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,9 @@ def network(view: ViewName, directory: Path | None = None, threads: int | None =
 
 
 def shipped() -> Path:
-    """Return the directory of the weights that come with the package."""
-    return Path(__file__).parent / "weights"
+    """Return the directory of the weights: ``COVIEW_WEIGHTS`` if that is set, else the package's."""
+    own = os.environ.get("COVIEW_WEIGHTS")
+    return Path(own) if own else Path(__file__).parent / "weights"
 
 
 def weights_file(view: ViewName, directory: Path | None = None) -> Path:
