@@ -45,24 +45,21 @@ class Decision:
             reason = "no hypothesis fits the map" if votes else "too few points to search with"
             return Verdict(None, KeyframeEvidence(query.stamp, State.SEARCHING, reason))
         best = candidates[0]
+        here = [same_place(c.T_map_odom, best.T_map_odom, query) for c in candidates]
         rival = max(
-            (
-                c.evidence.score
-                for c in candidates[1:]
-                if not same_place(c.T_map_odom, best.T_map_odom, query)
-            ),
-            default=0.0,
+            (c.evidence.score for c, same in zip(candidates, here, strict=True) if not same), default=0.0
         )
+        favour = max(c.hypothesis.lead for c, same in zip(candidates, here, strict=True) if same)
         if not self._agrees(best, query):
             self.clear()
-        state, doubt = self._doubt(best.evidence, rival)
+        state, doubt = self._doubt(best.evidence, rival, favour)
         if doubt is None and not self._has_rivals(best, candidates, query, votes):
             needed = self.config.acceptance.confirmations
             doubt = f"rivals rest on {votes} keyframes' votes, {needed} needed"
         if doubt is None:
             self._favourite = best
             self._confirmed += 1
-            self._proof += self._increment(best, candidates, query)
+            self._proof += self._increment(best.evidence, favour)
             state, doubt = self._confirmation()
         if best.hypothesis.station is None:
             doubt += FROM_THERE
@@ -76,18 +73,18 @@ class Decision:
             ),
         )  # fmt: skip
 
-    def _doubt(self, evidence: Evidence, rival: float) -> tuple[State, str | None]:
+    def _doubt(self, evidence: Evidence, rival: float, favour: float) -> tuple[State, str | None]:
         """Say why this keyframe does not count for its best candidate; None if it does."""
         rule, alone = self.config.acceptance, self.config.stationary
-        least = rule.single_score if alone else rule.score
+        # two that do not know of each other name the same place: each may be less sure of it
+        clear = not alone and favour >= rule.favoured_lead
+        least = rule.single_score if alone else rule.favoured_score if clear else rule.score
+        ground = rule.favoured_ground if clear else rule.ground
         lead = rule.single_lead if alone else rule.lead
         if evidence.score < least or evidence.inside < rule.inside:
             return State.SEARCHING, f"no place fits: best score {evidence.score:.2f}, {least:.2f} needed"
-        if evidence.ground < rule.ground:
-            return (
-                State.AMBIGUOUS,
-                f"the ground does not fit: {evidence.ground:.2f}, {rule.ground:.2f} needed",
-            )
+        if evidence.ground < ground:
+            return State.AMBIGUOUS, f"the ground does not fit: {evidence.ground:.2f}, {ground:.2f} needed"
         if evidence.score - rival < lead:
             return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
         return State.AMBIGUOUS, None
@@ -100,17 +97,14 @@ class Decision:
         )
         return voted or votes >= self.config.acceptance.confirmations
 
-    def _increment(self, best: Candidate, candidates: list[Candidate], query: Query) -> float:
+    def _increment(self, evidence: Evidence, favour: float) -> float:
         """Return what a keyframe that counts adds to the proof: less if much of what it saw is not on the map.
 
         More if the place is also the one that learned features favour most, for they know nothing of its fit.
         """
         rule = self.config.acceptance
-        favoured = any(
-            c.hypothesis.lead > 0 and same_place(c.T_map_odom, best.T_map_odom, query) for c in candidates
-        )
-        beyond = best.evidence.score - (rule.favoured_floor if favoured else rule.proof_floor)
-        return max(0.0, beyond) * min(1.0, best.evidence.inside / rule.inside_fully)
+        beyond = evidence.score - (rule.favoured_floor if favour > 0 else rule.proof_floor)
+        return max(0.0, beyond) * min(1.0, evidence.inside / rule.inside_fully)
 
     def _confirmation(self) -> tuple[State, str]:
         rule = self.config.acceptance

@@ -75,8 +75,18 @@ def test_votes_for_this_place_count_whoever_named_it_first() -> None:
 
 
 def test_votes_never_make_a_place_true_that_does_not_fit() -> None:
-    assert keyframes_needed(candidate(RULE.score - 0.02, lead=100.0)) is None
+    assert keyframes_needed(candidate(RULE.favoured_score - 0.02, lead=100.0)) is None
     assert keyframes_needed(candidate(WEAK, lead=100.0), candidate(WEAK - 0.05, ELSEWHERE)) is None
+    assert keyframes_needed(candidate(WEAK, lead=100.0, inside=RULE.inside - 0.02)) is None
+
+
+def test_a_lower_score_is_enough_only_where_features_favour_the_place_clearly() -> None:
+    low = RULE.score - 0.03
+    assert keyframes_needed(candidate(low)) is None
+    assert keyframes_needed(candidate(low, lead=0.9 * RULE.favoured_lead)) is None
+    needed = keyframes_needed(candidate(low, lead=RULE.favoured_lead))
+    assert needed is not None
+    assert needed > RULE.confirmations
 
 
 def test_one_scan_alone_gains_nothing_by_votes() -> None:
