@@ -25,7 +25,7 @@ from coview_stream.stream import serve
 from coview_stream.stream.engine import SearchEngine, TrackEngine
 from coview_stream.stream.keys import robot_keys
 
-RELEARN = "build it again with 'coview-stream build --learned'"
+RELEARN = "build it again"
 
 
 def forget():

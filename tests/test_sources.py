@@ -78,7 +78,7 @@ def test_each_can_be_asked_alone(learned_map):
 
 
 def test_a_map_without_features_is_refused_where_they_are_asked_for(world_map):
-    with pytest.raises(MapError, match=r"'coview-stream build it again'.*--reloc coview"):
+    with pytest.raises(MapError, match=r"build it again.*--reloc coview"):
         Localizer(world_map, LocalizerConfig(reloc="learned"))
     with pytest.raises(ConfigError, match="reloc is 'guesswork'"):
         LocalizerConfig(reloc="guesswork")

@@ -181,7 +181,7 @@ def test_maps_from_before_can_still_be_read(world_map):
 def test_those_of_other_weights_are_refused(built):
     arrays, parameters = built
     FeatureMap(arrays, parameters).check()
-    with pytest.raises(MapError, match=r"other weights .* 'coview-stream build --learned'"):
+    with pytest.raises(MapError, match=r"other weights .* build it again"):
         FeatureMap(arrays, {**parameters, "weights": "0" * 64}).check()
 
 
