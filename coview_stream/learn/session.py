@@ -86,7 +86,7 @@ SMOKE = Plan(
         travel=(3.0, 8.0),
         rays=60_000,
     ),
-    training=TrainingConfig(steps=100, pieces=3, each=4, width=8, wrong=1),
+    training=TrainingConfig(steps=100, pieces=2, each=6, rate=1e-2, width=8, wrong=2),
 )
 """A minute on two cores: whether everything works and something is learnt, not how well it can be."""
 

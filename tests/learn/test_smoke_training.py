@@ -22,7 +22,7 @@ def test_smoke_training_learns_to_find_places(tmp_path: Path) -> None:
     card = train_session(tmp_path, SMOKE)
     assert card["loss"]["last"] < 0.6 * card["loss"]["first"]
     assert card["validation"]["AR@1"] >= 5 * card["validation"]["chance"]
-    assert card["validation"]["AR@5"] >= 0.4  # to answer the map's middle is right in a fifth of the cases
+    assert card["validation"]["AR@1"] >= 0.4  # to answer the map's middle is right in a fifth of the cases
     image = np.full((LAYERS, 128, 128), 128, dtype=np.uint8)
     for view in ("aerial", "ground"):
         features = Network(view, tmp_path)(image)  # type: ignore[arg-type] # a literal, by name
