@@ -16,7 +16,6 @@ from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
-from coview_kernels.trimmed_icp import normal_equations, trim
 from coview_kernels.voxel import transform_unique
 from coview_kernels.warming import warm_up
 
@@ -37,13 +36,11 @@ __all__ = [
     "coview",
     "describe_points",
     "nearest",
-    "normal_equations",
     "polar_bin",
     "shutdown",
     "station_bins",
     "submit",
     "transform_unique",
-    "trim",
     "unit_columns",
     "visible",
     "warm_up",

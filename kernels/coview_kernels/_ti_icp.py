@@ -31,8 +31,8 @@ FIRST_BIN, BINS = 107 << 6, 2048
 # settings; see icp.py
 KEEP, ITERATIONS, SCALES, LEAST, PRIOR, ABOVE = 8, 9, 10, 11, 12, 13
 PIVOT, MEAN, BELIEF, FIRST = 14, 17, 29, 65
-# and of each scale radius, width of the weights, the shift and turn that end it, and which points take part
-RADIUS, WIDTH, SHIFT, TURN, EVERY, EACH = 0, 1, 2, 3, 4, 5
+# and of each scale radius, width of the weights, and the shift and turn that end it
+RADIUS, WIDTH, SHIFT, TURN, EACH = 0, 1, 2, 3, 4
 # state: pose by rows (12), then these, the information (36), the sums of a step (30), and six values to work with
 SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, OFF = 12, 13, 14, 15, 16, 17, 53, 83
 RUNNING, DONE, LOST = 0, 1, 2
@@ -100,13 +100,12 @@ def trim(keep, chunks, n, first, bins: ti.template()):
 
 @ti.func
 def add_up(
-    T, about, width, every, number, above, last, share, source: ti.template(), order: ti.template(),
+    T, about, width, above, last, share, source: ti.template(), order: ti.template(),
     partners: ti.template(), bins: ti.template(), state: ti.template(),
 ):  # fmt: skip
     """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs."""
     acc = ti.Vector.zero(ti.f64, 30)
-    for k in range(number):
-        i = every * k
+    for i in range(order.shape[0]):
         if bins[i] <= (last[0] if i < above else last[1]):
             at = placed(T, floats(source, 3 * order[i]))
             normal = floats(partners, PARTNER * i + 3)
@@ -236,13 +235,13 @@ def align(
             frame = ti.Vector([settings[k] for k in ti.static(range(8))])
             T = ti.Vector([state[k] for k in ti.static(range(12))])
             scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
-            radius, every = settings[scale + RADIUS], ti.cast(settings[scale + EVERY], ti.i32)
+            radius = settings[scale + RADIUS]
             above = ti.cast(settings[ABOVE], ti.i32)
             mine = n + 2 * c * BINS
             for b in range(mine, mine + 2 * BINS):
                 bins[b] = 0
-            for k in range(n // every // chunks + (2 << BLOCK)):
-                i = every * ((((k >> BLOCK) * chunks + c) << BLOCK) + (k & ((1 << BLOCK) - 1)))
+            for k in range(n // chunks + (2 << BLOCK)):
+                i = (((k >> BLOCK) * chunks + c) << BLOCK) + (k & ((1 << BLOCK) - 1))
                 if i < n:
                     at = placed(T, floats(source, 3 * order[i]))
                     near = pair(frame, starts, rows, normals, at, i, radius, memory, partners)
@@ -257,14 +256,11 @@ def align(
     for _ in range(1):
         T = ti.Vector([state[k] for k in ti.static(range(12))])
         scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
-        every = ti.cast(settings[scale + EVERY], ti.i32)
-        number = (n + every - 1) // every
         pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
         about = placed(T, pivot)
-        last, share = trim(settings[KEEP], chunks, number, n, bins)
+        last, share = trim(settings[KEEP], chunks, n, bins)
         add_up(
-            T, about, settings[scale + WIDTH], every, number, settings[ABOVE], last, share, source, order, partners,
-            bins, state,
+            T, about, settings[scale + WIDTH], settings[ABOVE], last, share, source, order, partners, bins, state,
         )  # fmt: skip
         if state[SUMS + 29] < settings[LEAST]:
             state[STATUS] = LOST

@@ -19,7 +19,7 @@ from coview_kernels import check, reference, runtime
 from coview_kernels.arrays import F32, F64, Mask
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
-from coview_kernels.reference.icp import Alignment, Plan, Scale, by_kind
+from coview_kernels.reference.icp import Alignment, Plan, Scale
 
 __all__ = ["Alignment", "Belief", "Scale", "align_planes"]
 
@@ -88,12 +88,8 @@ def align_planes(
         raise ValueError(f"at least one iteration and scale are needed, got {iterations} and {len(scales)}")
     if not all(math.isfinite(v) and v > 0 for pair in scales for v in pair):
         raise ValueError(f"scales must hold positive metres and radians, got {scales}")
-    if any(scale.every != int(scale.every) for scale in scales):
-        raise ValueError(f"scales must take every n-th point, n whole, got {scales}")
     if least < 1:
         raise ValueError(f"least must be at least 1, got {least}")
-    # the kernel counts in 32 bits
-    scales = [scale._replace(every=min(int(scale.every), max(1, len(points)))) for scale in scales]
     belief = None
     if prior is not None:
         mean = check.finite64("the prior's mean", prior.mean, 4, 4)
@@ -116,11 +112,13 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     memory, partners = np.full(4 * n, -1.0), np.full(6 * n, _FAR, dtype=np.float32)
     bins = np.empty(n + 2 * chunks * _BINS, dtype=np.int32)
     system, state = np.empty((6, 7)), np.zeros(_SUMS + 36)
+    above = np.flatnonzero(kind)
+    order = np.concatenate((above, np.flatnonzero(~kind)))
     state[:12] = plan.T[:3].ravel()
     launch = Launch(
         "icp", "align",
-        _settings(cells.frame, plan, int(np.count_nonzero(kind))), cells.starts, cells.rows, normals.reshape(-1),
-        source.reshape(-1), by_kind(kind).astype(np.int32), memory, partners, bins, system, state, chunks,
+        _settings(cells.frame, plan, len(above)), cells.starts, cells.rows, normals.reshape(-1),
+        source.reshape(-1), order.astype(np.int32), memory, partners, bins, system, state, chunks,
     )  # fmt: skip
     while not state[_STATUS]:
         launch()
@@ -142,7 +140,7 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
 
 def _settings(frame: F64, plan: Plan, above: int) -> F64:
     """All numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
-    values = np.zeros(65 + 5 * len(plan.scales))
+    values = np.zeros(65 + 4 * len(plan.scales))
     values[:8] = frame
     values[8:14] = (
         plan.keep, plan.iterations, len(plan.scales), plan.least, plan.prior is not None, above,

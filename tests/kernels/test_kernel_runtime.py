@@ -41,8 +41,7 @@ def test_public_names():
         *("FrameIntake", "Intake", "describe_points"),
         *("MatchIndex", "Nearest"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
-        "normal_equations",
-        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "trim", "unit_columns"),
+        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unit_columns"),
         *("visible", "warm_up"),
     }
     assert all(callable(getattr(coview_kernels, name)) for name in coview_kernels.__all__)

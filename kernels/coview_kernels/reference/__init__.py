@@ -11,7 +11,6 @@ from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
 from coview_kernels.reference.screen import screen
-from coview_kernels.reference.trimmed_icp import normal_equations
 from coview_kernels.reference.voxel import transform_unique
 
 __all__ = [
@@ -19,7 +18,6 @@ __all__ = [
     "coview",
     "describe_points",
     "nearest",
-    "normal_equations",
     "polar_bin",
     "screen",
     "station_bins",

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, I64, Mask
+from coview_kernels.arrays import F32, F64, Mask
 from coview_kernels.reference.nearest import nearest
-from coview_kernels.reference.trimmed_icp import normal_equations
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -28,8 +27,6 @@ class Scale(NamedTuple):
     """A step shorter than this, metres,"""
     turn: float = 5e-5
     """and than this, radians, ends it."""
-    every: int = 1
-    """Only every n-th point of either kind takes part."""
 
 
 class Plan(NamedTuple):
@@ -65,9 +62,8 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
     """See :func:`coview_kernels.align_planes`; ``tree`` holds the map."""
     T, total, answer = plan.T, 0, None
     for scale in plan.scales:
-        some = by_kind(kind)[:: scale.every]
         for _ in range(plan.iterations):
-            step = _step(tree, normals, source[some], kind[some], plan, T, scale)
+            step = _step(tree, normals, source, kind, plan, T, scale)
             if step is None:
                 return None
             increment, information, rmse, pairs = step
@@ -79,11 +75,6 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
             if converged:
                 break
     return answer
-
-
-def by_kind(kind: Mask) -> I64:
-    """Order (N,) of the points in which every n-th is every n-th of either kind, those of the first kind before."""
-    return np.concatenate((np.flatnonzero(kind), np.flatnonzero(~kind)))
 
 
 def _step(
@@ -103,9 +94,8 @@ def _step(
     residual = np.einsum("ij,ij->i", gap, n)
     weight = share / (1.0 + (residual / scale.width) ** 2)
     about = T[:3, :3] @ plan.pivot + T[:3, 3]
-    q = tree.data[pairs].astype(np.float32)
-    H, b, squares = normal_equations(source[found[chosen]], q, n, weight, T, about)
-    mean_square = squares / weight.sum()
+    H, b = _normal_equations(gap + tree.data[pairs] - about, n, residual, weight)
+    mean_square = weight @ (residual * residual) / weight.sum()
     information, gradient = H / (mean_square + 1e-6), b / (mean_square + 1e-6)
     if plan.prior is not None:
         mean, belief = plan.prior
@@ -116,6 +106,15 @@ def _step(
         gradient = gradient + belief @ np.concatenate([turn, shift])
     increment: F64 = -np.linalg.solve(information + 1e-6 * np.eye(6), gradient)
     return increment, information, float(np.sqrt(mean_square)), len(chosen)
+
+
+def _normal_equations(arm: F64, normals: F32, residual: F64, weight: F64) -> tuple[F64, F64]:
+    """H (6, 6) = sum w J^T J and b (6,) = sum w J^T r, with J = (arm x n, n) for points at ``arm`` of the pivot."""
+    J = np.concatenate([np.cross(arm, normals), normals], axis=1)
+    weighted = weight[:, None] * J
+    H = J.T @ weighted
+    # BLAS rounds the two halves differently
+    return 0.5 * (H + H.T), weighted.T @ residual
 
 
 def _shares(squares: F32, kind: Mask, keep: float, points: int) -> F64:
