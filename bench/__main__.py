@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.rows import Row
-from bench.running import counted, run
-from bench.suite import OWN, SUITE, Entry
-from bench.tables import line, rule
+from bench.harness.rows import Row
+from bench.harness.running import counted, run
+from bench.harness.suite import OWN, SUITE, Entry
+from bench.harness.tables import line, rule
 
 HEAD = ("benchmark", "ours", "baseline", "unit", "ratio", "target", "verdict")
 _WIDTHS = (60, 9, 9, 7, 7, 12, 13)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.harness.places import Place
 from bench.peers.method import Answer
-from bench.peers.places import Place
 from coview_stream import BaseMap
 from coview_stream.geometry import inverse, pose_from
 

@@ -7,11 +7,11 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from bench.harness.places import WORLDS, places, world
+from bench.harness.worlds import isolated, map_of
 from bench.peers.method import Peer
-from bench.peers.places import WORLDS, places, world
 from bench.peers.roster import PEERS
 from bench.peers.trial import Trial, run_trial
-from bench.worlds import isolated, map_of
 
 
 def contest(

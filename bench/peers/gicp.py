@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from bench.harness.places import Place
 from bench.peers.method import Answer
-from bench.peers.places import Place
 from bench.peers.start import started
 from coview_stream import BaseMap
 from coview_stream.geometry import lengths

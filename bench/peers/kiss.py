@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.harness.places import Place
 from bench.peers.method import Answer
-from bench.peers.places import Place
 from coview_stream import BaseMap
 from coview_stream.geometry import pose_from
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from bench.peers.places import Place
+from bench.harness.places import Place
 from coview_stream import BaseMap
 from coview_stream.geometry import Pose
 

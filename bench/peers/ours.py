@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.harness.places import Place
 from bench.peers.method import Answer
-from bench.peers.places import Place
 from bench.peers.start import started
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.peers.places import Place
+from bench.harness.places import Place
 from coview_stream.geometry import Pose, pose_from, rot_z
 
 OFF, TURNED = 0.5, float(np.radians(3.0))

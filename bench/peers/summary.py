@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.engine import folder as worlds_folder
+from bench.harness.rows import Row, bounded, failed, informs
 from bench.peers.contest import contest
 from bench.peers.roster import OUR_TRACKING, OURS, PEERS
 from bench.peers.trial import Trial
-from bench.rows import Row, bounded, failed, informs
+from bench.speed.engine import folder as worlds_folder
 
 _PLACES, _QUICK = 10, 3
 _LIMIT_S = 30.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.map_build import baseline, ours, site
+from bench.speed.map_build import baseline, ours, site
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,110 @@
+"""A real forest: one plot that was scanned from the ground and from the air, sought among real airborne tiles.
+
+The airborne scan of the plot (27 x 26 m, ponderosa) is put into the middle of each tile (another, coniferous
+forest), thinned to the density of the tile; the query is the mobile scan of the plot at several headings. It is one
+plot, from another forest than what surrounds it, and smaller than what a query usually shows: a check, no statistic.
+Queries of the tiles themselves cannot be made, for nobody has scanned them from the ground.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.forest.methods import METHODS, Methods
+from bench.forest.tables import EXACT_DEGREES, EXACT_METRES, recall, success
+from bench.forest.worlds import Drive
+from bench.harness.tables import number, table
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.geometry import Points, inverse, pose_from, rot_z, transform
+
+Floats = npt.NDArray[np.float64]
+
+TILES = ("bcts_2.laz", "bcts_3.laz")
+HEADINGS = 4
+
+_EYE = 1.5  # metres above the ground, where the robot is said to be
+_VOXEL = 0.1  # metres: the mobile scan is as dense as no robot's
+_RADIUS = 30.0
+
+
+def measured(data: Path, tiles: Sequence[str] = TILES) -> list[dict[str, Any]]:
+    """Ask all methods for the plot in each tile, at each heading.
+
+    Raises:
+        InputError: a scan cannot be read.
+    """
+    air, ground = (_metres(data / "forest_plot" / name) for name in ("ALS_Clip.laz", "MLS_Clip.laz"))
+    answers = []
+    for name in tiles:
+        whole, shift = pasted(_metres(data / "forest_als" / name), air, np.random.default_rng(7))
+        with tempfile.TemporaryDirectory() as folder:
+            base = Path(folder) / "base.npy"
+            np.save(base, (whole - whole.mean(axis=0)).astype(np.float32))
+            methods = Methods(BaseMap.build(base, radius=_RADIUS, learned=True))
+        offset = shift - whole.mean(axis=0)
+        for k in range(HEADINGS):
+            drive = standing(ground + offset, 0.4 + 2 * np.pi * k / HEADINGS)
+            answers.append({"world": name, "kind": "real plot", "first": not k, **methods.ask(drive)})
+    return answers
+
+
+def pasted(tile: Floats, plot: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Put a plot (N, 3) into the middle of a tile (M, 3): the points of both, and the shift (3,) of the plot."""
+    middle = 0.5 * (tile[:, :2].min(axis=0) + tile[:, :2].max(axis=0))
+    low, high = plot[:, :2].min(axis=0), plot[:, :2].max(axis=0)
+    half = 0.5 * (high - low)
+    hole = (np.abs(tile[:, :2] - middle) <= half).all(axis=1)
+    lift = lowest(tile[hole]) - lowest(plot)
+    shift = np.array([*(middle - 0.5 * (low + high)), lift])
+    share = min(1.0, hole.sum() / len(plot))
+    thin = plot[rng.random(len(plot)) < share]
+    return np.concatenate([tile[~hole], thin + shift]), shift
+
+
+def lowest(points: Floats) -> float:
+    """Typical height of the ground in a cloud (N, 3): the median of the lowest points of cells of 4 m."""
+    cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / 4.0).astype(np.int64)
+    least: dict[tuple[int, int], float] = {}
+    for (i, j), z in zip(cell.tolist(), points[:, 2].tolist(), strict=True):
+        least[i, j] = min(z, least.get((i, j), np.inf))
+    return float(np.median(list(least.values())))
+
+
+def standing(points: Floats, heading: float) -> Drive:
+    """Return what a robot in the middle of a scan (N, 3) would have seen, if it saw all; its odometry is turned."""
+    middle = 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
+    near = np.hypot(*(points[:, :2] - middle).T) < 3.0
+    truth = pose_from(rot_z(heading), np.array([*middle, lowest(points[near]) + _EYE]))
+    seen = transform(inverse(truth), points)
+    cells = np.floor(seen / _VOXEL).astype(np.int64)
+    kept = seen[np.unique(cells, axis=0, return_index=True)[1]]
+    cloud: Points = kept.astype(np.float32)
+    return Drive("mls", 0.0, np.eye(4)[None], (cloud,), truth)
+
+
+def _metres(file: Path) -> Floats:
+    from coview_stream.clouds import read_cloud
+
+    cloud = read_cloud(file)
+    return np.asarray(cloud.points.astype(np.float64) + cloud.origin)
+
+
+def plot_table(answers: Sequence[dict[str, Any]]) -> str:
+    """AR@1 / AR@5 by method over all tiles and headings, and how exactly the plot was registered."""
+    rows = [
+        [method, f"{100 * recall(answers, method, 1):.0f} / {100 * recall(answers, method, 5):.0f}"]
+        for method in METHODS
+    ]
+    poses = [answer["after"] for answer in answers if answer["after"] is not None]
+    metres = float(np.median([pose[0] for pose in poses])) if poses else None
+    share = success(answers, "after", EXACT_METRES, EXACT_DEGREES)
+    rows.append(["registered within 0.3 m and 1 deg, %", f"{100 * share:.0f}"])
+    rows.append(["registered: median metres off, wrong places included", number(metres, 2)])
+    chance = 100 * float(np.mean([answer["chance"] for answer in answers]))
+    return table((f"AR@1 / AR@5, %, {len(answers)} queries, chance {chance:.1f}", ""), rows)

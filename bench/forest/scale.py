@@ -1,0 +1,185 @@
+"""How long a whole query takes on maps of 0.1 and 1 km2: one drawn forest's features and stations, laid side by side.
+
+The middle 128 m of a drawn stand are repeated until the map is as large as it should be. All that depends on a map's
+size (correlation, reading the stations, votes, keypoints of the map) works on the large map; registration looks at the
+surroundings of five places, which are the same on any map, so each place is registered where its likeness in the
+original stand is. The copies are alike: where five fit equally well, none is given up after the coarse scales, and a
+query takes longer than where one place is right. The limits are for two cores; BLAS takes the threads of
+OPENBLAS_NUM_THREADS, the kernels those of COVIEW_THREADS, transforms and the network one.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.forest.chains import Chain
+from bench.forest.common import say
+from bench.forest.query import query_of
+from bench.forest.worlds import drawn
+from bench.harness.tables import number, table
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry import pose_from, transform
+from coview_stream.place.consensus import Consensus, Hypothesis
+from coview_stream.place.descriptor import ground_below
+from coview_stream.place.learned.feature_map import FeatureMap
+from coview_stream.place.learned.feature_tiles import TILE
+from coview_stream.query import Query
+from coview_stream.sources import Knowledge
+
+Ints = npt.NDArray[np.int64]
+
+SIDES = (10, 32)
+"""Tiles of 32 m along the edge: 0.10 and 1.05 km2."""
+LIMITS = {10: 0.4, 32: 3.0}
+"""Seconds a query that issue 6 allows."""
+
+CUT = 4
+"""Tiles along the edge of what is repeated."""
+
+_SEED, _QUERIES, _REPEAT = 20_001, 4, 3
+_PARTS = ("view", "correlation", "consensus", "sharpening", "registration")
+
+
+def repeated(tiles: Ints, low: Ints, side: int, cut: int = CUT) -> tuple[Ints, Ints]:
+    """Lay the tiles (T, 2) within ``cut`` of ``low`` (2,) side by side, ``side`` along the edge.
+
+    Returns:
+        (N,) which tile stands at each place, and (N, 2) the places, from ``low`` on.
+
+    Raises:
+        ValueError: the map has nothing in one of them.
+    """
+    number = {tuple(tile): k for k, tile in enumerate(tiles.tolist())}
+    row, column = np.indices((side, side)).reshape(2, -1)
+    places = np.stack([column, row], axis=1)
+    originals = (places % cut + low).tolist()
+    if missing := [tile for tile in map(tuple, originals) if tile not in number]:
+        raise ValueError(f"the map has nothing in tile {missing[0]}")
+    return np.array([number[tuple(tile)] for tile in originals]), places + low
+
+
+def enlarged(base_map: BaseMap, side: int) -> tuple[FeatureMap, npt.NDArray[np.float32], Ints]:
+    """Features and stations (M, 3) of the repeated middle of a map, and its lowest tile (2,)."""
+    features = base_map.learned
+    assert features is not None
+    tiles = features.index.tiles.astype(np.int64)
+    low = np.floor(tiles.mean(axis=0) + 0.5).astype(np.int64) - CUT // 2
+    which, places = repeated(tiles, low, side)
+    edge = float(TILE)
+    copies = np.stack(np.meshgrid(*[np.arange(-(-side // CUT))] * 2), axis=-1).reshape(-1, 2) * CUT * edge
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "learned.local": features._local[which],
+        "learned.sigma": features._sigma[which],
+        "learned.tiles": places.astype(np.int32),
+    }
+    high = (low + side) * edge
+    inner = _within(features.place_at, low * edge, (low + CUT) * edge)
+    at = (features.place_at[inner] + copies[:, None]).reshape(-1, 2)
+    kept = _within(at, low * edge, high)
+    arrays["learned.place"] = np.tile(features.place[inner], (len(copies), 1))[kept]
+    arrays["learned.place_at"] = at[kept].astype(np.float32)
+    own = base_map.stations[_within(base_map.stations, low * edge, (low + CUT) * edge)]
+    stations = np.tile(own, (len(copies), 1))
+    stations[:, :2] = (own[:, :2] + copies[:, None]).reshape(-1, 2)
+    stations = stations[_within(stations, low * edge, high)]
+    large = FeatureMap(arrays, {"weights": features.weights, "cell": 1.0})
+    return large, stations.astype(np.float32), low
+
+
+def _within(at: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    return np.asarray(((at[:, :2] >= low) & (at[:, :2] < high)).all(axis=1))
+
+
+def home(hypothesis: Hypothesis, query: Query, low: Ints) -> Hypothesis:
+    """Move a hypothesis to its likeness in the original."""
+    at = transform(hypothesis.T_map_odom, query.position[None])[0, :2]
+    edge = CUT * float(TILE)
+    shift = np.floor((at - low * float(TILE)) / edge) * -edge
+    return replace(
+        hypothesis, T_map_odom=pose_from(np.eye(3), np.array([*shift, 0.0])) @ hypothesis.T_map_odom
+    )
+
+
+def scaled(folder: Path) -> Iterator[dict[str, Any]]:
+    """Seconds of each part of a query, medians over a few, for each size of the map."""
+    config = LocalizerConfig(reloc="learned")
+    place = drawn(folder, _SEED, _QUERIES)
+    base_map = BaseMap.build(place.base, radius=30.0, learned=True)
+    queries = [query_of(drive, config)[0] for drive in place.drives]
+    chain = Chain(base_map, config)
+    for side in SIDES:
+        features, stations, low = enlarged(base_map, side)
+        begin = time.perf_counter()
+        whole = _LargeMap(base_map, features, stations)
+        learned = Knowledge.of(whole, config).learned
+        assert learned is not None
+        learned.prepare()
+        peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
+        consensus = Consensus(stations, base_map.config.block, peaks)
+        prepared = time.perf_counter() - begin
+        spent: list[list[float]] = []
+        for query in [queries[0], *queries * _REPEAT]:
+            consensus.clear()
+            ticks = [time.perf_counter()]
+            centre = np.array([*query.position[:2], ground_below(query.surroundings, query.position)])
+            view = learned.view(query.surroundings, centre)
+            ticks.append(time.perf_counter())
+            volume = learned.distances(view)
+            ticks.append(time.perf_counter())
+            consensus.vote(centre, {"learned": volume})
+            named = consensus.hypotheses()
+            ticks.append(time.perf_counter())
+            named = learned.sharpened(named, view)
+            ticks.append(time.perf_counter())
+            chain.register([home(each, query, low) for each in named], chain.source(query), query)
+            ticks.append(time.perf_counter())
+            spent.append(np.diff(ticks).tolist())
+        medians = np.median(np.array(spent[1:]), axis=0).tolist()  # the first one waits for memory and crops
+        total = float(np.median(np.array(spent[1:]).sum(axis=1)))
+        say(f"{side} x {side} tiles: {total:.2f} s a query")
+        yield {
+            "km2": features.tile_area / 1e6, "stations": len(stations), "prepare": prepared, "total": total,
+            "limit": LIMITS[side], "threads": _threads(), **dict(zip(_PARTS, medians, strict=True)),
+        }  # fmt: skip
+
+
+class _LargeMap(BaseMap):
+    """A map with other features and stations than the original's."""
+
+    def __init__(self, original: BaseMap, features: FeatureMap, stations: npt.NDArray[np.float32]) -> None:
+        self.__dict__.update(original.__dict__)
+        self.__dict__ |= {"learned": features, "stations": stations}
+
+
+def _threads() -> str:
+    names = ("OPENBLAS_NUM_THREADS", "COVIEW_THREADS")
+    return ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in names)
+
+
+def scale_table(rows: Sequence[dict[str, Any]]) -> str:
+    """One line per size of the map, seconds."""
+    head = (
+        "map, km2",
+        "stations",
+        "prepared once, s",
+        *(f"{part}, s" for part in _PARTS),
+        "query, s",
+        "limit, s",
+    )
+    shown = [
+        [
+            number(row["km2"], 2), str(row["stations"]), number(row["prepare"], 2),
+            *(number(row[part], 3) for part in _PARTS), number(row["total"], 2), number(row["limit"], 1),
+        ]
+        for row in rows
+    ]  # fmt: skip
+    return f"{table(head, shown)}\n\n{rows[0]['threads']}; {os.cpu_count()} cores."

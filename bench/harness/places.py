@@ -1,0 +1,108 @@
+"""The queries that all peers answer: places along a simulated run, each as a robot just switched on there sees it.
+
+A place is the end of a drive of eight metres: the localizer gets the five keyframes of that drive one after the
+other, the others the same points at once, as one gravity-aligned submap about the robot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.harness.worlds import map_of, prepare, world_name
+from coview_stream import BaseMap
+from coview_stream.clouds import open_run, read_tum
+from coview_stream.clouds.runs import Run
+from coview_stream.config import DescriptorConfig, KeyframeConfig
+from coview_stream.geometry import Points, Pose, inverse, pose_from
+from coview_stream.place.keyframes import KeyframeBuffer
+from coview_stream.query import Needs, Query
+from coview_stream.sim import SimulationConfig
+
+KEYFRAMES = 5
+"""Keyframes of a query: a drive of eight metres."""
+
+WORLDS = {
+    "town": SimulationConfig("town", "vlp16", seed=2201, size=240.0, length=90.0),
+    "campus": SimulationConfig("campus", "os64", seed=2202, size=240.0, length=90.0),
+}
+"""Airborne base map (20 pulses per square metre), ground run; seeds that nothing was tuned on."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """One query with its answer.
+
+    Attributes:
+        queries: of the keyframes, oldest first, for the localizer.
+        submap: (N, 3) float32 all points of the keyframes, metres: axes of the odometry (gravity aligned), zero at
+            the robot.
+        T_map_submap: (4, 4) the truth; the map's coordinates are relative to its origin.
+    """
+
+    queries: list[Query]
+    submap: Points
+    T_map_submap: Pose
+
+    def errors(self, T_map_submap: Pose) -> tuple[float, float]:
+        """Distance (metres) and angle (degrees) of an answer from the truth."""
+        off = inverse(self.T_map_submap) @ T_map_submap
+        cosine = np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+        return float(np.linalg.norm(off[:3, 3])), float(np.degrees(np.arccos(cosine)))
+
+    @property
+    def T_odom_submap(self) -> Pose:
+        """(4, 4): where the robot is in the odometry frame, without its turn."""
+        return pose_from(np.eye(3), self.queries[-1].position)
+
+
+def world(folder: Path, scene: str) -> Path:
+    """Simulate a world and build its map unless that is done; return its directory."""
+    prepare(folder, WORLDS[scene])
+    return folder / world_name(WORLDS[scene])
+
+
+def base_map(folder: Path, scene: str) -> BaseMap:
+    """Load the map of a world."""
+    return BaseMap.load(map_of(folder, WORLDS[scene]))
+
+
+def places(folder: Path, scene: str, count: int) -> list[Place]:
+    """``count`` places, evenly along the run of a world that is there."""
+    there, site = folder / world_name(WORLDS[scene]), base_map(folder, scene)
+    run, (_, truth) = open_run(there / "run"), read_tum(there / "truth.tum")
+    settings = KeyframeConfig()
+    position = np.array([T[:3, 3] for T in run.poses])
+    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    last = driven[-1] - KEYFRAMES * settings.distance
+    starts = np.searchsorted(driven, np.linspace(0.0, last, count))
+    return [_place(run, truth, int(start), site.origin, settings, site.descriptor_config) for start in starts]
+
+
+def _place(
+    run: Run,
+    truth: npt.NDArray[np.float64],
+    start: int,
+    origin: npt.NDArray[np.float64],
+    settings: KeyframeConfig,
+    descriptor: DescriptorConfig,
+) -> Place:
+    buffer, queries = KeyframeBuffer(settings), []
+    for index in range(start, len(run)):
+        frame = run.read(index)
+        T_odom_body = frame.T_odom_body.copy()
+        T_odom_body[:3, 3] -= run.poses[start][:3, 3]
+        keyframe = buffer.add(frame.points, T_odom_body, frame.stamp)
+        if keyframe is not None:
+            queries.append(Query.of(buffer, keyframe, frame.points, Needs(descriptor)))
+        if len(queries) == KEYFRAMES:
+            break
+    position = queries[-1].position
+    submap = (buffer.recent(KEYFRAMES) - position.astype(np.float32)).astype(np.float32)
+    T_map_body = truth[index].copy()
+    T_map_body[:3, 3] -= origin
+    T_submap_body = pose_from(T_odom_body[:3, :3], np.zeros(3))
+    return Place(queries, submap, T_map_body @ inverse(T_submap_body))

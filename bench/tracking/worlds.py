@@ -1,0 +1,245 @@
+"""Worlds that tracking is measured in, and their maps: as it is, with a gap, and of an earlier time.
+
+A world is simulated once (the base map's scan, the truth and the frames of a drive) and kept; what happens to the robot
+in a scenario is made of those frames. Frames are kept as int16 steps of 4 mm, a fifth of the lidar's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.harness.worlds import fingerprint, remembered_seconds
+from coview_stream.config import MapConfig
+from coview_stream.geometry import Points
+from coview_stream.report.evaluation import driven
+from coview_stream.sim import KINDS, SimulationConfig
+from coview_stream.sim.scenes import Scene, build_scene
+
+Floats = npt.NDArray[np.float64]
+
+STEP = 0.004
+"""Metres; what frames are rounded to."""
+
+GAP = (120.0, 220.0)
+"""Metres of the drive between which the map of a gap holds nothing near the robot ..."""
+GAP_RADIUS = 40.0
+"""... within so many metres."""
+
+CHANGED = 0.3
+"""Share of the buildings, cars, poles and trees that are others in the changed map."""
+
+_TREES, _UNDERGROWTH = 0.012, 0.008  # per square metre, of a sparse forest
+_SELF = "bench/tracking/worlds.py"
+_MAPPER = (
+    "coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds", "coview_stream/place/descriptor.py",
+    "coview_kernels", _SELF,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class World:
+    """A place and a drive of ``length`` metres at ``speed`` m/s, and how far the odometry of its plain run drifts.
+
+    Attributes:
+        kind: town, campus or sparse-forest (120 stems per hectare, a third of the simulator's forest).
+        drift: share of the distance, over 100 m (see :func:`bench.tracking_drives.drift_share`).
+    """
+
+    kind: str
+    sensor: str
+    seed: int
+    size: float
+    length: float
+    speed: float
+    drift: float
+
+    @property
+    def name(self) -> str:
+        """Directory below the benchmark's folder."""
+        return f"tracking-{self.kind}-{self.sensor}-{self.seed}"
+
+    @property
+    def config(self) -> SimulationConfig:
+        """What the simulator is asked for."""
+        scene = "forest" if self.kind == "sparse-forest" else self.kind
+        return SimulationConfig(scene, self.sensor, self.seed, self.size, self.length, speed=self.speed)
+
+    def scene(self, changed: float = 0.0) -> Scene:
+        """Draw the place."""
+        config = self.config
+        sparse = {"forest": KINDS["forest"]._replace(trees=_TREES, undergrowth=_UNDERGROWTH)}
+        with patch.dict(KINDS, sparse) if self.kind == "sparse-forest" else nullcontext():
+            return build_scene(config.scene, config.seed, config.size, changed)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The drive through a world, frame by frame.
+
+    Attributes:
+        truth: (N, 4, 4) map <- body.
+    """
+
+    truth: Floats
+    _counts: npt.NDArray[np.int64]
+    _rows: npt.NDArray[np.int16]
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    def read(self, index: int) -> Points:
+        """Frame (K, 3) float32 metres, body frame."""
+        end = int(self._counts[: index + 1].sum())
+        rows = self._rows[end - int(self._counts[index]) : end]
+        return np.asarray(rows.astype(np.float32) * np.float32(STEP))
+
+
+def open_world(folder: Path, world: World) -> Recorded:
+    """Open the drive of a world, simulated now unless it is there."""
+    out = folder / world.name
+    wanted = {"world": asdict(world) | {"drift": 0}, "code": fingerprint("coview_stream/sim", _SELF)}
+    remembered_seconds(out / "simulated.json", wanted, lambda: _simulate(out, world))
+    rows = np.memmap(out / "frames.i16", np.int16, "r").reshape(-1, 3)
+    return Recorded(np.load(out / "truth.npy"), np.load(out / "counts.npy"), rows)
+
+
+def map_of(folder: Path, world: World, variant: str = "plain") -> Path:
+    """Return a map of a world, built now unless it is there: ``plain``, ``gap`` or ``changed``."""
+    drive = open_world(folder, world)
+    out = folder / world.name
+    file = out / f"{variant}.coview"
+    wanted = {
+        "world": asdict(world) | {"drift": 0}, "map": asdict(MapConfig()), "code": fingerprint(*_MAPPER),
+    }  # fmt: skip
+    makers: dict[str, Callable[[], Floats]] = {
+        "plain": lambda: np.load(out / "base.npy").astype(np.float64),
+        "gap": lambda: _with_gap(np.load(out / "base.npy").astype(np.float64), drive.truth),
+        "changed": lambda: _scanned(earlier(world.scene(CHANGED), world.seed, CHANGED), world),
+    }
+    remembered_seconds(out / f"{variant}.json", wanted, lambda: _build(file, makers[variant]()))
+    return file
+
+
+def in_gap(truth: Floats, positions: Floats) -> npt.NDArray[np.bool_]:
+    """Whether each of (N, 2 or 3) positions lies where the map of a gap holds nothing."""
+    from scipy.spatial import cKDTree
+
+    way = driven(truth)
+    inner = (way >= GAP[0] + GAP_RADIUS) & (way <= GAP[1] - GAP_RADIUS)
+    if not inner.any():
+        return np.zeros(len(positions), dtype=bool)
+    near = cKDTree(truth[inner, :2, 3]).query(positions[:, :2], distance_upper_bound=GAP_RADIUS)[0]
+    return np.asarray(np.isfinite(near))
+
+
+def earlier(scene: Scene, seed: int, share: float) -> Scene:
+    """Return the place as it was: other cars, poles and trees (``scene.now``), and a ``share`` of other buildings.
+
+    A third of those is not built yet, a third is smaller and of another height, a third is turned round and shifted by
+    1 to 2.5 m either way. ``mapped`` is what the aircraft saw then; ``now`` is what the unchanged scene's drive sees.
+    """
+    rng = np.random.default_rng([seed, 31])
+    solid = scene.now.solid
+    owner = _owners(scene)
+    chosen = rng.permutation(len(scene.footprints))[: round(share * len(scene.footprints))]
+    vertices, gone = solid.vertices.copy(), np.zeros(len(solid.vertices), dtype=bool)
+    for rank, building in enumerate(chosen):
+        mine = owner == building
+        plot = scene.footprints[building]
+        base = np.array([plot.x, plot.y, plot.ground])
+        if rank % 3 == 0:
+            gone |= mine
+            continue
+        local = vertices[mine] - base
+        c, s = np.cos(plot.yaw), np.sin(plot.yaw)
+        local[:, :2] = local[:, :2] @ np.array([[c, -s], [s, c]])  # frontage along x
+        if rank % 3 == 1:
+            local *= (rng.uniform(0.6, 0.8), rng.uniform(0.6, 0.8), rng.choice([0.6, 1.5]))
+        else:
+            local[:, :2] = (local[:, :2] + rng.uniform(1.0, 2.5, 2) * rng.choice([-1, 1], 2)) * (-1, -1)
+        local[:, :2] = local[:, :2] @ np.array([[c, s], [-s, c]])
+        vertices[mine] = local + base
+    keep = ~gone[solid.triangles[:, 0]]
+    epoch = replace(scene.now, solid=solid._replace(vertices=vertices, triangles=solid.triangles[keep]))
+    return replace(scene, mapped=epoch, now=scene.mapped)
+
+
+def _owners(scene: Scene, margin: float = 2.0) -> npt.NDArray[np.intp]:
+    """(V,) the building that each vertex of ``scene.now.solid`` belongs to, -1 for none.
+
+    A mesh is of unconnected pieces (walls, roofs, porches, and the ground); a piece belongs to the building whose
+    footprint its middle lies in, or is nearest to within ``margin`` metres.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    solid = scene.now.solid
+    a, b, c = solid.triangles.T
+    count = len(solid.vertices)
+    edges = coo_matrix((np.ones(2 * len(a), bool), (np.r_[a, b], np.r_[b, c])), shape=(count, count))
+    pieces, piece = connected_components(edges, directed=False)
+    size = np.bincount(piece, minlength=pieces)
+    middle = np.column_stack([np.bincount(piece, solid.vertices[:, d], pieces) / size for d in (0, 1)])
+    best, owner = np.full(pieces, margin), np.full(pieces, -1, dtype=np.intp)
+    for k, plot in enumerate(scene.footprints):
+        c, s = np.cos(plot.yaw), np.sin(plot.yaw)
+        local = np.abs((middle - (plot.x, plot.y)) @ np.array([[c, -s], [s, c]]))
+        out = np.hypot(*np.maximum(local - (plot.w / 2, plot.d / 2), 0.0).T)
+        nearer = (out < best) & (size < 1000)  # the ground is one piece
+        best[nearer], owner[nearer] = out[nearer], k
+    return np.asarray(owner[piece])
+
+
+def _simulate(out: Path, world: World) -> None:
+    from coview_stream.sim.simulate import frames, trajectories
+
+    scene = world.scene()
+    _, truth, _ = trajectories(scene, world.config)
+    out.mkdir(parents=True, exist_ok=True)
+    np.save(out / "base.npy", _scanned(scene, world).astype(np.float32))
+    np.save(out / "truth.npy", truth)
+    with _whole(out / "frames.i16") as part, part.open("wb") as stream:
+        counts = [_write(stream, points) for points in frames(scene, world.config, truth)]
+    np.save(out / "counts.npy", np.array(counts, dtype=np.int64))
+
+
+def _write(stream: Any, points: Points) -> int:
+    stream.write(np.round(points / STEP).astype(np.int16).tobytes())
+    return len(points)
+
+
+@contextmanager
+def _whole(file: Path) -> Iterator[Path]:
+    part = file.with_suffix(".part")
+    yield part
+    part.replace(file)
+
+
+def _scanned(scene: Scene, world: World) -> Floats:
+    from coview_stream.sim.simulate import base_map
+
+    return base_map(scene, world.config)
+
+
+def _with_gap(points: Floats, truth: Floats) -> Floats:
+    return points[~in_gap(truth, points)]
+
+
+def _build(file: Path, points: Floats) -> None:
+    from coview_stream import BaseMap
+    from coview_stream.clouds import write_cloud
+
+    source = file.with_suffix(".laz")
+    try:
+        write_cloud(source, points)
+        BaseMap.build(source).save(file)
+    finally:
+        source.unlink(missing_ok=True)

@@ -1,0 +1,29 @@
+"""A drive and what a localizer told on it, small enough to know the score."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.harness.trajectory_scores import Told
+from coview_stream.geometry import pose_from, rot_z
+from coview_stream.rotation import exp_so3
+
+
+def way(count=1500, step=0.2):
+    """A winding drive of ``step`` metres a frame, tilted by a degree."""
+    heading = 0.6 * np.sin(np.arange(count) * step / 20.0) + 0.3
+    steps = step * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(count)])
+    tilt = exp_so3(np.radians([1.0, 0.0, 0.0]))
+    places = np.cumsum(steps, axis=0)
+    return np.stack([pose_from(rot_z(h) @ tilt, p) for h, p in zip(heading, places, strict=True)])
+
+
+def told(states, poses=None, reasons=None, covariance=None, stamps=None):
+    count = len(states)
+    known = np.array([state == "TRACKING" for state in states])
+    poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses.copy()
+    poses[~known] = np.nan
+    covariance = np.eye(6) if covariance is None else covariance
+    stamps = 0.1 * np.arange(count) if stamps is None else np.asarray(stamps)
+    reasons = [""] * count if reasons is None else reasons
+    return Told(stamps, states, reasons, poses, np.tile(covariance, (count, 1, 1)), np.full(count, 0.005))
