@@ -11,7 +11,6 @@ from coview_stream.geometry import Points, Pose, inverse, transform
 from coview_stream.odometer import Odometer
 from coview_stream.place.keyframes import thinned
 from coview_stream.pose.attempt import Attempt, Registrar, Scan
-from coview_stream.pose.chain import Estimate
 from coview_stream.pose.covariance import (
     angles_first,
     carried_along,
@@ -19,7 +18,7 @@ from coview_stream.pose.covariance import (
 )
 from coview_stream.pose.drift import Drift
 from coview_stream.pose.glance import Glance
-from coview_stream.pose.graph import Smoother, make_smoother
+from coview_stream.pose.graph import Estimate, PoseGraph
 from coview_stream.pose.judgement import Habit, Judgement
 from coview_stream.pose.registration import LocalMap, LocalMaps, Registration
 from coview_stream.pose.source import local_source
@@ -46,7 +45,7 @@ class Tracker:
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
-        self._graph: Smoother = make_smoother(config.graph)
+        self._graph = PoseGraph(config.graph)
         self._odometer = Odometer(config.tracking)
         self._habit = Habit()
         self._glance = Glance()
@@ -193,7 +192,7 @@ class Tracker:
         self._odometer.mark(T_odom_body)
         self._believe(T_odom_body)
 
-    def _moved(self, T_odom_body: Pose, idle: bool) -> Smoother:
+    def _moved(self, T_odom_body: Pose, idle: bool) -> PoseGraph:
         """Add a keyframe where odometry leads."""
         driven, turned = self._odometer.since_keyframe()
         spread = self.drift.covariance(driven + _IDLE_DRIVE * idle, turned)

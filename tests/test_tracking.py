@@ -40,9 +40,8 @@ def test_a_good_registration_is_believed(world_map, world_drive):
     assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
 
 
-@pytest.mark.parametrize("backend", ["auto", "numpy"])
-def test_a_drive_is_followed_longer_than_the_graph_is(world_map, slow_drive, backend):
-    config = LocalizerConfig(graph=GraphConfig(backend=backend, window=2, restart=6))
+def test_a_drive_is_followed_longer_than_the_graph_is(world_map, slow_drive):
+    config = LocalizerConfig(graph=GraphConfig(window=2, restart=6))
     ride = ride_of(world_map, slow_drive, config, 0)
     for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):
         assert ride.update(cloud, truth).verified

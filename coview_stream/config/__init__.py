@@ -9,17 +9,16 @@ from __future__ import annotations
 from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.learned import LearnedConfig, Reloc
 from coview_stream.config.localizer import LocalizerConfig
-from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, Visibility, map_preset
+from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, map_preset
 from coview_stream.config.place import ConsensusConfig, KeyframeConfig, RetrievalConfig
 from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
-from coview_stream.config.tracking import GraphBackend, GraphConfig, TrackingConfig
+from coview_stream.config.tracking import GraphConfig, TrackingConfig
 
 __all__ = [
     "AcceptanceConfig",
     "Channel",
     "ConsensusConfig",
     "DescriptorConfig",
-    "GraphBackend",
     "GraphConfig",
     "KeyframeConfig",
     "LearnedConfig",
@@ -31,6 +30,5 @@ __all__ = [
     "Reloc",
     "RetrievalConfig",
     "TrackingConfig",
-    "Visibility",
     "map_preset",
 ]

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 from coview_stream.config.checks import counts, positive, require
-
-GraphBackend = Literal["auto", "gtsam", "numpy"]
 
 
 @dataclass(frozen=True)
@@ -70,23 +67,19 @@ class TrackingConfig:
 class GraphConfig:
     """How poses are smoothed (see :mod:`coview_stream.pose.graph`).
 
-    ``backend`` is ``gtsam``, ``numpy``, or ``auto``: gtsam where it can be imported, else NumPy. Both answer alike for
-    the newest pose. The gtsam graph grows to ``restart`` keyframes and begins anew with the newest ``window`` of them;
-    the NumPy one does so when it has a quarter more. What they drop lives on in the belief that it left behind, so
-    a longer window only lets old registrations be weighed again, and linearised again, in the light of later ones.
+    The graph grows to ``restart`` keyframes and begins anew with the newest ``window`` of them. What it drops lives on
+    in the belief that it left behind, so a longer window only lets old registrations be weighed again, and linearised
+    again, in the light of later ones.
     ``huber`` is where, in standard deviations, a registration's pull stops growing. It is the norm of six residuals at
     once, which is 2.4 on average and exceeds 3.5 in one case of twenty; the usual 1.345 is meant for a single one. It
     must not be a kernel that lets go altogether: with an optimistic covariance that locks the map out for good.
     """
 
-    backend: GraphBackend = "auto"
     window: int = 40
     restart: int = 120
     huber: float = 3.5
 
     def __post_init__(self) -> None:
-        allowed = get_args(GraphBackend)
-        require(self.backend in allowed, self, "backend", f"one of {', '.join(allowed)}")
         counts(self, "window", "restart", least=2)
         require(self.restart > self.window, self, "restart", f"greater than window ({self.window})")
         positive(self, "huber")

@@ -12,9 +12,8 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.fix import Cause
 from coview_stream.geometry import Points, Pose, inverse, tilt_of, transform
-from coview_stream.pose.chain import Estimate
 from coview_stream.pose.covariance import registration_covariance, without_prior
-from coview_stream.pose.graph import Smoother
+from coview_stream.pose.graph import Estimate, PoseGraph
 from coview_stream.pose.judgement import Habit, Judgement
 from coview_stream.pose.rays import RangeImage
 from coview_stream.pose.registration import LocalMap, Prior, Source, register
@@ -72,7 +71,7 @@ class Registrar:
         target: LocalMap,
         scales: tuple[float, ...],
         habit: Habit,
-        graph: Smoother,
+        graph: PoseGraph,
     ) -> Attempt:
         """Register, verify and judge; where the numbers leave nothing to hold on to, the belief stays.
 

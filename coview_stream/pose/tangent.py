@@ -7,7 +7,7 @@ covariance says, both name the same motions: r = R xi_r and s = R xi_t. So a cov
 the rotation alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its lever arm [t]x R, would belong to turning
 about the map's origin.)
 
-Radians and metres; functions take single poses (4, 4) or stacks (..., 4, 4).
+Radians and metres; poses are (4, 4).
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from coview_stream.rotation import exp_so3, log_so3
 Array = npt.NDArray[np.float64]
 Matrix6 = npt.NDArray[np.float64]
 Vector6 = npt.NDArray[np.float64]
-
-_SMALL = 1e-4  # radians: below, the coefficient's series is exact to the last digit
 
 
 def along_body(covariance: Matrix6, T_map_body: Pose) -> Matrix6:
@@ -64,37 +62,12 @@ def cross(v: Array) -> Array:
     return np.asarray(K - np.swapaxes(K, -1, -2))
 
 
-def log_se3(T: Pose) -> Vector6:
-    """Return xi (..., 6) = (rotation, translation) of which the poses are the exponential."""
-    turn = log_so3(T[..., :3, :3])
-    angle = np.linalg.norm(turn, axis=-1)
-    small = angle < _SMALL
-    half = 0.5 * np.where(small, 1.0, angle)
-    factor = np.where(small, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half * half))
-    K = cross(turn)
-    straight = np.eye(3) - 0.5 * K + factor[..., None, None] * (K @ K)
-    return np.concatenate([turn, (straight @ T[..., :3, 3, None])[..., 0]], axis=-1)
-
-
 def adjoint(T: Pose) -> Matrix6:
-    """Matrices (..., 6, 6) with T exp(xi) = exp(Ad xi) T."""
-    R = T[..., :3, :3]
-    Ad = np.zeros((*T.shape[:-2], 6, 6))
-    Ad[..., :3, :3] = Ad[..., 3:, 3:] = R
-    Ad[..., 3:, :3] = cross(T[..., :3, 3]) @ R
+    """Matrix (6, 6) with T exp(xi) = exp(Ad xi) T."""
+    Ad = np.zeros((6, 6))
+    Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
+    Ad[3:, :3] = cross(T[:3, 3]) @ T[:3, :3]
     return Ad
-
-
-def log_slope(xi: Vector6) -> Matrix6:
-    """How log(T exp(d)) grows with d at d = 0, (..., 6, 6): the inverse right Jacobian of SE(3) at xi = log T.
-
-    By its series (Bernoulli numbers) to the fourth order, 1e-6 off at half a radian.
-    """
-    ad = np.zeros((*xi.shape[:-1], 6, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = cross(xi[..., :3])
-    ad[..., 3:, :3] = cross(xi[..., 3:])
-    square = ad @ ad
-    return np.asarray(np.eye(6) + 0.5 * ad + square / 12.0 - (square @ square) / 720.0)
 
 
 def checked_pose(name: str, T: npt.ArrayLike) -> Pose:

@@ -17,7 +17,7 @@ from coview_stream.decision import Verdict
 from coview_stream.errors import MapError, RunError
 from coview_stream.localizer import Localizer
 from coview_stream.pose import gicp
-from coview_stream.pose.graph import make_smoother
+from coview_stream.pose.graph import PoseGraph
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.search import GlobalSearch
 from coview_stream.sources import Knowledge
@@ -91,7 +91,7 @@ class TrackEngine:
 
     def prepare(self) -> None:
         """Import what the graph of poses runs on; the map is cropped where robots are."""
-        make_smoother(self.config.graph)
+        PoseGraph(self.config.graph)
 
     def _localizer(self, job: FrameJob) -> Localizer:
         epoch, localizer = self._robots.get(job.robot, (None, None))

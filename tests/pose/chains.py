@@ -10,7 +10,6 @@ from coview_stream.geometry import exp_se3, inverse, pose_from
 from coview_stream.pose.tangent import shifted
 from coview_stream.rotation import exp_so3
 
-NO_GTSAM = "gtsam is not installed here; the graph runs on NumPy"
 START = pose_from(exp_so3([0.1, -0.2, 2.2]), [120.0, -40.0, 7.0])
 START_COVARIANCE = np.diag([0.01, 0.01, 0.03, 0.3, 0.3, 0.2]) ** 2
 ODOMETRY = np.diag([0.001, 0.001, 0.002, 0.02, 0.02, 0.02]) ** 2
@@ -50,15 +49,15 @@ def drive(
     return Drive(truth, steps, seen)
 
 
-def run(smoother, drive, odometry=ODOMETRY, registration=REGISTRATION, start=START_COVARIANCE):
+def run(graph, drive, odometry=ODOMETRY, registration=REGISTRATION, start=START_COVARIANCE):
     """All estimates, from the first keyframe on."""
-    smoother.start(drive.truth[0], start)
-    estimates = [smoother.estimate]
+    graph.start(drive.truth[0], start)
+    estimates = [graph.estimate]
     for step, seen in zip(drive.steps, drive.seen[1:], strict=True):
-        smoother.move(step, odometry)
+        graph.move(step, odometry)
         if seen is not None:
-            smoother.correct(seen, registration)
-        estimates.append(smoother.estimate)
+            graph.correct(seen, registration)
+        estimates.append(graph.estimate)
     return estimates
 
 

@@ -13,8 +13,7 @@ from coview_stream.geometry import inverse, pose_from, rot_z
 from coview_stream.place.keyframes import thinned
 from coview_stream.pose import attempt
 from coview_stream.pose.attempt import Attempt, Registrar, Scan
-from coview_stream.pose.chain import Estimate
-from coview_stream.pose.graph import make_smoother
+from coview_stream.pose.graph import Estimate, PoseGraph
 from coview_stream.pose.judgement import Habit
 from coview_stream.pose.registration import LocalMaps, Prior, register
 from coview_stream.pose.source import local_source
@@ -39,11 +38,11 @@ def scan_of(cloud, truth) -> Scan:
 
 def attempted(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> Attempt:
     """Attempt it from a belief, which is what the graph predicts unless that is given too."""
-    smoother = make_smoother(CONFIG.graph)
-    smoother.start(*(graph or belief))
+    pose_graph = PoseGraph(CONFIG.graph)
+    pose_graph.start(*(graph or belief))
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
     scales = CONFIG.registration.track
-    return Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), smoother)
+    return Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), pose_graph)
 
 
 def off(found, truth):
@@ -130,12 +129,12 @@ def assert_unheld(found, truth):
 def test_beyond_what_was_surveyed_nothing_is_held_against_the_place(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
     edge = np.array([0.0, 0.0, 0.0, 60.0 - truth[0, 3], 0.0, 0.0])
-    smoother = make_smoother(CONFIG.graph)
+    pose_graph = PoseGraph(CONFIG.graph)
     belief = Estimate(shifted(truth, edge), TIGHT)
-    smoother.start(*belief)
+    pose_graph.start(*belief)
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
     scales = CONFIG.registration.track
-    found = Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), smoother)
+    found = Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), pose_graph)
     assert found.judgement.cause is Cause.OFF_MAP
 
 

@@ -1,11 +1,10 @@
-"""The graph beside other solutions: a dense one, the other backend's, and one that never forgets."""
+"""The pose graph beside other solutions: a dense one, and one that never forgets."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from chains import (
-    NO_GTSAM,
     ODOMETRY,
     REGISTRATION,
     START,
@@ -17,9 +16,7 @@ from chains import (
 )
 
 from coview_stream.config import GraphConfig
-from coview_stream.pose import graph_gtsam
-from coview_stream.pose.graph import make_smoother
-from coview_stream.pose.graph_numpy import huber
+from coview_stream.pose.graph import _RELINEARIZE, PoseGraph
 from coview_stream.pose.tangent import along_body, along_map, difference, shifted
 
 HUBER = GraphConfig().huber
@@ -28,7 +25,7 @@ HUBER = GraphConfig().huber
 # ---- against a dense solution
 
 
-def dense(way, kernel, start=START_COVARIANCE):
+def dense(way, start=START_COVARIANCE):
     """All poses at once, by derivatives from differences and full matrices; the newest pose and covariance."""
     n = len(way.truth)
     X = [START]
@@ -57,7 +54,7 @@ def dense(way, kernel, start=START_COVARIANCE):
             ahead, behind = ([*X[:k], shifted(X[k], s * h), *X[k + 1 :]] for s in (1, -1))
             J[:, column] = (np.concatenate(residuals(ahead)) - np.concatenate(residuals(behind))) / 2e-5
         w = np.ones(len(r))
-        w[n:] = kernel(np.array([np.linalg.norm(one) for one in r[n:]]))
+        w[n:] = [HUBER / max(HUBER, np.linalg.norm(one)) for one in r[n:]]
         W = np.repeat(w, 6)
         H = J.T @ (W[:, None] * J)
         step = -np.linalg.solve(H, J.T @ (W * np.concatenate(r)))
@@ -67,12 +64,12 @@ def dense(way, kernel, start=START_COVARIANCE):
     return X[-1], np.linalg.inv(H)[-6:, -6:]
 
 
-def test_the_newest_pose_is_the_dense_solutions(backend):
+def test_the_newest_pose_is_the_dense_solutions(graph):
     """With an outlier of metres among the corrections; residuals here are along the map's axes, not the body's."""
     way = drive(8, seed=2, every=2)
     way.seen[4] = shifted(way.seen[4], np.array([0, 0, 0, 3.0, -2.0, 1.0]))
-    T, covariance = dense(way, huber(HUBER))
-    found = run(make_smoother(GraphConfig(backend=backend)), way)[-1]
+    T, covariance = dense(way)
+    found = run(graph, way)[-1]
     gap = np.abs(difference(found.T_map_body, T))
     assert gap[:3].max() < 1e-4
     assert gap[3:].max() < 2e-3
@@ -82,25 +79,12 @@ def test_the_newest_pose_is_the_dense_solutions(backend):
 # ---- the window
 
 
-def test_numpy_and_gtsam_agree():
-    pytest.importorskip("gtsam", reason=NO_GTSAM)
-    way = drive(240, seed=5, outliers=0.05)
-    short = {"window": 20, "restart": 50}
-    a = run(make_smoother(GraphConfig(backend="gtsam", **short)), way)
-    b = run(make_smoother(GraphConfig(backend="numpy", **short)), way)
-    gaps = np.abs([difference(p.T_map_body, q.T_map_body) for p, q in zip(a, b, strict=True)])
-    sigmas = np.sqrt([np.diag(q.covariance) for q in b])
-    assert (gaps / sigmas).max() < 0.2  # gtsam weighs anew only what has moved by a threshold
-    assert np.median(gaps[:, 3:].max(axis=1)) < 1e-3
-    assert np.abs(np.sqrt([np.diag(p.covariance) for p in a]) / sigmas - 1.0).max() < 0.05
-
-
 def full_isam2(way):
     """One iSAM2 that never forgets, its tangent handled here."""
     import gtsam
 
     parameters = gtsam.ISAM2Params()
-    parameters.setRelinearizeThreshold(graph_gtsam._RELINEARIZE)
+    parameters.setRelinearizeThreshold(_RELINEARIZE)
     parameters.relinearizeSkip = 1
     isam = gtsam.ISAM2(parameters)
     gaussian, robust = gtsam.noiseModel.Gaussian.Covariance, gtsam.noiseModel.Robust.Create
@@ -131,11 +115,9 @@ def full_isam2(way):
 
 def test_two_thousand_keyframes_are_as_in_a_graph_that_never_forgets():
     """To a hundredth of a sigma and a millimetre, and memory does not grow."""
-    pytest.importorskip("gtsam", reason=NO_GTSAM)
     way = drive(2000, seed=6, every=10, outliers=0.05)
-    config = GraphConfig(backend="gtsam")
-    smoother = make_smoother(config)
-    found, full = run(smoother, way), full_isam2(way)
+    pose_graph = PoseGraph()
+    found, full = run(pose_graph, way), full_isam2(way)
     gaps = np.abs([difference(e.T_map_body, T) for e, (T, _) in zip(found, full, strict=True)])
     sigmas = np.sqrt([np.diag(C) for _, C in full])
     assert (gaps / sigmas).max() < 0.01
@@ -143,32 +125,32 @@ def test_two_thousand_keyframes_are_as_in_a_graph_that_never_forgets():
     covariances = np.array([np.diag(e.covariance) for e in found])
     assert np.abs(np.sqrt(covariances) / sigmas - 1.0).max() < 0.01
     assert shift_errors(found, way.truth)[100:].mean() < 0.15
-    assert config.window <= len(smoother) <= config.restart
+    assert pose_graph.config.window <= len(pose_graph) <= pose_graph.config.restart
 
 
-def test_what_is_held_is_bounded(backend):
-    config = GraphConfig(backend=backend, window=5, restart=9)
-    smoother, way = make_smoother(config), drive(60, seed=7)
+def test_what_is_held_is_bounded():
+    config = GraphConfig(window=5, restart=9)
+    graph, way = PoseGraph(config), drive(60, seed=7)
     lengths = []
-    smoother.start(START, START_COVARIANCE)
+    graph.start(START, START_COVARIANCE)
     for step, seen in zip(way.steps, way.seen[1:], strict=True):
-        smoother.move(step, ODOMETRY)
+        graph.move(step, ODOMETRY)
         if seen is not None:
-            smoother.correct(seen, REGISTRATION)
-        lengths.append(len(smoother))
+            graph.correct(seen, REGISTRATION)
+        lengths.append(len(graph))
     assert max(lengths) <= config.restart
     assert min(lengths[config.window :]) >= config.window
 
 
 @pytest.mark.parametrize("every", [1, 4, 30])
-def test_a_short_window_forgets_nothing_that_matters(backend, every):
+def test_a_short_window_forgets_nothing_that_matters(every):
     """The past meets the future in one pose; the smoothed belief there would count things twice.
 
     The kernel is out of the way: what it has weighed cannot be weighed again once it is forgotten.
     """
     way = drive(80, seed=8, every=every)
-    long = run(make_smoother(GraphConfig(backend=backend, window=200, restart=400, huber=100.0)), way)
-    short = run(make_smoother(GraphConfig(backend=backend, window=3, restart=5, huber=100.0)), way)
+    long = run(PoseGraph(GraphConfig(window=200, restart=400, huber=100.0)), way)
+    short = run(PoseGraph(GraphConfig(window=3, restart=5, huber=100.0)), way)
     for a, b in zip(long, short, strict=True):
         sigma = np.sqrt(np.diag(a.covariance))
         assert (np.abs(difference(a.T_map_body, b.T_map_body)) < 0.05 * sigma).all()

@@ -1,4 +1,4 @@
-"""The two tangents name the same motions, and the graph's derivatives are what differences say."""
+"""The two tangents name the same motions, those of gtsam."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import InputError
-from coview_stream.geometry import exp_se3, inverse, pose_from
+from coview_stream.geometry import exp_se3, pose_from
 from coview_stream.pose.tangent import (
     adjoint,
     along_body,
@@ -14,11 +14,9 @@ from coview_stream.pose.tangent import (
     checked_covariance,
     checked_pose,
     difference,
-    log_se3,
-    log_slope,
     shifted,
 )
-from coview_stream.rotation import exp_so3, log_so3
+from coview_stream.rotation import exp_so3
 
 T = pose_from(exp_so3([0.4, -0.7, 1.9]), [300.0, -200.0, 12.0])
 
@@ -58,7 +56,8 @@ def test_converting_forth_and_back_changes_nothing():
 
 
 def test_gtsams_tangent_is_the_bodys():
-    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed here")
+    import gtsam
+
     xi = np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.1])
     pose = gtsam.Pose3(T)
     np.testing.assert_allclose(pose.retract(xi).matrix(), T @ exp_of(xi), atol=1e-9)
@@ -66,38 +65,15 @@ def test_gtsams_tangent_is_the_bodys():
     np.testing.assert_allclose(adjoint(T), pose.AdjointMap(), atol=1e-9)
 
 
-def test_difference_and_shift_undo_each_other():
-    step = np.array([0.1, -0.2, 0.3, 1.0, 2.0, -3.0])
-    np.testing.assert_allclose(difference(shifted(T, step), T), step, atol=1e-12)
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 2.5, np.pi - 1e-6])
-def test_the_logarithm_undoes_the_exponential(angle):
-    xi = np.array([0.0, 0.6 * angle, -0.8 * angle, 1.0, -2.0, 0.5])
-    np.testing.assert_allclose(log_so3(exp_so3(xi[:3])), xi[:3], atol=1e-9)
-    np.testing.assert_allclose(log_se3(exp_of(xi)), xi, atol=1e-6)
-
-
-def test_stacks_are_taken_one_by_one():
-    stack = np.stack([T, inverse(T), exp_se3(np.full(6, 0.1))])
-    for function in (log_se3, adjoint):
-        np.testing.assert_allclose(function(stack), [function(one) for one in stack])
-    np.testing.assert_allclose(log_slope(log_se3(stack)), [log_slope(log_se3(one)) for one in stack])
+def test_difference_and_shift_undo_each_other(angle):
+    step = np.array([0.0, 0.6 * angle, -0.8 * angle, 1.0, 2.0, -3.0])
+    np.testing.assert_allclose(difference(shifted(T, step), T), step, atol=1e-9)
 
 
 def test_the_adjoint_moves_an_increment_to_the_other_side():
     xi = np.array([0.1, -0.05, 0.2, 0.5, 0.3, -0.4])
     np.testing.assert_allclose(T @ exp_of(xi), exp_of(adjoint(T) @ xi) @ T, atol=1e-6)
-
-
-def test_the_logarithms_slope_is_what_differences_say():
-    xi = np.array([0.2, -0.3, 0.25, 2.0, -1.0, 0.7])
-    middle, h = exp_of(xi), 1e-4
-    steps = h * np.eye(6)
-    found = np.column_stack(
-        [(log_se3(middle @ exp_of(s)) - log_se3(middle @ exp_of(-s))) / (2 * h) for s in steps]
-    )
-    np.testing.assert_allclose(log_slope(xi), found, atol=2e-5)
 
 
 @pytest.mark.parametrize("bad", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1])])
