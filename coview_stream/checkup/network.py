@@ -12,7 +12,6 @@ from functools import partial
 from coview_stream.checkup.channel import cloud_findings, odometry_findings
 from coview_stream.checkup.finding import Finding
 from coview_stream.checkup.offers import Offer, look, suggestion
-from coview_stream.checkup.others import connected, tokens
 from coview_stream.checkup.together import node_finding, together_findings
 from coview_stream.checkup.traffic import Heard, Seen, see_cloud, see_odometry
 from coview_stream.errors import MessageError
@@ -20,7 +19,7 @@ from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, prepare
 from coview_stream.stream.keys import RobotKeys
 from coview_stream.stream.messages import Sample
 from coview_stream.stream.records import read_status
-from coview_stream.stream.transport import Transport
+from coview_stream.stream.transport import Connection, Transport
 
 Wait = Callable[[float], object]
 Codecs = tuple[str | None, str | None]
@@ -40,8 +39,7 @@ def reach_finding(transport: Transport, connect: Sequence[str], wait: Wait = tim
         wait(_STEP)
         waited += _STEP
     if _met(transport):
-        counts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in connected(transport).items() if n]
-        return Finding("ok", "network", f"connected: {', '.join(counts)}")
+        return Finding("ok", "network", f"connected: {_counted(transport.connection())}")
     if not connect:
         return Finding(
             "FAIL", "network", "nobody has connected", "start the others, and name this endpoint to them"
@@ -77,7 +75,15 @@ def knock(endpoint: str) -> str:
 
 
 def _met(transport: Transport) -> bool:
-    return any(connected(transport).values())
+    connection = transport.connection()
+    return bool(connection.routers or connection.peers)
+
+
+def _counted(connection: Connection) -> str:
+    """Text of how many routers, peers and clients are connected, such as ``1 router, 2 peers``."""
+    clients = len(connection.clients)
+    counts = {"router": len(connection.routers), "peer": len(connection.peers) - clients, "client": clients}
+    return ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
 
 
 def listen(
@@ -128,7 +134,7 @@ def listen(
     over = True
     for one in heard:
         one.ended = clock()
-        one.alive = bool(tokens(transport, one.keys.alive))
+        one.alive = bool(transport.tokens(one.keys.alive))
     return heard
 
 

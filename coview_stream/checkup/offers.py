@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from coview_stream.checkup.others import tokens
 from coview_stream.errors import ConfigError
 from coview_stream.stream.keys import robot_keys
 from coview_stream.stream.rmw import dds_type
@@ -60,7 +59,7 @@ def look(
         transport.subscribe(key, lambda sample: add(from_key(sample.key)), "newest")
     wait(seconds)
     for expression in _TOKENS:
-        for token in tokens(transport, expression):
+        for token in transport.tokens(expression):
             add(from_token(token))
     return sorted(found)
 

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.clouds.runs import open_run
     from coview_stream.errors import ConfigError
     from coview_stream.stream.keys import robot_keys
-    from coview_stream.stream.reach import await_subscriber, open_client
+    from coview_stream.stream.reach import open_client
     from coview_stream.stream.replay import replay
     from coview_stream.stream.schedule import ReplayConfig, odometry_spacing
     from coview_stream.stream.sender import Sender
@@ -98,14 +98,14 @@ def run(args: argparse.Namespace) -> int:
                 file=sys.stderr,
             )
         with stop_on_signals() as stop:
-            heard = await_subscriber(transport, sender.cloud_key, args.wait, stop.wait)
+            heard = transport.await_subscriber(sender.cloud_key, args.wait, stop.wait)
             if not heard and not stop.requested:
                 print(f"nobody subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)
             total = None if args.loop else len(recorded)
             quiet = not (args.progress or sys.stderr.isatty())
             with tqdm(total=total, desc=f"replaying {args.robot}", unit="frame", disable=quiet) as bar:
                 report = replay(recorded, sender, config, stop, lambda frames: bar.update(frames - bar.n))
-        report.heard = heard or await_subscriber(transport, sender.cloud_key, _LOOK)
+        report.heard = heard or transport.await_subscriber(sender.cloud_key, _LOOK)
         sender.settle()
     finally:
         transport.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -110,16 +110,6 @@ class Run:
             path,
             cloud.dropped,
         )
-
-    def with_odometry(self, poses: Poses) -> Run:
-        """Return the same frames with other poses (N, 4, 4), odometry <- body, metres.
-
-        Raises:
-            RunError: the number of poses is not that of the frames, or one is not finite.
-        """
-        if poses.shape != (len(self), 4, 4) or not np.isfinite(poses).all():
-            raise RunError(f"{self.path}: odometry of shape {poses.shape} does not fit {len(self)} frames")
-        return replace(self, poses=poses)
 
 
 def open_run(

@@ -40,11 +40,9 @@ def check_apart(keys: Sequence[RobotKeys]) -> None:
 
 
 def _check_inputs(one: RobotKeys, other: RobotKeys) -> None:
-    import zenoh
-
     for first, a in zip(_OPTIONS, (one.cloud, one.odometry), strict=True):
         for second, b in zip(_OPTIONS, (other.cloud, other.odometry), strict=True):
-            if zenoh.KeyExpr(a).intersects(zenoh.KeyExpr(b)):
+            if matches(a, b):
                 both = first if first == second else f"{first} and {second}"
                 raise ConfigError(
                     f"{first} {a!r} of robot {one.robot} and {second} {b!r} of {other.robot} have messages in common: "

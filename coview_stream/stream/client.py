@@ -18,7 +18,7 @@ from coview_stream.geometry import Pose
 from coview_stream.stream.keys import RobotKeys, robot_keys
 from coview_stream.stream.mailbox import Mailbox
 from coview_stream.stream.messages import PoseMessage, Sample
-from coview_stream.stream.reach import ask, await_subscriber, open_client
+from coview_stream.stream.reach import open_client
 from coview_stream.stream.records import read_status
 from coview_stream.stream.sender import Sender, nanoseconds
 from coview_stream.stream.transport import Transport
@@ -169,7 +169,7 @@ class RobotClient:
             TransportError: the client is closed.
         """
         self._check_open()
-        return await_subscriber(self._transport, self._sender.cloud_key, seconds)
+        return self._transport.await_subscriber(self._sender.cloud_key, seconds)
 
     def relocalize(self, timeout: float = 5.0) -> dict[str, Any]:
         """Make the node forget the pose and search again; returns its reply.
@@ -178,12 +178,12 @@ class RobotClient:
             TransportError: nobody answered within ``timeout`` seconds, the node refused, or the client is closed.
         """
         self._check_open()
-        return ask(self._transport, self.keys.relocalize, timeout=timeout)
+        return self._transport.query(self.keys.relocalize, timeout=timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:
         """Make the node forget everything about this robot; returns its reply. Errors as :meth:`relocalize`."""
         self._check_open()
-        return ask(self._transport, self.keys.reset, timeout=timeout)
+        return self._transport.query(self.keys.reset, timeout=timeout)
 
     def close(self) -> None:
         """Undeclare, end all iterators and close the session unless it was handed in; idempotent."""

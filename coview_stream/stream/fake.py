@@ -1,8 +1,9 @@
-"""A network in memory: no threads, no clock, every call finished when it returns. For tests of whatever streams."""
+"""A network in memory: no threads, no clock, every call finished when it returns. For tests of what streams."""
 
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -78,6 +79,33 @@ class FakeTransport:
         """Hold a token until :meth:`close`."""
         self._tokens.append(check_expression(key, "key", wildcards=False))
 
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Ask what :meth:`answer` declared; there is nothing to wait for.
+
+        Raises:
+            TransportError: if nobody answers on ``key``, the network is away, or the handler raises.
+        """
+        handler = next((handler for name, handler in self._answers.items() if matches(name, key)), None)
+        if handler is None or not self._here:
+            raise TransportError(f"{key}: nobody answers")
+        try:
+            return handler(dict(parameters or {}))
+        except Exception as error:
+            self.raised.append(error)
+            raise TransportError(f"{key}: the node refused: {error}") from error
+
+    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+        """Those of :attr:`announced` that match, sorted, each once."""
+        return sorted({token for token in self.announced if matches(expression, token)})
+
+    def await_subscriber(
+        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
+    ) -> bool:
+        """Return True at once: every publication counts as heard, as :attr:`published` keeps it."""
+        return True
+
     def connection(self) -> Connection:
         """One router, ``fake``, unless the network is away."""
         return Connection(routers=("fake",)) if self._here and not self.closed else Connection()
@@ -94,8 +122,8 @@ class FakeTransport:
     # what the test uses
 
     @property
-    def tokens(self) -> tuple[str, ...]:
-        """Liveliness tokens that others can see right now."""
+    def announced(self) -> tuple[str, ...]:
+        """Liveliness tokens that others can see right now, in the order in which they were announced."""
         return tuple(self._tokens) if self._here else ()
 
     @property
@@ -118,21 +146,6 @@ class FakeTransport:
     def samples(self, key: str) -> list[Sample]:
         """Return what was published on keys that match ``key``, oldest first."""
         return [sample for sample in self.published if matches(key, sample.key)]
-
-    def query(self, key: str, parameters: dict[str, str] | None = None) -> dict[str, Any]:
-        """Ask as a remote client would; what the handler raises comes back as ``{"error": ...}``.
-
-        Raises:
-            TransportError: if nobody answers on ``key``, or the network is away.
-        """
-        handler = next((handler for name, handler in self._answers.items() if matches(name, key)), None)
-        if handler is None or not self._here:
-            raise TransportError(f"nobody answers on {key!r}")
-        try:
-            return handler(dict(parameters or {}))
-        except Exception as error:
-            self.raised.append(error)
-            return {"error": str(error)}
 
     def go_away(self) -> None:
         """Let the router vanish: publications are lost, queries fail, tokens are gone; declarations stay."""

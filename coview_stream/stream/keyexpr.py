@@ -1,4 +1,4 @@
-"""Zenoh key expressions: what is a valid one, and which keys it matches. Pure; needs no zenoh."""
+"""Zenoh key expressions: what is a valid one, and which keys it matches."""
 
 from __future__ import annotations
 
@@ -82,33 +82,7 @@ def check_expression(text: str, option: str, wildcards: bool = True) -> str:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Whether ``expression`` includes the plain ``key``.
+    """Whether two valid key expressions have a key in common: of a plain ``key``, whether ``expression`` holds it."""
+    import zenoh
 
-    ``*`` stands for one chunk, ``**`` for any number, ``$*`` for any text within one; none of them for a chunk that
-    starts with ``@``.
-    """
-    return _match(expression.split("/"), key.split("/"))
-
-
-def _match(pattern: list[str], chunks: list[str]) -> bool:
-    if not pattern:
-        return not chunks
-    head, rest = pattern[0], pattern[1:]
-    if head == "**":
-        if _match(rest, chunks):
-            return True
-        return bool(chunks) and not chunks[0].startswith("@") and _match(pattern, chunks[1:])
-    return bool(chunks) and _match_chunk(head, chunks[0]) and _match(rest, chunks[1:])
-
-
-def _match_chunk(pattern: str, chunk: str) -> bool:
-    if pattern == chunk:
-        return True
-    if chunk.startswith("@"):
-        return False
-    if pattern == "*":
-        return True
-    return (
-        "$*" in pattern
-        and re.fullmatch(".*".join(map(re.escape, pattern.split("$*"))), chunk, re.S) is not None
-    )
+    return bool(zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)))

@@ -57,21 +57,6 @@ class Lane(Protocol):
         ...
 
 
-class InlineLane:
-    """Runs jobs on the caller's thread."""
-
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-
-    def run(self, job: Job) -> Result:
-        """Do one job."""
-        kind, value = attempt(self.engine, job)
-        return unwrap(kind, value)
-
-    def close(self) -> None:
-        """Nothing to end."""
-
-
 class ProcessLane:
     """Runs jobs in a child process. A child that hangs, wherever, is killed.
 

@@ -253,7 +253,3 @@ class Node:
             self._reporter.rates[robot].add(now)
         if self._reporter.has_news(session):
             self._reporter.changed.set()
-
-    def publish_statuses(self, now: float, everyone: bool = True) -> None:
-        """Publish the status of every robot, or of those whose state has changed."""
-        self._reporter.publish(now, everyone)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -210,17 +209,3 @@ def _spread(values: deque[float]) -> str:
         return "-"
     p50, p99 = np.percentile(values, [50, 99])
     return f"p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {max(values):.1f} ms"
-
-
-class SteadyClock:
-    """The monotonic clock, without a way to end early."""
-
-    def now(self) -> float:
-        """Seconds, steady."""
-        return time.monotonic()
-
-    def wait(self, seconds: float) -> bool:
-        """Sleep."""
-        if seconds > 0:
-            time.sleep(seconds)
-        return False

@@ -150,12 +150,10 @@ def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
 
 def warn_of_others(transport: Transport, keys: Sequence[RobotKeys]) -> None:
     """Say which of the robots another node serves as well, as far as can be seen from here."""
-    from coview_stream.checkup.others import tokens
-
     try:
         # one question for all robots of a base: chunks of the key are base, name and "alive"
         everybody = {k.alive.rsplit("/", 2)[0] + "/*/alive" for k in keys}
-        held = {token for expression in everybody for token in tokens(transport, expression)}
+        held = {token for expression in everybody for token in transport.tokens(expression)}
     except TransportError as error:
         log.warning("cannot see whether another node is there: %s", error)
         return

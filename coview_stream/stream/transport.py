@@ -1,7 +1,8 @@
-"""What the node needs of a network: zenoh provides it, and a fake one for tests without threads or time."""
+"""What nodes and clients need of a network: zenoh provides it, and an in-memory one without threads or time."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -35,6 +36,8 @@ class Connection:
 
     routers: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()
+    clients: tuple[str, ...] = ()
+    """Those of the peers that are clients."""
 
 
 class Transport(Protocol):
@@ -54,6 +57,33 @@ class Transport(Protocol):
 
     def announce(self, key: str) -> None:
         """Hold a liveliness token on ``key`` until :meth:`close`."""
+        ...
+
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Ask on ``key`` and return the first JSON reply.
+
+        Raises:
+            TransportError: nobody answered within ``timeout`` seconds, or the answer was an error or no JSON object.
+        """
+        ...
+
+    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+        """Keys of the liveliness tokens that match ``expression`` right now, sorted; none while not connected.
+
+        Raises:
+            TransportError: they cannot be asked for.
+        """
+        ...
+
+    def await_subscriber(
+        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
+    ) -> bool:
+        """Wait up to ``seconds`` until somebody subscribes to ``key``; False if nobody did.
+
+        ``wait(seconds)`` passes the time between two looks; what it returns as true ends the waiting early.
+        """
         ...
 
     def connection(self) -> Connection:

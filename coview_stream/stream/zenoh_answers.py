@@ -1,4 +1,4 @@
-"""Answers to zenoh's queries. They are rare: one thread for all keys, which sleeps until somebody asks."""
+"""Queries in zenoh: answers to those of others, for all keys on one thread, and the first reply to one of ours."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
+from coview_stream.errors import TransportError
 from coview_stream.stream.guard import Guard
 
 _JSON = "application/json"
@@ -49,3 +50,38 @@ class Answers:
             query.reply_err(json.dumps({"error": str(error)}), encoding=_JSON)
         else:
             query.reply(key, reply, encoding=_JSON)
+
+
+def first_reply(session: Any, key: str, parameters: dict[str, str], timeout: float) -> dict[str, Any] | None:
+    """Query ``key`` and return the first JSON reply, None where nobody answers within ``timeout`` seconds.
+
+    Raises:
+        TransportError: the answer is an error, or no JSON object.
+    """
+    import zenoh
+
+    for reply in session.get(zenoh.Selector(key, parameters), timeout=timeout):
+        if reply.ok is None:
+            raise TransportError(f"{key}: the node refused: {_error_of(reply.err.payload.to_bytes())}")
+        return _json_object(key, reply.ok.payload.to_bytes())
+    return None
+
+
+def _json_object(key: str, payload: bytes) -> dict[str, Any]:
+    try:
+        answer = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise TransportError(
+            f"{key}: the answer is no JSON ({error}); is this a coview_stream node?"
+        ) from error
+    if not isinstance(answer, dict):
+        raise TransportError(f"{key}: the answer is no JSON object; is this a coview_stream node?")
+    return answer
+
+
+def _error_of(payload: bytes) -> str:
+    """Text of an error reply: the ``error`` of its JSON, or the bytes as text."""
+    try:
+        return str(json.loads(payload)["error"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return payload[:200].decode("utf-8", "replace")

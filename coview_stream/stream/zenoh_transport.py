@@ -17,12 +17,13 @@ from coview_stream.stream import zenoh_config
 from coview_stream.stream.guard import Guard
 from coview_stream.stream.messages import Sample
 from coview_stream.stream.transport import Connection, Policy, Publisher, Urgency
-from coview_stream.stream.zenoh_answers import Answers
+from coview_stream.stream.zenoh_answers import Answers, first_reply
 from coview_stream.stream.zenoh_config import zenoh_errors
 from coview_stream.stream.zenoh_samples import ZenohPublisher, plain, quality
 
 _log = logging.getLogger(__name__)
 
+_POLL = 0.02  # seconds; a look at the matching status costs microseconds
 _RETRY = 0.5  # seconds between two attempts to find the first router
 _PATIENCE = 2.0  # seconds that opening waits for the first attempt: a host that is off does not even refuse
 _NO_ROUTER = (
@@ -121,6 +122,60 @@ class ZenohTransport:
         """Hold a liveliness token until :meth:`close`. Errors as in :meth:`subscribe`."""
         self._declare(key, lambda session: self._declared.append(session.liveliness().declare_token(key)))
 
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Ask on ``key``, where need be after waiting for the first router, and return the first JSON reply.
+
+        Raises:
+            TransportError: nobody answered within ``timeout`` seconds, or the answer was an error or no JSON object.
+        """
+        deadline = time.monotonic() + timeout
+        while (session := self._session) is None and time.monotonic() < deadline:
+            time.sleep(_POLL)
+        if session is not None:
+            left = max(_POLL, deadline - time.monotonic())
+            answer = first_reply(session, key, parameters or {}, left)
+            if answer is not None:
+                return answer
+        raise TransportError(
+            f"{key}: nobody answered within {timeout:g} s; is the node running and connected?"
+        )
+
+    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+        """Keys of the liveliness tokens that match right now, sorted; none while there is no session.
+
+        Raises:
+            TransportError: if ``expression`` is no key expression or zenoh fails.
+        """
+        session = self._session
+        if session is None:
+            return []
+        with zenoh_errors(f"tokens {expression!r}"):
+            replies = [reply.ok for reply in session.liveliness().get(expression, timeout=timeout)]
+        return sorted({str(sample.key_expr) for sample in replies if sample is not None})
+
+    def await_subscriber(
+        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
+    ) -> bool:
+        """Wait up to ``seconds`` until somebody subscribes to ``key``; False if nobody did.
+
+        ``wait(seconds)`` passes the time between two looks; what it returns as true ends the waiting early.
+        """
+        probe: Any = None
+        deadline = time.monotonic() + seconds
+        try:
+            while True:
+                if probe is None and (session := self._session) is not None:
+                    probe = session.declare_publisher(key)
+                if probe is not None and probe.matching_status.matching:
+                    return True
+                if time.monotonic() >= deadline or wait(_POLL):
+                    return False
+        finally:
+            if probe is not None:
+                probe.undeclare()
+
     @property
     def session(self) -> Any:
         """The zenoh session; None while closed or waiting for the first router."""
@@ -132,8 +187,11 @@ class ZenohTransport:
             if self._session is None:
                 return Connection()
             others = [(str(o.whatami), str(o.zid)) for o in self._session.info.transports()]
-        routers = sorted(zid for kind, zid in others if kind == "router")
-        return Connection(tuple(routers), tuple(sorted(zid for kind, zid in others if kind != "router")))
+        return Connection(
+            tuple(sorted(zid for kind, zid in others if kind == "router")),
+            tuple(sorted(zid for kind, zid in others if kind != "router")),
+            tuple(sorted(zid for kind, zid in others if kind == "client")),
+        )
 
     def close(self) -> None:
         """Undeclare everything and end the threads; takes well under a second. Idempotent."""

@@ -185,14 +185,6 @@ def test_frames_must_be_files_and_differ(run: Path) -> None:
         open_run(run)
 
 
-def test_other_odometry_must_fit(run: Path) -> None:
-    opened = open_run(run)
-    moved = opened.with_odometry(POSES[::-1])
-    np.testing.assert_array_equal(moved.read(0).T_odom_body, POSES[-1])
-    with pytest.raises(RunError, match="does not fit"):
-        opened.with_odometry(POSES[:2])
-
-
 def test_trajectory_round_trip_and_quaternions_of_any_length(tmp_path: Path) -> None:
     write_tum(tmp_path / "a.tum", STAMPS, POSES)
     stamps, poses = read_tum(tmp_path / "a.tum")

@@ -12,7 +12,7 @@ from coview_stream.stream.config import NodeConfig
 from coview_stream.stream.fake import FakeTransport
 from coview_stream.stream.jobs import FrameJob
 from coview_stream.stream.keys import robot_keys
-from coview_stream.stream.lane import DiedError, InlineLane
+from coview_stream.stream.lane import DiedError, attempt, unwrap
 from coview_stream.stream.node import Node
 from coview_stream.stream.session import Session
 
@@ -37,6 +37,24 @@ class Engine:
 
     def forget(self, robot):
         pass
+
+
+class InlineLane:
+    """Runs jobs on the caller's thread."""
+
+    def __init__(self, engine):
+        self.engine = engine
+
+    def run(self, job):
+        return unwrap(*attempt(self.engine, job))
+
+    def close(self):
+        pass
+
+
+def publish_statuses(node, now, everyone=True):
+    """Publish the status of every robot, or of those whose state has changed."""
+    node._reporter.publish(now, everyone)
 
 
 class Lane(InlineLane):
@@ -97,5 +115,5 @@ class Site:
         return [json.loads(s.payload) for s in self.net.samples(self.keys[name].status)]
 
     def status(self, name):
-        self.node.publish_statuses(time.monotonic())
+        publish_statuses(self.node, time.monotonic())
         return self.statuses(name)[-1]

@@ -63,7 +63,9 @@ def test_queries_are_answered_or_say_why_not() -> None:
     net.answer("r1/rpc/reset", lambda parameters: {"ok": True, **parameters})
     net.answer("r1/rpc/relocalize", refuse)
     assert net.query("r1/rpc/reset", {"why": "test"}) == {"ok": True, "why": "test"}
-    assert net.query("r1/rpc/relocalize") == {"error": "not now"}
+    with pytest.raises(TransportError, match="refused: not now"):
+        net.query("r1/rpc/relocalize")
+    assert [str(error) for error in net.raised] == ["not now"]
     with pytest.raises(TransportError, match="r2/rpc/reset"):
         net.query("r2/rpc/reset")
 
@@ -78,13 +80,15 @@ def test_the_network_goes_away_and_comes_back() -> None:
     assert net.connection().routers == ("fake",)
     net.go_away()
     publisher.put(Encoded(b"lost"))
-    assert (net.connection().routers, net.tokens, net.lost, heard) == ((), (), 1, [])
+    assert (net.connection().routers, net.announced, net.lost, heard) == ((), (), 1, [])
     with pytest.raises(TransportError):
         net.query("q")
+    assert net.tokens("**") == []
     net.come_back()
+    assert net.tokens("*") == ["alive"]
     publisher.put(Encoded(b"here"))
     assert [sample.payload for sample in heard] == [b"here"]
-    assert (net.connection().routers, net.tokens, net.query("q")) == (("fake",), ("alive",), {})
+    assert (net.connection().routers, net.announced, net.query("q")) == (("fake",), ("alive",), {})
 
 
 def test_close_ends_everything_and_may_be_called_twice() -> None:
@@ -95,7 +99,7 @@ def test_close_ends_everything_and_may_be_called_twice() -> None:
     transport.close()
     transport.close()
     net.publish(Sample("a", b""))
-    assert (heard, net.tokens, net.closed, transport.connection().routers) == ([], (), True, ())
+    assert (heard, net.announced, net.closed, transport.connection().routers) == ([], (), True, ())
 
 
 def test_a_key_that_zenoh_would_refuse_is_refused() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from live import until
 from robots import tracking
+from sites import InlineLane
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, CoViewError, InputError
@@ -24,7 +25,6 @@ from coview_stream.stream.lane import (
     CancelledError,
     DiedError,
     FailedError,
-    InlineLane,
     ProcessLane,
     RejectedError,
 )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from live import until
 from robots import KEYS, SHA, cloud, message, ns, odometry, tracking
+from sites import publish_statuses
 
 from coview_stream.errors import CoViewError
 from coview_stream.geometry import inverse
@@ -99,7 +100,7 @@ def worked(node, *lanes):
 
 
 def status(node, net):
-    node.publish_statuses(0.0)
+    publish_statuses(node, 0.0)
     return json.loads(net.samples(KEYS.status)[-1].payload)
 
 

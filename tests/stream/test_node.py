@@ -9,7 +9,7 @@ import time
 import pytest
 from live import until
 from robots import SHA, ns
-from sites import STEP, THREADS, Site
+from sites import STEP, THREADS, Site, publish_statuses
 
 from coview_stream import __version__
 from coview_stream.stream.codecs import decode_pose
@@ -42,7 +42,7 @@ def test_keys_and_urgencies(pair):
     urgencies = {p.key: p.urgency for p in pair.net.publishers}
     assert urgencies["coview/r1/out/pose"] == "realtime"
     assert urgencies["coview/r2/out/status"] == "report"
-    assert set(pair.net.tokens) == {"coview/r1/alive", "coview/r2/alive"}
+    assert set(pair.net.announced) == {"coview/r1/alive", "coview/r2/alive"}
 
 
 def test_the_status_says_all_of_the_contract(site):
@@ -83,20 +83,20 @@ def test_the_rate_of_poses(site):
     for k in range(1, 6):
         site.moves("r1", STEP * k)
         site.node.publish_poses(begin + 0.1 * k)
-    site.node.publish_statuses(begin + 0.6)
+    publish_statuses(site.node, begin + 0.6)
     assert site.statuses("r1")[-1]["pose"]["rate_hz"] == pytest.approx(10.0)
-    site.node.publish_statuses(begin + 10.0)
+    publish_statuses(site.node, begin + 10.0)
     assert site.statuses("r1")[-1]["pose"]["rate_hz"] == 0.0
 
 
 def test_only_changes_are_told_between_regular_statuses(pair):
     now = time.monotonic()
-    pair.node.publish_statuses(now)
-    pair.node.publish_statuses(now, everyone=False)
+    publish_statuses(pair.node, now)
+    publish_statuses(pair.node, now, everyone=False)
     assert (len(pair.statuses("r1")), len(pair.statuses("r2"))) == (1, 1)
     pair.frame("r1", 0.0)
-    pair.node.publish_statuses(now, everyone=False)
-    pair.node.publish_statuses(now, everyone=False)
+    publish_statuses(pair.node, now, everyone=False)
+    publish_statuses(pair.node, now, everyone=False)
     assert [s["state"] for s in pair.statuses("r1")] == ["SEARCHING", "TRACKING"]
     assert len(pair.statuses("r2")) == 1
 
@@ -106,8 +106,8 @@ def test_a_router_that_comes_back_is_counted(site):
     site.frame("r1", 0.0)
     for times in (1, 2):
         site.net.go_away()
-        site.node.publish_statuses(time.monotonic())
-        site.node.publish_statuses(time.monotonic())
+        publish_statuses(site.node, time.monotonic())
+        publish_statuses(site.node, time.monotonic())
         site.net.come_back()
         status = site.status("r1")
         assert status["connection"] == {"routers": ["fake"], "peers": [], "reconnects": times}
@@ -118,7 +118,7 @@ def test_a_router_that_comes_late_is_no_reconnection():
     site = Site("r1")
     site.net.go_away()
     site.node.declare()
-    site.node.publish_statuses(time.monotonic())
+    publish_statuses(site.node, time.monotonic())
     site.net.come_back()
     assert site.status("r1")["connection"]["reconnects"] == 0
 
@@ -151,7 +151,7 @@ def test_close_says_goodbye_once(site):
     last = site.statuses("r1")[-1]
     assert (last["state"], last["reason"]) == ("LOST", "the node is shutting down")
     assert site.net.closed
-    assert site.net.tokens == ()
+    assert site.net.announced == ()
     assert (site.track.closed, site.search.closed) == (1, 1)
     count = len(site.net.published)
     site.node.close()
@@ -223,7 +223,7 @@ def test_a_pause_that_the_network_explains_keeps_the_place(away, losses):
     site.frame("r1", 0.0)
     if away:
         site.net.go_away()
-        site.node.publish_statuses(time.monotonic())
+        publish_statuses(site.node, time.monotonic())
         site.net.come_back()
     site.frame("r1", 4.0)
     assert site.status("r1")["counters"]["losses"] == losses

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from live import until
 from robots import ns, query, unknown
-from sites import STEP, Site
+from sites import STEP, Site, publish_statuses
 
 from coview_stream.errors import CloudError
 from coview_stream.stream.config import NodeConfig
@@ -202,7 +202,7 @@ class Unsayable:
 def test_one_robots_status_that_raises_silences_nobody(pair):
     pair.sessions["r1"].whereabouts.evidence = Unsayable()
     for _ in range(3):
-        pair.node.publish_statuses(time.monotonic())
+        publish_statuses(pair.node, time.monotonic())
     assert len(pair.statuses("r2")) == 3
     assert pair.statuses("r1") == []
     pair.sessions["r1"].whereabouts.evidence = None

@@ -80,8 +80,8 @@ def test_poses_in_the_way_of_rmw_zenoh():
     sent = site.net.samples(keys.pose)
     assert [s.encoding for s in sent] == ["", ""]
     assert [read_attachment(s.attachment)[0] for s in sent] == [1, 2]
-    nodes = [t for t in site.net.tokens if "/NN/" in t]
-    publishers = [t for t in site.net.tokens if "/MP/" in t]
+    nodes = [t for t in site.net.announced if "/NN/" in t]
+    publishers = [t for t in site.net.announced if "/MP/" in t]
     assert (len(nodes), len(publishers)) == (1, 1)
     assert "%r1%coview%pose" in publishers[0]
     assert read_attachment(sent[0].attachment)[2] == gid_of(publishers[0])
@@ -93,10 +93,10 @@ def test_poses_in_the_way_of_rmw_zenoh():
 def test_robots_of_one_ros_node_have_publishers_of_their_own():
     site = Site("r1", "r2", preset="rmw_zenoh")
     site.node.declare()
-    publishers = sorted(t for t in site.net.tokens if "/MP/" in t)
+    publishers = sorted(t for t in site.net.announced if "/MP/" in t)
     assert len(publishers) == 2
     assert len({t.split("/")[4] for t in publishers}) == 2  # entity ids
-    assert len([t for t in site.net.tokens if "/NN/" in t]) == 1
+    assert len([t for t in site.net.announced if "/NN/" in t]) == 1
 
 
 def test_another_format_when_asked_for():
