@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from coview_stream.pose.verification import Evidence
 _SHARES = tuple(f.name for f in fields(Evidence))
 
 
-class State(str, Enum):
+class State(StrEnum):
     """What the localizer knows of its place."""
 
     SEARCHING = "SEARCHING"
@@ -29,7 +29,7 @@ class State(str, Enum):
     """It was known; the evidence has gone. Searching again."""
 
 
-class Cause(str, Enum):
+class Cause(StrEnum):
     """What decided about a registration while tracking; docs/tracking.md says what an operator can do about each."""
 
     VERIFIED = "verified"

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.levels import below_another
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.store import Arrays
@@ -104,6 +105,7 @@ def build_arrays(
         "crs": crs,
         "sources": {_label(path, paths): _sha256(path) for path in paths},
         "source_points": source_points,
+        "ground_filter": ground_filter(points),  # it differs between platforms
         "stations_below_another": int(below_another(stations, config.block).sum()),
         "learned": learned[1],
     }

@@ -25,8 +25,17 @@ _FEWEST = 10
 
 
 def cloth_available() -> bool:
-    """Whether the wheel is installed (it has none for some platforms)."""
+    """Tell whether the wheel is installed; there is none for Python 3.13 and for ARM."""
     return importlib.util.find_spec("CSF") is not None
+
+
+def require_cloth() -> None:
+    """Raise DependencyError where the wheel is not installed."""
+    if not cloth_available():
+        raise DependencyError(
+            "the ground filter `cloth` needs the wheel cloth-simulation-filter, which exists for x86-64 and Python up "
+            "to 3.12: pip install cloth-simulation-filter there, or use method='morphological'"
+        )
 
 
 def cloth_ground(
@@ -43,11 +52,7 @@ def cloth_ground(
     Raises:
         DependencyError: the wheel is not installed.
     """
-    if not cloth_available():
-        raise DependencyError(
-            "the ground filter `cloth` needs `pip install cloth-simulation-filter`; use "
-            "method='morphological' where it has no wheel"
-        )
+    require_cloth()
     ground = np.zeros(len(points), dtype=bool)
     low = points[:, :2].min(axis=0).astype(np.float64)
     counts = np.maximum(1, np.ceil(np.ptp(points[:, :2], axis=0) / _TILE)).astype(int)

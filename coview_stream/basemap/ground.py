@@ -1,14 +1,15 @@
-"""Ground points of a base map, by cloth simulation (paper, section 3.1)."""
+"""Ground points of a base map, by cloth simulation (paper, section 3.1) or by a morphological filter."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from coview_stream.basemap.cloth import cloth_available, cloth_ground
+from coview_stream.basemap.cloth import cloth_available, cloth_ground, require_cloth
 from coview_stream.basemap.ground_raster import GroundRaster, Heights, cells, filled, lowest_per_cell
 from coview_stream.basemap.morphology import morphological_ground
 from coview_stream.errors import ConfigError
@@ -25,7 +26,8 @@ class GroundConfig:
     """How ground is told from the rest. Defaults are scored in ``bench/ground.py``.
 
     Attributes:
-        method: ``auto`` takes the cloth where its wheel is installed, else the morphological filter.
+        method: ``auto`` takes the cloth where its wheel is installed, else the morphological filter
+            (see :func:`ground_filter`).
         cell: the filter sees the lowest point of each cell of this size, metres.
         cloth_resolution: distance of cloth nodes, metres.
         rigidness: 1 for mountains, 2 for relief, 3 for plains.
@@ -70,6 +72,26 @@ class GroundConfig:
                 raise ConfigError(f"{name}={getattr(self, name)}: must lie in {low} to {high}")
 
 
+def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal["cloth", "morphological"]:
+    """Name of the filter that tells the ground of these (N, 3) points, metres.
+
+    With ``auto`` it is the cloth, but the morphological filter where the cloth's wheel is not installed (there is none
+    for Python 3.13 and for ARM) and where the points are too narrow for the cloth to hang.
+
+    Raises:
+        DependencyError: ``method`` is ``cloth`` and its wheel is not installed.
+    """
+    config = config or GroundConfig()
+    if config.method == "morphological":
+        return "morphological"
+    if config.method == "cloth":
+        require_cloth()
+        return "cloth"
+    extent = float(min(np.ptp(points[:, :2], axis=0)))
+    hangs = extent > 5 * config.cloth_resolution
+    return "cloth" if hangs and cloth_available() else "morphological"
+
+
 def ground_mask(points: Points, config: GroundConfig | None = None) -> npt.NDArray[np.bool_]:
     """Which of the points lie on the ground.
 
@@ -108,6 +130,7 @@ def ground_surface(points: Points, config: GroundConfig | None = None) -> Ground
     Arguments and errors as ``ground_mask``; ``points`` must not be empty.
     """
     config = config or GroundConfig()
+    method = ground_filter(points, config)
     corner, shape, flat, cell = _cells_within(points, config)
     index = lowest_per_cell(points, flat)
     lowest, occupied = points[index], flat[index]
@@ -115,7 +138,7 @@ def ground_surface(points: Points, config: GroundConfig | None = None) -> Ground
     z.flat[occupied] = lowest[:, 2]
     usable = ~_stray_low(z).flat[occupied]
     lowest, occupied = lowest[usable], occupied[usable]
-    ground = _filtered(lowest, z, occupied, cell, config)
+    ground = _filtered(lowest, z, occupied, cell, config, method)
     return GroundRaster(_refined(z, occupied, ground, config, cell), float(corner[0]), float(corner[1]), cell)
 
 
@@ -138,14 +161,17 @@ def _stray_low(z: Heights) -> npt.NDArray[np.bool_]:
 
 
 def _filtered(
-    lowest: Points, z: Heights, occupied: npt.NDArray[np.int64], cell: float, config: GroundConfig
+    lowest: Points,
+    z: Heights,
+    occupied: npt.NDArray[np.int64],
+    cell: float,
+    config: GroundConfig,
+    method: Literal["cloth", "morphological"],
 ) -> npt.NDArray[np.bool_]:
     """Which of the lowest points are ground; all of them if they are too few to tell."""
     if len(lowest) < _FEWEST:
         return np.ones(len(lowest), dtype=bool)
-    extent = float(min(np.ptp(lowest[:, :2], axis=0)))
-    hangs = extent > 5 * config.cloth_resolution
-    if config.method == "cloth" or (config.method == "auto" and cloth_available() and hangs):
+    if method == "cloth":
         ground = cloth_ground(
             lowest,
             resolution=config.cloth_resolution,

@@ -37,10 +37,10 @@ def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterato
 def python_finding(version: tuple[int, ...]) -> Finding:
     """Look at the interpreter's version."""
     text = f"{'.'.join(map(str, version))}, {platform.system()} {platform.machine()}"
-    if (3, 10) <= version[:2] < (3, 13):
+    if (3, 11) <= version[:2] < (3, 14):
         return Finding("ok", "python", text)
     return Finding(
-        "warn", "python", text, "3.10, 3.11 and 3.12 are tested: make the environment with one of them"
+        "warn", "python", text, "3.11, 3.12 and 3.13 are tested: make the environment with one of them"
     )
 
 

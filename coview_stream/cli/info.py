@@ -55,6 +55,7 @@ def describe(base_map: BaseMap) -> dict[str, object]:
         "to": [round(float(v), 2) for v in high],
         "origin": base_map.origin.tolist(),
         "crs": base_map.crs,
+        "ground filter": base_map.parameters.get("ground_filter"),
         "learned": _learned(base_map),
         "sources": base_map.sources,
         "sha256": base_map.sha256,

@@ -59,7 +59,7 @@ class Track:
         """
         first = np.searchsorted(self.stamps, begin_ns + 1) - 1
         last = np.searchsorted(self.stamps, end_ns) + 1
-        part = self._part[max(0, np.searchsorted(self.stamps, stamp_ns + SAME_NS, side="right") - 1)]
+        part = self._part[max(0, int(np.searchsorted(self.stamps, stamp_ns + SAME_NS, side="right")) - 1)]
         low, high = np.searchsorted(self._part, part, "left"), np.searchsorted(self._part, part, "right")
         chosen = slice(max(0, first, low), min(last, high))
         return Segment(self.stamps[chosen], self.poses[chosen])

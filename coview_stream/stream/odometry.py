@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 
@@ -23,7 +23,7 @@ _RECENT = 2 * _NS
 _JUMP_ANGLE = np.radians(20.0)
 
 
-class Intake(str, Enum):
+class Intake(StrEnum):
     """What an odometry sample was to the samples before it."""
 
     CONTINUES = "continues"

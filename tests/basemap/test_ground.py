@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 
 from coview_stream.basemap.cloth import cloth_available
-from coview_stream.basemap.ground import GroundConfig, ground_mask
+from coview_stream.basemap.ground import GroundConfig, ground_filter, ground_mask
 from coview_stream.basemap.ground_raster import GroundRaster, filled, ground_raster
 from coview_stream.basemap.levels import LevelConfig, ground_levels
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, DependencyError
 
 METHODS = [
     pytest.param("cloth", marks=pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")),
@@ -77,6 +77,28 @@ def test_filter_is_silent_and_leaves_no_files(
     sys.stdout.write("after\n")
     assert capfd.readouterr().out == "before\nafter\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
+    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = scene[0]
+    expected = ground_mask(points, GroundConfig(method="morphological"))
+    monkeypatch.setitem(sys.modules, "CSF", None)
+    assert ground_filter(points) == "morphological"
+    np.testing.assert_array_equal(ground_mask(points), expected)
+    with pytest.raises(DependencyError, match="method='morphological'"):
+        ground_mask(points, GroundConfig(method="cloth"))
+
+
+@pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")
+def test_the_cloth_is_the_default_where_it_can_hang(
+    scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]],
+) -> None:
+    points = scene[0]
+    assert ground_filter(points) == "cloth"
+    assert ground_filter(points[points[:, 0] ** 2 < 4.0]) == "morphological"
+    np.testing.assert_array_equal(ground_mask(points), ground_mask(points, GroundConfig(method="cloth")))
 
 
 def test_cloth_tiles_have_no_seams() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.build import surveyed_cells
+from coview_stream.basemap.cloth import cloth_available
 from coview_stream.clouds.writers import write_cloud
 from coview_stream.config import map_preset
 from coview_stream.errors import CloudError, ConfigError, CoViewError, MapError
@@ -57,6 +60,15 @@ def test_points_stay_where_they_were_to_a_centimetre(whole, cut):
     distance, _ = cKDTree(cut).query(whole.points + whole.origin - UTM)
     # a voxel's mean lies between its points, not farther than half its diagonal from one of them
     assert np.quantile(distance, 0.99) < 0.22
+
+
+def test_a_map_records_which_filter_found_its_ground(whole, cut, tmp_path, monkeypatch):
+    assert whole.parameters["ground_filter"] == ("cloth" if cloth_available() else "morphological")
+    monkeypatch.setitem(sys.modules, "CSF", None)
+    np.save(tmp_path / "site.npy", cut + UTM)
+    built = BaseMap.build(tmp_path / "site.npy", **SMALL)
+    built.save(tmp_path / "site.coview")
+    assert BaseMap.load(tmp_path / "site.coview").parameters["ground_filter"] == "morphological"
 
 
 def test_tiles_equal_one_file(whole, cut, tmp_path):

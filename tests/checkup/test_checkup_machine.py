@@ -37,7 +37,9 @@ def test_a_good_machine(monkeypatch):
 @pytest.mark.parametrize(
     ("finding", "verdict", "part"),
     [
-        (machine.python_finding((3, 13, 1)), "warn", "3.10"),
+        (machine.python_finding((3, 14, 1)), "warn", "3.11"),
+        (machine.python_finding((3, 10, 9)), "warn", "3.11"),
+        (machine.python_finding((3, 13, 1)), "ok", ""),
         (machine.processor_finding("cpu", 8, 1.5), "warn", "2 or more"),
         (machine.processor_finding("cpu", 1, None), "warn", "2 or more"),
         (machine.processor_finding("cpu", 4, 3.0), "ok", ""),

@@ -25,7 +25,7 @@ def certificate(name, issuer=None, hosts=()):
     """Return a key and a certificate for ``name``, signed by ``issuer``; without one, an authority's."""
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now, day = datetime.datetime.now(datetime.timezone.utc), datetime.timedelta(days=1)
+    now, day = datetime.datetime.now(datetime.UTC), datetime.timedelta(days=1)
     builder = (
         x509.CertificateBuilder(issuer[1].subject if issuer else subject, subject)
         .public_key(key.public_key())
