@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.rotation import exp_so3, matrices, nearest_rotation, quaternions
+from coview_stream.rotation import matrices, nearest_rotation, quaternions
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -83,11 +83,6 @@ def rotation_angle(T: Pose) -> float:
 def tilt_of(T: Pose) -> float:
     """Angle between the vertical axes of two frames, radians."""
     return float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
-
-
-def exp_se3(xi: npt.NDArray[np.float64]) -> Pose:
-    """Left-multiplied pose increment from (rx, ry, rz, x, y, z): rotate, then shift."""
-    return pose_from(exp_so3(xi[:3]), xi[3:])
 
 
 def orthonormal(T: Pose) -> Pose:

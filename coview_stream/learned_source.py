@@ -51,7 +51,7 @@ class Learned:
             for each in self._storeys(peak):
                 found.setdefault((each.station, each.shift), each)
         named = list(found.values())[: _MOST * self.config.learned.peaks]
-        return self.learned.sharpened(named, self._view) if self.config.learned.sharpen else named
+        return self.learned.sharpened(named, self._view)
 
     def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
         """Return a peak, and its likes at the stations above and below: from above they look the same."""

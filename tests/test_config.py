@@ -30,9 +30,7 @@ BAD = [
     (DescriptorConfig, "channels", ()),
     (DescriptorConfig, "channels", ("coview", "coview")),
     (DescriptorConfig, "channels", ("colour",)),
-    (DescriptorConfig, "visibility", "x-ray"),
     (DescriptorConfig, "voxel", -0.1),
-    (DescriptorConfig, "eye", 0.0),
     (MapConfig, "block", 0.0),
     (MapConfig, "block", 50.0),
     (MapConfig, "voxel", 2.5),
@@ -100,10 +98,10 @@ def test_presets():
 
 
 def test_preset_options_reach_the_right_configuration():
-    changed = map_preset("slam", block=1.0, sectors=30, channels=("density",), voxel=0.5)
+    changed = map_preset("slam", block=1.0, sectors=30, channels=("coview",), voxel=0.5)
     assert changed.block == 1.0
     assert changed.descriptor.sectors == 30
-    assert changed.descriptor.channels == ("density",)
+    assert changed.descriptor.channels == ("coview",)
     # voxel is the stored cloud's; the descriptor's own stays
     assert changed.voxel == 0.5
     assert map_preset("slam", voxel=0.2).descriptor.voxel == DescriptorConfig().voxel

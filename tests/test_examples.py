@@ -52,7 +52,7 @@ def test_locate_run(world, capsys):
 
 def test_custom_descriptor(world, capsys):
     shares = example("custom_descriptor.py")(world)
-    assert set(shares) == {"scan_context", "coview", "coview_strict", "density"}
+    assert set(shares) == {"scan_context", "coview", "coview_strict"}
     assert max(shares["scan_context"], shares["coview"]) >= 0.5
     assert capsys.readouterr().out.count("keyframes") == len(shares)
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from se3 import exp_se3
 
 from coview_stream import last_pose
 from coview_stream.errors import ConfigError
-from coview_stream.geometry import exp_se3, pose_from
+from coview_stream.geometry import pose_from
 from coview_stream.last_pose import LastPose, default_folder, file_of, forget, load, save
 
 SHA = "0123456789abcdef" * 4

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import small_world
+from se3 import exp_se3
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.writers import write_cloud
@@ -18,7 +19,7 @@ from coview_stream.config import (
     RegistrationConfig,
 )
 from coview_stream.fix import State
-from coview_stream.geometry import exp_se3, inverse, pose_from, rot_z, tilt_of
+from coview_stream.geometry import inverse, pose_from, rot_z, tilt_of
 from coview_stream.localizer import Localizer
 from coview_stream.place.consensus import Hypothesis
 from coview_stream.place.keyframes import Keyframe, KeyframeBuffer

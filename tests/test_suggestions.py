@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_world
+from se3 import exp_se3
 from small_world import pose_error
 from suggested import BESIDE, NEAR, RULE, first_fix, follow, voteless
 
@@ -12,7 +13,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.writers import write_cloud
 from coview_stream.errors import RunError
 from coview_stream.fix import State
-from coview_stream.geometry import exp_se3, pose_from, rot_z, tilt_of
+from coview_stream.geometry import pose_from, rot_z, tilt_of
 from coview_stream.localizer import Localizer
 from coview_stream.suggestions import FROM_THERE
 

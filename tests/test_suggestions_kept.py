@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from se3 import exp_se3
 from small_world import pose_error
 from suggested import BESIDE, NEAR, RULE, follow, voteless
 from test_search import HERE, KEYFRAME, candidate, judged
@@ -13,7 +14,7 @@ from test_search import HERE, KEYFRAME, candidate, judged
 from coview_stream import suggestions
 from coview_stream.config import LocalizerConfig
 from coview_stream.fix import State
-from coview_stream.geometry import exp_se3, inverse, pose_from, rot_z
+from coview_stream.geometry import inverse, pose_from, rot_z
 from coview_stream.localizer import Localizer
 from coview_stream.pose.registration import LocalMaps
 from coview_stream.query import same_place

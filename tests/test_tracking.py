@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from se3 import exp_se3
 from small_world import pose_error, scan
 from trackers import OFF, Ride, garbage, on_the_way, refused, registration, ride_of
 
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
 from coview_stream.fix import Cause
-from coview_stream.geometry import exp_se3, inverse, pose_from
+from coview_stream.geometry import inverse, pose_from
 from coview_stream.pose.covariance import registration_covariance
 
 RULE = AcceptanceConfig()

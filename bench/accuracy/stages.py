@@ -1,7 +1,7 @@
 """The search alone, before any registration: which place each variant of the method would name.
 
-A run's keyframes are made once, and stations are described once per (channel, visibility), so that a dozen
-variants cost little more than one.
+A run's keyframes are made once, and stations are described once per channel, so that a dozen variants cost little more
+than one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from coview_stream.config import (
     DescriptorConfig,
     KeyframeConfig,
     RetrievalConfig,
-    Visibility,
 )
 from coview_stream.geometry import Points, Pose, inverse, transform, wrap_angle, yaw_of
 from coview_stream.place.consensus import Consensus
@@ -81,7 +80,7 @@ class Bank:
         arrays, self._parameters, _ = store.load(path)
         self._geometry = {name: a for name, a in arrays.items() if not name.startswith("descriptor.")}
         self.built = BaseMap(arrays, self._parameters)
-        self._known: dict[tuple[Channel, Visibility], npt.NDArray[np.float16]] = {}
+        self._known: dict[Channel, npt.NDArray[np.float16]] = {}
 
     def map(self, descriptor: DescriptorConfig) -> BaseMap:
         """Return the base map as if it had been built with ``descriptor``."""
@@ -90,12 +89,11 @@ class Bank:
         return BaseMap(self._geometry | described, self._parameters | {"config": config})
 
     def _described(self, name: Channel, descriptor: DescriptorConfig) -> npt.NDArray[np.float16]:
-        key = (name, descriptor.visibility if name.startswith("coview") else "off")
-        if key not in self._known:
+        if name not in self._known:
             one, block = replace(descriptor, channels=(name,)), self.built.config.block
             points, stations = np.array(self.built.points), self.built.stations
-            self._known[key] = describe_storeys(points, stations, block, one)[name]
-        return self._known[key]
+            self._known[name] = describe_storeys(points, stations, block, one)[name]
+        return self._known[name]
 
 
 def keyframes_of(

@@ -22,6 +22,8 @@ if TYPE_CHECKING:  # it brings half of SciPy along
     from coview_stream.place.learned.feature_map import FeatureMap
 
 _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
+_FIXED = {"visibility": "paper", "eye": 1.5}
+"""Descriptor options of earlier versions, in the files of those: the value that is all there is now."""
 
 
 class BaseMap:
@@ -46,6 +48,9 @@ class BaseMap:
             fields.setdefault("learned", False)  # maps from before it
             descriptor = dict(fields.pop("descriptor"))
             descriptor["channels"] = tuple(descriptor["channels"])
+            for name, only in _FIXED.items():
+                if (value := descriptor.pop(name, only)) != only:
+                    raise ConfigError(f"{name} is {value!r}; only {only!r} is known now")
             self.config = MapConfig(descriptor=DescriptorConfig(**descriptor), **fields)
             self.crs: str | None = parameters["crs"]
             self.sources: dict[str, str] = dict(parameters["sources"])

@@ -112,7 +112,7 @@ def describe_stations(
             config.radius,
         )
         for name in config.channels:
-            described[name][part] = channel(name, grid, config)
+            described[name][part] = channel(name, grid)
         if progress:
             progress(min(start + _PORTION, len(stations)), len(stations))
     return described

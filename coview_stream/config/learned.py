@@ -19,7 +19,7 @@ class LearnedConfig:
     features are compared with the map's at every ``cell`` metres and at ``yaws`` headings; with all of a map of up to
     ``dense_area`` square metres, with the surroundings of the ``shortlist`` tiles that look most alike where it is
     larger. ``peaks`` best places go on to registration, and while both sources vote as many of the other source's.
-    ``sharpen`` lets keypoints that match make each of them exact first.
+    Keypoints that match make each of them exact first.
     """
 
     reach: float = 30.0
@@ -28,7 +28,6 @@ class LearnedConfig:
     dense_area: float = 2.0e6
     shortlist: int = 50
     peaks: int = 5
-    sharpen: bool = True
 
     def __post_init__(self) -> None:
         positive(self, "dense_area")

@@ -8,8 +8,7 @@ from typing import Any, Literal, get_args
 from coview_stream.config.checks import counts, positive, require
 from coview_stream.errors import ConfigError
 
-Channel = Literal["scan_context", "coview", "coview_strict", "density"]
-Visibility = Literal["paper", "eye", "off"]
+Channel = Literal["scan_context", "coview", "coview_strict"]
 Preset = Literal["slam", "tls"]
 
 
@@ -19,21 +18,19 @@ class DescriptorConfig:
 
     ``channels`` names the descriptors that vote together: ``scan_context`` is the maximum height of every bin,
     ``coview`` keeps what both views can see (eqs 1-3: horizontally visible, or dense), ``coview_strict`` only
-    what is horizontally visible, ``density`` the number of voxels in a bin (eq. 3). Measured: unlike views
-    (airborne map) favour co-visibility, like views favour Scan Context, the two together are right on both.
+    what is horizontally visible. Measured: unlike views (airborne map) favour co-visibility, like views favour Scan
+    Context, the two together are right on both.
     """
 
     radius: float = 50.0
     rings: int = 20
     sectors: int = 60
     channels: tuple[Channel, ...] = ("scan_context", "coview")
-    visibility: Visibility = "paper"
-    eye: float = 1.5
     voxel: float = 0.5
     ground_zero: bool = True
 
     def __post_init__(self) -> None:
-        positive(self, "radius", "eye", "voxel")
+        positive(self, "radius", "voxel")
         require(self.radius <= 1000, self, "radius", "at most 1000 m")
         counts(self, "rings", "sectors", least=4)
         known = get_args(Channel)
@@ -41,7 +38,6 @@ class DescriptorConfig:
             bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}"
         )
         require(len(set(self.channels)) == len(self.channels), self, "channels", "without repetition")
-        require(self.visibility in get_args(Visibility), self, "visibility", "paper, eye or off")
 
 
 @dataclass(frozen=True)

@@ -19,25 +19,15 @@ _VERTICAL: dict[Channel, Literal["max", "off"]] = {"coview": "max", "coview_stri
 _GROUND_RADIUS = 6.0  # metres around a keyframe in which its own VLS shows the ground (notes: sd 3 cm)
 
 
-def channel(name: Channel, grid: PolarGrid, config: DescriptorConfig) -> Descriptor:
-    """One descriptor channel (..., R, S) of polar bins; metres above the ground, or voxels for ``density``.
+def channel(name: Channel, grid: PolarGrid) -> Descriptor:
+    """One descriptor channel (..., R, S) of polar bins; metres above the ground.
 
     Heights below the zero carry no shape (they are ground in a hollow) and count as zero.
     """
     if name == "scan_context":
         value: Descriptor = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
         return value
-    if name == "density":
-        density: Descriptor = np.log1p(grid.count).astype(np.float32)
-        return density
-    return kernels.coview(
-        grid.max_height,
-        grid.sum_height,
-        grid.count,
-        vertical=_VERTICAL[name],
-        mode=config.visibility,
-        eye=config.eye,
-    )
+    return kernels.coview(*grid, vertical=_VERTICAL[name])
 
 
 def describe(
@@ -48,7 +38,7 @@ def describe(
     Args:
         points: (N, 3) gravity-aligned points, metres, one per voxel.
         centre: (3,) the zero of the descriptor: the keyframe's x and y and the ground below it.
-        config: bins, channels and visibility.
+        config: bins and channels.
     """
     first: Channel = "coview" if "coview" in config.channels else "coview_strict"
     grid, context, _ = kernels.describe_points(
@@ -58,10 +48,8 @@ def describe(
         config.sectors,
         config.radius,
         vertical=_VERTICAL[first],
-        mode=config.visibility,
-        eye=config.eye,
     )
-    return {name: context if name == first else channel(name, grid, config) for name in config.channels}
+    return {name: context if name == first else channel(name, grid) for name in config.channels}
 
 
 def ring_key(descriptor: Descriptor) -> npt.NDArray[np.float32]:

@@ -82,7 +82,7 @@ def surfaces(points: Points) -> Surfaces | None:
 
 
 def register_surfaces(
-    kinds: list[list[Surfaces]],
+    kinds: list[Surfaces],
     target: Surfaces,
     grid: kernels.PointGrid,
     normals: Points,
@@ -97,7 +97,7 @@ def register_surfaces(
     """Register the kinds of points of a scan.
 
     Args:
-        kinds: for every scale the scan's points, those above the ground and those on it, what there is of them.
+        kinds: the scan's points, those above the ground and those on it, what there is of them.
         target: the map.
         grid: the same points, to be searched.
         normals: (K, 3) of theirs.
@@ -117,9 +117,9 @@ def register_surfaces(
     if not all(np.isfinite(a).all() for a in (T_map_source, pivot, *(prior or ()))):
         raise ValueError("T_map_source, its pivot or the prior is not finite")
     T, total, answer = np.array(T_map_source, dtype=np.float64), 0, None
-    for scale, clouds in zip(scales, kinds, strict=True):
+    for scale in scales:
         for _ in range(iterations):
-            pairs = _pairs(clouds, target, grid, normals, T, pivot, scale.radius, keep)
+            pairs = _pairs(kinds, target, grid, normals, T, pivot, scale.radius, keep)
             if pairs is None:
                 return None
             step, information = fused_step(pairs.information, pairs.gradient, T, pivot, prior)

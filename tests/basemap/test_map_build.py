@@ -181,7 +181,7 @@ def test_no_source_and_no_such_source(tmp_path):
 
 def test_a_configuration_takes_the_place_of_preset_and_options(cut, tmp_path):
     np.save(tmp_path / "site.npy", cut[::3])
-    config = map_preset("slam", block=4.0, channels=("density",), **SMALL)
+    config = map_preset("slam", block=4.0, channels=("coview_strict",), **SMALL)
     built = BaseMap.build(tmp_path / "site.npy", config=config)
     assert built.config == config
     assert np.allclose((built.stations[:, :2] / 4.0) % 1.0, 0.5)
@@ -192,6 +192,25 @@ def test_a_map_that_lacks_an_array_is_refused(whole, name):
     arrays = {k: v for k, v in whole._arrays.items() if k != name}
     with pytest.raises(MapError, match=r"lacks.*build it again"):
         BaseMap(arrays, whole.parameters)
+
+
+def with_option(whole, **option):
+    config = whole.parameters["config"]
+    return whole.parameters | {"config": config | {"descriptor": config["descriptor"] | option}}
+
+
+def test_a_map_of_an_earlier_version_holds_options_that_are_gone(whole):
+    earlier = BaseMap(whole._arrays, with_option(whole, visibility="paper", eye=1.5))
+    assert earlier.config == whole.config
+    assert earlier.parameters["config"]["descriptor"]["eye"] == 1.5  # the checksum is of what was written
+
+
+@pytest.mark.parametrize(
+    "option", [{"visibility": "eye"}, {"visibility": "off"}, {"eye": 2.0}, {"channels": ["density"]}]
+)
+def test_a_map_made_with_an_option_that_is_gone_is_refused(whole, option):
+    with pytest.raises(MapError, match=f"{next(iter(option))} is .*build it again"):
+        BaseMap(whole._arrays, with_option(whole, **option))
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_portions_do_not_change_the_descriptors(monkeypatch):
     points = np.random.default_rng(5).uniform([-15, -15, 0], [15, 15, 6], (4000, 3)).astype(np.float32)
     stations = find_stations(sloping_ground(), 2.0)
     raster = rasterise(points, aligned_corner(points, 2.0, 0.5), 0.5, 0.5, margin=4)
-    config = DescriptorConfig(radius=12.0, rings=6, sectors=12, channels=("scan_context", "density"))
+    config = DescriptorConfig(radius=12.0, rings=6, sectors=12, channels=("scan_context", "coview"))
     whole = describe_stations(raster, stations, config)
     seen = []
     monkeypatch.setattr("coview_stream.basemap.stations._PORTION", 7)

@@ -11,7 +11,7 @@ from coview_stream.config import DescriptorConfig
 from coview_stream.place.descriptor import describe, ground_below, ring_key
 
 ALL = DescriptorConfig(
-    radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "coview_strict", "density")
+    radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "coview_strict")
 )
 
 
@@ -56,12 +56,6 @@ def test_heights_are_the_greatest_above_the_centre_and_hollows_count_as_ground()
     assert found[2, 1] == 5.0
     assert found[4, 1] == 0.0
     assert (found >= 0).all()
-
-
-def test_density_counts_points():
-    found = describe(polar(5.0, np.linspace(31, 59, 20), 1.0), np.zeros(3), ALL)["density"]
-    assert found[2, 1] == pytest.approx(np.log(21.0))
-    assert np.count_nonzero(found) == 1
 
 
 def test_scan_and_map_describe_the_same_cloud_alike():

@@ -142,18 +142,23 @@ def test_the_maps_edge_neither_favours_nor_punishes():
     assert punished[50, 5] < 0.8 * inside
 
 
+def centre_of(coarse, row, col):
+    """x and y (..., 2) of the centres of cells, metres; between cells where the numbers are not whole."""
+    return (np.stack([col, row], axis=-1) + 0.5) * coarse.cell + coarse.corner
+
+
 def test_only_the_blocks_asked_for_are_scored_and_like_in_the_whole():
     rng = np.random.default_rng(5)
     known, corner = features(rng, 4, 150, 90), (100.0, -50.0)
     coarse = CoarseMap(known, corner, block=64)
     query, weight = features(rng, 4, 32, 32) * disk(32), disk(32)
     whole = correlate(query, weight, coarse, YAWS[:3])
-    place = coarse.centre_of(70, 33)
+    place = centre_of(coarse, 70, 33)
     near = coarse.blocks_near([place], 20.0)
     assert 0 < len(near) < len(coarse)
     part = correlate(query, weight, coarse, YAWS[:3], near)
     rows, cols = np.indices(known.shape[1:])
-    within = np.hypot(*(coarse.centre_of(rows, cols) - place).transpose(2, 0, 1)) <= 20.0
+    within = np.hypot(*(centre_of(coarse, rows, cols) - place).transpose(2, 0, 1)) <= 20.0
     assert np.isfinite(part[:, within]).all()
     scored = np.isfinite(part)
     assert scored.sum() < np.isfinite(whole).sum()
@@ -167,14 +172,13 @@ def test_each_block_answers_for_its_own_cells_only():
     for block in range(len(coarse)):
         answered[coarse.place_of(block)] += 1
         rows, cols = coarse.place_of(block)
-        middle = coarse.centre_of((rows.start + rows.stop - 1) / 2, (cols.start + cols.stop - 1) / 2)
+        middle = centre_of(coarse, (rows.start + rows.stop - 1) / 2, (cols.start + cols.stop - 1) / 2)
         assert coarse.blocks_near([middle], 0.5).tolist() == [block]
     assert (answered == 1).all()
 
 
 def test_places_and_cells():
     coarse = CoarseMap(np.ones((1, 8, 9), np.float32), (10.0, -6.0), cell=2.0)
-    np.testing.assert_allclose(coarse.centre_of(3, 2), [15.0, 1.0])
     row, col = coarse.cell_of([[15.9, 1.9], [9.9, -6.1]])
     assert (row.tolist(), col.tolist()) == ([3, -1], [2, -1])
 

@@ -108,30 +108,28 @@ def views(rng, pose, shared=40, own=160, alike=0.35, noise=0.3):
     return query, Keypoints(there, other, np.full(len(there), 0.5, np.float32))
 
 
-@pytest.mark.parametrize("gated", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_place_becomes_a_pose(seed, gated):
+def test_a_place_becomes_a_pose(seed):
     rng = np.random.default_rng(seed)
     pose = (*rng.uniform(-300, 300, 2), rng.uniform(-np.pi, np.pi))
     query, known = views(rng, pose)
     start = (pose[0] + 3.0, pose[1] - 2.0, pose[2] + 0.15)
-    found = sharpen(query, known, start, LearnedMatchConfig(gated=gated))
+    found = sharpen(query, known, start)
     assert found is not None
     assert np.hypot(found.x - pose[0], found.y - pose[1]) < 0.25
     assert abs(wrap_angle(found.yaw - pose[2])) < np.radians(1.0)
-    assert found.inliers >= (20 if gated else 10)
+    assert found.inliers >= 20
     assert found.exact
     assert found.rms < 0.7
-    assert found == sharpen(query, known, start, LearnedMatchConfig(gated=gated))
+    assert found == sharpen(query, known, start)
 
 
-@pytest.mark.parametrize("gated", [True, False])
 @pytest.mark.parametrize("off", [(9.0, 0.0, 0.0), (0.0, 0.0, 0.6), (0.0, 0.0, np.pi)])
-def test_a_pose_too_far_from_the_start_is_none(off, gated):
+def test_a_pose_too_far_from_the_start_is_none(off):
     pose = (10.0, 20.0, 0.5)
     query, known = views(np.random.default_rng(1), pose)
     start = tuple(np.add(pose, off))
-    config = LearnedMatchConfig(gated=gated, least_inliers=10)
+    config = LearnedMatchConfig(least_inliers=10)
     assert sharpen(query, known, start, config) is None
 
 
@@ -140,17 +138,16 @@ def test_a_mirror_image_is_no_match():
     query, known = views(np.random.default_rng(2), pose, own=0)
     assert sharpen(query, known, pose) is not None
     mirrored = Keypoints(known.xy * (1.0, -1.0), known.descriptors, known.sigma)
-    config = LearnedMatchConfig(gated=False, least_inliers=12, most_shift=50.0, most_turn=4.0)
+    config = LearnedMatchConfig(least_inliers=12, most_shift=50.0, most_turn=4.0)
     assert sharpen(query, known, pose, config) is not None
     assert sharpen(query, mirrored, pose, config) is None
 
 
-@pytest.mark.parametrize("gated", [True, False])
-def test_chance_agreement_is_not_enough(gated):
+def test_chance_agreement_is_not_enough():
     found = []
     for seed in range(12):
         query, known = views(np.random.default_rng(seed), (0.0, 0.0, 0.0), shared=0)
-        found.append(sharpen(query, known, (0.0, 0.0, 0.0), LearnedMatchConfig(gated=gated)))
+        found.append(sharpen(query, known, (0.0, 0.0, 0.0)))
     assert found == [None] * 12
 
 

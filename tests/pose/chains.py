@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from se3 import exp_se3
 
-from coview_stream.geometry import exp_se3, inverse, pose_from
+from coview_stream.geometry import inverse, pose_from
 from coview_stream.pose.tangent import shifted
 from coview_stream.rotation import exp_so3
 

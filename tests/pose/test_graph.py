@@ -7,10 +7,11 @@ import sys
 import numpy as np
 import pytest
 from chains import ODOMETRY, REGISTRATION, START, START_COVARIANCE, drive, relative, run, shift_errors
+from se3 import exp_se3
 
 from coview_stream.config import GraphConfig
 from coview_stream.errors import ConfigError, DependencyError, InputError
-from coview_stream.geometry import exp_se3, pose_from
+from coview_stream.geometry import pose_from
 from coview_stream.pose.graph import PoseGraph
 from coview_stream.pose.tangent import difference, shifted
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from courtyard import courtyard, local_map, parts, plane, source_of
+from se3 import exp_se3
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry import exp_se3, inverse, pose_from, rot_z, rotation_angle, transform
+from coview_stream.geometry import inverse, pose_from, rot_z, rotation_angle, transform
 from coview_stream.pose.registration import LocalMaps, Prior, Source, register
 
 CONFIG = RegistrationConfig()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from se3 import exp_se3
 
 from coview_stream.errors import InputError
-from coview_stream.geometry import exp_se3, pose_from
+from coview_stream.geometry import pose_from
 from coview_stream.pose.tangent import (
     adjoint,
     along_body,

@@ -125,11 +125,6 @@ class CoarseMap:
                 found.append(block)
         return np.array(found, dtype=np.int64)
 
-    def centre_of(self, row: npt.ArrayLike, col: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Return x and y (..., 2) of the centres of cells, metres; between cells where the numbers are not whole."""
-        at = np.stack([np.asarray(col, dtype=np.float64), np.asarray(row, dtype=np.float64)], axis=-1)
-        return np.asarray((at + 0.5) * self.cell + self.corner)
-
     def cell_of(self, xy: npt.ArrayLike) -> tuple[Indices, Indices]:
         """Rows and columns of the cells in which places (..., 2) lie; negative or too large beyond the map."""
         at = np.floor((np.asarray(xy, dtype=np.float64) - self.corner) / self.cell).astype(np.int64)

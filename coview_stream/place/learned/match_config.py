@@ -12,21 +12,18 @@ from coview_stream.config.checks import counts, positive, require
 class LearnedMatchConfig:
     """Keypoints, pairs, their consistency, and what a match has to be.
 
-    ``keypoints`` of least uncertainty describe a query; a pair is kept where each is among the other's ``nearest``
-    (``mutual``) or one is among the other's, the ``pairs`` most similar of them. Two pairs agree where the distance
-    between their points differs by less than ``tolerance`` between the views (weight: a bell of width ``spread``);
-    pairs less than ``least_apart`` away from each other
-    say nothing about the heading and do not count. The search for the largest consistent set gives up being exact
-    after ``nodes`` branches. A match has at least ``least_inliers`` and lies within ``most_shift`` (metres) and
-    ``most_turn`` (radians) of where it was sought; the query reaches ``reach`` metres around its middle.
-    ``gated`` pairs only points that can meet within these bounds: many more right pairs are found, but chance
-    agreement too lies near the start. Of 200 keypoints without any partner, mutual nearest ones agree in sets of up to
-    7 by chance, the two nearest of either side in sets of 9 (at 1.5 m tolerance 12): ``least_inliers`` has to be more.
+    ``keypoints`` of least uncertainty describe a query; a pair is kept where each is the other's nearest among those
+    that can meet, the ``pairs`` most similar of them. Two pairs agree where the distance between their points differs
+    by less than ``tolerance`` between the views (weight: a bell of width ``spread``); pairs less than ``least_apart``
+    away from each other say nothing about the heading and do not count. The search for the largest consistent set
+    gives up being exact after ``nodes`` branches. A match has at least ``least_inliers`` and lies within ``most_shift``
+    (metres) and ``most_turn`` (radians) of where it was sought; the query reaches ``reach`` metres around its middle.
+    Pairing only points that can meet within these bounds finds many more right pairs, but chance agreement too lies
+    near the start. Of 200 keypoints without any partner, mutual nearest ones agree in sets of up to 7 by chance:
+    ``least_inliers`` has to be more.
     """
 
     keypoints: int = 200
-    nearest: int = 1
-    mutual: bool = True
     pairs: int = 300
     tolerance: float = 1.0
     spread: float = 0.4
@@ -36,10 +33,9 @@ class LearnedMatchConfig:
     most_shift: float = 6.0
     most_turn: float = math.radians(15.0)
     reach: float = 30.0
-    gated: bool = True
 
     def __post_init__(self) -> None:
-        counts(self, "keypoints", "nearest", "nodes")
+        counts(self, "keypoints", "nodes")
         counts(self, "least_inliers", least=2)
         counts(self, "pairs", least=2)
         require(self.pairs <= 400, self, "pairs", "400 at most: the time grows with their square")

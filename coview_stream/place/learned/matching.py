@@ -14,18 +14,14 @@ def nearest_pairs(
     query: F32,
     known: F32,
     *,
-    nearest: int = 1,
-    mutual: bool = True,
     most: int = 300,
     possible: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[Pairs, F32]:
-    """Pair descriptors that are most similar, by inner product.
+    """Pair descriptors each of which is the most similar to the other, by inner product.
 
     Args:
         query: (N, C) unit descriptors.
         known: (M, C) unit descriptors.
-        nearest: a pair joins a descriptor with one of so many nearest of the other side.
-        mutual: in both directions; else one is enough, which finds more right pairs and more wrong ones.
         most: pairs at most.
         possible: (N, M) which pairs may be (all).
 
@@ -42,20 +38,8 @@ def nearest_pairs(
     similarity = query @ known.T
     if possible is not None:
         similarity[~possible] = -np.inf
-    forth, back = _nearest(similarity, nearest), _nearest(similarity.T, nearest).T
-    kept = (forth & back) if mutual else (forth | back)
-    row, col = np.nonzero(kept & np.isfinite(similarity))
-    values = similarity[row, col]
+    row, forth, back = np.arange(len(query)), similarity.argmax(axis=1), similarity.argmax(axis=0)
+    row = row[(back[forth] == row) & np.isfinite(similarity[row, forth])]
+    values = similarity[row, forth[row]]
     order = np.argsort(-values, kind="stable")[:most]
-    return np.stack([row[order], col[order]], axis=1), values[order]
-
-
-def _nearest(similarity: F32, count: int) -> npt.NDArray[np.bool_]:
-    """Mark the ``count`` greatest of each row."""
-    marked = np.zeros(similarity.shape, dtype=bool)
-    if count >= similarity.shape[1]:
-        marked[:] = True
-    else:
-        found = np.argpartition(-similarity, count - 1, axis=1)[:, :count]
-        np.put_along_axis(marked, found, True, axis=1)
-    return marked
+    return np.stack([row, forth[row]], axis=1)[order], values[order]

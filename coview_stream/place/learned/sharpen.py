@@ -52,15 +52,8 @@ def sharpen(
     """
     config = config or LearnedMatchConfig()
     near = known.around(start[:2], config.reach + config.most_shift)
-    possible = _meeting(query, near, start, config) if config.gated else None
-    pairs, _ = nearest_pairs(
-        query.descriptors,
-        near.descriptors,
-        nearest=config.nearest,
-        mutual=config.mutual,
-        most=config.pairs,
-        possible=possible,
-    )
+    possible = _meeting(query, near, start, config)
+    pairs, _ = nearest_pairs(query.descriptors, near.descriptors, most=config.pairs, possible=possible)
     if len(pairs) < config.least_inliers:
         return None
     left, right = query.where(pairs[:, 0]), near.where(pairs[:, 1])
