@@ -43,7 +43,7 @@ def test_a_map_is_built_and_described(cloud, tmp_path, capsys):
 
 def test_preset_channels_and_descriptor_options(cloud, tmp_path):
     target = tmp_path / "site.coview"
-    options = "--preset tls --rings 5 --sectors 8".split()
+    options = ["--preset", "tls", "--rings", "5", "--sectors", "8"]
     options += ["--channels", "coview_strict, scan_context"]
     assert main(["build", str(cloud), "-o", str(target), *options]) == 0
     config = BaseMap.load(target).descriptor_config
