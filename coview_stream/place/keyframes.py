@@ -57,11 +57,11 @@ class KeyframeBuffer:
         self.travelled = 0.0
         self.newest: Points = np.empty((0, 3), dtype=np.float32)
         self._pending: list[Points] = []
-        self._intake = kernels.FrameIntake(config.voxel, config.range_min)
+        self._filter = kernels.VoxelFilter(config.voxel, config.range_min)
 
     def thin(self, cloud: Points, T_odom_body: Pose) -> Points:
         """Thin one frame (N, 3) in the body frame to :attr:`newest`, for who needs no keyframes."""
-        self.newest = self._intake(cloud, T_odom_body).points.copy()  # which the next frame overwrites
+        self.newest = self._filter(cloud, T_odom_body)[0].copy()  # which the next frame overwrites
         return self.newest
 
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:

@@ -51,7 +51,7 @@ class Engine(Protocol):
 class TrackEngine:
     """Takes in frames: keyframes, deskewing, registration around a known place."""
 
-    kernels = ("FrameIntake", "transform_unique", "nearest", "align_planes")
+    kernels = ("transform_unique", "nearest", "align_planes")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map

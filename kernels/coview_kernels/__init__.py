@@ -1,4 +1,4 @@
-"""Numerical kernels of coview_stream: arrays in, arrays out; no files, no network, no localization.
+"""Numerical kernels of coview_stream: functions from arrays to arrays, without files, network or localization.
 
 Every function checks its arguments, then runs in Taichi on one owner thread, or in NumPy
 (:mod:`coview_kernels.reference`) where Taichi is missing or ``COVIEW_KERNELS=numpy`` is set; both agree. All
@@ -8,27 +8,25 @@ can be called from any thread. Importing this package does not import Taichi; th
 from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
-from coview_kernels.covisibility import coview, visible
+from coview_kernels.covisibility import coview
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
-from coview_kernels.intake import FrameIntake, Intake
 from coview_kernels.matching import MatchIndex, Nearest
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
-from coview_kernels.voxel import transform_unique
-from coview_kernels.warming import warm_up
+from coview_kernels.voxel_filter import VoxelFilter, transform_unique
+from coview_kernels.warm_up import warm_up
 
 __all__ = [
     "Alignment",
     "Belief",
-    "FrameIntake",
-    "Intake",
     "MatchIndex",
     "Nearest",
     "PointGrid",
     "PolarGrid",
     "Scale",
+    "VoxelFilter",
     "align_planes",
     "all_shift_distance",
     "backend",
@@ -42,6 +40,5 @@ __all__ = [
     "submit",
     "transform_unique",
     "unit_columns",
-    "visible",
     "warm_up",
 ]

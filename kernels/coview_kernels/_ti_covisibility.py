@@ -16,9 +16,6 @@ def covisible(
     rings: ti.i32,
     sectors: ti.i32,
     vertical: ti.i32,
-    hide: ti.i32,
-    scale: ti.i32,
-    eye: ti.f64,
     highest: ti.template(),
     total: ti.template(),
     count: ti.template(),
@@ -26,9 +23,8 @@ def covisible(
 ):
     """Write the context of the grid that begins at ``at``.
 
-    vertical: 0 off, 1 greatest, 2 mean height; hide 0: every occupied bin is visible. Slopes are (h - eye) /
-    (scale * i + 1) with i from 0: scale 1 is mode paper, 2 is mode eye, doubled. They are compared by products
-    that are exact; see reference/.
+    vertical: 0 off, 1 greatest, 2 mean height. Slopes are h / (i + 1) with i from 0; they are compared by products
+    that are exact, see reference/.
     """
     size = rings * sectors
     points = ti.cast(0, ti.i64)
@@ -44,9 +40,9 @@ def covisible(
             out = ti.cast(0.0, ti.f32)
             if n > 0:
                 top = highest[b]
-                h = ti.cast(top, ti.f64) - eye
-                a = scale * i + 1
-                if hide == 0 or best_a == 0 or h * best_a > a * best_h:
+                h = ti.cast(top, ti.f64)
+                a = i + 1
+                if best_a == 0 or h * best_a > a * best_h:
                     best_h = h
                     best_a = a
                     out = top
@@ -64,9 +60,6 @@ def coview(
     rings: ti.i32,
     sectors: ti.i32,
     vertical: ti.i32,
-    hide: ti.i32,
-    scale: ti.i32,
-    eye: ti.f64,
     highest: Floats,
     total: Floats,
     count: Integers,
@@ -79,4 +72,4 @@ def coview(
             step = (grids + chunks - 1) // chunks
             for m in range(ti.min(grids, c * step), ti.min(grids, (c + 1) * step)):
                 at = m * rings * sectors
-                covisible(at, rings, sectors, vertical, hide, scale, eye, highest, total, count, value)
+                covisible(at, rings, sectors, vertical, highest, total, count, value)

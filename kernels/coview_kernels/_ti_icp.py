@@ -17,7 +17,7 @@ DOUBLES = ti.types.ndarray(ti.f64, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
 
 SLACK = 1e-9  # metres: more than rounding adds to a bound
-MOST_SHARE = 5.0  # weight of a point of the rarer kind
+MAX_SHARE = 5.0  # weight of a point of the rarer kind
 MARGIN = 0.15  # metres that a search looks further than it must, so that it serves later poses; 0.05-0.3 are as fast
 BLOCK = 6  # 2^6 points go to one thread, the next to another: those that must search far come in clusters
 
@@ -29,7 +29,7 @@ PARTNER = 6
 # and before them the bin of every point
 FIRST_BIN, BINS = 107 << 6, 2048
 # settings; see icp.py
-KEEP, ITERATIONS, SCALES, LEAST, PRIOR, ABOVE = 8, 9, 10, 11, 12, 13
+KEEP, ITERATIONS, SCALES, MIN_PAIRS, PRIOR, ABOVE = 8, 9, 10, 11, 12, 13
 PIVOT, MEAN, BELIEF, FIRST = 14, 17, 29, 65
 # and of each scale radius, width of the weights, and the shift and turn that end it
 RADIUS, WIDTH, SHIFT, TURN, EACH = 0, 1, 2, 3, 4
@@ -80,21 +80,21 @@ def pair(
 
 
 @ti.func
-def trim(keep, chunks, n, first, bins: ti.template()):
+def trim(keep, chunks, n, bins: ti.template()):
     """For either kind of point: the farthest bin that is kept, and the weight of each pair that is."""
     last = ti.Vector([-1, -1])
     share = ti.Vector.zero(ti.f64, 2)
     for kind in ti.static(range(2)):
         found = 0
-        for b in range(first + kind * BINS, first + kind * BINS + BINS):
+        for b in range(n + kind * BINS, n + kind * BINS + BINS):
             for c in range(1, chunks):
                 bins[b] = bins[b] + bins[b + 2 * c * BINS]
             found += bins[b]
         kept = 0
         while kept < found and kept < ti.max(1, ti.cast(keep * found, ti.i32)):
             last[kind] += 1
-            kept += bins[first + kind * BINS + last[kind]]
-        share[kind] = ti.min(0.5 * n / ti.max(1, kept), MOST_SHARE)
+            kept += bins[n + kind * BINS + last[kind]]
+        share[kind] = ti.min(0.5 * n / ti.max(1, kept), MAX_SHARE)
     return last, share
 
 
@@ -262,7 +262,7 @@ def align(
         add_up(
             T, about, settings[scale + WIDTH], settings[ABOVE], last, share, source, order, partners, bins, state,
         )  # fmt: skip
-        if state[SUMS + 29] < settings[LEAST]:
+        if state[SUMS + 29] < settings[MIN_PAIRS]:
             state[STATUS] = LOST
         else:
             solve(pivot, about, settings, state, system)

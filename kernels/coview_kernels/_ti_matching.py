@@ -1,11 +1,11 @@
 # mypy: ignore-errors
 """Taichi source of matching.py: from a query to its nearest stations in one launch of three tasks.
 
-prepare: a query's integers and its table of turns (twin: :mod:`coview_kernels.screen`); screen: the
-greatest correlation with every station, in integers, on all threads; score: whatever may be among the k best, once
-more in float64. Only the screen is worth waking threads for.
+prepare: a query's integers and its table of rotations (twin: :mod:`coview_kernels.matching_bounds`); correlate: the
+greatest correlation with every station, in integers, on all threads; score: every station that may be among the k
+best, once more in float64. Only the second is worth waking threads for.
 
-The screen keeps 16-bit lanes in local vectors, which LLVM keeps in registers. A store to an argument is never
+It keeps 16-bit lanes in local vectors, which LLVM keeps in registers. A store to an argument is never
 vectorised (it might alias the others); a local vector is known to be private. The inner loops therefore compile to
 vpmulhw and vpaddw on 16 lanes: measured 5 times the rate of a reduction.
 """
@@ -16,7 +16,7 @@ from coview_kernels import runtime
 
 ti = runtime.library()
 f32, f64, i16, i32, u16 = ti.f32, ti.f64, ti.i16, ti.i32, ti.u16
-_ROUNDED = 2e-9  # as in matching.py
+_ROUNDING = 2e-9  # as in matching.py
 
 
 @ti.func
@@ -70,12 +70,12 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
     @ti.kernel
     def match(
         raw: ti.types.ndarray(f32, 1),
-        wave: ti.types.ndarray(f64, 1),
-        grain: ti.types.ndarray(f64, 1),
-        norm: ti.types.ndarray(f64, 1),
-        room: ti.types.ndarray(f64, 1),
-        turns: ti.types.ndarray(f64, 1),
-        reach: f64,
+        fourier: ti.types.ndarray(f64, 1),
+        step_size: ti.types.ndarray(f64, 1),
+        block_norm: ti.types.ndarray(f64, 1),
+        max_query_norm: ti.types.ndarray(f64, 1),
+        rotations: ti.types.ndarray(f64, 1),
+        max_norm: f64,
         numbers: ti.types.ndarray(f64, 1),
         twice: ti.types.ndarray(f64, 1),
         scale: ti.types.ndarray(f64, 1),
@@ -83,7 +83,7 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
         turn: ti.types.ndarray(i16, 1),
         found: ti.types.ndarray(f64, 1),
         stations: ti.types.ndarray(i16, 1),
-        missed: ti.types.ndarray(f32, 1),
+        residual: ti.types.ndarray(f32, 1),
         best: ti.types.ndarray(i32, 1),
         length: i32,
         descriptors: ti.types.ndarray(u16, 1),
@@ -115,24 +115,30 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
                     twice[r * 2 * sectors + sectors + s] = u / sectors
                     if u != 0.0:
                         for b in range(2 * blocks):
-                            sums[b] += u * wave[s * 2 * blocks + b]
+                            sums[b] += u * fourier[s * 2 * blocks + b]
                 for b in range(2 * blocks):
                     numbers[r * 2 * blocks + b] = sums[b]
                     square += sums[b] * sums[b]
                 for b in range(blocks):
-                    g, h = grain[r * 2 * blocks + b], grain[r * 2 * blocks + blocks + b]
+                    g, h = step_size[r * 2 * blocks + b], step_size[r * 2 * blocks + blocks + b]
                     p, q = sums[b] * g, sums[blocks + b] * h
                     s, t = sums[blocks + b] * g, sums[b] * h
                     first[b] += p * p + ti.select(b == 0, 0.0, q * q)
                     second[b] += ti.select(b == 0, q * q, s * s + t * t)
             for b in range(blocks):
-                second[b] = room[b] / ti.max(ti.sqrt(ti.max(first[b], second[b])), 1e-30)
+                second[b] = max_query_norm[b] / ti.max(ti.sqrt(ti.max(first[b], second[b])), 1e-30)
                 first[b] = 0.0
             for r in range(rings):
                 for b in range(blocks):
                     at, under = r * 2 * blocks + b, (r * 2 + 1) * blocks + b
-                    p, q = second[b] * numbers[at] * grain[at], second[b] * numbers[under] * grain[under]
-                    s, t = second[b] * numbers[under] * grain[at], -second[b] * numbers[at] * grain[under]
+                    p, q = (
+                        second[b] * numbers[at] * step_size[at],
+                        second[b] * numbers[under] * step_size[under],
+                    )
+                    s, t = (
+                        second[b] * numbers[under] * step_size[at],
+                        -second[b] * numbers[at] * step_size[under],
+                    )
                     t = ti.select(b == 0, q, t)
                     q = ti.select(b == 0, 0.0, q)
                     s = ti.select(b == 0, 0.0, s)
@@ -150,24 +156,24 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
             error = ti.cast(0.0, f64)
             most = ti.cast(0.0, f64)
             for b in range(blocks):
-                rounding += ti.sqrt(2.0 * first[b]) * norm[b] / second[b]
-                # turns are zero where a block stands for no frequency
-                scale[b] = ti.select(turns[b * wide] != 0.0, 256.0 / second[b], 0.0)
+                rounding += ti.sqrt(2.0 * first[b]) * block_norm[b] / second[b]
+                # rotations are zero where a block stands for no frequency
+                scale[b] = ti.select(rotations[b * wide] != 0.0, 256.0 / second[b], 0.0)
                 error += ti.sqrt(ti.cast(2.0, f64)) * scale[b]
                 most = ti.max(most, scale[b])
             error = rows / 2.0 * (error + scale[0])
             span = ti.sqrt(square)
-            unit = ti.max(2.01 * most, (reach * (span + rounding) + error) / 31000.0)
+            unit = ti.max(2.01 * most, (max_norm * (span + rounding) + error) / 31000.0)
             for n in range(lanes):
                 live = ti.select(n < shifts, 65536.0 / unit, 0.0)
-                nyquist = turns[2 * blocks * wide + n] * scale[0] * live
+                nyquist = rotations[2 * blocks * wide + n] * scale[0] * live
                 turn[4 * lanes + n] = ti.cast(ti.floor(nyquist + 0.5), i16)
                 turn[5 * lanes + n] = ti.cast(0, i16)
                 for part in range(4):
                     total = ti.select(part == 0, nyquist, 0.0)
                     for j in range(half):
                         at = part * half + j
-                        value = turns[at * wide + n] * scale[at % blocks] * live
+                        value = rotations[at * wide + n] * scale[at % blocks] * live
                         total += value
                         turn[(6 + at) * lanes + n] = ti.cast(ti.floor(value + 0.5), i16)
                     total = ti.floor(total * (rows / 2.0 / 65536.0) + half / 2.0 + 0.5)
@@ -239,18 +245,18 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
             worth = -100000  # in whole units: spares most stations the look at what they miss
             for m in range(best.shape[0]):
                 if best[m] > worth:
-                    bound = best[m] * unit - (ti.cast(missed[m], f64) * span + rest)
+                    bound = best[m] * unit - (ti.cast(residual[m], f64) * span + rest)
                     if bound > least:
                         insert(top, k, bound)
                         least = top[k - 1]
                         worth = ti.max(worth, ti.cast((least + rest) / unit, i32) - 1)
-            least -= _ROUNDED
-            worth = ti.max(-100000, ti.cast((least - rest - (reach - 1.0) * span) / unit, i32) - 2)
+            least -= _ROUNDING
+            worth = ti.max(-100000, ti.cast((least - rest - (max_norm - 1.0) * span) / unit, i32) - 2)
             count = 0
             for m in range(best.shape[0]):
                 if best[m] < worth:
                     continue
-                bound = best[m] * unit + (ti.cast(missed[m], f64) * span + rest)
+                bound = best[m] * unit + (ti.cast(residual[m], f64) * span + rest)
                 if bound >= least:
                     if count < listed.shape[0]:
                         listed[count] = m
@@ -264,7 +270,7 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
                 i = 0
                 for j in range(count):
                     i = j if upper[j] > upper[i] else i
-                least = ti.max(least, top[k - 1] - _ROUNDED)
+                least = ti.max(least, top[k - 1] - _ROUNDING)
                 if upper[i] < least:
                     break
                 upper[i] = -9.0
@@ -279,8 +285,8 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
                     q = (y[b] + rings) * scale[b]
                     row = (2 * blocks if b == 0 else blocks + b) * wide
                     for n in range(wide):
-                        guess[n] += p * turns[b * wide + n] + q * turns[row + n]
-                error = ti.cast(missed[m], f64) * span + rest
+                        guess[n] += p * rotations[b * wide + n] + q * rotations[row + n]
+                error = ti.cast(residual[m], f64) * span + rest
                 floor = least - error
                 for n in range(sectors):
                     floor = ti.max(floor, guess[n] - 2.0 * error)

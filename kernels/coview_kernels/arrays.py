@@ -1,8 +1,12 @@
-"""Array types that the kernels share."""
+"""Array types that the kernels share, and the checks of their arguments.
+
+Every public kernel checks its arguments here before any arithmetic; the error names the argument.
+"""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+import math
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +19,9 @@ I64 = npt.NDArray[np.int64]
 C64 = npt.NDArray[np.complex64]
 Mask = npt.NDArray[np.bool_]
 
-Mode = Literal["paper", "eye", "off"]
-Vertical = Literal["max", "mean", "off"]
+Vertical = Literal["off", "max", "mean"]
+VERTICALS: tuple[Vertical, ...] = get_args(Vertical)
+"""In the order of the numbers that the kernels take for them."""
 
 
 class PolarGrid(NamedTuple):
@@ -26,5 +31,54 @@ class PolarGrid(NamedTuple):
     """(..., R, S) greatest height above the centre, metres."""
     sum_height: F32
     """(..., R, S) sum of the heights above the centre, metres."""
-    count: I32  # type: ignore[assignment]  # hides tuple.count, which nobody misses
-    """(..., R, S) number of points; the only witness of occupancy, since a height of 0 is a valid height."""
+    count: I32  # type: ignore[assignment]  # hides tuple.count, which is not needed here
+    """(..., R, S) number of points; alone tells occupied bins from empty ones, since 0 is a valid height."""
+
+
+def as_float32(name: str, value: npt.ArrayLike, *shape: int | None) -> F32:
+    """Return ``value`` as a C-contiguous float32 array of ``shape`` (None: any length); ValueError otherwise."""
+    return _as_array(name, value, np.float32, shape)
+
+
+def as_int32(name: str, value: npt.ArrayLike, *shape: int | None) -> I32:
+    """Return ``value`` as a C-contiguous int32 array of ``shape`` (None: any length); ValueError otherwise."""
+    return _as_array(name, value, np.int32, shape)
+
+
+def as_finite64(name: str, value: npt.ArrayLike, *shape: int | None) -> F64:
+    """Return ``value`` as a C-contiguous float64 array of ``shape`` without NaN or inf; ValueError otherwise."""
+    array: F64 = _as_array(name, value, np.float64, shape)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds NaN or inf")
+    return array
+
+
+def _as_array(name: str, value: npt.ArrayLike, dtype: Any, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
+    array = np.ascontiguousarray(value, dtype=dtype)
+    fits = array.ndim == len(shape) and all(
+        n is None or n == m for n, m in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise ValueError(f"{name} has shape {np.shape(value)}, expected {wanted}")
+    return array
+
+
+def check_same_shape(name: str, array: npt.NDArray[Any], other: str, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless ``array`` has ``shape``, which is that of ``other``."""
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, but {other} has {shape}")
+
+
+def check_grid_size(rings: int, sectors: int, r_max: float) -> None:
+    """Raise ValueError unless there is at least one ring and sector and ``r_max`` is finite and positive."""
+    if rings < 1 or sectors < 1:
+        raise ValueError(f"rings and sectors must be at least 1, got {rings} and {sectors}")
+    if not (math.isfinite(r_max) and r_max > 0):
+        raise ValueError(f"r_max must be finite and positive, got {r_max}")
+
+
+def check_vertical(vertical: str) -> None:
+    """Raise ValueError unless ``vertical`` is an option of co-visibility."""
+    if vertical not in VERTICALS:
+        raise ValueError(f"vertical must be one of {', '.join(VERTICALS)}, got {vertical!r}")

@@ -1,6 +1,6 @@
-"""Eq. 13, all of it: trimmed point-to-plane ICP, coarse to fine, with weights against outliers and a prior.
+"""Trimmed point-to-plane ICP (eq. 13), coarse to fine, with weights against outliers and a prior.
 
-Two things make it quick. An iteration is one prepared launch, of which the searches are spread over the threads. And a
+An iteration is one prepared launch, of which the searches are spread over the threads. A
 point's partner is looked up, not searched for, where it cannot have changed: a search also tells how far all other
 map points are at least, and as long as the point has moved less than that leaves room for, the partner is the same
 (the triangle inequality; exact). Late iterations, which move the cloud by centimetres, hardly search at all.
@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference, runtime
-from coview_kernels.arrays import F32, F64, Mask
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import F32, F64, Mask, as_finite64, as_float32, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
 from coview_kernels.reference.icp import Alignment, Plan, Scale
@@ -30,7 +30,7 @@ _FAR = 1e18  # metres, where the partner of a point is that has none
 
 
 class Belief(NamedTuple):
-    """A Gaussian belief about the pose, fused with what the pairs say."""
+    """A Gaussian belief about the pose, fused with the normal equations of the pairs."""
 
     mean: npt.ArrayLike
     """(4, 4) ``T_target_source``."""
@@ -49,7 +49,7 @@ def align_planes(
     *,
     keep: float,
     iterations: int,
-    least: int = 50,
+    min_pairs: int = 50,
     prior: Belief | None = None,
 ) -> Alignment | None:
     """Register points to a map of points with normals.
@@ -57,7 +57,7 @@ def align_planes(
     Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
     keeps the floor(keep * found) nearest pairs, at least one, and all that are as far as the last of them, to a
     hundredth; and it takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r /
-    width)^2). The share is such that both kinds weigh the same, whatever their numbers, but 5 at most.
+    width)^2). The share is such that both kinds weigh the same for any numbers of points, but 5 at most.
 
     Args:
         grid: the map, (K, 3).
@@ -69,7 +69,7 @@ def align_planes(
         scales: coarse to fine.
         keep: share of the pairs in (0, 1].
         iterations: at most, on each scale.
-        least: pairs without which there is no answer.
+        min_pairs: pairs that an answer needs, at least 1.
         prior: belief to fuse.
 
     Returns:
@@ -78,32 +78,32 @@ def align_planes(
     Raises:
         ValueError: a shape is wrong, a pose not finite, or a setting out of its range; the message names it.
     """
-    points = check.float32("source", source, None, 3)
+    points = as_float32("source", source, None, 3)
     of = np.ascontiguousarray(kind, dtype=bool)
-    check.same_shape("kind", of, "one value per point", (len(points),))
-    planes = check.float32("normals", normals, len(grid.points), 3)
+    check_same_shape("kind", of, "one value per point", (len(points),))
+    planes = as_float32("normals", normals, len(grid.points), 3)
     if not 0 < keep <= 1:
         raise ValueError(f"keep must lie in (0, 1], got {keep}")
     if iterations < 1 or not len(scales):
         raise ValueError(f"at least one iteration and scale are needed, got {iterations} and {len(scales)}")
     if not all(math.isfinite(v) and v > 0 for pair in scales for v in pair):
         raise ValueError(f"scales must hold positive metres and radians, got {scales}")
-    if least < 1:
-        raise ValueError(f"least must be at least 1, got {least}")
+    if min_pairs < 1:
+        raise ValueError(f"min_pairs must be at least 1, got {min_pairs}")
     belief = None
     if prior is not None:
-        mean = check.finite64("the prior's mean", prior.mean, 4, 4)
-        belief = mean, check.finite64("the prior's information", prior.information, 6, 6)
+        mean = as_finite64("the prior's mean", prior.mean, 4, 4)
+        belief = mean, as_finite64("the prior's information", prior.information, 6, 6)
     plan = Plan(
-        check.finite64("T", T, 4, 4), check.finite64("pivot", pivot, 3), tuple(scales), keep, iterations, least,
+        as_finite64("T", T, 4, 4), as_finite64("pivot", pivot, 3), tuple(scales), keep, iterations, min_pairs,
         belief,
     )  # fmt: skip
-    if not len(grid.points) or len(points) < least:
+    if not len(grid.points) or len(points) < min_pairs:
         return None
-    return runtime.dispatch(_align, _twin, grid, planes, points, of, plan)
+    return runtime.dispatch(_align, _plain, grid, planes, points, of, plan)
 
 
-def _twin(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
+def _plain(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
     return reference.align_planes(grid.tree, normals, source, kind, plan)
 
 
@@ -139,11 +139,11 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
 
 
 def _settings(frame: F64, plan: Plan, above: int) -> F64:
-    """All numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
+    """Return all numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
     values = np.zeros(65 + 4 * len(plan.scales))
     values[:8] = frame
     values[8:14] = (
-        plan.keep, plan.iterations, len(plan.scales), plan.least, plan.prior is not None, above,
+        plan.keep, plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None, above,
     )  # fmt: skip
     values[14:17] = plan.pivot
     if plan.prior is not None:

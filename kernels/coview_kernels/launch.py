@@ -1,7 +1,7 @@
-"""Launches of a kernel whose arguments stay: what Taichi does in Python for every call, done once.
+"""Launches of a kernel whose arguments stay, prepared once instead of at every call.
 
 A call of a Taichi 1.7 kernel costs 36 us, 22 us more for each array and 6 for each number (measured): types
-are looked up, checked and converted every time. A :class:`Launch` lays the arguments down once and afterwards
+are looked up, checked and converted every time. A :class:`Launch` sets the arguments once and afterwards
 costs 4 us, plus 3 for an array that changes. It uses Taichi's own launch context, which is not public, so only
 that of the versions it has been tested with; elsewhere (quadrants, which is quick by itself) it calls the
 kernel.
@@ -15,21 +15,21 @@ import numpy as np
 
 from coview_kernels import runtime
 
-_TESTED = {"taichi": (1, 7)}
+_TESTED_VERSIONS = {"taichi": (1, 7)}
 
 SPAN = 512
 """Iterations per chunk of a parallel loop.
 
-Both libraries cut a range into blocks of 512 iterations at least, whatever ``block_dim`` says: a loop over C
+Both libraries cut a range into blocks of at least 512 iterations for any ``block_dim``: a loop over C
 chunks of work must run over ``C * SPAN`` and do the work in every SPAN-th iteration, or one thread does it all.
 """
 
 
 class Launch:
-    """A kernel of module ``_ti_<module>`` and its arguments; to be used on the owner thread, or as :meth:`ready` says.
+    """Kernel of module ``_ti_<module>`` with its arguments; to be used on the owner thread, or as :meth:`ready` says.
 
-    The arrays must be C-contiguous and of the types that the kernel declares, numbers Python's own: nothing
-    checks them. The arrays are kept alive here and may be written to between calls.
+    The arrays must be C-contiguous and of the types that the kernel declares, numbers Python's own: they are not
+    checked. The arrays are kept alive here and may be written to between calls.
     """
 
     def __init__(self, module: str, name: str, *arguments: Any) -> None:
@@ -43,7 +43,7 @@ class Launch:
         """Replace an argument, from now on."""
         self._arguments[index] = value
         if self._program is not None:
-            _lay(self._context, index, value)
+            _set_argument(self._context, index, value)
 
     def ready(self) -> bool:
         """Whether the kernel has run before in the program that runs now: from then on any thread may call it."""
@@ -54,7 +54,7 @@ class Launch:
         program = runtime.program()
         if self._program is not program:
             library = runtime.library()
-            if _TESTED.get(library.__name__) != tuple(library.__version__[:2]):
+            if _TESTED_VERSIONS.get(library.__name__) != tuple(library.__version__[:2]):
                 self._kernel()(*self._arguments)
                 return
             self._prepare(program)
@@ -74,14 +74,14 @@ class Launch:
             _compiled[self._name] = program, native, compiled
         self._context, self._compiled = native.make_launch_context(), compiled
         for index, value in enumerate(self._arguments):
-            _lay(self._context, index, value)
+            _set_argument(self._context, index, value)
         self._program = program
 
 
 _compiled: dict[tuple[str, str], tuple[Any, Any, Any]] = {}
 
 
-def _lay(context: Any, index: int, value: Any) -> None:
+def _set_argument(context: Any, index: int, value: Any) -> None:
     if isinstance(value, np.ndarray):
         address = value.__array_interface__["data"][0]
         context.set_arg_external_array_with_shape((index,), address, value.nbytes, value.shape, 0)

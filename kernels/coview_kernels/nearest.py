@@ -1,4 +1,4 @@
-"""The nearest point of a cloud, for many queries: a grid over the cloud instead of a tree.
+"""Nearest point of a cloud for many queries, by a grid over the cloud instead of a tree.
 
 Columns of cells stand side by side and a column's cells follow one another upwards, so the points of a stretch of a
 column are one stretch of memory. Map clouds are surfaces: a column holds few points and most queries look into one to
@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference, runtime
-from coview_kernels.arrays import F32, F64, I32, I64
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import F32, F64, I32, I64, as_finite64, as_float32
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 _CELL = 1.0  # metres; 0.5 to 1.5 are as fast for clouds of a point every 0.25 m, and small cells cost memory
-_MOST_LAYERS = 128  # what lies higher shares the topmost: a stray point in the sky must not thin out the rest
-_MOST_CELLS = 1 << 22  # 16 MB; a wider cloud has larger cells
+_MAX_LAYERS = 128  # higher points share the topmost: a stray point in the sky must not make all cells larger
+_MAX_CELLS = 1 << 22  # 16 MB; a wider cloud has larger cells
 _EYE = np.eye(4)
 
 
@@ -40,7 +40,7 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PointGrid:
-    """A cloud to be searched by :func:`nearest`; what the backend needs for that is made at the first search.
+    """A cloud to be searched by :func:`nearest`; the backend's index is made at the first search.
 
     Attributes:
         points: (K, 3) float32, metres.
@@ -54,7 +54,7 @@ class PointGrid:
     cell: float = _CELL
 
     def __post_init__(self) -> None:
-        cloud = check.float32("points", self.points, None, 3)
+        cloud = as_float32("points", self.points, None, 3)
         if not np.isfinite(cloud).all():
             raise ValueError("points hold NaN or inf")
         if not (math.isfinite(self.cell) and self.cell > 0):
@@ -64,11 +64,11 @@ class PointGrid:
     @cached_property
     def cells(self) -> Cells:
         """The points by cell, for the kernel; read it on the owner thread."""
-        return _sorted(self.points, self.cell)
+        return _sort_by_cell(self.points, self.cell)
 
     @cached_property
     def tree(self) -> cKDTree:
-        """The points in a k-d tree, for the twin."""
+        """The points in a k-d tree, for the NumPy twin."""
         from scipy.spatial import cKDTree
 
         # an unbalanced tree is built three times as fast and searched as fast
@@ -94,11 +94,11 @@ def nearest(
         ValueError: ``queries`` or ``T`` has the wrong shape, ``radius`` is not finite and positive, or ``T`` not
             finite.
     """
-    cloud = check.float32("queries", queries, None, 3)
-    pose = None if T is None else check.finite64("T", T, 4, 4)
+    cloud = as_float32("queries", queries, None, 3)
+    pose = None if T is None else as_finite64("T", T, 4, 4)
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(f"radius must be finite and positive, got {radius}")
-    return runtime.dispatch(_nearest, _twin, grid, cloud, float(radius), pose)
+    return runtime.dispatch(_nearest, _plain, grid, cloud, float(radius), pose)
 
 
 def _nearest(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple[F64, I64]:
@@ -109,11 +109,11 @@ def _nearest(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tup
     return answer[0], answer[1].astype(np.int64)
 
 
-def _twin(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple[F64, I64]:
+def _plain(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple[F64, I64]:
     return reference.nearest(grid.tree, queries, radius, T)
 
 
-def _sorted(points: F32, edge: float) -> Cells:
+def _sort_by_cell(points: F32, edge: float) -> Cells:
     """Sort the points into cells, of a larger ``edge`` if there would be too many."""
     if not len(points):
         return Cells(
@@ -123,8 +123,8 @@ def _sorted(points: F32, edge: float) -> Cells:
     low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
     while True:
         shape = np.floor((high - low) / edge) + 1
-        shape[2] = min(shape[2], _MOST_LAYERS)
-        if shape.prod() <= _MOST_CELLS:
+        shape[2] = min(shape[2], _MAX_LAYERS)
+        if shape.prod() <= _MAX_CELLS:
             break
         edge *= 1.5
     frame = np.array([*low, edge, 1.0 / edge, *shape])

@@ -8,17 +8,28 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check, reference, runtime
-from coview_kernels.arrays import F32, F64, I32, Mode, PolarGrid, Vertical
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import (
+    F32,
+    F64,
+    I32,
+    PolarGrid,
+    Vertical,
+    as_finite64,
+    as_float32,
+    as_int32,
+    check_grid_size,
+    check_vertical,
+)
 from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table
 from coview_kernels.sectors import ring_edges2, sector_edges
 
-_MOST = 100_000  # rings or sectors that float32 tells apart
-_MOST_BINS = 1 << 20
+_MAX_SIDE = 100_000  # rings or sectors that float32 tells apart
+_MAX_BINS = 1 << 20
 _POINTS_PER_CHUNK = 8192  # fewer are done before another thread is awake
-_BEHIND = 3  # bins behind those of the grid: outside, not finite, near an edge
-_NOTHING: F32 = np.empty(0, dtype=np.float32)
+_EXTRA = 3  # bins behind those of the grid: points outside, not finite, near an edge
+_EMPTY: F32 = np.empty(0, dtype=np.float32)
 
 
 def polar_bin(
@@ -45,21 +56,20 @@ def polar_bin(
     Raises:
         ValueError: a shape or a number is out of its range.
     """
-    cloud = check.float32("points", points, None, 3)
-    origin = check.finite64("centre", centre, 3)
-    check.grid_size(rings, sectors, r_max)
-    native = _polar_bin if tells_apart(rings, sectors) else reference.polar_bin
+    cloud = as_float32("points", points, None, 3)
+    origin = as_finite64("centre", centre, 3)
+    check_grid_size(rings, sectors, r_max)
+    native = _polar_bin if _tells_apart(rings, sectors) else reference.polar_bin
     return runtime.dispatch(native, reference.polar_bin, cloud, origin, rings, sectors, float(r_max))
 
 
-def tells_apart(rings: int, sectors: int) -> bool:
+def _tells_apart(rings: int, sectors: int) -> bool:
     """Whether the kernel can tell so many rings and sectors apart."""
-    return max(rings, sectors) <= _MOST and rings * sectors <= _MOST_BINS
+    return max(rings, sectors) <= _MAX_SIDE and rings * sectors <= _MAX_BINS
 
 
 def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) -> tuple[PolarGrid, int]:
-    grid, dropped = _bins(rings, sectors, r_max)(points, centre)
-    return PolarGrid(*(a.copy() for a in grid)), dropped
+    return _bins(rings, sectors, r_max)(points, centre)
 
 
 def describe_points(
@@ -69,8 +79,6 @@ def describe_points(
     sectors: int,
     r_max: float,
     vertical: Vertical = "max",
-    mode: Mode = "paper",
-    eye: float = 1.5,
 ) -> tuple[PolarGrid, F32, int]:
     """:func:`polar_bin` and :func:`coview` of its grid in one go, to the bit.
 
@@ -81,72 +89,55 @@ def describe_points(
     Raises:
         ValueError: a shape, a number or an option is out of its range.
     """
-    check.visibility(vertical, mode, eye)
+    check_vertical(vertical)
     grid, dropped = polar_bin(points, centre, rings, sectors, r_max)
-    return grid, reference.coview(*grid, vertical=vertical, mode=mode, eye=eye), dropped
+    return grid, reference.coview(*grid, vertical=vertical), dropped
 
 
-class PolarBins:
-    """Bins, edges and results that stay from call to call; for the owner thread only."""
+class _PolarBins:
+    """Bins, edges and results of one grid size, which stay from call to call; for the owner thread only."""
 
-    def __init__(self, rings: int, sectors: int, r_max: float, chunks: int) -> None:
+    def __init__(self, rings: int, sectors: int, r_max: float) -> None:
+        self._chunks = runtime.workers()
         self._size = rings * sectors
-        shape = chunks, self._size + _BEHIND
+        shape = self._chunks, self._size + _EXTRA
         edges = np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
         self._params = np.array([0.0, 0.0, 0.0, rings / r_max])
         self._highest, self._total = np.empty(shape, dtype=np.float32), np.empty(shape)
         self._count = np.empty(shape, dtype=np.int32)
         self._sum = np.empty((rings, sectors))
-        top, height = np.empty((2, rings, sectors), dtype=np.float32)
-        self._grid = PolarGrid(top, height, np.empty((rings, sectors), dtype=np.int32))
-        self.arguments = (
-            *(rings, sectors, self._params, edges),
+        self._launch = Launch(
+            *("polar", "bins", _EMPTY, 0, 1, rings, sectors, self._params, edges),
             *(a.reshape(-1) for a in (self._highest, self._total, self._count)),
         )
-        """Of a kernel that adds points."""
 
-    def clear(self, centre: F64 | None) -> None:
-        """Empty the bins; their centre is (3,), metres, or stays."""
-        if centre is not None:
-            self._params[:3] = centre
+    def __call__(self, points: F32, centre: F64) -> tuple[PolarGrid, int]:
+        """Return the grid of the points (N, 3) around ``centre`` (3,), and the number of rows not finite."""
+        self._params[:3] = centre
         self._highest.fill(-np.inf)
         self._total.fill(0.0)
         self._count.fill(0)
-
-    def grid(self) -> tuple[PolarGrid, int]:
-        """Return what was added since, in buffers that the next call overwrites, and how many were not finite."""
-        top, height, number = self._grid
-        shape, size = number.shape, self._size
-        np.maximum.reduce(self._highest[:, :size].reshape(-1, *shape), axis=0, out=top)
-        np.add.reduce(self._count[:, :size].reshape(-1, *shape), axis=0, out=number)
-        np.copyto(top, 0.0, where=number == 0)
-        with np.errstate(over="ignore", invalid="ignore"):  # of absurd heights
-            np.add.reduce(self._total[:, :size].reshape(-1, *shape), axis=0, out=self._sum)
-            height[:] = self._sum
-        return self._grid, int(self._count[:, size + 1].sum())
-
-
-class _Binning:
-    """Bins points in one launch."""
-
-    def __init__(self, rings: int, sectors: int, r_max: float) -> None:
-        self._chunks = runtime.workers()
-        self._bins = PolarBins(rings, sectors, r_max, self._chunks)
-        self._launch = Launch("polar", "bins", _NOTHING, 0, 1, *self._bins.arguments)
-
-    def __call__(self, points: F32, centre: F64) -> tuple[PolarGrid, int]:
         chunks = min(self._chunks, 1 + len(points) // _POINTS_PER_CHUNK)
-        self._bins.clear(centre)
         for index, value in enumerate((points.reshape(-1), len(points), chunks)):
             self._launch.put(index, value)
         self._launch()
-        self._launch.put(0, _NOTHING)  # keeps no cloud alive
-        return self._bins.grid()
+        self._launch.put(0, _EMPTY)  # keeps no cloud alive
+        return self._merged()
+
+    def _merged(self) -> tuple[PolarGrid, int]:
+        shape, size = self._sum.shape, self._size
+        top = np.maximum.reduce(self._highest[:, :size].reshape(-1, *shape), axis=0)
+        count = np.add.reduce(self._count[:, :size].reshape(-1, *shape), axis=0, dtype=np.int32)
+        top[count == 0] = 0.0
+        with np.errstate(over="ignore", invalid="ignore"):  # of absurd heights
+            np.add.reduce(self._total[:, :size].reshape(-1, *shape), axis=0, out=self._sum)
+            height = self._sum.astype(np.float32)
+        return PolarGrid(top, height, count), int(self._count[:, size + 1].sum())
 
 
 @lru_cache(maxsize=8)
-def _bins(rings: int, sectors: int, r_max: float) -> _Binning:
-    return _Binning(rings, sectors, r_max)
+def _bins(rings: int, sectors: int, r_max: float) -> _PolarBins:
+    return _PolarBins(rings, sectors, r_max)
 
 
 def station_bins(
@@ -186,13 +177,13 @@ def station_bins(
     Raises:
         ValueError: shapes disagree, a station lies outside the raster, or a number is out of its range.
     """
-    top = check.float32("raster_max", raster_max, None, None)
-    count = check.int32("raster_count", raster_count, *top.shape)
-    total = check.float32("raster_sum", raster_sum, *top.shape)
-    row = check.int32("rows", rows, None)
-    col = check.int32("cols", cols, len(row))
-    base = check.float32("ground", ground, len(row))
-    check.grid_size(rings, sectors, r_max)
+    top = as_float32("raster_max", raster_max, None, None)
+    count = as_int32("raster_count", raster_count, *top.shape)
+    total = as_float32("raster_sum", raster_sum, *top.shape)
+    row = as_int32("rows", rows, None)
+    col = as_int32("cols", cols, len(row))
+    base = as_float32("ground", ground, len(row))
+    check_grid_size(rings, sectors, r_max)
     if not (math.isfinite(cell) and cell > 0):
         raise ValueError(f"cell must be finite and positive, got {cell}")
     if np.any((row < 0) | (row >= top.shape[0]) | (col < 0) | (col >= top.shape[1])):

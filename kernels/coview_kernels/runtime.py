@@ -1,4 +1,4 @@
-"""The one place that imports Taichi (or quadrants, its maintained fork with the same interface).
+"""Start, choice and end of the backend, in the only module that imports Taichi (or quadrants, its maintained fork).
 
 Taichi is started at the first kernel, not at import, and belongs to one thread: a program must be initialised
 and first launched on the same thread, and concurrent launches fail now and then. So one daemon thread owns it
@@ -29,7 +29,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
-from coview_kernels.owner import OwnerThread, StoppedError
+from coview_kernels.owner_thread import OwnerThread, StoppedError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,14 +77,14 @@ _backend: str | None = None
 
 
 def _import(name: str) -> ModuleType:
-    _settle()
+    _ensure_home()
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
     return importlib.import_module(name)
 
 
-def _settle() -> None:
-    """Have a ``HOME``: Taichi ends the process where there is none, as a bare service environment has it."""
+def _ensure_home() -> None:
+    """Set ``HOME`` where it is missing, as in the environment of a service: Taichi would end the process."""
     if os.name == "posix" and not os.environ.get("HOME"):
         os.environ.pop("HOME", None)  # an empty one would hide what the password database says
         home = os.path.expanduser("~")  # noqa: PTH111  # Path raises for a user who has none
@@ -98,7 +98,7 @@ def _program(library: Any) -> Any:
 
 
 def _init(library: Any) -> None:
-    # init prints a line, whatever its log level. A name in its module hides the builtin there, and only
+    # init prints a line at every log level. A name in its module hides the builtin there, and only
     # there: redirecting sys.stdout would swallow what other threads print meanwhile.
     misc = library.lang.misc
     misc.print = lambda *args, **kwargs: None
@@ -111,11 +111,11 @@ def _init(library: Any) -> None:
         )
     finally:
         del misc.print
-    _hasten(library)
+    _disable_wrapping(library)
 
 
-def _hasten(library: Any) -> None:
-    """Have the compiler's front end write its notes on the source unwrapped.
+def _disable_wrapping(library: Any) -> None:
+    """Make the compiler's front end write its notes on the source unwrapped.
 
     Taichi makes one for every node of a kernel, for error messages, and breaks its lines at 80 columns: a third of the
     time that a kernel takes to load from the cache, where nothing can be wrong any more.
@@ -129,7 +129,7 @@ def _hasten(library: Any) -> None:
 
 
 class _Unwrapped:
-    """Stands for ``textwrap.TextWrapper`` where lines may be long."""
+    """Replacement of ``textwrap.TextWrapper`` that leaves lines long."""
 
     def __init__(self, **_: Any) -> None: ...
 
@@ -139,12 +139,12 @@ class _Unwrapped:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def workers() -> int:
-    """Threads that a kernel spreads over: the cores of this process, at most ``COVIEW_THREADS`` of them.
+    """Return the number of threads of a kernel: the cores of this process, at most ``COVIEW_THREADS`` of them.
 
     Raises:
         ValueError: ``COVIEW_THREADS`` is no whole number from 1 up.
@@ -165,7 +165,7 @@ def library() -> Any:
 
 
 def program() -> Any:
-    """Return the initialised program of :func:`library`; whatever was compiled for another one is void."""
+    """Return the initialised program of :func:`library`; kernels compiled for another one are void."""
     return _program(library())
 
 
@@ -203,7 +203,7 @@ def _choose() -> str:
 
 
 def backend() -> str:
-    """Which implementation runs: ``taichi``, ``quadrants`` or ``numpy``. Starts it, if need be.
+    """Return the backend that runs, ``taichi``, ``quadrants`` or ``numpy``; start it if need be.
 
     Raises:
         ValueError: ``COVIEW_KERNELS`` names no backend.
@@ -243,7 +243,7 @@ def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
 
 
 def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """``native`` on the owner thread where Taichi runs, else its twin ``plain`` on the caller's thread."""
+    """Run ``native`` on the owner thread where Taichi runs, else its twin ``plain`` on the caller's thread."""
     global _owner, _backend
     if backend() == "numpy":
         return plain(*args, **kwargs)
@@ -270,7 +270,7 @@ def dispatch_here(
     *args: P.args,
     **kwargs: P.kwargs,
 ) -> R:
-    """As :func:`dispatch`, but ``native`` runs on the caller's thread if ``ready()``, and the owner rests meanwhile.
+    """Dispatch as :func:`dispatch` does, but run ``native`` on the caller's thread if ``ready()``; the owner waits.
 
     For short kernels: to wake the owner, and then the caller again, takes 0.25 ms where cores sleep. ``native`` must
     only launch what :meth:`coview_kernels.launch.Launch.ready` has found prepared, and hand nothing to the owner.
@@ -307,7 +307,7 @@ def _at_exit() -> None:
 
 def _after_fork() -> None:
     global _lock, _owner, _backend
-    _lock = threading.RLock()  # whoever held it does not exist here
+    _lock = threading.RLock()  # the thread that held it does not exist here
     _owner, _backend = None, "numpy"
 
 

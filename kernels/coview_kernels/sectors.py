@@ -1,4 +1,4 @@
-"""Which ring and sector an offset falls into, decided the same way by every kernel.
+"""Ring and sector of an offset, decided in the same way by every kernel.
 
 An offset (dx, dy) is rounded to float32, so that its products are exact in float64. Both decisions then
 compare exact numbers with a table, and neither fused multiply-add nor a vectorised sine can move a point

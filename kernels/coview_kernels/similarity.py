@@ -1,4 +1,4 @@
-"""Eqs 7-9: the distance of a query to every candidate at every shift, exactly, by the correlation theorem.
+"""Distance of a query to every candidate at every shift (eqs 7-9), exactly, by the correlation theorem.
 
 Descriptors are compared by the cosines of their columns (sectors). Turning one of them by n sectors shifts
 its columns, so all S shifts together are one circular correlation per ring: a product per frequency, summed
@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_kernels import check
-from coview_kernels.arrays import C64, F32
+from coview_kernels.arrays import C64, F32, as_float32
 
-_SERIAL = 4000  # elements of a complex matrix up to which OpenBLAS multiplies a vector on one thread (4096)
-_PORTION = 1024  # candidates transformed at a time: 1.2 MB per 20 x 60 spectrum array stays near the cache
+_MAX_SERIAL = (
+    4000  # elements of a complex matrix up to which OpenBLAS multiplies a vector on one thread (4096)
+)
+_BATCH = 1024  # candidates transformed at a time: 1.2 MB per 20 x 60 spectrum array stays near the cache
 
 
 def _fft() -> Any:
@@ -63,11 +64,11 @@ def column_spectra(desc: npt.ArrayLike) -> C64:
         ValueError: not three axes.
     """
     fft = _fft()
-    candidates = check.float32("desc", desc, None, None, None)
+    candidates = as_float32("desc", desc, None, None, None)
     m, rings, sectors = candidates.shape
     spectra = np.empty((sectors // 2 + 1, m, rings), dtype=np.complex64)
-    for start in range(0, m, _PORTION):
-        part = unit_columns(candidates[start : start + _PORTION])
+    for start in range(0, m, _BATCH):
+        part = unit_columns(candidates[start : start + _BATCH])
         spectra[:, start : start + len(part)] = fft.rfft(part, axis=-1).transpose(2, 0, 1)
     return spectra
 
@@ -116,7 +117,7 @@ def _products(spectra: C64, queries: C64) -> C64:
     2.8 ms); where the cores are busy each wake-up waits for a time slice, and 31 of them took 300 ms.
     """
     frequencies, m, rings = spectra.shape
-    block = max(1, _SERIAL // rings)
+    block = max(1, _MAX_SERIAL // rings)
     even = m // block * block
     out = np.empty((frequencies, m, queries.shape[2]), dtype=np.complex64)
     np.matmul(

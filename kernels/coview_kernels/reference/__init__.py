@@ -1,6 +1,6 @@
-"""Every kernel in plain NumPy, same names and signatures.
+"""NumPy twins of the kernels, with the same names and signatures.
 
-The oracle of the tests, and the implementation where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
+They are the oracle of the tests, and the implementation where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
 Functions here trust their arguments; the public twins in :mod:`coview_kernels` check them first.
 """
 
@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
 from coview_kernels.reference.icp import align_planes
+from coview_kernels.reference.matching_bounds import best_correlations
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
-from coview_kernels.reference.screen import screen
-from coview_kernels.reference.voxel import transform_unique
+from coview_kernels.reference.voxel_filter import transform_unique
 
 __all__ = [
     "align_planes",
+    "best_correlations",
     "coview",
     "describe_points",
     "nearest",
     "polar_bin",
-    "screen",
     "station_bins",
     "transform_unique",
     "visible",

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_kernels.arrays import F32, I32, Mask, Mode, Vertical
+from coview_kernels.arrays import F32, I32, Mask, Vertical
 
-_LOWEST = -np.finfo(np.float64).max  # of a height of minus infinity: what is occupied is above what is not
+_LOWEST = -np.finfo(
+    np.float64
+).max  # slope of a height of minus infinity: an occupied bin is above empty ones
 
 
-def visible(max_height: F32, count: I32, mode: Mode, eye: float = 1.5) -> Mask:
-    """See :func:`coview_kernels.visible`."""
+def visible(max_height: F32, count: I32) -> Mask:
+    """Return the horizontally visible bins (..., R, S) of eq. 2; see :func:`coview_kernels.coview`."""
     occupied: Mask = count > 0
-    if mode == "off":
-        return occupied
     # Slopes are quotients of a float32 and a small integer, rounded once: equal ones stay equal, and distinct ones
     # distinct. So a tie is a tie on every machine.
-    zero = 0.0 if mode == "paper" else float(np.float32(eye))
-    half = 0.0 if mode == "paper" else 0.5
-    distance = np.arange(1, occupied.shape[-2] + 1)[:, None] - half
+    distance = np.arange(1.0, occupied.shape[-2] + 1)[:, None]
     with np.errstate(invalid="ignore"):  # an empty bin may hold anything
-        slope = np.where(
-            occupied, np.maximum((max_height.astype(np.float64) - zero) / distance, _LOWEST), -np.inf
-        )
+        slope = np.where(occupied, np.maximum(max_height.astype(np.float64) / distance, _LOWEST), -np.inf)
     horizon = np.full_like(slope, -np.inf)
     np.maximum.accumulate(slope[..., :-1, :], axis=-2, out=horizon[..., 1:, :])
     seen: Mask = slope > horizon
@@ -34,12 +30,10 @@ def coview(
     sum_height: F32,
     count: I32,
     vertical: Vertical = "max",
-    mode: Mode = "paper",
-    eye: float = 1.5,
 ) -> F32:
     """See :func:`coview_kernels.coview`."""
     occupied = count > 0
-    horizontal = visible(max_height, count, mode, eye)
+    horizontal = visible(max_height, count)
     value = np.where(horizontal, max_height, np.float32(0))
     if vertical == "off":
         return value

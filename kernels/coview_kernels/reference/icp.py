@@ -12,7 +12,7 @@ from coview_kernels.reference.nearest import nearest
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_MOST_SHARE = 5.0  # a handful of points must not outweigh thousands
+_MAX_SHARE = 5.0  # a handful of points must not outweigh thousands
 _FIRST_BIN, _BINS = 107 << 6, 2048  # of squared distances: 64 to an octave, from 2^-20 square metres up
 
 
@@ -24,9 +24,9 @@ class Scale(NamedTuple):
     width: float
     """Of the Cauchy weights, metres."""
     shift: float = 1e-3
-    """A step shorter than this, metres,"""
+    """The scale ends with a step that is shorter than this, metres, ..."""
     turn: float = 5e-5
-    """and than this, radians, ends it."""
+    """... and turns by less than this, radians."""
 
 
 class Plan(NamedTuple):
@@ -37,12 +37,12 @@ class Plan(NamedTuple):
     scales: tuple[Scale, ...]
     keep: float
     iterations: int
-    least: int
+    min_pairs: int
     prior: tuple[F64, F64] | None
 
 
 class Alignment(NamedTuple):
-    """What a registration found, with its evidence."""
+    """Result of a registration, with its evidence."""
 
     T: F64
     """(4, 4) ``T_target_source``."""
@@ -87,7 +87,7 @@ def _step(
     gap = source[found].astype(np.float64) @ T[:3, :3].T + T[:3, 3] - tree.data[pairs]
     share = _shares(np.einsum("ij,ij->i", gap, gap).astype(np.float32), kind[found], plan.keep, len(source))
     chosen = np.flatnonzero(share)
-    if len(chosen) < plan.least:
+    if len(chosen) < plan.min_pairs:
         return None
     share, gap, pairs = share[chosen], gap[chosen], pairs[chosen]
     n = normals[pairs]
@@ -126,7 +126,7 @@ def _shares(squares: F32, kind: Mask, keep: float, points: int) -> F64:
         if len(index):
             number = max(1, int(keep * len(index)))
             kept = index[bins[index] <= np.partition(bins[index], number - 1)[number - 1]]
-            share[kept] = min(0.5 * points / len(kept), _MOST_SHARE)
+            share[kept] = min(0.5 * points / len(kept), _MAX_SHARE)
     return share
 
 

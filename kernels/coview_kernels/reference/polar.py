@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, I32, I64, Mode, PolarGrid, Vertical
+from coview_kernels.arrays import F32, F64, I32, I64, PolarGrid, Vertical
 from coview_kernels.reference.covisibility import coview
 from coview_kernels.sectors import polar_index
 
@@ -39,12 +39,10 @@ def describe_points(
     sectors: int,
     r_max: float,
     vertical: Vertical = "max",
-    mode: Mode = "paper",
-    eye: float = 1.5,
 ) -> tuple[PolarGrid, F32, int]:
     """See :func:`coview_kernels.describe_points`."""
     grid, dropped = polar_bin(points, centre, rings, sectors, r_max)
-    return grid, coview(*grid, vertical=vertical, mode=mode, eye=eye), dropped
+    return grid, coview(*grid, vertical=vertical), dropped
 
 
 def cell_table(cell: float, rings: int, sectors: int, r_max: float) -> tuple[I64, I64, I64]:

@@ -1,4 +1,4 @@
-"""A daemon thread that runs calls from a queue, one after the other, for callers on any thread."""
+"""Daemon thread that runs calls from a queue, one after the other, for callers on any thread."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class _Job:
 
 
 class OwnerThread:
-    """Runs every call on one thread; a call from that thread itself runs at once. A hand-over costs 20 us."""
+    """Thread that runs every call; a call from that thread itself runs at once. A hand-over costs 20 us."""
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._stopped = False
-        self._busy = threading.Lock()  # held by whoever runs a call
+        self._busy = threading.Lock()  # held while a call runs
         self._gate = threading.Lock()  # no job may enter the queue behind the one that ends the thread
         self._thread = threading.Thread(target=self._loop, name=name, daemon=True)
         self._thread.start()

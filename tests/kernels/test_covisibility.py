@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coview_kernels import coview, covisibility, reference, visible
+from coview_kernels import coview, covisibility, reference
+from coview_kernels.reference import visible
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _kernel_for_few_grids_too():
+def _kernel_for_any_number_of_grids():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(covisibility, "_LEAST_BINS", 0)
+        patch.setattr(covisibility, "_MIN_BINS", 0)
         yield
 
 
-MODES = st.sampled_from(["paper", "eye", "off"])
 VERTICALS = st.sampled_from(["max", "mean", "off"])
 
 
@@ -34,42 +34,37 @@ def grids(draw):
     return height, (height * count).astype(np.float32), count
 
 
-@given(grids(), MODES, VERTICALS, st.sampled_from([0.0, 1.5, 1.7]))
-def test_agrees_with_numpy(grid, mode, vertical, eye):
+@given(grids(), VERTICALS)
+def test_kernel_agrees_with_numpy(grid, vertical):
     height, total, count = grid
-    seen = visible(height, count, mode, eye)
-    assert seen.dtype == np.bool_
-    np.testing.assert_array_equal(seen, reference.visible(height, count, mode, eye))
-    context = coview(height, total, count, vertical, mode, eye)
+    context = coview(height, total, count, vertical)
     assert context.dtype == np.float32
-    expected = reference.coview(height, total, count, vertical, mode, eye)
+    expected = reference.coview(height, total, count, vertical)
     np.testing.assert_allclose(context, expected, rtol=1e-6, atol=0)
 
 
-@given(grids(), st.sampled_from(["paper", "eye"]))
-def test_agrees_with_equation_2_in_exact_arithmetic(grid, mode):
+@given(grids())
+def test_visible_agrees_with_equation_2_in_exact_arithmetic(grid):
     height, _, count = (a.reshape(-1, *a.shape[-2:]) for a in grid)
-    seen = visible(height, count, mode, 1.5)
+    seen = visible(height, count)
     for m, j in np.ndindex(len(height), height.shape[2]):
         horizon = None
         for i in range(1, height.shape[1] + 1):
             now = False
             if count[m, i - 1, j] > 0:
-                h = Fraction(float(height[m, i - 1, j]))
-                slope = h / i if mode == "paper" else (h - Fraction(3, 2)) / (i - Fraction(1, 2))
+                slope = Fraction(float(height[m, i - 1, j])) / i
                 now = horizon is None or slope > horizon
                 horizon = slope if now else horizon
             assert seen[m, i - 1, j] == now
 
 
-def test_a_wall_hides_what_is_lower_behind_it_and_not_what_towers():
+def test_wall_hides_lower_bins_behind_it_but_not_higher_ones():
     height = np.array([0.0, 5.0, 0.0, 9.0, 30.0], dtype=np.float32)[:, None]
     count = np.ones((5, 1), dtype=np.int32)
-    assert visible(height, count, "paper")[:, 0].tolist() == [True, True, False, False, True]
-    assert visible(height, count, "off").all()
+    assert visible(height, count)[:, 0].tolist() == [True, True, False, False, True]
 
 
-def test_density_lets_the_airborne_view_see_behind_the_wall():
+def test_dense_bins_behind_a_wall_are_visible_from_above():
     height = np.array([[5.0], [4.0], [3.0]], dtype=np.float32)
     count = np.array([[1], [7], [1]], dtype=np.int32)
     total = np.array([[5.0], [14.0], [3.0]], dtype=np.float32)
@@ -78,32 +73,28 @@ def test_density_lets_the_airborne_view_see_behind_the_wall():
     assert coview(height, total, count, "off")[:, 0].tolist() == [5, 0, 0]
 
 
-def test_the_mean_density_counts_empty_bins():
+def test_mean_density_counts_empty_bins():
     height = np.array([[5.0, 0.0], [4.0, 0.0]], dtype=np.float32)
     count = np.array([[3, 0], [1, 0]], dtype=np.int32)
     # mean over four bins is 1: the second bin just reaches it; over the two occupied ones it would be 2
     assert coview(height, height, count)[1, 0] == 4.0
 
 
-@given(grids(), MODES, VERTICALS)
-def test_empty_bins_neither_count_nor_hide(grid, mode, vertical):
+@given(grids(), VERTICALS)
+def test_values_of_empty_bins_are_ignored(grid, vertical):
     height, total, count = (a.copy() for a in grid)
-    expected = coview(height, total, count, vertical, mode)
+    expected = coview(height, total, count, vertical)
     height[count == 0] = np.nan
     total[count == 0] = np.inf
-    np.testing.assert_array_equal(coview(height, total, count, vertical, mode), expected)
+    np.testing.assert_array_equal(coview(height, total, count, vertical), expected)
 
 
-def test_bad_arguments_are_named():
+def test_errors_name_the_argument():
     grid = np.zeros((2, 3))
     with pytest.raises(ValueError, match="count"):
-        visible(grid, np.zeros((3, 2)), "paper")
-    with pytest.raises(ValueError, match="mode"):
-        visible(grid, grid, "Paper")
+        coview(grid, grid, np.zeros((3, 2)))
     with pytest.raises(ValueError, match="max_height"):
-        visible(np.zeros(3), np.zeros(3), "paper")
-    with pytest.raises(ValueError, match="eye"):
-        coview(grid, grid, grid, eye=np.nan)
+        coview(np.zeros(3), np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="vertical"):
         coview(grid, grid, grid, "highest")
     with pytest.raises(ValueError, match="sum_height"):

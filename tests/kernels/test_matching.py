@@ -1,4 +1,4 @@
-"""The pruned answer is the exhaustive one, on random and adversarial cases; bounds hold against float64."""
+"""Pruned matching gives the exhaustive answer, on random and adversarial cases; bounds hold against float64."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import coview_kernels as ck
-from coview_kernels import reference, runtime, search
-from coview_kernels.screen import Bounds, Screen
-from coview_kernels.search import Search
+from coview_kernels import matching, reference, runtime
+from coview_kernels.matching import MatchKernel
+from coview_kernels.matching_bounds import Bounds, QuantizedStations
 
 TOLERANCE = 1e-6
 SHAPES = ((4, 12), (3, 7), (20, 60), (5, 2), (2, 1), (7, 33))
@@ -21,14 +21,14 @@ SHAPES = ((4, 12), (3, 7), (20, 60), (5, 2), (2, 1), (7, 33))
 NATIVE = pytest.mark.skipif(os.environ.get("COVIEW_KERNELS") == "numpy", reason="the kernel itself")
 
 
-def native_bounds(screen: Screen, desc, query) -> Bounds:
+def native_bounds(stations: QuantizedStations, desc, query) -> Bounds:
     if ck.backend() == "numpy":
-        return screen.bounds(query)
+        return stations.bounds(query)
 
     def run():
-        search = Search(screen, desc)
-        search.scored(query, 0)
-        return search.bounds()
+        kernel = MatchKernel(stations, desc)
+        kernel.candidates(query, 0)
+        return kernel.bounds()
 
     return ck.submit(run)
 
@@ -109,10 +109,10 @@ SPREAD = 1200  # stations; a thread takes 512 at least
 
 @pytest.mark.parametrize("way", ["serial", pytest.param("parallel", marks=NATIVE), "float32"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_equals_the_exhaustive_answer(kind, way, monkeypatch):
+def test_top_k_equals_exhaustive_search(kind, way, monkeypatch):
     # 11 kinds x (6 shapes serial, 3 parallel, 3 float32) x 4 maps x 24 queries: 12,672 cases
     if way == "parallel":
-        monkeypatch.setattr(search, "_SERIAL", 1)
+        monkeypatch.setattr(matching, "_MIN_PARALLEL", 1)
     rng = np.random.default_rng(KINDS.index(kind))
     serial = set()
     for shape in SHAPES if way == "serial" else SHAPES[:3]:
@@ -124,20 +124,20 @@ def test_equals_the_exhaustive_answer(kind, way, monkeypatch):
                 asked = np.roll(query, turn, axis=1) * (rng.random(query.shape) < 0.97)
                 k = int(rng.choice([1, 2, 10, m, m + 3]))
                 agrees(index.top_k(asked, k), asked, oracle, k)
-            if index._search is not None:
-                serial.add(index._search._serial)
+            if index._kernel is not None:
+                serial.add(index._kernel._serial)
     if ck.backend() != "numpy":
         assert serial == {way != "parallel" or runtime.workers() == 1}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_bounds_hold(kind):
+def test_bounds_contain_the_exact_correlation(kind):
     rng = np.random.default_rng(100 + KINDS.index(kind))
     for shape in SHAPES:
         desc, query = scene(rng, kind, 40, shape)
         best = correlations(query, desc).max(axis=1)
-        screen = Screen(desc)
-        for bounds in (screen.bounds(query), native_bounds(screen, desc, query)):
+        stations = QuantizedStations(desc)
+        for bounds in (stations.bounds(query), native_bounds(stations, desc, query)):
             assert (np.abs(bounds.estimate - best) <= bounds.error).all()
 
 
@@ -145,7 +145,7 @@ def test_bounds_are_tight_enough_to_prune():
     rng = np.random.default_rng(5)
     desc, _ = scene(rng, "random", 3000, (20, 60))
     query = np.roll(desc[700], 9, axis=1) + rng.normal(0, 2, (20, 60)).astype(np.float32)
-    bounds = native_bounds(Screen(desc), desc, query)
+    bounds = native_bounds(QuantizedStations(desc), desc, query)
     assert bounds.error.max() < 0.03
     assert (bounds.estimate + bounds.error > (bounds.estimate - bounds.error).max()).sum() == 1
     found = ck.MatchIndex(desc).top_k(query, 3)
@@ -154,20 +154,20 @@ def test_bounds_are_tight_enough_to_prune():
 
 @NATIVE
 @pytest.mark.parametrize("shape", [(20, 60), (3, 7), (1, 63), (40, 34)])
-def test_the_kernel_is_its_twin_to_the_bit(shape):
+def test_kernel_agrees_with_numpy_to_the_bit(shape):
     rng = np.random.default_rng(6)
     desc = rng.normal(size=(50, *shape))
-    screen = Screen(desc)
-    search = ck.submit(Search, screen, desc)
-    query = rng.integers(-2000, 2001, search.query.shape).astype(np.int16)
-    turn = rng.integers(-600, 601, search.turn.shape).astype(np.int16)
+    stations = QuantizedStations(desc)
+    kernel = ck.submit(MatchKernel, stations, desc)
+    query = rng.integers(-2000, 2001, kernel.query.shape).astype(np.int16)
+    turn = rng.integers(-600, 601, kernel.turn.shape).astype(np.int16)
     turn[5] = 0
-    best = ck.submit(search.best, query, turn)
-    np.testing.assert_array_equal(best, reference.screen(screen.stations, query, turn))
+    best = ck.submit(kernel.best, query, turn)
+    np.testing.assert_array_equal(best, reference.best_correlations(stations.stations, query, turn))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.0])
-def test_many_alike_are_told_apart_with_spectra_too(scale):
+def test_top_k_of_near_duplicates_with_and_without_spectra(scale):
     rng = np.random.default_rng(7)
     desc = (rng.uniform(1, 9, (1, 6, 20)) + scale * 1e-2 * rng.standard_normal((2500, 6, 20))).astype(
         np.float16
@@ -179,7 +179,7 @@ def test_many_alike_are_told_apart_with_spectra_too(scale):
         agrees(index.top_k(query, k, spectra=spectra), query, desc, k)
 
 
-def test_an_index_takes_less_than_600_bytes_beyond_a_kilobyte_and_keeps_a_memory_map(tmp_path):
+def test_index_takes_less_than_1300_bytes_a_station_and_keeps_a_memory_map(tmp_path):
     file = np.lib.format.open_memmap(tmp_path / "d.npy", "w+", np.float16, (300, 20, 60))
     file[:] = np.random.default_rng(8).uniform(0, 9, file.shape)
     index = ck.MatchIndex(file)
@@ -187,23 +187,23 @@ def test_an_index_takes_less_than_600_bytes_beyond_a_kilobyte_and_keeps_a_memory
     assert index.descriptors is file
 
 
-def test_queries_beside_frames_and_a_shutdown_from_many_threads():
+def test_queries_and_frames_from_many_threads_during_a_shutdown():
     rng = np.random.default_rng(9)
     desc, _ = scene(rng, "random", 200, (6, 20))
     index = ck.MatchIndex(desc)
     queries = [desc[n].astype(np.float32) for n in range(24)]
     cloud = rng.uniform(-9, 9, (400, 3)).astype(np.float32)
-    points = ck.FrameIntake(1.0)(cloud, np.eye(4)).points.copy()
+    points = ck.VoxelFilter(1.0)(cloud, np.eye(4))[0].copy()
     half_way = Barrier(5, timeout=60)
 
     def ask(_):
-        take = ck.FrameIntake(1.0)
+        voxel_filter = ck.VoxelFilter(1.0)
         answers = []
         for n, query in enumerate(queries):
             if n == 12:
                 half_way.wait()
             # the frame runs on the owner thread, the query on this one, while others do the same
-            np.testing.assert_array_equal(take(cloud, np.eye(4)).points, points)
+            np.testing.assert_array_equal(voxel_filter(cloud, np.eye(4))[0], points)
             answers.append(index.top_k(query, 5))
         return answers
 
@@ -224,7 +224,7 @@ def test_queries_beside_frames_and_a_shutdown_from_many_threads():
         np.testing.assert_allclose(*distances, rtol=0, atol=TOLERANCE)
 
 
-def test_no_stations_and_no_query():
+def test_empty_map_and_empty_query():
     none = ck.MatchIndex(np.empty((0, 4, 8), dtype=np.float16)).top_k(np.ones((4, 8)), 5)
     assert none.station.shape == none.shift.shape == none.distance.shape == (0,)
     found = ck.MatchIndex(np.ones((6, 4, 8), dtype=np.float16)).top_k(np.zeros((4, 8)), 3)
@@ -232,7 +232,7 @@ def test_no_stations_and_no_query():
     np.testing.assert_array_equal(found.distance, 1.0)
 
 
-def test_bad_arguments_are_named():
+def test_errors_name_the_argument():
     index = ck.MatchIndex(np.ones((3, 4, 6), dtype=np.float16))
     with pytest.raises(ValueError, match="query has shape"):
         index.top_k(np.ones((4, 7)), 1)
@@ -246,3 +246,9 @@ def test_bad_arguments_are_named():
         ck.MatchIndex(np.ones((3, 4, 64)))
     with pytest.raises(ValueError, match="descriptors hold"):
         ck.MatchIndex(np.full((3, 4, 6), np.inf, dtype=np.float16))
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.int32])
+def test_descriptors_of_another_type_raise(kind):
+    with pytest.raises(ValueError, match="expected float16 or float32"):
+        ck.MatchIndex(np.ones((3, 20, 60), dtype=kind))

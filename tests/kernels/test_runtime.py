@@ -38,27 +38,27 @@ def test_public_names():
     assert coview_kernels.__all__ == sorted(coview_kernels.__all__)
     assert set(coview_kernels.__all__) == {
         *("Alignment", "Belief", "Scale", "align_planes"),
-        *("FrameIntake", "Intake", "describe_points"),
+        *("VoxelFilter", "describe_points"),
         *("MatchIndex", "Nearest"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unit_columns"),
-        *("visible", "warm_up"),
+        "warm_up",
     }
     assert all(callable(getattr(coview_kernels, name)) for name in coview_kernels.__all__)
     for name in reference.__all__:
-        assert getattr(reference, name) is not getattr(coview_kernels, name)
+        assert getattr(reference, name) is not getattr(coview_kernels, name, None)
 
 
 @needs_library
 @pytest.mark.skipif(os.name != "posix", reason="HOME is POSIX")
 @pytest.mark.parametrize("known", [True, False])
-def test_a_bare_environment_without_a_home(known, tmp_path):
+def test_environment_without_home(known, tmp_path):
     begin = "import os, pwd\nos.environ.pop('HOME', None)\n"
     if known:  # unless the password database names a directory that can be written
         home = f"type('Entry', (), {{'pw_dir': {str(tmp_path)!r}}})"
         begin += f"pwd.getpwuid = lambda user: {home}\n"
     else:
-        begin += "def nobody(user): raise KeyError(user)\npwd.getpwuid = nobody\n"
+        begin += "def unknown(user): raise KeyError(user)\npwd.getpwuid = unknown\n"
     said = succeeds(begin + "use(); print(ck.backend(), os.environ['HOME'])", TMPDIR=str(tmp_path / ".."))
     name, home = said.split()
     assert name in LIBRARIES
@@ -74,7 +74,7 @@ def test_only_runtime_imports_taichi():
             )
 
 
-def test_import_is_cheap_and_every_backend_is_silent():
+def test_import_loads_no_backend_and_kernels_print_nothing():
     code = "import sys\nassert not {'taichi', 'quadrants', 'scipy'} & set(sys.modules)\n"
     code += "use()\nprint(ck.backend())"
     for name in [*LIBRARIES, "numpy"]:
@@ -82,13 +82,13 @@ def test_import_is_cheap_and_every_backend_is_silent():
     assert succeeds(code) == (LIBRARIES[0] if LIBRARIES else "numpy") + "\n"
 
 
-def test_an_unknown_backend_is_named():
+def test_unknown_backend_raises():
     done = run_python("import coview_kernels as ck; ck.backend()", COVIEW_KERNELS="cuda")
     assert done.returncode == 1
     assert "COVIEW_KERNELS is 'cuda'" in done.stderr
 
 
-def test_without_a_library_numpy_serves():
+def test_numpy_is_used_where_taichi_is_missing():
     blocked = (
         "import sys\nsys.modules['taichi'] = sys.modules['quadrants'] = None\nuse()\nprint(ck.backend())"
     )
@@ -110,7 +110,7 @@ def test_submit_returns_raises_and_nests():
     assert submit(int) == 0
 
 
-def test_one_thread_owns_the_kernels():
+def test_all_kernels_run_on_one_thread():
     threads = {submit(threading.get_ident) for _ in range(3)}
     assert len(threads) == 1
     assert (threading.get_ident() in threads) == (backend() == "numpy")
@@ -156,7 +156,7 @@ def test_shutdown_while_other_threads_compute_loses_no_call():
 @needs_library
 @pytest.mark.parametrize("name", LIBRARIES)
 @pytest.mark.parametrize("launched", [True, False])
-def test_a_host_that_runs_taichi_keeps_it(name, launched):
+def test_host_that_initialised_taichi_before_us_keeps_it(name, launched):
     host = (
         f"import {name} as ti\nimport threading\nti.init(arch=ti.cpu)\n"
         "field = ti.field(ti.f32, shape=4)\n" + ("field.fill(3.0)\n" if launched else "") + "use()\n"
@@ -171,7 +171,7 @@ def test_a_host_that_runs_taichi_keeps_it(name, launched):
 
 @needs_library
 @pytest.mark.parametrize("name", LIBRARIES)
-def test_a_host_that_starts_taichi_after_us_takes_it_over(name):
+def test_host_that_initialises_taichi_after_us_keeps_it(name):
     host = (
         f"import {name} as ti\nuse()\nassert ck.backend() == {name!r}\nti.init(arch=ti.cpu)\n"
         "field = ti.field(ti.f32, shape=4)\nfield[1] = 7.0\nuse()\nassert ck.backend() == 'numpy'\n"
@@ -182,7 +182,7 @@ def test_a_host_that_starts_taichi_after_us_takes_it_over(name):
     assert done.stdout.endswith("fine\n")
 
 
-def test_a_forked_child_computes_in_numpy():
+def test_forked_child_computes_in_numpy():
     code = (
         "import os, warnings\nwarnings.simplefilter('ignore')\nuse()\nchild = os.fork()\n"
         "if child == 0:\n    use()\n    os._exit(0 if ck.backend() == 'numpy' else 3)\n"
@@ -191,7 +191,7 @@ def test_a_forked_child_computes_in_numpy():
     assert succeeds(code) == ""
 
 
-def test_the_interpreter_exits_while_another_thread_still_works():
+def test_interpreter_exits_while_another_thread_computes():
     code = (
         "import threading\nuse()\n"
         "def forever():\n    while True:\n        use()\n"
@@ -201,8 +201,8 @@ def test_the_interpreter_exits_while_another_thread_still_works():
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_kernel_modules_insist_on_the_owner():
-    code = "import coview_kernels._ti_sieve"
+def test_import_of_a_kernel_module_off_the_owner_thread_raises():
+    code = "import coview_kernels._ti_voxel_filter"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={"PYTHONPATH": str(ROOT / "kernels")},
@@ -213,8 +213,8 @@ def test_kernel_modules_insist_on_the_owner():
     assert "runtime.kernels" in done.stderr
 
 
-def test_the_compilers_notes_on_the_source_are_not_wrapped():
-    """What :func:`coview_kernels.runtime._hasten` replaces is there: else kernels load a third slower."""
+def test_wrapping_of_source_notes_is_disabled():
+    """What :func:`coview_kernels.runtime._disable_wrapping` replaces is there: else kernels load a third slower."""
     if backend() == "numpy":
         pytest.skip("no compiler")
     notes = importlib.import_module(f"{backend()}.lang.ast.ast_transformer_utils")
@@ -223,7 +223,7 @@ def test_the_compilers_notes_on_the_source_are_not_wrapped():
     assert wrapper.wrap("  ") == textwrap.TextWrapper(width=80).wrap("  ")
 
 
-def test_unknown_kernels_cannot_be_warmed():
+def test_warm_up_of_an_unknown_kernel_raises():
     with pytest.raises(ValueError, match=r"no kernel nearset; there are .*nearest"):
         warm_up("nearset", "nearest")
 
@@ -233,7 +233,7 @@ def test_workers_are_at_least_one(monkeypatch):
     assert 1 <= runtime.workers() <= 16
 
 
-def test_workers_are_bounded_by_the_environment(monkeypatch):
+def test_coview_threads_bounds_the_workers(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
     for asked, given in (("", 8), ("1", 1), ("3", 3), ("64", 8)):
         monkeypatch.setenv("COVIEW_THREADS", asked)
@@ -241,7 +241,7 @@ def test_workers_are_bounded_by_the_environment(monkeypatch):
 
 
 @pytest.mark.parametrize("asked", ["0", "-1", "two", "1.5", " "])
-def test_a_bound_that_is_no_number_of_threads_is_refused(monkeypatch, asked):
+def test_invalid_coview_threads_raises(monkeypatch, asked):
     monkeypatch.setenv("COVIEW_THREADS", asked)
     with pytest.raises(ValueError, match=r"COVIEW_THREADS is .+ whole number"):
         runtime.workers()

@@ -29,7 +29,7 @@ def assert_same(grid, expected):
     st.sampled_from([5.0, 50.0]),
     st.sampled_from([(0, 0, 0), (2.5, -7.5, 1.0), (0.1, 0.2, 0.3)]),
 )
-def test_agrees_with_numpy(points, size, r_max, centre):
+def test_polar_bin_agrees_with_numpy(points, size, r_max, centre):
     grid, dropped = polar_bin(points, centre, *size, r_max)
     expected, expected_dropped = reference.polar_bin(points, np.array(centre, dtype=float), *size, r_max)
     assert_same(grid, expected)
@@ -40,23 +40,21 @@ def test_agrees_with_numpy(points, size, r_max, centre):
     clouds(),
     SIZES,
     st.sampled_from(["max", "mean", "off"]),
-    st.sampled_from(["paper", "eye", "off"]),
-    st.sampled_from([0.0, 1.5]),
 )
-def test_describing_at_once_is_binning_and_co_visibility(points, size, vertical, mode, eye):
+def test_describe_points_is_polar_bin_and_coview(points, size, vertical):
     centre = np.array([2.5, -7.5, 1.0])
-    grid, context, dropped = describe_points(points, centre, *size, 50.0, vertical, mode, eye)
+    grid, context, dropped = describe_points(points, centre, *size, 50.0, vertical)
     expected, expected_dropped = polar_bin(points, centre, *size, 50.0)
     assert_same(grid, expected)
     assert dropped == expected_dropped
-    np.testing.assert_array_equal(context, coview(*expected, vertical=vertical, mode=mode, eye=eye))
-    plain = reference.describe_points(points, centre, *size, 50.0, vertical, mode, eye)
+    np.testing.assert_array_equal(context, coview(*expected, vertical=vertical))
+    plain = reference.describe_points(points, centre, *size, 50.0, vertical)
     np.testing.assert_array_equal(context, plain[1])
     assert context.dtype == plain[1].dtype
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_chunks_add_up(monkeypatch, threads):
+def test_result_does_not_depend_on_the_number_of_threads(monkeypatch, threads):
     polar._bins.cache_clear()
     monkeypatch.setattr(polar.runtime, "workers", lambda: threads)
     points = np.random.default_rng(9).normal(0, 20, (30_000, 3)).astype(np.float32)
@@ -70,7 +68,7 @@ def test_chunks_add_up(monkeypatch, threads):
 
 
 @given(clouds(max_points=120), st.sampled_from([(3, 4), (20, 60)]))
-def test_agrees_with_the_definition_away_from_edges(points, size):
+def test_polar_bin_agrees_with_its_definition_away_from_edges(points, size):
     rings, sectors = size
     count = np.zeros(size, dtype=int)
     highest = np.zeros(size)
@@ -93,7 +91,7 @@ def test_agrees_with_the_definition_away_from_edges(points, size):
 
 
 @pytest.mark.parametrize("implementation", [polar_bin, reference.polar_bin])
-def test_edges_belong_outward_and_counter_clockwise(implementation):
+def test_edge_points_belong_to_the_outer_ring_and_counter_clockwise_sector(implementation):
     def where(x, y):
         grid, _ = implementation(np.array([[x, y, 1.0]], dtype=np.float32), np.zeros(3), 5, 4, 10.0)
         found = np.argwhere(grid.count)
@@ -113,7 +111,7 @@ def test_edges_belong_outward_and_counter_clockwise(implementation):
 
 
 @pytest.mark.parametrize("sectors", [3, 8, 60, 64, 361])
-def test_points_on_every_sector_edge_agree(sectors):
+def test_kernel_and_numpy_agree_on_sector_edges(sectors):
     angle = np.arange(sectors) * 2 * np.pi / sectors
     radius = np.linspace(0.1, 49.9, 40)
     on = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
@@ -126,14 +124,20 @@ def test_points_on_every_sector_edge_agree(sectors):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_index_turns_with_the_cloud(seed):
+def test_polar_index_rotates_with_the_cloud(seed):
     offset = np.random.default_rng(seed).uniform(-40, 40, (100, 2)).astype(np.float32)
     here = polar_index(offset[:, 0], offset[:, 1], 20, 60, 60.0)
     turned = polar_index(-offset[:, 1], offset[:, 0], 20, 60, 60.0)
     np.testing.assert_array_equal(turned, here // 60 * 60 + (here % 60 + 15) % 60)
 
 
-def test_empty_and_all_in_one_bin():
+def test_more_sectors_than_the_kernel_supports():
+    points = np.random.default_rng(7).normal(0, 15, (2_000, 3)).astype(np.float32)
+    grid, _ = polar_bin(points, (0, 0, 0), 2, 400_000, 30.0)
+    assert_same(grid, reference.polar_bin(points, np.zeros(3), 2, 400_000, 30.0)[0])
+
+
+def test_empty_cloud_and_cloud_in_one_bin():
     grid, dropped = polar_bin(np.empty((0, 3)), (0, 0, 0), 20, 60, 50.0)
     assert dropped == 0
     assert not any(a.any() for a in grid)
@@ -144,7 +148,7 @@ def test_empty_and_all_in_one_bin():
     assert grid.sum_height.min() == -2000.0
 
 
-def test_two_million_points():
+def test_polar_bin_of_two_million_points():
     points = np.random.default_rng(2).normal(0, 20, (2_000_000, 3)).astype(np.float32)
     points[::500, 1] = np.inf
     grid, dropped = polar_bin(points, (1.0, 2.0, -1.5), 20, 60, 50.0)
@@ -167,7 +171,7 @@ def rasters(draw):
 
 
 @given(rasters(), st.sampled_from([(1, 1), (4, 6), (20, 60)]), st.sampled_from([0.5, 1.0, 2.3]))
-def test_stations_agree_with_numpy(raster, size, cell):
+def test_station_bins_agrees_with_numpy(raster, size, cell):
     top, count, total, rows, cols, ground = raster
     rows, cols, ground = rows.astype(np.int32), cols.astype(np.int32), ground.astype(np.float32)
     arguments = (top, count, total, cell, rows, cols, ground, *size, 8.0)
@@ -178,7 +182,7 @@ def test_stations_agree_with_numpy(raster, size, cell):
 
 
 @given(rasters())
-def test_a_station_sees_the_raster_as_points_at_cell_centres(raster):
+def test_station_bins_are_polar_bins_of_cell_centres(raster):
     top, count, total, rows, cols, ground = raster
     grid = station_bins(top, count, total, 0.5, rows, cols, ground, 5, 8, 6.0)
     assert grid.count.shape == (len(rows), 5, 8)
@@ -192,7 +196,7 @@ def test_a_station_sees_the_raster_as_points_at_cell_centres(raster):
         np.testing.assert_allclose(grid.sum_height[m], expected.sum_height, rtol=1e-4, atol=1e-3)
 
 
-def test_what_an_empty_cell_holds_does_not_matter():
+def test_values_of_empty_raster_cells_are_ignored():
     count = np.array([[1, 0, 0]], dtype=np.int32)
     junk = np.array([[2.0, np.nan, 1e30]], dtype=np.float32)
     grid = station_bins(junk, count, junk, 1.0, [0], [1], [1.0], 3, 4, 6.0)
@@ -200,12 +204,12 @@ def test_what_an_empty_cell_holds_does_not_matter():
     assert grid.max_height.max() == grid.sum_height.max() == 1.0
 
 
-def test_bad_arguments_are_named():
+def test_errors_name_the_argument():
     cloud, raster = np.zeros((1, 3)), np.zeros((4, 5))
     with pytest.raises(ValueError, match="centre"):
         polar_bin(cloud, (0, np.nan, 0), 20, 60, 50.0)
-    with pytest.raises(ValueError, match="mode"):
-        describe_points(cloud, (0, 0, 0), 20, 60, 50.0, mode="ear")
+    with pytest.raises(ValueError, match="vertical"):
+        describe_points(cloud, (0, 0, 0), 20, 60, 50.0, "highest")
     with pytest.raises(ValueError, match="r_max"):
         polar_bin(cloud, (0, 0, 0), 20, 60, 0.0)
     with pytest.raises(ValueError, match="rings"):

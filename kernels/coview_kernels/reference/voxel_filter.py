@@ -1,4 +1,4 @@
-"""Transform and first-of-voxel de-duplication in plain NumPy."""
+"""Rigid transform, range filter and first point of each voxel in plain NumPy."""
 
 from __future__ import annotations
 

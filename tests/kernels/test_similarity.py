@@ -9,10 +9,10 @@ from coview_kernels import all_shift_distance, column_spectra, polar_bin, unit_c
 
 
 @st.composite
-def descriptors(draw, least=0):
+def descriptors(draw, min_candidates=0):
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     rings, sectors = draw(st.integers(1, 8)), draw(st.integers(1, 13))
-    candidates, queries = draw(st.integers(least, 5)), draw(st.integers(1, 3))
+    candidates, queries = draw(st.integers(min_candidates, 5)), draw(st.integers(1, 3))
     desc = rng.normal(0, 3, (candidates + queries, rings, sectors)).astype(np.float32)
     desc[rng.random(desc.shape) < draw(st.sampled_from([0.0, 0.5, 0.95]))] = 0.0
     return desc[:queries], desc[queries:]
@@ -31,7 +31,7 @@ def loops(query, candidate):
 
 
 @given(descriptors())
-def test_agrees_with_plain_loops(pair):
+def test_all_shift_distance_agrees_with_loops(pair):
     queries, candidates = pair
     sectors = queries.shape[2]
     spectra = column_spectra(candidates)
@@ -62,23 +62,23 @@ def test_shift_n_means_a_yaw_of_minus_n_sectors(steps):
     assert distance.min() == pytest.approx(1 - occupied / 60, abs=1e-5)
 
 
-@given(descriptors(least=1))
-def test_columns_have_unit_length_or_stay_zero(pair):
+@given(descriptors(min_candidates=1))
+def test_unit_columns_have_length_one_or_stay_zero(pair):
     desc = pair[1]
     norm = np.linalg.norm(unit_columns(desc).astype(float), axis=-2)
     np.testing.assert_allclose(norm, desc.any(axis=-2).astype(float), atol=1e-6)
 
 
-def test_a_tiny_column_has_a_direction_too():
+def test_unit_columns_of_tiny_values():
     np.testing.assert_allclose(unit_columns(np.full((4, 1), 1e-30)), 0.5)
 
 
-def test_an_empty_query_costs_one_everywhere():
+def test_empty_query_has_distance_one_everywhere():
     spectra = column_spectra(np.ones((3, 4, 6), dtype=np.float32))
     np.testing.assert_array_equal(all_shift_distance(np.zeros((4, 6)), spectra, 6), np.ones((3, 6)))
 
 
-def test_many_candidates_are_transformed_in_portions():
+def test_column_spectra_of_many_candidates():
     desc = np.random.default_rng(4).normal(size=(2500, 2, 5)).astype(np.float32)
     spectra = column_spectra(desc)
     expected = np.fft.rfft(unit_columns(desc), axis=-1).transpose(2, 0, 1)
@@ -86,7 +86,7 @@ def test_many_candidates_are_transformed_in_portions():
 
 
 @pytest.mark.parametrize("rings", [3, 5000])
-def test_candidates_are_multiplied_in_blocks(rings):
+def test_all_shift_distance_of_many_candidates(rings):
     rng = np.random.default_rng(8)
     desc = rng.normal(size=(12 if rings > 100 else 3000, rings, 4)).astype(np.float32)
     spectra = column_spectra(desc)
@@ -98,7 +98,7 @@ def test_candidates_are_multiplied_in_blocks(rings):
             np.testing.assert_allclose(distance[q, :, n], 1 - same, atol=1e-5)
 
 
-def test_bad_arguments_are_named():
+def test_errors_name_the_argument():
     spectra = column_spectra(np.ones((3, 4, 6)))
     with pytest.raises(ValueError, match="query"):
         all_shift_distance(np.ones((4, 7)), spectra, 6)

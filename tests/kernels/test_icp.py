@@ -1,4 +1,4 @@
-"""The registration kernel against its plain twin: same pose, evidence and end, whatever the scene, start and prior."""
+"""Registration kernel against its NumPy twin: same pose, evidence and end for many scenes, starts and priors."""
 
 from __future__ import annotations
 
@@ -51,12 +51,14 @@ def scan_of(points, rng, truth, outliers, noise):
     return local, above, local.mean(axis=0, dtype=np.float64)
 
 
-def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, least=50, **changes):
+def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, min_pairs=50, **changes):
     """Answers of the kernel and of its twin."""
     options = FIXED | changes
-    ours = align_planes(grid, normals, local, above, T, pivot, scales, prior=prior, least=least, **options)
+    ours = align_planes(
+        grid, normals, local, above, T, pivot, scales, prior=prior, min_pairs=min_pairs, **options
+    )
     belief = None if prior is None else (np.asarray(prior.mean), np.asarray(prior.information))
-    plan = Plan(T, pivot, scales, options["keep"], options["iterations"], least, belief)
+    plan = Plan(T, pivot, scales, options["keep"], options["iterations"], min_pairs, belief)
     return ours, reference.align_planes(grid.tree, normals, local, above, plan)
 
 
@@ -76,7 +78,7 @@ def assert_same(ours, plain, pivot):
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 3]))
-def test_agrees_with_the_twin(seed, outliers, believed, threads):
+def test_kernel_agrees_with_numpy(seed, outliers, believed, threads):
     rng = np.random.default_rng(seed)
     points, normals = room(rng, 0.01)
     truth = pose([0, 0, rng.uniform(-3, 3)], rng.uniform(-9, 9, 3))
@@ -92,23 +94,7 @@ def test_agrees_with_the_twin(seed, outliers, believed, threads):
     assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < 0.1
 
 
-def test_coarse_scales_make_do_with_some_points():
-    rng = np.random.default_rng(5)
-    points, normals = room(rng, 0.01)
-    truth = pose([0, 0, 1.0], points.mean(axis=0, dtype=np.float64))
-    local, above, pivot = scan_of(points, rng, truth, 0.1, 0.02)
-    start = truth + 0.0
-    start[:3, 3] += [0.2, -0.3, 0.1]
-    every = tuple(scale._replace(every=4) for scale in SCALES[:2])
-    grid = PointGrid(points)
-    ours, plain = both(grid, normals, local, above, start, pivot, scales=(*every, SCALES[2]))
-    assert_same(ours, plain, pivot)
-    ours, plain = both(grid, normals, local, above, start, pivot, scales=every)
-    assert_same(ours, plain, pivot)
-    assert ours.pairs <= len(local) // 4 + 1
-
-
-def test_equal_distances_are_kept_together():
+def test_pairs_of_equal_distance_are_kept_together():
     """Lattices seen exactly, a sixteenth of a metre off: all of a kind are equally far, and stay or go together."""
     u, v = (a.ravel() for a in np.meshgrid(np.arange(0, 8, 0.25), np.arange(0, 8, 0.25)))
     parts = np.stack([u, v, 0 * u], 1), np.stack([0 * u + 16, u, v + 1], 1)
@@ -124,7 +110,7 @@ def test_equal_distances_are_kept_together():
         np.testing.assert_allclose(ours.T, np.eye(4), atol=1e-6)
 
 
-def test_a_far_start_of_large_turns():
+def test_converges_from_a_start_half_a_radian_off():
     """The increment's rotation is exact, not linear: half a radian in one step."""
     rng = np.random.default_rng(2)
     points, normals = room(rng, 0.01)
@@ -148,13 +134,13 @@ def test_one_kind_of_point_or_few_pairs():
         assert_same(*both(grid, normals, local, kind, truth, pivot), pivot)
     far = truth + 0.0
     far[2, 3] += 50.0
-    for start, least in ((far, 50), (truth, 650)):
-        ours, plain = both(grid, normals, local, above, start, pivot, least=least)
+    for start, min_pairs in ((far, 50), (truth, 650)):
+        ours, plain = both(grid, normals, local, above, start, pivot, min_pairs=min_pairs)
         assert ours is None
         assert plain is None
 
 
-def test_a_belief_decides_where_nothing_else_does():
+def test_prior_decides_unobservable_directions():
     """A bare floor leaves heading and place free; the mean of a sure belief is where they end."""
     u, v = (a.ravel() for a in np.meshgrid(np.arange(0, 12, 0.3), np.arange(0, 12, 0.3)))
     floor = np.stack([u, v, 0 * u], 1).astype(np.float32)
@@ -168,7 +154,7 @@ def test_a_belief_decides_where_nothing_else_does():
     np.testing.assert_allclose(ours.T, mean, atol=2e-3)
 
 
-def test_empty_sides_find_nothing():
+def test_empty_map_or_source_returns_none():
     none = np.empty((0, 3))
     cloud, up = np.random.default_rng(4).normal(size=(99, 3)), np.tile([0.0, 0, 1], (99, 1))
     options = {"T": np.eye(4), "pivot": np.zeros(3), "scales": SCALES, **FIXED}
@@ -176,7 +162,7 @@ def test_empty_sides_find_nothing():
     assert align_planes(PointGrid(cloud), up, none, np.ones(0), **options) is None
 
 
-def test_bad_arguments_are_named():
+def test_errors_name_the_argument():
     cloud = np.zeros((2, 3))
     good = {
         "normals": cloud, "source": cloud, "kind": np.ones(2), "T": np.eye(4), "pivot": np.zeros(3),
@@ -190,3 +176,12 @@ def test_bad_arguments_are_named():
     for name, value in bad.items():
         with pytest.raises(ValueError, match=name.rstrip("s")):
             align_planes(PointGrid(cloud), **(good | {name: value}))
+
+
+def test_min_pairs_below_one_raises():
+    cloud = np.random.default_rng(2).uniform(-5, 5, (300, 3)).astype(np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (300, 1))
+    arguments = PointGrid(cloud), up, cloud, np.zeros(300, bool), np.eye(4), np.zeros(3), SCALES
+    assert align_planes(*arguments, **FIXED, min_pairs=1) is not None
+    with pytest.raises(ValueError, match="min_pairs must be at least 1"):
+        align_planes(*arguments, **FIXED, min_pairs=0)

@@ -32,7 +32,7 @@ def finite(points):
 @given(
     clouds(), clouds(), poses(), st.sampled_from([0.3, 2.5, 9.0, 200.0]), st.sampled_from([0.4, 1.0, 30.0])
 )
-def test_agrees_with_the_tree(cloud, queries, T, radius, cell):
+def test_kernel_agrees_with_numpy(cloud, queries, T, radius, cell):
     grid = PointGrid(finite(cloud), cell)
     distance, index = nearest(grid, queries, radius)
     expected, _ = reference.nearest(grid.tree, queries, radius)
@@ -44,7 +44,7 @@ def test_agrees_with_the_tree(cloud, queries, T, radius, cell):
 
 
 @given(clouds(120), clouds(60), st.sampled_from([0.5, 4.0, 100.0]))
-def test_both_agree_with_brute_force(cloud, queries, radius):
+def test_kernel_and_numpy_agree_with_brute_force(cloud, queries, radius):
     cloud = finite(cloud)
     cloud = cloud[np.abs(cloud).max(axis=1, initial=0) < 1e6]
     grid = PointGrid(cloud)
@@ -56,7 +56,7 @@ def test_both_agree_with_brute_force(cloud, queries, radius):
 @pytest.mark.parametrize(
     "stretch", [[1, 1, 1], [1, 1, 1000], [3000, 3000, 1], [1e6, 1, 1e6], [0, 0, 1], [0, 0, 0]]
 )
-def test_clouds_of_any_extent(stretch):
+def test_wide_high_and_flat_clouds(stretch):
     """Wide ones get larger cells, high ones a topmost layer that holds the rest, flat ones a single row."""
     rng = np.random.default_rng(1)
     cloud = (rng.uniform(-5, 5, (4000, 3)) * stretch).astype(np.float32)
@@ -70,7 +70,7 @@ def test_clouds_of_any_extent(stretch):
         assert_answers(cloud, queries, *nearest(grid, queries, radius), expected)
 
 
-def test_a_stray_point_in_the_sky_leaves_the_cells_small():
+def test_outlier_high_above_does_not_enlarge_the_cells():
     cloud = np.random.default_rng(2).uniform(0, 20, (1000, 3)).astype(np.float32)
     cloud[0, 2] = 9e4
     grid = PointGrid(cloud, 0.5)
@@ -79,7 +79,7 @@ def test_a_stray_point_in_the_sky_leaves_the_cells_small():
     np.testing.assert_array_equal(distance, 0.0)
 
 
-def test_the_radius_is_exclusive_and_equally_near_points_are_all_right():
+def test_radius_is_exclusive_and_ties_give_any_point():
     grid = PointGrid(np.array([[0, 0, 0], [2, 0, 0], [2, 0, 0]], np.float32))
     distance, index = nearest(grid, [[1, 0, 0], [2, 0, 0], [-1, 0, 0]], 1.0)
     np.testing.assert_array_equal(distance, [np.inf, 0.0, np.inf])
@@ -88,7 +88,7 @@ def test_the_radius_is_exclusive_and_equally_near_points_are_all_right():
     assert nearest(grid, [[1, 0, 0]], 1.001)[0] == 1.0
 
 
-def test_empty_sides():
+def test_empty_cloud_or_queries():
     empty = PointGrid(np.empty((0, 3)))
     distance, index = nearest(empty, np.ones((2, 3)), 5.0)
     np.testing.assert_array_equal(distance, np.inf)
@@ -98,7 +98,7 @@ def test_empty_sides():
     assert (distance.dtype, index.dtype) == (np.float64, np.int64)
 
 
-def test_bad_arguments_are_named():
+def test_errors_name_the_argument():
     cloud = np.zeros((2, 3))
     with pytest.raises(ValueError, match="points"):
         PointGrid(np.zeros((2, 2)))

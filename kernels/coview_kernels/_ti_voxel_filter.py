@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Taichi source of sieve.py: one pass over the points, with a hash table of cubes of 4 x 4 x 4 voxels.
+"""Taichi source of voxel_filter.py: one pass over the points, with a hash table of cubes of 4 x 4 x 4 voxels.
 
 Points go by blocks. They are moved and their voxels numbered into local vectors, which the compiler does several
 points at a time (a store to an argument might alias and is never vectorised). Then they are looked up one by one: a
@@ -35,25 +35,25 @@ def voxel_of(p: f32, limit: f32, inverse: f64, middle: i32) -> i32:
 
 
 @ti.func
-def place(
+def number_voxels(
     start: i32,
     points: ti.template(),
-    move: ti.template(),
+    settings: ti.template(),
     a: ti.template(),
     b: ti.template(),
     c: ti.template(),
     plane: ti.template(),
     rest: ti.template(),
 ):
-    """Move a block to a, b, c and number their voxels; how many are not finite, how many out of reach.
+    """Move a block to a, b, c and number their voxels; return how many are not finite and how many out of reach.
 
-    ``plane`` is the cube's place along x and y, ``rest`` along z, the voxel in the cube (6 bits) and whether the
+    ``plane`` is the cube's index along x and y, ``rest`` along z, the voxel in the cube (6 bits) and whether the
     point is in range.
     """
-    T = ti.Vector([move[k] for k in ti.static(range(12))])
-    inverse, nearest, farthest = move[12], move[13], move[14]
-    limit = ti.cast(move[15], f32)
-    middle = ti.Vector([ti.cast(move[16 + k], i32) - FAR for k in ti.static(range(3))])
+    T = ti.Vector([settings[k] for k in ti.static(range(12))])
+    inverse, nearest, farthest = settings[12], settings[13], settings[14]
+    limit = ti.cast(settings[15], f32)
+    middle = ti.Vector([ti.cast(settings[16 + k], i32) - FAR for k in ti.static(range(3))])
     infinite, far = 0, 0
     for j in range(BLOCK):
         i = 3 * (start + j)
@@ -80,8 +80,8 @@ def place(
 
 
 @ti.func
-def look_up(
-    generation: i64,
+def keep_first(
+    call: i64,
     bits: i32,
     merge: i64,
     out: i32,
@@ -96,15 +96,15 @@ def look_up(
     table: ti.template(),
     moved: ti.template(),
 ):
-    """Append the first point of each voxel to ``moved``; its new end, the cubes added, and the last cube.
+    """Append the first point of each voxel to ``moved``; return its new end, the cubes added, and the last cube.
 
-    ``table`` has a key and 64 bits for each cube. A place is free unless its key is of this ``generation``: nothing
-    is ever cleared. The bits of the last cube, at ``at``, are in ``seen`` until there is another one.
+    ``table`` has a key and 64 bits for each cube. A slot is free unless its key is of this ``call``: nothing is
+    ever cleared. The bits of the last cube, at ``at``, are in ``seen`` until there is another one.
     """
     cubes = 0
     for j in range(BLOCK):
         w = rest[j]
-        k = (generation << STAMP) | (ti.cast(plane[j], i64) << 14) | ti.cast(w >> 7, i64)
+        k = (call << STAMP) | (ti.cast(plane[j], i64) << 14) | ti.cast(w >> 7, i64)
         voxel = ti.cast(w & 1, i64) << ti.cast((w >> 1) & 63, i64)
         if (k != last) & (voxel != 0):
             table[2 * at + 1] = seen
@@ -112,7 +112,7 @@ def look_up(
             wrap = (1 << bits) - 1
             at = ti.cast((k * i64(GOLDEN)) >> (64 - bits), i32) & wrap
             held = table[2 * at]
-            while (held != k) & ((held >> STAMP) == generation):
+            while (held != k) & ((held >> STAMP) == call):
                 at = (at + 1) & wrap
                 held = table[2 * at]
             fresh = ti.cast(held != k, i32)
@@ -129,22 +129,22 @@ def look_up(
 
 
 @ti.kernel
-def sieve(
+def voxel_filter(
     points: Floats,
     blocks: i32,
-    generation: i64,
+    call: i64,
     bits: i32,
     merge: i64,
-    move: Doubles,
+    settings: Doubles,
     table: Longs,
     moved: Floats,
     totals: Integers,
 ):
     """Append the kept rows to ``moved``.
 
-    ``merge``: -1, or 0 to keep every point. ``move``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
+    ``merge``: -1, or 0 to keep every point. ``settings``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
     and r_max, a coordinate beyond reach, the sensor's voxel. ``totals``: kept, not finite, out of reach, cubes;
-    they go on from call to call. The table has a place behind its own, where nothing is kept.
+    they go on from call to call. One slot behind the table's own receives what is not kept.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -153,12 +153,12 @@ def sieve(
         out, infinite, far, cubes = totals[0], totals[1], totals[2], totals[3]
         last, seen, at = i64(0), i64(0), 1 << bits
         for block in range(blocks):
-            odd, off = place(block * BLOCK, points, move, a, b, c, plane, rest)
+            odd, off = number_voxels(block * BLOCK, points, settings, a, b, c, plane, rest)
             infinite += odd
             far += off
             if cubes + BLOCK <= 1 << (bits - 1):
-                out, more, at, last, seen = look_up(
-                    generation, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
+                out, more, at, last, seen = keep_first(
+                    call, bits, merge, out, at, last, seen, a, b, c, plane, rest, table, moved
                 )
                 cubes += more
         table[2 * at + 1] = seen

@@ -1,4 +1,4 @@
-"""Kernels compiled before they are needed: from the cache, too, each takes a tenth of a second or more."""
+"""Compilation of the kernels before they are needed: each takes a tenth of a second or more, from the cache too."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import numpy as np
 from coview_kernels import runtime
 from coview_kernels.covisibility import coview
 from coview_kernels.icp import Scale, align_planes
-from coview_kernels.intake import FrameIntake
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
-from coview_kernels.voxel import transform_unique
+from coview_kernels.voxel_filter import transform_unique
 
 _CLOUD = np.ones((2, 3), dtype=np.float32)
 _EYE, _ORIGIN, _ONE = np.eye(4), np.zeros(3), np.zeros(1, dtype=np.int32)
@@ -21,12 +20,14 @@ _EYE, _ORIGIN, _ONE = np.eye(4), np.zeros(3), np.zeros(1, dtype=np.int32)
 def _align() -> None:
     scales = [Scale(1.0, 1.0)]
     align_planes(
-        PointGrid(_CLOUD), _CLOUD, _CLOUD, np.ones(2), _EYE, _ORIGIN, scales, keep=1.0, iterations=1, least=1
+        *(PointGrid(_CLOUD), _CLOUD, _CLOUD, np.ones(2), _EYE, _ORIGIN, scales),
+        keep=1.0,
+        iterations=1,
+        min_pairs=1,
     )
 
 
 _CALLS: dict[str, Callable[[], object]] = {
-    "FrameIntake": lambda: FrameIntake(1.0)(_CLOUD, _EYE),
     "align_planes": _align,
     "coview": lambda: coview(*np.ones((3, 100, 20, 60))),
     "describe_points": lambda: describe_points(_CLOUD, _ORIGIN, 2, 4, 8.0),
@@ -43,7 +44,8 @@ def warm_up(*names: str) -> None:
     """Start the backend and compile kernels now rather than at first use.
 
     Args:
-        names: of the public functions that will be called; none stands for all.
+        names: of the public functions that will be called, all of them by default. ``transform_unique`` stands for
+            :class:`coview_kernels.VoxelFilter` too.
 
     Raises:
         ValueError: a name is unknown.
