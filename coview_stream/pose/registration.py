@@ -152,7 +152,6 @@ def register(
     prior: Prior | None = None,
     centre: npt.NDArray[np.float64] | None = None,
     iterations: int | None = None,
-    thin: int = 1,
 ) -> Registration | None:
     """Trimmed ICP or GICP, as ``config.method`` says, from an initial pose.
 
@@ -165,7 +164,6 @@ def register(
         prior: belief to fuse; its mean is about ``centre`` too.
         centre: (3,) source-frame point that rotations are about (the body's position); default the mean.
         iterations: at most this many on each scale; default the configuration's.
-        thin: all scales but the last make do with every n-th point of either kind.
 
     Returns:
         The result, or None where fewer than 50 points find a partner.
@@ -180,7 +178,7 @@ def register(
         belief = kernels.Belief(prior.T_map_source, prior.information * config.inflation**2)
     if config.method == "gicp":
         return _by_gicp(
-            source, T_map_source, target, config, _stages(scales, config, thin), belief, pivot, iterations
+            source, T_map_source, target, config, _stages(scales, config), belief, pivot, iterations
         )
     found = kernels.align_planes(
         target.grid,
@@ -189,10 +187,10 @@ def register(
         source.above,
         T_map_source,
         pivot,
-        _stages(scales, config, thin),
+        _stages(scales, config),
         keep=config.keep,
         iterations=iterations or config.iterations,
-        least=LEAST_PAIRS,
+        min_pairs=LEAST_PAIRS,
         prior=belief,
     )
     return None if found is None else Registration(*found)
@@ -212,9 +210,8 @@ def _by_gicp(
 
     if target.surfaces is None:
         return None
-    thinned = {n: source if n == 1 else source.every(n) for n in {stage.every for stage in stages}}
     return register_surfaces(
-        [thinned[stage.every].surfaces for stage in stages],
+        source.surfaces,
         target.surfaces,
         target.grid,
         target.normals,
@@ -227,7 +224,7 @@ def _by_gicp(
     )
 
 
-def _stages(scales: tuple[float, ...], config: RegistrationConfig, thin: int) -> list[kernels.Scale]:
+def _stages(scales: tuple[float, ...], config: RegistrationConfig) -> list[kernels.Scale]:
     """Return the scales as the kernel takes them; all but the last end early, as the next one goes on from there."""
     last = len(scales) - 1
     return [
@@ -236,7 +233,6 @@ def _stages(scales: tuple[float, ...], config: RegistrationConfig, thin: int) ->
             max(config.residual_scale, _WIDTH_SHARE * scale),
             _STOP_SHIFT if k == last else max(_STOP_SHIFT, _COARSE_SHIFT * scale),
             _STOP_TURN if k == last else max(_STOP_TURN, _COARSE_TURN * scale),
-            1 if k == last else thin,
         )
         for k, scale in enumerate(scales)
     ]
