@@ -58,33 +58,6 @@ class GroundRaster:
         return out
 
 
-def ground_raster(
-    points: Points, mask: npt.NDArray[np.bool_], cell: float = 1.0, fill: float = 10.0
-) -> GroundRaster:
-    """Raster the median height of the ground points; holes are filled up to ``fill`` metres away.
-
-    Args:
-        points: (N, 3) float32 metres, finite.
-        mask: (N,) which of them are ground.
-        cell: edge length in metres.
-        fill: unknown cells further than this from a known one stay NaN.
-
-    Raises:
-        ConfigError: no ground point, ``cell`` is not positive, or the raster would be absurdly large.
-    """
-    ground = points[mask]
-    if not len(ground) or not cell > 0:
-        raise ConfigError(f"ground raster of {len(ground)} points with cell={cell}: both must be positive")
-    corner, shape, flat = cells(ground, cell)
-    order = np.lexsort((ground[:, 2], flat))
-    unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
-    z: Heights = np.full(shape, np.nan, dtype=np.float32)
-    z.flat[unique] = ground[order[first + count // 2], 2]
-    near = ndimage.distance_transform_edt(np.isnan(z)) * cell <= fill
-    z = np.where(near, filled(z), np.float32(np.nan))
-    return GroundRaster(z, float(corner[0]), float(corner[1]), cell)
-
-
 def cells(
     points: Points, cell: float
 ) -> tuple[npt.NDArray[np.float64], tuple[int, int], npt.NDArray[np.int64]]:

@@ -12,11 +12,10 @@ from coview_stream.sim.site import Site
 
 _LORRIES = 0.95  # from this kind on
 _LANE = 2.2  # metres from the middle of the robot's lane to the middle of a vehicle
-SPOT_COLUMNS = ("x", "y", "yaw", "kind")
 
 
 def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: float) -> Floats:
-    """(N, 4) places beside the streets, ``offset`` metres from the centre line, in random order.
+    """(N, 4) x, y, yaw and kind of places beside the streets, ``offset`` metres from the centre line, in random order.
 
     Places on a crossing are left out. ``kind`` is a random number in [0, 1).
     """

@@ -12,7 +12,7 @@ import pytest
 
 from coview_stream.basemap.cloth import cloth_available
 from coview_stream.basemap.ground import GroundConfig, ground_filter, ground_mask
-from coview_stream.basemap.ground_raster import GroundRaster, filled, ground_raster
+from coview_stream.basemap.ground_raster import GroundRaster, filled
 from coview_stream.basemap.levels import LevelConfig, ground_levels
 from coview_stream.errors import ConfigError, DependencyError
 
@@ -128,21 +128,6 @@ def test_absurd_extent_is_refused() -> None:
 def test_config_is_validated(field: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(field))):
         GroundConfig(**field)  # type: ignore[arg-type]  # fields by name
-
-
-def test_raster_follows_a_slope_and_fills_near_holes_only() -> None:
-    xy = np.random.default_rng(8).uniform(0, 60, (40_000, 2))
-    hole = (np.abs(xy - 30) < 15).all(axis=1)
-    points = np.column_stack([xy, 0.2 * xy[:, 0]])[~hole].astype(np.float32)
-    raster = ground_raster(points, np.ones(len(points), bool), cell=1.0, fill=5.0)
-    at = np.array([[10.3, 20.7], [16.5, 30.0], [30.0, 30.0], [-1.0, 5.0], [61.0, 5.0]])
-    heights = raster.height_at(at)
-    np.testing.assert_allclose(heights[:2], 0.2 * at[:2, 0], atol=0.15)
-    assert heights[1] == pytest.approx(3.3, abs=0.5)
-    assert np.isnan(heights[2:]).all()
-    assert np.isfinite(ground_raster(points, np.ones(len(points), bool), fill=50.0).z).all()
-    with pytest.raises(ConfigError):
-        ground_raster(points, np.zeros(len(points), bool))
 
 
 def test_height_is_bilinear_and_ignores_unknown_neighbours() -> None:

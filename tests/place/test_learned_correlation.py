@@ -177,12 +177,6 @@ def test_each_block_answers_for_its_own_cells_only():
     assert (answered == 1).all()
 
 
-def test_places_and_cells():
-    coarse = CoarseMap(np.ones((1, 8, 9), np.float32), (10.0, -6.0), cell=2.0)
-    row, col = coarse.cell_of([[15.9, 1.9], [9.9, -6.1]])
-    assert (row.tolist(), col.tolist()) == ([3, -1], [2, -1])
-
-
 def test_turning_goes_from_x_to_y():
     image = np.zeros((1, 32, 32), np.float32)
     image[0, 15:17, 24:26] = 1.0  # 9 cells along x from the middle

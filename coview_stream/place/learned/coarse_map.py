@@ -125,11 +125,6 @@ class CoarseMap:
                 found.append(block)
         return np.array(found, dtype=np.int64)
 
-    def cell_of(self, xy: npt.ArrayLike) -> tuple[Indices, Indices]:
-        """Rows and columns of the cells in which places (..., 2) lie; negative or too large beyond the map."""
-        at = np.floor((np.asarray(xy, dtype=np.float64) - self.corner) / self.cell).astype(np.int64)
-        return at[..., 1], at[..., 0]
-
     def _transformed(self, blocks: Indices) -> C64:
         out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.channels), dtype=np.complex64)
         for k, block in enumerate(blocks):  # one by one: what is in between stays small
