@@ -12,13 +12,16 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from coview_stream.version import __version__
+
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.config import LocalizerConfig, MapConfig
     from coview_stream.errors import CoViewError
-    from coview_stream.fix import Cause, Fix, KeyframeEvidence, State
-    from coview_stream.localizer import Localizer
-    from coview_stream.stream.client import RobotClient
+    from coview_stream.localization.localizer import Localizer
+    from coview_stream.localization.result import Fix, KeyframeEvidence, State
+    from coview_stream.localization.tracking.monitor import Cause
+    from coview_stream.stream.client.client import RobotClient
 
 __all__ = [
     "BaseMap",
@@ -34,19 +37,17 @@ __all__ = [
     "__version__",
 ]
 
-__version__ = "0.1.0"
-
 _HOMES = {
     "BaseMap": "basemap.basemap",
-    "Cause": "fix",
+    "Cause": "localization.tracking.monitor",
     "CoViewError": "errors",
-    "Fix": "fix",
-    "KeyframeEvidence": "fix",
-    "Localizer": "localizer",
+    "Fix": "localization.result",
+    "KeyframeEvidence": "localization.result",
+    "Localizer": "localization.localizer",
     "LocalizerConfig": "config",
     "MapConfig": "config",
-    "RobotClient": "stream.client",
-    "State": "fix",
+    "RobotClient": "stream.client.client",
+    "State": "localization.result",
 }
 
 

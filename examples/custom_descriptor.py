@@ -14,11 +14,12 @@ from typing import get_args
 import numpy as np
 
 from coview_stream import BaseMap
-from coview_stream.clouds import open_run, read_tum
+from coview_stream.clouds import read_tum
 from coview_stream.config import Channel, KeyframeConfig, RetrievalConfig
-from coview_stream.place.descriptor import describe, ground_below
-from coview_stream.place.keyframes import KeyframeBuffer
-from coview_stream.place.retrieval import Retrieval
+from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.localization.search.keyframes import KeyframeBuffer
+from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.recordings.open_run import open_run
 
 NEAR = 3.0  # metres: the station found counts as right
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream import BaseMap, Localizer, State
-from coview_stream.clouds import open_run, read_tum
+from coview_stream.clouds import read_tum
+from coview_stream.recordings.open_run import open_run
 
 
 def main(world: Path) -> list[float]:

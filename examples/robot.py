@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from coview_stream import RobotClient
-from coview_stream.clouds import Frame, open_run
+from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings.run import Frame
 
 
 def drive(robot: RobotClient, frames: Iterable[Frame], seconds: float) -> None:

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 from coview_stream import BaseMap, Fix
-from coview_stream.clouds import open_run
-from coview_stream.offline import locate
+from coview_stream.localization.offline import locate
+from coview_stream.recordings.open_run import open_run
 
 
 def main(base: Path, scan: Path) -> Fix:

@@ -7,8 +7,8 @@ import pytest
 import small_world
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.clouds.writers import write_cloud
-from coview_stream.localizer import Localizer
+from coview_stream.clouds.files import write_cloud
+from coview_stream.localization.localizer import Localizer
 
 RADIUS = 30.0
 
@@ -49,7 +49,7 @@ def world_map(map_cloud_file):
 @pytest.fixture(scope="session")
 def learned_map(world_map):
     """The same with features of the network in the package, whatever they are worth."""
-    from coview_stream.place.learned.feature_build import feature_arrays
+    from coview_stream.descriptors.feature_build import feature_arrays
 
     arrays, parameters = feature_arrays(np.array(world_map.points))
     return BaseMap({**world_map._arrays, **arrays}, {**world_map.parameters, "learned": parameters})

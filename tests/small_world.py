@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import write_tum
-from coview_stream.clouds.writers import write_cloud
-from coview_stream.geometry import inverse, pose_from, rot_z, transform, yaw_of
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, yaw_of
 
 SENSOR_HEIGHT = 1.7
 HALF = 34.0  # metres: half the side of the map

@@ -12,10 +12,10 @@ import pytest
 
 from coview_stream.cli import COMMANDS, build_parser
 from coview_stream.clouds import read_tum
+from coview_stream.messages import decode_cloud, encode_pose
+from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.sim import SimulationConfig, simulate
-from coview_stream.stream.codecs import decode_cloud, encode_pose
-from coview_stream.stream.fake import FakeTransport
-from coview_stream.stream.messages import PoseMessage, Sample
+from coview_stream.stream.transport.memory_transport import FakeTransport
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

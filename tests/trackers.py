@@ -8,9 +8,10 @@ import numpy as np
 import small_world
 
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry import inverse, pose_from, rot_z
-from coview_stream.pose.registration import LocalMaps, Registration
-from coview_stream.tracking import Tracker
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.result import Registration
+from coview_stream.localization.tracking.tracker import Tracker
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])
 OFF = pose_from(np.eye(3), [0.2, -0.15, 0.0])
@@ -37,7 +38,7 @@ class Ride:
     """A tracker and the odometry that it is shown.
 
     Attributes:
-        tracker: see :class:`coview_stream.tracking.Tracker`.
+        tracker: see :class:`coview_stream.localization.tracking.tracker.Tracker`.
         T_odom_map: (4, 4) what odometry is off by; change it for a slip.
     """
 

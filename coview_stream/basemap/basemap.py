@@ -1,5 +1,7 @@
 """The base map: stations with descriptors to search in, and a tiled cloud with normals to register to."""
 
+# FOLDED coview_stream/basemap/basemap.py: """Whether a map's learned features can be used here; apart from the sources, for a node's parent imports it."""
+
 from __future__ import annotations
 
 import json
@@ -13,15 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.basemap import store, tiles
-from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, map_preset
-from coview_stream.errors import ConfigError, MapError
-from coview_stream.geometry import Points
+from coview_stream.basemap import file_format, tiles
+from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
+from coview_stream.errors import ConfigError, CoViewError, MapError
+from coview_stream.geometry.transforms import Points
 
-if TYPE_CHECKING:  # it brings half of SciPy along
-    from coview_stream.place.learned.feature_map import FeatureMap
+if TYPE_CHECKING:
+    from coview_stream.descriptors.feature_map import FeatureMap
+
 
 _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
+
 _FIXED = {"visibility": "paper", "eye": 1.5}
 """Descriptor options of earlier versions, in the files of those: the value that is all there is now."""
 
@@ -39,7 +43,7 @@ class BaseMap:
         sha256: hash of parameters and content; empty until saved or loaded.
     """
 
-    def __init__(self, arrays: store.Arrays, parameters: dict[str, Any], sha256: str = "") -> None:
+    def __init__(self, arrays: file_format.Arrays, parameters: dict[str, Any], sha256: str = "") -> None:
         missing = [name for name in _REQUIRED if name not in arrays]
         if missing:
             raise MapError(f"the map lacks {', '.join(missing)}; build it again")
@@ -99,11 +103,11 @@ class BaseMap:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> BaseMap:
         """Memory-map a ``.coview`` file; raises :class:`MapError` if it is missing, damaged or of another version."""
-        return cls(*store.load(Path(path)))
+        return cls(*file_format.load(Path(path)))
 
     def save(self, path: str | os.PathLike[str]) -> str:
         """Write the map atomically and return its sha256; raises :class:`MapError` if that fails."""
-        self.sha256 = store.save(Path(path), self._arrays, self.parameters)
+        self.sha256 = file_format.save(Path(path), self._arrays, self.parameters)
         return self.sha256
 
     def __len__(self) -> int:
@@ -135,7 +139,7 @@ class BaseMap:
         parameters = self.parameters.get("learned")
         if parameters is None:
             return None
-        from coview_stream.place.learned.feature_map import FeatureMap
+        from coview_stream.descriptors.feature_map import FeatureMap
 
         return FeatureMap(self._arrays, parameters)
 
@@ -152,3 +156,40 @@ class BaseMap:
         inside = ((index >= 0) & (index < np.array(grid.shape)[::-1])).all(axis=1)
         index[~inside] = 0
         return np.asarray(inside & (grid[index[:, 1], index[:, 0]] > 0))
+
+
+def check_reloc(base_map: BaseMap, reloc: Reloc, load: bool = True) -> str | None:
+    """Try what the first query would stumble on: features, weights and onnxruntime.
+
+    Args:
+        base_map: the map.
+        reloc: what is asked for.
+        load: also load the network, which takes 0.3 s and 60 MB; whoever does not search need not.
+
+    Returns:
+        Why ``auto`` goes without the features that the map has, with the remedy; None if it does not have to.
+
+    Raises:
+        MapError: ``learned`` is asked for, and the map has no features, damaged ones, or some of other weights.
+        InputError: likewise, and there are no weights, or some that cannot be loaded.
+        DependencyError: likewise, and there is no onnxruntime, or one that cannot be loaded.
+    """
+    if reloc == "coview":
+        return None
+    try:
+        if base_map.learned is not None:
+            base_map.learned.check()
+            if load:
+                from coview_stream.descriptors.network import network
+
+                network("ground", None, 1)
+        elif reloc == "learned":
+            raise MapError(
+                "the map has no learned features; build it again without --no-learned, or go without "
+                "them (--reloc coview)"
+            )
+    except CoViewError as error:
+        if reloc == "learned":
+            raise
+        return f"going without learned features: {error}"
+    return None

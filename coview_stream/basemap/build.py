@@ -12,17 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from coview_stream.basemap.file_format import Arrays
+from coview_stream.basemap.floors import below_another
 from coview_stream.basemap.ground import ground_filter
-from coview_stream.basemap.levels import below_another
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
-from coview_stream.basemap.store import Arrays
 from coview_stream.basemap.tiles import sort_by_tile
 from coview_stream.clouds.cloud import merge
+from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
-from coview_stream.clouds.readers import read_cloud
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
-from coview_stream.geometry import Points
+from coview_stream.geometry.transforms import Points
 
 _MIN_POINTS = 1000
 _SURVEY_MARGIN = 1  # cells
@@ -39,7 +39,7 @@ def build_arrays(
         DependencyError, InputError: learned features are asked for, and there is no onnxruntime or no weights.
     """
     if config.learned:
-        from coview_stream.place.learned.network import VIEW_NAMES, network
+        from coview_stream.descriptors.network import VIEW_NAMES, network
 
         for view in VIEW_NAMES:  # they may be missing, so ask before reading
             network(view)
@@ -84,7 +84,7 @@ def build_arrays(
 
     learned: tuple[Arrays, dict[str, Any] | None] = ({}, None)
     if config.learned:
-        from coview_stream.place.learned.feature_build import feature_arrays
+        from coview_stream.descriptors.feature_build import feature_arrays
 
         with _bar(progress, "learned features") as step:
             learned = feature_arrays(points, step)

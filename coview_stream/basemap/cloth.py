@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import DependencyError
-from coview_stream.geometry import Points
+from coview_stream.geometry.transforms import Points
 
 _TILE = 256.0
 _MARGIN = 24.0

@@ -1,5 +1,8 @@
 """Ground points of a base map, by cloth simulation (paper, section 3.1) or by a morphological filter."""
 
+# FOLDED coview_stream/basemap/ground.py: """A raster of ground heights, and the raster tools that the ground filter needs."""
+# FOLDED coview_stream/basemap/ground.py: """Progressive morphological ground filter: the stand-in where the cloth has no wheel."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -10,10 +13,9 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from coview_stream.basemap.cloth import cloth_available, cloth_ground, require_cloth
-from coview_stream.basemap.ground_raster import GroundRaster, Heights, cells, filled, lowest_per_cell
-from coview_stream.basemap.morphology import morphological_ground
 from coview_stream.errors import ConfigError
-from coview_stream.geometry import Points
+from coview_stream.geometry.rasters import Heights, cells, filled, lowest_per_cell
+from coview_stream.geometry.transforms import Points
 
 _FEWEST = 50
 """Below this many occupied cells a cloth has nothing to hang on."""
@@ -221,3 +223,71 @@ def _gradient(z: Heights, cell: float) -> Heights:
 
 def _slope(surface: GroundRaster) -> Heights:
     return _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
+
+
+@dataclass(frozen=True)
+class GroundRaster:
+    """Ground heights of square cells in the frame of the points, metres.
+
+    Attributes:
+        z: (H, W) float32, row along y and column along x; NaN where the ground is unknown.
+        x0: x of the lower corner of cell (0, 0).
+        y0: y of the lower corner of cell (0, 0).
+        cell: edge length.
+    """
+
+    z: Heights
+    x0: float
+    y0: float
+    cell: float
+
+    def height_at(self, xy: npt.NDArray[np.floating]) -> Heights:
+        """Ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
+
+        Bilinear between cell centres; unknown neighbours carry no weight.
+        """
+        height, width = self.z.shape
+        column = (xy[:, 0].astype(np.float64) - self.x0) / self.cell
+        row = (xy[:, 1].astype(np.float64) - self.y0) / self.cell
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
+        known = inside & np.isfinite(self.z[row.astype(np.intp), column.astype(np.intp)])
+        left, low = np.floor(column - 0.5).astype(np.intp), np.floor(row - 0.5).astype(np.intp)
+        total, weight = np.zeros(len(xy)), np.zeros(len(xy))
+        for dr, dc in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            r, c = np.clip(low + dr, 0, height - 1), np.clip(left + dc, 0, width - 1)
+            w = (1 - np.abs(row - 0.5 - (low + dr))) * (1 - np.abs(column - 0.5 - (left + dc)))
+            z = self.z[r, c].astype(np.float64)
+            usable = np.isfinite(z)
+            total += np.where(usable, w * z, 0.0)
+            weight += np.where(usable, w, 0.0)
+        out = np.full(len(xy), np.nan, dtype=np.float32)
+        np.divide(total, weight, out=out, where=known & (weight > 0), casting="unsafe")
+        return out
+
+
+_LARGEST_WINDOW = 40.0
+"""Metres: wider roofs are taken for ground, larger hills survive whole."""
+
+_STEEPEST = 0.3
+
+_FIRST_THRESHOLD = 0.5
+
+
+def morphological_ground(z: Heights, cell: float) -> npt.NDArray[np.bool_]:
+    """Which cells of a raster of lowest heights (H, W; NaN where empty; metres) are ground.
+
+    Openings with growing windows remove what is narrower than the window and stands out of the opened surface
+    by more than a slope of 0.3 explains.
+    """
+    surface = filled(z)
+    ground = np.isfinite(z)
+    window, previous = 1.0, 0.0
+    while window <= _LARGEST_WINDOW:
+        size = 2 * max(1, round(window / cell / 2)) + 1
+        # separable: a square window costs two passes of one row
+        opened = ndimage.grey_opening(surface, size=(size, size), mode="nearest")
+        threshold = min(_FIRST_THRESHOLD + _STEEPEST * (window - previous) / 2, 3.0)
+        ground &= ~(surface - opened > threshold)
+        surface, previous, window = opened, window, window * 1.5
+    return ground

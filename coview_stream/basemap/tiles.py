@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry import Points
+from coview_stream.geometry.transforms import Points
 
 _NORMAL_SCALE = 127.0
 

@@ -19,8 +19,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from coview_stream import __version__
 from coview_stream.errors import ConfigError, CoViewError
+from coview_stream.version import __version__
 
 PROGRAM = "coview-stream"
 

@@ -43,13 +43,13 @@ def run(args: argparse.Namespace) -> int:
     """Build, save and say what came out."""
     import time
 
-    from coview_stream.basemap import store
+    from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.errors import MapError
 
     if args.output.resolve() in [path.resolve() for path in args.maps]:
         raise MapError(f"{args.output}: is one of the scans to read; give the map another name")
-    store.check_target(args.output)
+    file_format.check_target(args.output)
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
@@ -66,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _can_be_learned() -> bool:
     """Whether features can be made; says so if not, for somebody may rely on them."""
+    from coview_stream.descriptors.network import VIEW_NAMES, network
     from coview_stream.errors import CoViewError
-    from coview_stream.place.learned.network import VIEW_NAMES, network
 
     try:
         for view in VIEW_NAMES:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.clouds.runs import Run
-    from coview_stream.offline import Located
+    from coview_stream.localization.offline import Located
+    from coview_stream.recordings.run import Run
     from coview_stream.report.evaluation import Evaluation, Trajectory
     from coview_stream.sim import SimulationConfig
 
@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Do the four steps, write what came out, print the errors."""
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.clouds.runs import open_run
     from coview_stream.clouds.trajectory import read_tum
+    from coview_stream.recordings.open_run import open_run
     from coview_stream.sim import SimulationConfig, simulate
 
     config = SimulationConfig(
@@ -101,8 +101,8 @@ def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
 def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> Located:
     from tqdm import tqdm
 
-    from coview_stream.fix import Fix
-    from coview_stream.offline import locate
+    from coview_stream.localization.offline import locate
+    from coview_stream.localization.result import Fix
 
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=not shown, leave=False) as bar:
 
@@ -118,8 +118,8 @@ def _live(recorded: Run, out: Path, shown: bool) -> Located:
     """Serve, replay and watch; what was published, frame by frame."""
     from tqdm import tqdm
 
-    from coview_stream.offline import from_stream
-    from coview_stream.stream.live import stream
+    from coview_stream.cli.demo_processes import stream
+    from coview_stream.localization.offline import from_stream
 
     stamps = recorded.stamps.tolist()
     with tqdm(total=len(recorded), desc="driving", unit="frame", disable=not shown, leave=False) as bar:
@@ -139,7 +139,7 @@ def _report(located: Located, base_map: BaseMap, truth: Trajectory, out: Path) -
     import numpy as np
 
     from coview_stream.clouds.trajectory import read_tum
-    from coview_stream.offline import draw, write
+    from coview_stream.localization.offline import draw, write
     from coview_stream.report.evaluation import evaluate, frame_errors
     from coview_stream.report.plots import plot_errors, plot_map
 
@@ -158,7 +158,7 @@ def _write_report(
 ) -> None:
     import json
 
-    from coview_stream.clouds.writers import atomic
+    from coview_stream.clouds.files import atomic
 
     facts = json.loads(verdict.to_json()) | {"world": config.to_dict(), "seconds": seconds}
     with atomic(out / "report.json") as stream:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from coview_stream.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
-    from coview_stream.checkup.finding import Finding
-    from coview_stream.stream.keys import RobotKeys
+    from coview_stream.doctor.finding import Finding
+    from coview_stream.stream.transport.keys import RobotKeys
 
 HELP = "check this machine, a map, the network and what robots send, and say what to do"
 
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a line per finding; exit code 1 if something will not work."""
-    from coview_stream.checkup.finding import failed
+    from coview_stream.doctor.finding import failed
 
     keys = _checked(args)
     findings: list[Finding] = []
@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _checked(args: argparse.Namespace) -> list[RobotKeys]:
     """Refuse wrong options before anything slow is done, and return the robots' keys."""
-    from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS
-    from coview_stream.stream.keys import robot_keys
+    from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS
+    from coview_stream.stream.transport.keys import robot_keys
 
     if not 0 < args.seconds <= _LONGEST:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0, {_LONGEST:g} at most")
@@ -78,8 +78,8 @@ def _checked(args: argparse.Namespace) -> list[RobotKeys]:
 
 
 def _checkup(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
-    from coview_stream.checkup.machine import machine_findings, memory
-    from coview_stream.checkup.site import open_site, site_findings
+    from coview_stream.doctor.machine_checks import machine_findings, memory
+    from coview_stream.doctor.map_checks import open_site, site_findings
 
     connect = _endpoints(args)
     zenoh = connect is not None and _zenoh_takes(args, connect)
@@ -101,7 +101,7 @@ def _zenoh_takes(args: argparse.Namespace, connect: list[str]) -> bool:
         import zenoh  # noqa: F401 - only whether it is there
     except ImportError:
         return False
-    from coview_stream.stream.zenoh_config import compose
+    from coview_stream.stream.transport.zenoh_config import compose
 
     compose(connect, args.listen, args.config)
     return True
@@ -109,7 +109,7 @@ def _zenoh_takes(args: argparse.Namespace, connect: list[str]) -> bool:
 
 def _endpoints(args: argparse.Namespace) -> list[str] | None:
     """Endpoints to connect to; None if the network is not asked for."""
-    from coview_stream.stream.reach import DEFAULT_ENDPOINT
+    from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
 
     if not (args.robot or args.connect or args.listen or args.config):
         return None
@@ -119,9 +119,9 @@ def _endpoints(args: argparse.Namespace) -> list[str] | None:
 def _network(
     args: argparse.Namespace, connect: list[str], keys: list[RobotKeys], sha256: str | None
 ) -> Iterator[Finding]:
-    from coview_stream.checkup.finding import from_error
-    from coview_stream.checkup.network import reach_finding, robots_findings
-    from coview_stream.stream.zenoh_transport import open_transport
+    from coview_stream.doctor.finding import from_error
+    from coview_stream.doctor.network_checks import reach_finding, robots_findings
+    from coview_stream.stream.transport.zenoh_transport import open_transport
 
     try:
         with _silence("coview_stream.stream"):  # what the transport would log is a finding here

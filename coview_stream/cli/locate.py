@@ -7,11 +7,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.odometry import add_gravity, lidar_options
-from coview_stream.cli.reloc import add_reloc
+from coview_stream.cli.options import add_gravity, add_reloc, lidar_options
 
 if TYPE_CHECKING:
-    from coview_stream.odometry.lidar import LidarOdometry
+    from coview_stream.odometry.lidar_odometry import LidarOdometry
 
 HELP = "localize a recorded run on a base map, offline"
 
@@ -50,14 +49,13 @@ def run(args: argparse.Namespace) -> int:
     """Localize and write; exit code 1 if no frame could be localised."""
     from tqdm import tqdm
 
-    from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.clouds.runs import open_run
+    from coview_stream.basemap.basemap import BaseMap, check_reloc
     from coview_stream.config import LocalizerConfig, RegistrationConfig, RetrievalConfig
     from coview_stream.errors import InputError
-    from coview_stream.fix import Fix
-    from coview_stream.offline import locate, summary, write
-    from coview_stream.pose.gicp import library
-    from coview_stream.reloc import check_reloc
+    from coview_stream.localization.offline import locate, summary, write
+    from coview_stream.localization.registration.gicp import library
+    from coview_stream.localization.result import Fix
+    from coview_stream.recordings.open_run import open_run
 
     lidar = _lidar(args.odometry, args.gravity)
     if args.registration == "gicp":
@@ -103,6 +101,6 @@ def _lidar(odometry: str, gravity: str | None) -> LidarOdometry | None:
     config = lidar_options(odometry, gravity)
     if config is None:
         return None
-    from coview_stream.odometry.lidar import LidarOdometry
+    from coview_stream.odometry.lidar_odometry import LidarOdometry
 
     return LidarOdometry(config)

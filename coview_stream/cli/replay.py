@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from coview_stream.cli.odometry import KISS_ICP
+from coview_stream.cli.options import KISS_ICP
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
@@ -62,14 +62,14 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.clouds.bare import open_bare_run
-    from coview_stream.clouds.runs import open_run
     from coview_stream.errors import ConfigError
-    from coview_stream.stream.keys import robot_keys
-    from coview_stream.stream.reach import open_client
-    from coview_stream.stream.replay import replay
-    from coview_stream.stream.schedule import ReplayConfig, odometry_spacing
-    from coview_stream.stream.sender import Sender
+    from coview_stream.recordings.lidar_runs import open_bare_run
+    from coview_stream.recordings.open_run import open_run
+    from coview_stream.stream.client.replay import replay
+    from coview_stream.stream.client.replay_schedule import ReplayConfig, odometry_spacing
+    from coview_stream.stream.client.sender import Sender
+    from coview_stream.stream.transport.keys import robot_keys
+    from coview_stream.stream.transport.rpc import open_client
 
     if not args.wait >= 0:
         raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")

@@ -8,15 +8,21 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.odometry import KISS_ICP, ROBOT, add_gravity, lidar_options
-from coview_stream.cli.reloc import add_reloc
-from coview_stream.cli.state import add_state, ready_state
+from coview_stream.cli.options import (
+    KISS_ICP,
+    ROBOT,
+    add_gravity,
+    add_reloc,
+    add_state,
+    lidar_options,
+    ready_state,
+)
 from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
-    from coview_stream.stream.node import Node
-    from coview_stream.stream.serve import ServeOptions
+    from coview_stream.stream.node.node import Node
+    from coview_stream.stream.node.serve import ServeOptions
 
 _ENDING = 1.5  # seconds for everything to end after a signal: we promise two
 
@@ -96,11 +102,11 @@ def run(args: argparse.Namespace) -> int:
     import logging
 
     from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.stream.codecs import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
-    from coview_stream.stream.config import NodeConfig
-    from coview_stream.stream.keys import robot_keys
-    from coview_stream.stream.reach import DEFAULT_ENDPOINT
-    from coview_stream.stream.serve import ServeOptions
+    from coview_stream.config.node import NodeConfig
+    from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
+    from coview_stream.stream.node.serve import ServeOptions
+    from coview_stream.stream.transport.keys import robot_keys
+    from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
 
     logging.basicConfig(
         level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
@@ -141,8 +147,8 @@ def _serve(options: ServeOptions, stop: Stop) -> bool:
 
     Opening has a thread of its own, for a signal must end even what waits for a host that does not answer.
     """
-    from coview_stream.stream.lane import CancelledError
-    from coview_stream.stream.serve import open_node
+    from coview_stream.stream.node.engine_process import CancelledError
+    from coview_stream.stream.node.serve import open_node
 
     opened: list[Node] = []
     failed: list[BaseException] = []

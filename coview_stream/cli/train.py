@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate what is missing, train, write the weights and their card, and say how well they do."""
-    from coview_stream.learn.session import SMOKE, USUAL, train_session
+    from coview_stream.training.train import SMOKE, USUAL, train_session
 
     plan = SMOKE if args.smoke else USUAL
     card = train_session(

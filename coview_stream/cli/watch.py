@@ -16,10 +16,10 @@ from coview_stream.errors import ConfigError, MessageError
 
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
-    from coview_stream.stream.mailbox import Mailbox
-    from coview_stream.stream.messages import PoseMessage, Sample
-    from coview_stream.stream.transport import Transport
-    from coview_stream.stream.watching import Fleet
+    from coview_stream.messages.types import PoseMessage, Sample
+    from coview_stream.stream.client.client import Mailbox
+    from coview_stream.stream.client.fleet import Fleet
+    from coview_stream.stream.transport.transport import Transport
 
 HELP = "see robots' poses live: a table, JSON lines, or a viewer"
 
@@ -51,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
     from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.stream.reach import open_client
-    from coview_stream.stream.watching import Fleet
+    from coview_stream.stream.client.fleet import Fleet
+    from coview_stream.stream.transport.rpc import open_client
 
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
@@ -76,8 +76,8 @@ class _Source:
 
 
 def _sources(args: argparse.Namespace) -> list[_Source]:
-    from coview_stream.stream.keyexpr import check_prefix
-    from coview_stream.stream.keys import robot_keys
+    from coview_stream.stream.transport.key_expressions import check_prefix
+    from coview_stream.stream.transport.keys import robot_keys
 
     if args.robot:
         keys = [robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)]
@@ -106,7 +106,7 @@ class _Watch:
         show_pose: Callable[[PoseMessage], None],
         transport: Transport,
     ) -> None:
-        from coview_stream.stream.mailbox import Mailbox
+        from coview_stream.stream.client.client import Mailbox
 
         self._args, self._fleet, self._sources = args, fleet, sources
         self._show_pose, self._transport = show_pose, transport
@@ -155,8 +155,8 @@ class _Watch:
             print(json.dumps({"key": sample.key, **record}), flush=True)
 
     def _pose(self, arrived: float, source: _Source, sample: Sample) -> dict[str, Any]:
-        from coview_stream.stream.codecs import decode_pose
-        from coview_stream.stream.records import pose_record
+        from coview_stream.messages import decode_pose
+        from coview_stream.messages.json_messages import pose_record
 
         pose = replace(decode_pose(sample, hint=source.hint), robot=self._name(source, sample))
         self._fleet.add_pose(pose, arrived)
@@ -164,7 +164,7 @@ class _Watch:
         return pose_record(pose, sample)
 
     def _status(self, arrived: float, source: _Source, sample: Sample) -> dict[str, Any]:
-        from coview_stream.stream.records import read_status
+        from coview_stream.messages.json_messages import read_status
 
         status = read_status(sample)
         self._fleet.add_status(self._name(source, sample), status, arrived)
@@ -194,6 +194,6 @@ class _Watch:
 
 
 def _default() -> str:
-    from coview_stream.stream.reach import DEFAULT_ENDPOINT
+    from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
 
     return DEFAULT_ENDPOINT

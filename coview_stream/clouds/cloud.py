@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import CloudError
-from coview_stream.geometry import Points
+from coview_stream.geometry.transforms import Points
 
 LOCAL_LIMIT = 10_000.0
 """Coordinates below this (metres) keep a zero origin: float32 still resolves 1 mm there."""

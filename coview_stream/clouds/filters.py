@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.open3d_loader import open3d
 from coview_stream.errors import ConfigError
-from coview_stream.geometry import Points
+from coview_stream.geometry.transforms import Points
 
 _MAX_CELLS = 2**62
 """Voxel keys must fit a signed 64-bit integer."""

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.clouds.writers import atomic
+from coview_stream.clouds.files import atomic
 from coview_stream.errors import InputError, RunError
-from coview_stream.geometry import Pose, pose_to_tum
-from coview_stream.rotation import matrices, nearest_rotation
+from coview_stream.geometry.rotations import matrices, nearest_rotation
+from coview_stream.geometry.transforms import Pose, pose_to_tum
 
 Stamps = npt.NDArray[np.float64]
 Poses = npt.NDArray[np.float64]

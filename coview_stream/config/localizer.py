@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import get_args
 
-from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.checks import require
-from coview_stream.config.learned import LearnedConfig, Reloc
-from coview_stream.config.place import ConsensusConfig, KeyframeConfig, RetrievalConfig
 from coview_stream.config.registration import RegistrationConfig
-from coview_stream.config.tracking import GraphConfig, TrackingConfig
+from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
+from coview_stream.config.tracking import AcceptanceConfig, GraphConfig, TrackingConfig
 
 
 @dataclass(frozen=True)

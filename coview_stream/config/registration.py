@@ -16,16 +16,16 @@ class RegistrationConfig:
     """Trimmed ICP (eq. 13): point-to-plane, coarse to fine; or GICP, with the same schedule and settings.
 
     ``method`` is ``trimmed-icp`` or ``gicp``; the latter needs the extra of that name and is for tracking only, the
-    search's hypotheses go through trimmed ICP (see :mod:`coview_stream.pose.gicp`). ``residual_scale`` is trimmed
+    search's hypotheses go through trimmed ICP (see :mod:`coview_stream.localization.registration.gicp`). ``residual_scale`` is trimmed
     ICP's alone. ``keep`` is the overlap; the paper keeps 60 %, 70 % converges faster here and as well. ``search`` and
     ``track`` list the largest correspondence distances of the successive scales. Points above the ground and points
     on it are trimmed apart, else the ground, which fits anywhere, pushes out the facades that fix the position (KITTI
     04: 0.25 m median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic
     (points are not independent). A direction in which that leaves more than ``weak_from`` metres (an angle counts as
     what it moves at ``weak_lever`` metres) is one that the map hardly shows: its sigma is widened further, up to
-    ``weak_sigma`` metres (see :func:`coview_stream.pose.covariance.registration_covariance`). The ``shared`` sigmas are
+    ``weak_sigma`` metres (see :func:`coview_stream.localization.registration.covariance.registration_covariance`). The ``shared`` sigmas are
     of the error that neighbouring registrations have in common (see
-    :class:`coview_stream.pose.spread.Shared`): a scanned map's points lie off its surfaces. Inflation,
+    :class:`coview_stream.localization.tracking.shared_error.Shared`): a scanned map's points lie off its surfaces. Inflation,
     floors and shared sigmas are calibrated on simulated drives, seeds 5101 to 5110 of ``bench.tracking``; a real map's
     own error, against the ground truth that matters to you, comes on top.
     """

@@ -1,8 +1,15 @@
 """Where down is, from the ground around a lidar: a plane through the lowest points, if there is one.
 
 The ground's normal is gravity's direction only where the ground is level; walls correct it where there are some
-(:mod:`coview_stream.odometry.walls`). On a slope without walls the odometry frame leans with the slope.
+(:mod:`coview_stream.odometry.gravity`). On a slope without walls the odometry frame leans with the slope.
 """
+
+# FOLDED coview_stream/odometry/gravity.py: """Up, from what stands upright: walls are vertical where the ground slopes.
+#
+# Measured on nine simulated worlds, 20 frames each (town, campus, village, industrial; vlp16, os64, mid360): the ground's
+# normal leans 0.4 to 4.1 degrees against gravity (medians), with the walls taken into account 0.05 to 0.33. The walls
+# of these worlds are plumb; real ones nearly so.
+# """
 
 from __future__ import annotations
 
@@ -11,20 +18,28 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.odometry.config import MOST_TILT
-from coview_stream.odometry.walls import upright
+from coview_stream.config.odometry import MOST_TILT
 
 Array = npt.NDArray[np.float64]
 
 _REACH = 25.0  # metres around the sensor
+
 _CELL = 1.0  # metres: of each such cell the lowest point
+
 _BAND = 0.15  # metres to both sides of the plane
+
 _LEAST_HEIGHT = 0.1  # metres of the sensor above the ground
+
 _TRIES = 400
+
 _ROUNDS = 5  # of refinement
+
 _LEAST_CELLS = 40
+
 _LEAST_SHARE = 0.4  # of the cells whose lowest point could be ground
+
 _MOST_BELOW = 0.25  # of all cells may lie below the plane: a table top is not the ground
+
 _LEAST_SPREAD = 2.0  # metres, one sigma, of the ground's cells along the shorter axis
 
 
@@ -119,3 +134,62 @@ def _refined(lowest: Array, plane: tuple[Array, float] | None) -> tuple[Array, f
         normal *= np.sign(normal[2]) or 1.0
         plane = normal, float(-normal @ centre)
     return plane
+
+
+SLOPE = float(np.radians(4.0))
+"""One sigma of how far the ground's normal leans, radians."""
+
+_MOST_POINTS = 20_000
+
+_WALL_REACH = 40.0  # metres around the sensor
+
+_WALL_CELL = 2.0  # metres: points of one such cube are fitted by a plane
+
+_LEAST_POINTS = 8
+
+_THICKEST = 0.04  # metres, one sigma, off the plane
+
+_LEAST_WIDTH = 0.2  # metres, one sigma, along the shorter axis in the plane
+
+_UPRIGHT = np.sin(np.radians(15.0))
+
+_WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
+
+_WALL_ROUNDS = 10
+
+
+def upright(points: npt.NDArray[np.floating], up: Array, sigma: float = SLOPE) -> tuple[Array, int]:
+    """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
+
+    Where there are none, or all face one way, it stays as it is in the directions that they say nothing of.
+
+    Returns:
+        The unit vector, and how many patches of wall it was taken from.
+    """
+    normals = _patches(points[:: 1 + len(points) // _MOST_POINTS].astype(np.float64), up)
+    better = up
+    for _ in range(_WALL_ROUNDS):
+        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's: a car's door is no wall
+        information = (normals.T * weights) @ normals + np.eye(3) / sigma**2
+        better = np.linalg.solve(information, up / sigma**2)
+        better /= np.linalg.norm(better)
+    return better, len(normals)
+
+
+def _patches(points: Array, up: Array) -> Array:
+    """Return normals (K, 3) of the flat, roughly upright pieces of surface around."""
+    near = points[(points**2).sum(axis=1) < _WALL_REACH**2]
+    cell = np.floor(near / _WALL_CELL).astype(np.int64) @ np.array([1 << 40, 1 << 20, 1])
+    _, which, count = np.unique(cell, return_inverse=True, return_counts=True)
+    mean = _sums(near, which, len(count)) / count[:, None]
+    off = near - mean[which]
+    moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), which, len(count)) / count[:, None]
+    spread, axes = np.linalg.eigh(moments[count >= _LEAST_POINTS].reshape(-1, 3, 3))
+    normals = axes[:, :, 0]
+    flat = (spread[:, 0] < _THICKEST**2) & (spread[:, 1] > _LEAST_WIDTH**2)
+    return np.asarray(normals[flat & (np.abs(normals @ up) < _UPRIGHT)])
+
+
+def _sums(values: Array, which: npt.NDArray[np.intp], count: int) -> Array:
+    """Add up, (count, K), the rows of values (N, K) that go to each of ``count`` places."""
+    return np.stack([np.bincount(which, column, minlength=count) for column in values.T], axis=1)

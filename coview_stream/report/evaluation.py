@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from coview_stream.errors import InputError
-from coview_stream.geometry import Pose
+from coview_stream.geometry.transforms import Pose
 
 MAX_ROTATION = float(np.radians(5.0))
 """A pose is right below this rotation error (eq. 15), radians ..."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.extras import extra
-from coview_stream.geometry import pose_to_tum
-from coview_stream.stream.messages import PoseMessage
+from coview_stream.errors import extra
+from coview_stream.geometry.transforms import pose_to_tum
+from coview_stream.messages.types import PoseMessage
 
 _STRIP = 50  # poses after which a new piece of the way starts: redrawing all of it each time is quadratic
 _COLOURS = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up

@@ -6,9 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from coview_stream.sim.layout import Layout, directions
+from coview_stream.sim.layout import Layout, Site, directions
 from coview_stream.sim.mesh import Floats, Mesh, box, cylinder, frustum, join, placed
-from coview_stream.sim.site import Site
 
 _LORRIES = 0.95  # from this kind on
 _LANE = 2.2  # metres from the middle of the robot's lane to the middle of a vehicle

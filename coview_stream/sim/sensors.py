@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry import Points, Pose
+from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.sim.caster import Caster
 from coview_stream.sim.mesh import Floats
 

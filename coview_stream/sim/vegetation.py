@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.sim.layout import Site
 from coview_stream.sim.mesh import EMPTY, Floats, Mesh, copies, cylinder, ellipsoid, join, placed, prism
-from coview_stream.sim.site import Site
 
 _TRUNK = cylinder(1.0, 1.0, 6, top=0.6)
 _CROWN = ellipsoid(5, 8)

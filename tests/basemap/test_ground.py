@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 
 from coview_stream.basemap.cloth import cloth_available
-from coview_stream.basemap.ground import GroundConfig, ground_filter, ground_mask
-from coview_stream.basemap.ground_raster import GroundRaster, filled
-from coview_stream.basemap.levels import LevelConfig, ground_levels
+from coview_stream.basemap.floors import LevelConfig, ground_levels
+from coview_stream.basemap.ground import GroundConfig, GroundRaster, ground_filter, ground_mask
 from coview_stream.errors import ConfigError, DependencyError
+from coview_stream.geometry.rasters import filled
 
 METHODS = [
     pytest.param("cloth", marks=pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")),

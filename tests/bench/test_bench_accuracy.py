@@ -12,7 +12,7 @@ from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, fingerprint, map_of
 from bench.speed import build_map
 from coview_stream.clouds import write_cloud
 from coview_stream.config import DescriptorConfig
-from coview_stream.geometry import pose_from, rot_z
+from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.sim import SimulationConfig
 
 TINY = SimulationConfig("town", "os64", seed=1, size=120.0, length=9.0, density=10.0)
@@ -96,7 +96,7 @@ def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
 
 
 def test_fingerprints_tell_sources_apart():
-    parts = ("coview_stream/sim", "coview_stream/place/descriptor.py", "coview_kernels", "")
+    parts = ("coview_stream/sim", "coview_stream/descriptors/coview.py", "coview_kernels", "")
     assert len({fingerprint(part) if part else fingerprint() for part in parts}) == len(parts)
 
 

@@ -8,8 +8,8 @@ from bench.forest.methods import BASELINES, METHODS, Methods
 from bench.forest.tables import STEPS, recall, tables
 from bench.forest.worlds import drawn
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.learn.recipe import Recipe
-from coview_stream.place.learned.network import shipped, weights_name
+from coview_stream.descriptors.network import shipped, weights_name
+from coview_stream.training.recipe import Recipe
 
 TINY = Recipe(
     built=0.0, size=(80.0, 80.0), sensors=("os64",), slope=(0.0, 5.0), stems=(200.0, 300.0), rays=20_000,

@@ -7,7 +7,7 @@ import pytest
 
 from bench.forest.plot import HEADINGS, measured, plot_table
 from bench.forest.tables import false, recall
-from coview_stream.place.learned.network import shipped, weights_name
+from coview_stream.descriptors.network import shipped, weights_name
 
 pytestmark = pytest.mark.realdata
 

@@ -5,9 +5,9 @@ import pytest
 
 from bench.forest.chains import APART, chosen, of_places, of_volume
 from bench.forest.scale import CUT, home, repeated, scale_table
-from coview_stream.geometry import pose_from, rot_z, transform, yaw_of
-from coview_stream.place.consensus import Hypothesis
-from coview_stream.query import Query
+from coview_stream.geometry.transforms import pose_from, rot_z, transform, yaw_of
+from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.request import Query
 
 
 def query_at(xyz):

@@ -23,9 +23,9 @@ def test_what_lies_in_a_folder_is_known_by_its_files(tmp_path):
 
 
 def test_answers_depend_on_all_that_makes_worlds_and_on_what_is_measured():
-    for part in ("coview_stream/sim", "coview_stream/clouds", "coview_stream/geometry.py",
-                 "coview_stream/rotation.py", "coview_stream/learn/submaps.py", "coview_stream/place",
-                 "coview_stream/refinement.py", "bench/forest/chains.py"):  # fmt: skip
+    for part in ("coview_stream/sim", "coview_stream/clouds", "coview_stream/geometry/transforms.py",
+                 "coview_stream/geometry/rotations.py", "coview_stream/training/submaps.py", "coview_stream/place",
+                 "coview_stream/localization/search/refinement.py", "bench/forest/chains.py"):  # fmt: skip
         assert part in ANSWERS
     assert set(WORLDS) < set(ANSWERS)
     assert len(code()) == 10  # every file and folder is there

@@ -16,8 +16,8 @@ from bench.harness.trajectory_scores import Told
 from coview_stream.clouds import write_cloud, write_tum
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
-from coview_stream.geometry import inverse, pose_from, rot_z, transform, yaw_of
-from coview_stream.learn.recipe import Recipe
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, yaw_of
+from coview_stream.training.recipe import Recipe
 
 TINY = Recipe(
     built=0.0, size=(80.0, 80.0), sensors=("os64",), slope=(0.0, 5.0), stems=(150.0, 200.0), rays=6000,
@@ -31,7 +31,7 @@ def world(tmp_path_factory):
 
 
 def test_a_recorded_drive_is_the_submap_that_training_sees(world):
-    from coview_stream.learn.worlds import draw_world, submaps
+    from coview_stream.training.worlds import draw_world, submaps
 
     recipe = replace(TINY, submaps=2)
     for drive, (sensor, submap) in zip(

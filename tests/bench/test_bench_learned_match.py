@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bench.speed import learned_match
-from coview_stream.place.learned.clique import maximum_clique
-from coview_stream.place.learned.coarse_map import CoarseMap
-from coview_stream.place.learned.correlation import correlate
+from coview_stream.localization.search.learned.consistent_pairs import maximum_clique
+from coview_stream.localization.search.learned.correlation import correlate
+from coview_stream.localization.search.learned.feature_index import CoarseMap
 
 
 def test_both_dense_baselines_equal_ours_on_a_map_that_is_not_square():

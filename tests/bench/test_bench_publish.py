@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+from bench.harness.publish import PAGE, filled, main, suite_tables
 
 from bench.harness import publish
-from bench.harness.publish import PAGE, filled, main, suite_tables
 from bench.harness.rows import against, bounded
 
 PLACED = "before\n<!-- table: bench match -->\nold\n<!-- end -->\nafter\n<!-- table: machine -->\nwas\n<!-- end -->\n"

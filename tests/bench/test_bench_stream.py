@@ -14,7 +14,7 @@ from bench.stream import wire as stream_wire
 from bench.stream.drive import EPOCH_NS, FAR_FUTURE, RESTARTED, Drive, Phase, RobotPlan, schedule, stamp_of
 from bench.stream.scores import Posed, Told
 from coview_stream.clouds import write_tum
-from coview_stream.geometry import pose_from, rot_z
+from coview_stream.geometry.transforms import pose_from, rot_z
 
 SECOND = 10**9
 

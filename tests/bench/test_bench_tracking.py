@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench.tracking.plot import draw
 from told import told
 
 from bench.harness.suite import OWN
@@ -15,7 +16,6 @@ from bench.tracking import run as tracking_run
 from bench.tracking import tracking
 from bench.tracking import worlds as tracking_worlds
 from bench.tracking.coverage import pooled
-from bench.tracking.plot import draw
 from bench.tracking.scenarios import QUICK, Scenario, scenarios
 from bench.tracking.worlds import World, earlier, open_world
 from coview_stream.sim.scenes import build_scene

@@ -21,7 +21,7 @@ from bench.tracking.drives import (
     start,
 )
 from bench.tracking.worlds import GAP, in_gap
-from coview_stream.geometry import inverse, tilt_of, yaw_of
+from coview_stream.geometry.transforms import inverse, tilt_of, yaw_of
 
 
 def same_steps(a, b):

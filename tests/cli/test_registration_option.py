@@ -8,7 +8,7 @@ import pytest
 
 from coview_stream.cli import main, serve
 from coview_stream.errors import CoViewError
-from coview_stream.stream.lane import ProcessLane
+from coview_stream.stream.node.engine_process import ProcessLane
 
 
 def test_locate_says_at_once_what_is_missing(world_file, tmp_path, monkeypatch, capsys):

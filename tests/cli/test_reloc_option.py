@@ -7,15 +7,15 @@ import sys
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.basemap.store import load, save
+from coview_stream.basemap.file_format import load, save
 from coview_stream.cli import main, serve
 from coview_stream.config import LocalizerConfig
-from coview_stream.decision import BY_FEATURES
+from coview_stream.descriptors.network import network
 from coview_stream.errors import CoViewError
-from coview_stream.localizer import Localizer
-from coview_stream.place.learned.network import network
-from coview_stream.stream.jobs import SearchJob
-from coview_stream.stream.lane import ProcessLane
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.search.acceptance import BY_FEATURES
+from coview_stream.stream.node.engine_process import ProcessLane
+from coview_stream.stream.node.jobs import SearchJob
 
 
 def test_locate_names_the_remedy_on_a_map_without_features(world_file, tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 
 import coview_kernels as ck
 from coview_stream.config import KeyframeConfig
-from coview_stream.place.keyframes import KeyframeBuffer
+from coview_stream.localization.search.keyframes import KeyframeBuffer
 
 EYE = np.eye(4)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lidar_fakes import frame
+from fake_lidar_odometry import frame
 
+from coview_stream.config.odometry import LidarOdometryConfig, down, parse_gravity
 from coview_stream.errors import ConfigError
-from coview_stream.odometry.config import LidarOdometryConfig, down, parse_gravity
 from coview_stream.odometry.gravity import aligned, find_ground
 
 

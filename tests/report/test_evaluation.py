@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import InputError
-from coview_stream.geometry import pose_from, rot_z
+from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.report.evaluation import driven, evaluate, frame_errors
 
 STAMPS = 1000.0 + 0.1 * np.arange(20)

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from coview_stream.cli import main
-from coview_stream.clouds import open_run, read_cloud, read_tum
+from coview_stream.clouds import read_cloud, read_tum
 from coview_stream.errors import ConfigError, InputError
+from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import Simulated, SimulationConfig, simulate
 
 TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)

@@ -1,1 +1,0 @@
-"""Whether all is in order: the machine, a map, the network and what robots send; each finding says what to do."""

@@ -1,0 +1,226 @@
+"""Read a point cloud of any supported format, or say in one line why not."""
+
+# FOLDED coview_stream/clouds/files.py: """Write point clouds: complete files or none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.cloud import Cloud
+from coview_stream.clouds.las import read_las
+from coview_stream.clouds.npy_bin import read_bin, read_npy
+from coview_stream.clouds.pcd import read_pcd
+from coview_stream.clouds.ply import read_ply
+from coview_stream.errors import CloudError
+
+_READERS: dict[str, tuple[str, Callable[[Path], Cloud]]] = {
+    ".las": ("LAS", read_las),
+    ".laz": ("LAS", read_las),
+    ".pcd": ("PCD", read_pcd),
+    ".ply": ("PLY", read_ply),
+    ".npy": ("NPY", read_npy),
+    ".bin": ("KITTI bin", read_bin),
+}
+
+CLOUD_SUFFIXES = frozenset(_READERS)
+"""Suffixes, lower case with their dot, that ``read_cloud`` accepts."""
+
+_MAGIC = (
+    (b"LASF", "LAS"),
+    (b"ply\n", "PLY"),
+    (b"ply\r\n", "PLY"),
+    (b"# .PCD", "PCD"),
+    (b"VERSION", "PCD"),
+    (b"FIELDS", "PCD"),
+    (b"\x93NUMPY", "NPY"),
+    (b"ASTM-E57", "E57"),
+    (b"PK\x03\x04", "zip"),
+    (b"\x1f\x8b", "gzip"),
+    (b"\x89HDF", "HDF5"),
+    (b"version https://git-lfs", "git-lfs pointer"),
+)
+
+
+def is_cloud_name(path: str | os.PathLike[str]) -> bool:
+    """Whether the suffix is one that ``read_cloud`` accepts (hidden files are not clouds)."""
+    name = Path(path).name
+    return Path(name).suffix.lower() in CLOUD_SUFFIXES and not name.startswith(".")
+
+
+def read_cloud(path: str | os.PathLike[str]) -> Cloud:
+    """Read LAS, LAZ (COPC too), PCD, PLY, NPY or KITTI ``.bin``; metres, in the file's own frame.
+
+    The suffix names the format and the first bytes must agree with it. Rows that are not finite are dropped
+    and counted, so are LAS points that are withheld or labelled as noise.
+
+    Raises:
+        CloudError: the file is missing, a directory, empty, truncated, of another or unsupported format, or
+            holds no usable point. The message names the file and the remedy.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    head = _head(path)
+    if suffix == ".e57" or head.startswith(b"ASTM-E57"):
+        raise CloudError(f"{path}: E57 is not supported yet: convert it to LAZ or PLY")
+    if suffix not in _READERS:
+        known = ", ".join(sorted(CLOUD_SUFFIXES))
+        raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")
+    name, reader = _READERS[suffix]
+    found = sniff(head)
+    # raw float rows have no magic: anything that is not recognisably something else may be one
+    if found != name and not (suffix == ".bin" and found is None):
+        what = f"is {found}" if found else f"does not begin like {name}"
+        remedy = "unpack it" if found in ("zip", "gzip") else "rename it, or get the real file"
+        raise CloudError(f"{path}: named {suffix} but its content {what}; {remedy}")
+    try:
+        return reader(path)
+    except OSError as error:
+        raise CloudError(f"{path}: cannot be read ({error.strerror or error}); check the disk") from error
+    except MemoryError as error:
+        raise CloudError(f"{path}: does not fit into memory; split it into tiles") from error
+
+
+def _head(path: Path) -> bytes:
+    try:
+        if path.is_dir():
+            raise CloudError(f"{path}: is a directory; name the cloud files themselves")
+        with path.open("rb") as stream:
+            head = stream.read(512)
+    except FileNotFoundError as error:
+        raise CloudError(f"{path}: no such file; check the path") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise CloudError(f"{path}: cannot be opened ({reason}); check path and permissions") from error
+    if not head:
+        raise CloudError(f"{path}: is empty (0 bytes); copy or export it again")
+    return head
+
+
+def sniff(head: bytes) -> str | None:
+    """Name of the format whose magic bytes start ``head``; None if they say nothing."""
+    for magic, name in _MAGIC:
+        if head.startswith(magic):
+            return name
+    text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if text[:1] == b"<":
+        return "an HTML or XML page"
+    if text.startswith(b"#") and b".PCD" in text[:80]:
+        return "PCD"
+    if all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head):
+        # comment lines may come before a PCD's first keyword
+        return "PCD" if b"\nFIELDS" in head or b"\nVERSION" in head else "text"
+    return None
+
+
+_LAS_SCALE = 0.001
+
+_FLOAT32_LIMIT = 10_000.0
+
+Rows = npt.NDArray[np.floating]
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[BinaryIO]:
+    """Open a binary stream that becomes ``path`` only if the block ends without an error.
+
+    Raises:
+        OSError: the directory does not exist or cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            yield stream
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_cloud(
+    path: str | os.PathLike[str], points: npt.NDArray[np.floating], origin: npt.ArrayLike | None = None
+) -> None:
+    """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), as the suffix says.
+
+    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 where ``origin`` moves the
+    points beyond 10 km; LAS and LAZ hold millimetres; ``.bin`` is always float32 with zero intensity.
+
+    Raises:
+        CloudError: unknown suffix, wrong shape, far coordinates for ``.bin``, or the file cannot be written.
+    """
+    path = Path(path)
+    writer = _WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise CloudError(f"{path}: cannot write {path.suffix!r}; use one of {', '.join(sorted(_WRITERS))}")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise CloudError(f"{path}: points have shape {points.shape}; give (N, 3)")
+    rows = points
+    if origin is not None and np.any(origin):
+        rows = points.astype(np.float64) + np.asarray(origin, dtype=np.float64)
+    far = bool(len(rows)) and float(np.nanmax(np.abs(rows), initial=0.0)) > _FLOAT32_LIMIT
+    rows = rows.astype("<f8" if far and rows.dtype == np.float64 else "<f4", copy=False)
+    try:
+        with atomic(path) as stream:
+            writer(stream, np.ascontiguousarray(rows), path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise CloudError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
+
+
+def _pcd(stream: BinaryIO, rows: Rows, _: Path) -> None:
+    size = rows.dtype.itemsize
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\n"
+        f"SIZE {size} {size} {size}\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\n"
+        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    stream.write(header.encode("ascii"))
+    stream.write(rows.tobytes())
+
+
+def _ply(stream: BinaryIO, rows: Rows, _: Path) -> None:
+    kind = "double" if rows.dtype.itemsize == 8 else "float"
+    axes = "".join(f"property {kind} {axis}\n" for axis in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{axes}end_header\n"
+    stream.write(header.encode("ascii"))
+    stream.write(rows.tobytes())
+
+
+def _npy(stream: BinaryIO, rows: Rows, _: Path) -> None:
+    np.save(stream, rows, allow_pickle=False)
+
+
+def _bin(stream: BinaryIO, rows: Rows, path: Path) -> None:
+    if rows.dtype.itemsize == 8:
+        raise CloudError(f"{path}: float32 rows cannot hold coordinates beyond 10 km; write PCD, PLY or LAZ")
+    padded = np.zeros((len(rows), 4), "<f4")
+    padded[:, :3] = rows
+    stream.write(padded.tobytes())
+
+
+def _las(stream: BinaryIO, rows: Rows, path: Path) -> None:
+    import laspy
+
+    if not np.isfinite(rows).all():
+        raise CloudError(f"{path}: LAS cannot hold NaN or infinite coordinates; drop those rows first")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, _LAS_SCALE)
+    header.offsets = np.floor(rows.min(axis=0)).astype(np.float64) if len(rows) else np.zeros(3)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = rows.astype(np.float64).T
+    las.write(stream, do_compress=path.suffix.lower() == ".laz")
+
+
+_WRITERS: dict[str, Callable[[BinaryIO, Rows, Path], None]] = {
+    ".pcd": _pcd,
+    ".ply": _ply,
+    ".npy": _npy,
+    ".bin": _bin,
+    ".las": _las,
+    ".laz": _las,
+}

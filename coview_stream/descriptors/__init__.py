@@ -1,0 +1,1 @@
+"""What places look like: co-view context (paper, sec. 3) and learned features."""

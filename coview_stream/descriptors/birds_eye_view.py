@@ -1,0 +1,123 @@
+"""What the networks see: a cloud from above, cut into layers by height over the ground."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from coview_stream.geometry.rasters import filled
+from coview_stream.geometry.transforms import Points
+
+Image = npt.NDArray[np.uint8]
+"""(LAYERS, H, W): row along y, column along x."""
+
+CELL = 0.5
+"""Edge of an image's cell, metres."""
+
+SLABS = (0.5, 1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 40.0)
+"""Bounds of the height layers, metres above the ground."""
+
+LAYERS = len(SLABS) + 2
+"""One for each pair of bounds, then the greatest height, whether the ground was seen, and the ground's own relief."""
+
+BIRD_VIEW_VERSION = 1
+"""Raised when the same cloud is drawn differently: features of a map are of no use to queries drawn another way."""
+
+_LEVEL = 0.25  # metres: a layer counts how many of its levels are occupied, not points: those say how dense a scan is
+_GROUND_CELL = 2.0
+_SEEN = 0.4  # metres above the ground: what lies lower has been ground
+_SLOPING = 0.8  # metres about the first guess in which the ground is sought
+_STEEPEST = 0.7  # metres per metre: what rises faster stands on the ground
+_REACH = 10  # ground cells to either side that may say how low a cell can be: half a large building
+_UNDULATION = 8.0  # metres: relief is what differs from the mean of so far around
+_RELIEF = 1.5  # metres of relief that fill the layer
+
+
+def bird_view(points: Points, corner: npt.NDArray[np.floating], shape: tuple[int, int]) -> Image:
+    """Draw a gravity-aligned cloud from above.
+
+    Args:
+        points: (N, 3) metres; those outside the image are ignored.
+        corner: (2,) x and y of the lower corner of cell (0, 0), metres.
+        shape: rows and columns of the image, each a multiple of four cells (two metres).
+
+    Returns:
+        (LAYERS, H, W). A height layer holds the square root of the share of its 0.25 m levels that are occupied,
+        times 255; the layer above them the greatest height, 255 at the last bound; then 255 where ground was seen;
+        then how far the ground lies above its surroundings' mean, 128 for not at all or unknown.
+    """
+    height, width = shape
+    index = np.floor((points[:, :2] - np.asarray(corner, dtype=points.dtype)) / CELL).astype(np.int64)
+    inside = ((index >= 0) & (index < (width, height))).all(axis=1)
+    points, index = points[inside], index[inside]
+    image = np.zeros((LAYERS, height * width), dtype=np.float32)
+    image[-1] = 128.0
+    if not len(points):
+        return image.astype(np.uint8).reshape(LAYERS, height, width)
+    ratio = round(_GROUND_CELL / CELL)
+    ground, relief = _ground(points, index // ratio, (height // ratio, width // ratio))
+    above = points[:, 2] - _sampled(ground, (points[:, :2] - corner) / _GROUND_CELL - 0.5)
+    cell = index[:, 1] * width + index[:, 0]
+    _layers(image, cell, above)
+    fine = np.meshgrid(
+        (np.arange(width) + 0.5) / ratio - 0.5, (np.arange(height) + 0.5) / ratio - 0.5, indexing="xy"
+    )
+    curved = _sampled(relief, np.stack([each.ravel() for each in fine], axis=1))
+    image[-1] = np.clip(128.0 + curved * (127.0 / _RELIEF), 1.0, 255.0)
+    return image.astype(np.uint8).reshape(LAYERS, height, width)
+
+
+def _layers(
+    image: npt.NDArray[np.float32], cell: npt.NDArray[np.int64], above: npt.NDArray[np.floating]
+) -> None:
+    """Fill all layers of a flat image but the last from points in ``cell`` (N,) at ``above`` (N,) metres."""
+    size, levels = image.shape[1], int(SLABS[-1] / _LEVEL)
+    standing = (above >= SLABS[0]) & (above < SLABS[-1])
+    level = (above[standing] / _LEVEL).astype(np.int64)
+    occupied = np.zeros(size * levels, dtype=bool)
+    occupied[cell[standing] * levels + level] = True
+    columns = occupied.reshape(size, levels)
+    for k, (low, high) in enumerate(pairwise(SLABS)):
+        slab = columns[:, int(low / _LEVEL) : int(high / _LEVEL)]
+        image[k] = 255.0 * np.sqrt(slab.mean(axis=1, dtype=np.float32))
+    top = np.zeros(size, dtype=np.float32)
+    np.maximum.at(top, cell, np.clip(above, 0.0, SLABS[-1]).astype(np.float32))
+    image[-3] = top * (255.0 / SLABS[-1])
+    image[-2, cell[above < _SEEN]] = 255.0
+
+
+def _ground(
+    points: Points, index: npt.NDArray[np.int64], shape: tuple[int, int]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Height of the ground (h, w) by coarse cells, and its height above the mean around, 0 where it was not seen."""
+    flat = index[:, 1] * shape[1] + index[:, 0]
+    least = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
+    np.minimum.at(least, flat, points[:, 2])
+    lowest = least.reshape(shape)
+    seen = np.isfinite(lowest)
+    # nothing falls away faster than the steepest slope: the roof's middle is known from the ground beside it
+    offsets = np.arange(-_REACH, _REACH + 1) * _GROUND_CELL
+    cone = -_STEEPEST * np.hypot(offsets[:, None], offsets[None])
+    eroded = ndimage.grey_erosion(lowest, structure=cone, mode="constant", cval=np.inf)
+    ground = filled(np.where(np.isfinite(eroded), eroded, np.nan).astype(np.float32))
+    ground = ndimage.median_filter(ground, 3)
+    # the lowest point of a sloping cell lies below its middle: what is near the first guess says where the ground is
+    rest = points[:, 2] - ground.ravel()[flat]
+    near = np.abs(rest) < _SLOPING
+    count = np.bincount(flat[near], minlength=ground.size).reshape(shape)
+    total = np.bincount(flat[near], weights=rest[near], minlength=ground.size).reshape(shape)
+    ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
+    level = seen & (count > 0)
+    weight = ndimage.gaussian_filter(level.astype(np.float32), _UNDULATION / _GROUND_CELL)
+    mean = ndimage.gaussian_filter(np.where(level, ground, 0.0), _UNDULATION / _GROUND_CELL) / np.maximum(
+        weight, 1e-3
+    )
+    return ground, np.where(level & (weight > 1e-2), ground - mean, 0.0).astype(np.float32)
+
+
+def _sampled(values: npt.NDArray[np.float32], at: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    """Bilinear values (N,) of an image (h, w) at (N, 2) columns and rows."""
+    return np.asarray(ndimage.map_coordinates(values, at.T[::-1], order=1, mode="nearest", output=np.float32))

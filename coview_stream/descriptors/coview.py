@@ -1,0 +1,82 @@
+"""From a virtual scan's polar bins to its descriptor channels (paper, section 3.2, eqs 1-4)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+import coview_kernels as kernels
+from coview_kernels import PolarGrid
+from coview_stream.config import Channel, DescriptorConfig
+from coview_stream.geometry.transforms import Points
+
+Descriptor = npt.NDArray[np.float32]
+"""(R, S) or (M, R, S) float32."""
+
+_VERTICAL: dict[Channel, Literal["max", "off"]] = {"coview": "max", "coview_strict": "off"}
+_GROUND_RADIUS = 6.0  # metres around a keyframe in which its own VLS shows the ground (notes: sd 3 cm)
+
+
+def channel(name: Channel, grid: PolarGrid) -> Descriptor:
+    """One descriptor channel (..., R, S) of polar bins; metres above the ground.
+
+    Heights below the zero carry no shape (they are ground in a hollow) and count as zero.
+    """
+    if name == "scan_context":
+        value: Descriptor = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
+        return value
+    return kernels.coview(*grid, vertical=_VERTICAL[name])
+
+
+def describe(
+    points: Points, centre: npt.NDArray[np.float64], config: DescriptorConfig
+) -> dict[Channel, Descriptor]:
+    """Descriptor channels, (R, S) each, of the virtual local scan around ``centre``.
+
+    Args:
+        points: (N, 3) gravity-aligned points, metres, one per voxel.
+        centre: (3,) the zero of the descriptor: the keyframe's x and y and the ground below it.
+        config: bins and channels.
+    """
+    first: Channel = "coview" if "coview" in config.channels else "coview_strict"
+    grid, context, _ = kernels.describe_points(
+        points,
+        centre,
+        config.rings,
+        config.sectors,
+        config.radius,
+        vertical=_VERTICAL[first],
+    )
+    return {name: context if name == first else channel(name, grid) for name in config.channels}
+
+
+def ring_key(descriptor: Descriptor) -> npt.NDArray[np.float32]:
+    """Return the paper's rotation-invariant key (..., R): share of occupied (non-zero) sectors of every ring."""
+    key: npt.NDArray[np.float32] = (descriptor != 0).mean(axis=-1, dtype=np.float32)
+    return key
+
+
+def ground_below(points: Points, position: npt.NDArray[np.float64]) -> float:
+    """Height of the ground below ``position`` (3,), from the points around it, metres in their frame.
+
+    The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and it needs no mast height.
+    Without points below the sensor there, the sensor's own height is returned.
+    """
+    near = points[
+        (np.hypot(points[:, 0] - position[0], points[:, 1] - position[1]) < _GROUND_RADIUS)
+        & (points[:, 2] < position[2])
+    ]
+    if not len(near):
+        return float(position[2])
+    cells = np.floor(near[:, :2] - position[:2]).astype(np.int64)
+    key = cells[:, 0] * 1000 + cells[:, 1]
+    order = np.lexsort((near[:, 2], key))
+    _, first = np.unique(key[order], return_index=True)
+    return float(np.median(near[order[first], 2]))
+
+
+def on_ground(points: Points, position: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return ``position`` (3,), but at the height of the ground below it: see :func:`ground_below`."""
+    return np.array([position[0], position[1], ground_below(points, position)])

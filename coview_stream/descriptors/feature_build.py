@@ -1,0 +1,166 @@
+"""From a map's cloud to its learned features: bird views in windows, and the aerial network over them in windows.
+
+Windows overlap by more than a window's edge is felt, so the result does not depend on where they lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image, bird_view
+from coview_stream.descriptors.feature_map import TILE, packed, packed_sigma, weights_sha256
+from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL, Features, network
+from coview_stream.geometry.transforms import Points
+
+WINDOW = 256
+"""Metres along the edge of what is drawn and encoded at a time; a multiple of a tile's edge."""
+
+_DRAW_MARGIN = 48  # metres around a window whose points say where its ground is
+_NET_MARGIN = 64  # metres around a window that the network looks at: 30 m for its layers, 28 for GeM's disk
+_COVERED = 4  # metres from the nearest point within which the map is known: shadows of trunks and houses are
+_CELLS = round(1 / CELL)  # image cells a metre
+_PER_PLACE = 2  # cells of the network's global descriptors along the edge of a stored one's
+
+Windows = dict[tuple[int, int], Image]
+
+
+def feature_arrays(
+    points: Points,
+    progress: Callable[[int, int], None] | None = None,
+    directory: Path | None = None,
+    window: int = WINDOW,
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Arrays ``learned.*`` of a map and the parameters that say what made them.
+
+    Args:
+        points: (N, 3) the map's cloud, metres, z up, relative to the map's origin.
+        progress: called with windows done and all windows.
+        directory: of the weights; None for those of the package.
+        window: metres at a time, a multiple of 32.
+
+    Raises:
+        DependencyError: no onnxruntime. InputError: no weights.
+    """
+    encoder = network("aerial", directory)
+    low = np.floor(points[:, :2].min(axis=0) / TILE).astype(np.int64) * TILE
+    high = (np.floor(points[:, :2].max(axis=0) / TILE).astype(np.int64) + 1) * TILE
+    drawn = _drawn(points, low, high, window)
+    parts: list[dict[str, npt.NDArray[Any]]] = []
+    for done, (column, row) in enumerate(drawn):
+        corner = low + np.array([column, row]) * window
+        width, height = np.minimum(window, high - corner).tolist()
+        around = _with_margin(drawn, column, row, width, height, window)
+        parts.append(_stored(encoder(around), around, corner, (height, width)))
+        if progress:
+            progress(done + 1, len(drawn))
+    arrays = {f"learned.{name}": np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return arrays, {"weights": weights_sha256(directory), "cell": LOCAL_CELL}
+
+
+def _drawn(points: Points, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64], window: int) -> Windows:
+    """Bird views of the windows that have points, by column and row."""
+    columns, rows = (-(-(high - low) // window)).tolist()
+    views: Windows = {}
+    for row in range(rows):
+        band = points[_within(points[:, 1], low[1] + row * window, window, _DRAW_MARGIN)]
+        for column in range(columns):
+            part = band[_within(band[:, 0], low[0] + column * window, window, _DRAW_MARGIN)]
+            corner = low + np.array([column, row]) * window
+            inside = _within(part[:, 0], corner[0], window) & _within(part[:, 1], corner[1], window)
+            if inside.any():
+                width, height = np.minimum(window, high - corner).tolist()
+                shape = ((height + 2 * _DRAW_MARGIN) * _CELLS, (width + 2 * _DRAW_MARGIN) * _CELLS)
+                whole = bird_view(part, (corner - _DRAW_MARGIN).astype(np.float32), shape)
+                edge = _DRAW_MARGIN * _CELLS
+                views[column, row] = whole[:, edge:-edge, edge:-edge].copy()
+    return views
+
+
+def _within(
+    values: npt.NDArray[np.float32], begin: np.int64, size: int, margin: int = 0
+) -> npt.NDArray[np.bool_]:
+    low, high = float(begin - margin), float(begin + size + margin)
+    return np.asarray((values >= low) & (values < high))
+
+
+def _with_margin(views: Windows, column: int, row: int, width: int, height: int, window: int) -> Image:
+    """Return a window's view with :data:`_NET_MARGIN` metres of its neighbours' on every side."""
+    image = np.zeros(
+        (LAYERS, (height + 2 * _NET_MARGIN) * _CELLS, (width + 2 * _NET_MARGIN) * _CELLS), dtype=np.uint8
+    )
+    image[-1] = 128  # nothing is known of the ground there
+    reach = -(-_NET_MARGIN // window)
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            other = views.get((column + i, row + j))
+            if other is not None:
+                x, y = ((k * window + _NET_MARGIN) * _CELLS for k in (i, j))
+                to_x, of_x = _clipped(x, other.shape[2], image.shape[2])
+                to_y, of_y = _clipped(y, other.shape[1], image.shape[1])
+                image[:, to_y, to_x] = other[:, of_y, of_x]
+    return image
+
+
+def _clipped(begin: int, length: int, size: int) -> tuple[slice, slice]:
+    low, high = max(0, begin), max(0, min(size, begin + length))
+    return slice(low, max(low, high)), slice(low - begin, max(low, high) - begin)
+
+
+def _stored(
+    features: Features, image: Image, corner: npt.NDArray[np.int64], shape: tuple[int, int]
+) -> dict[str, npt.NDArray[Any]]:
+    """Features without their margin, as they are stored: those of the tiles that have points."""
+    height, width = shape
+    known = _known(image)
+    core = (slice(_NET_MARGIN, _NET_MARGIN + height), slice(_NET_MARGIN, _NET_MARGIN + width))
+    vectors = packed(features.local[:, core[0], core[1]].transpose(1, 2, 0))
+    local = np.where(known[core][..., None], vectors, np.int8(0))
+    sigma = np.where(known[core], packed_sigma(features.sigma[core]), 255).astype(np.uint8)
+    numbers = np.stack(np.meshgrid(np.arange(width // TILE), np.arange(height // TILE)), axis=-1)
+    full = _in_tiles(known[core]).any(axis=(1, 2))
+    place, place_at = _places(features.place, known[core], shape)
+    return {
+        "local": _in_tiles(local)[full],
+        "sigma": _in_tiles(sigma)[full],
+        "tiles": (numbers.reshape(-1, 2)[full] + corner // TILE).astype(np.int32),
+        "place": place,
+        "place_at": (place_at + corner).astype(np.float32),
+    }
+
+
+def _known(image: Image) -> npt.NDArray[np.bool_]:
+    """Which 1 m cells (H, W) of an image are near points."""
+    filled = image[:-1].any(axis=0)
+    rows, columns = (n // _CELLS for n in filled.shape)
+    coarse = filled.reshape(rows, _CELLS, columns, _CELLS).any(axis=(1, 3))
+    if not coarse.any():
+        return np.asarray(coarse)
+    return np.asarray(ndimage.distance_transform_edt(~coarse) <= _COVERED)
+
+
+def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Cells (H, W, ...) as tiles (T, 32, 32, ...), row by row."""
+    height, width, *rest = values.shape
+    blocks = values.reshape(height // TILE, TILE, width // TILE, TILE, *rest)
+    return np.asarray(blocks.swapaxes(1, 2).reshape(-1, TILE, TILE, *rest))
+
+
+def _places(
+    place: npt.NDArray[np.float32], known: npt.NDArray[np.bool_], shape: tuple[int, int]
+) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float64]]:
+    """Global descriptors (K, P) of squares of 8 m, made as a query's is of its four middle cells, and their middles."""
+    edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
+    height, width = (n // side for n in shape)
+    inner = place[:, edge : edge + _PER_PLACE * height, edge : edge + _PER_PLACE * width]
+    mean = inner.reshape(len(place), height, _PER_PLACE, width, _PER_PLACE).mean(axis=(2, 4))
+    mean /= np.linalg.norm(mean, axis=0) + np.float32(1e-9)
+    wanted = known.reshape(height, side, width, side).any(axis=(1, 3))
+    row, column = np.nonzero(wanted)
+    at = np.asarray((np.column_stack([column, row]) + 0.5) * side, dtype=np.float64)
+    return packed(mean[:, row, column].T), at

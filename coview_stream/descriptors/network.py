@@ -1,0 +1,159 @@
+"""The trained encoders, run by onnxruntime on the CPU."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels.runtime import workers
+from coview_stream.descriptors.birds_eye_view import LAYERS, Image
+from coview_stream.errors import ConfigError, DependencyError, InputError, extra
+
+ViewName = Literal["aerial", "ground"]
+
+VIEW_NAMES: tuple[ViewName, ...] = ("aerial", "ground")
+
+OUTPUTS = ("local", "sigma", "place")
+"""What a network gives, in this order."""
+
+CARD = "card.json"
+"""The file beside the weights that says how they were made."""
+
+LOCAL_CELL = 1.0
+"""Edge of a cell of local descriptors, metres."""
+
+PLACE_CELL = 4.0
+"""Edge of a cell of global descriptors, metres."""
+
+_MULTIPLE = 8  # image cells
+_INPUT = "image"
+_REMEDY = "install the package again, or name your own weights' folder in COVIEW_WEIGHTS"
+
+
+@dataclass(frozen=True)
+class Features:
+    """What a network makes of an image whose corner is the corner of all three.
+
+    Attributes:
+        local: (C, H / 2, W / 2) float32 of unit norm, independent of heading; cells of 1 m, row along y.
+        sigma: (H / 2, W / 2) float32, how uncertain a cell is as a keypoint, > 0.
+        place: (P, H / 8, W / 8) float32 of unit norm: global descriptor of what lies around each 4 m cell.
+    """
+
+    local: npt.NDArray[np.float32]
+    sigma: npt.NDArray[np.float32]
+    place: npt.NDArray[np.float32]
+
+
+class Network:
+    """The encoder of one view.
+
+    Raises:
+        InputError: there are no weights in the directory, they are not of this version, or of the other view.
+        DependencyError: onnxruntime is not installed, or cannot be loaded.
+    """
+
+    def __init__(self, view: ViewName, directory: Path | None = None, threads: int = 1) -> None:
+        runtime = _runtime()
+        path = weights_file(view, directory)
+        _compare(path)
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.log_severity_level = 3
+        try:
+            self._session: Any = runtime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+            (image,) = self._session.get_inputs()
+            layers = image.shape[1]
+            outputs = tuple(output.name for output in self._session.get_outputs())
+        except Exception as error:  # onnxruntime's errors have no common base that is public
+            raise InputError(f"{path}: cannot be loaded as weights; {_REMEDY}") from error
+        if (image.name, layers, outputs) != (_INPUT, LAYERS, OUTPUTS):
+            raise InputError(f"{path}: weights of another version ({layers} layers); {_REMEDY}")
+
+    def __call__(self, image: Image) -> Features:
+        """Encode an image (LAYERS, H, W); H and W are multiples of 8 cells, i.e. 4 m.
+
+        Raises:
+            ValueError: the image has another shape.
+        """
+        if (
+            image.ndim != 3
+            or image.shape[0] != LAYERS
+            or image.shape[1] % _MULTIPLE
+            or image.shape[2] % _MULTIPLE
+        ):
+            raise ValueError(
+                f"image {image.shape}: ({LAYERS}, H, W) with H and W multiples of {_MULTIPLE} needed"
+            )
+        scaled = image[None].astype(np.float32) / np.float32(255.0)
+        local, sigma, place = self._session.run(list(OUTPUTS), {_INPUT: scaled})
+        return Features(local[0], sigma[0, 0], place[0])
+
+
+@lru_cache(maxsize=4)
+def network(view: ViewName, directory: Path | None = None, threads: int | None = None) -> Network:
+    """Return the encoder of a view, loaded once; without ``threads`` it has as many as the kernels have.
+
+    Raises:
+        InputError, DependencyError: as :class:`Network`. ConfigError: COVIEW_THREADS is no number.
+    """
+    if threads is None:
+        try:
+            threads = workers()
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    return Network(view, directory, threads)
+
+
+def shipped() -> Path:
+    """Return the directory of the weights: ``COVIEW_WEIGHTS`` if that is set, else the package's."""
+    own = os.environ.get("COVIEW_WEIGHTS")
+    return Path(own) if own else Path(__file__).parent / "weights"
+
+
+def weights_file(view: ViewName, directory: Path | None = None) -> Path:
+    """Return where a view's weights are; raises :class:`InputError` if there are none."""
+    path = (directory or shipped()) / weights_name(view)
+    if not path.is_file():
+        raise InputError(f"{path}: no weights of the {view} network; {_REMEDY}")
+    return path
+
+
+def weights_name(view: str) -> str:
+    """Return the file name of a view's weights."""
+    return f"{view}.onnx"
+
+
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of a small file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _runtime() -> Any:
+    runtime = extra("onnxruntime", "onnxruntime>=1.18", "learned re-localization")
+    if not hasattr(runtime, "InferenceSession"):  # an uninstallation may leave an empty folder behind
+        raise DependencyError(
+            "learned re-localization: onnxruntime is not complete; "
+            "pip install --force-reinstall 'onnxruntime>=1.18'"
+        )
+    return runtime
+
+
+def _compare(path: Path) -> None:
+    """Refuse weights that are not those that the card beside them names, if it names any."""
+    try:
+        noted = json.loads((path.parent / CARD).read_text())["sha256"][path.name]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if file_sha256(path) != noted:
+        raise InputError(f"{path}: not the weights that {CARD} beside it names; {_REMEDY}")

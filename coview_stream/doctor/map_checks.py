@@ -1,0 +1,92 @@
+"""A base map: does it open, what is inside, and is there memory for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coview_stream.basemap.basemap import check_reloc
+from coview_stream.doctor.finding import Finding, from_error
+from coview_stream.doctor.machine_checks import GB, LEAST_MEMORY
+from coview_stream.errors import MapError
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.basemap import BaseMap
+
+_NETWORK = 0.2 * GB  # onnxruntime and the network in two processes, and what else is imported
+_SPECTRA = 80.0  # bytes per square metre
+
+
+def open_site(path: Path) -> tuple[BaseMap | None, Finding]:
+    """Open a map, which reads all of it and compares its checksum; None if it cannot be used."""
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.file_format import VERSION
+
+    try:
+        base_map = BaseMap.load(path)
+    except MapError as error:
+        return None, from_error("map", error)
+    text = (
+        f"{path}: format {VERSION}, {len(base_map)} stations, {len(base_map.points)} points, checksum holds"
+    )
+    return base_map, Finding("ok", "map", text)
+
+
+def site_findings(base_map: BaseMap, size: int, available: int | None) -> Iterator[Finding]:
+    """Judge an open map whose file has ``size`` bytes, with ``available`` bytes of memory (None: unknown)."""
+    yield Finding("ok", "map sha256", base_map.sha256)
+    if not len(base_map):
+        yield Finding(
+            "FAIL", "map stations", "none: nowhere to search", "build it again, from ground and walls"
+        )
+    yield _features_finding(base_map)
+    needed = node_memory(base_map)
+    text = f"a node needs about {needed / GB:.1f} GB, and {size / GB:.2f} GB of page cache for the file"
+    if available is not None and needed > available:
+        remedy = f"{available / GB:.1f} GB are available: build with a larger --block-size, or cut the map"
+        yield Finding("FAIL", "map memory", text, remedy)
+    elif available is not None and needed + size > available:
+        remedy = f"{available / GB:.1f} GB are available: searches will wait for the disk"
+        yield Finding("warn", "map memory", text, remedy)
+    else:
+        yield Finding("ok", "map memory", text)
+
+
+def _features_finding(base_map: BaseMap) -> Finding:
+    missing = check_reloc(base_map, "auto")
+    if missing is not None:
+        return replace(from_error("map features", missing), verdict="warn")
+    if base_map.learned is None:
+        return Finding("ok", "map features", "none: searches go by co-view descriptors")
+    return Finding("ok", "map features", f"{base_map.learned.bytes / 1e6:.1f} MB, of the installed networks")
+
+
+def node_memory(base_map: BaseMap) -> float:
+    """Bytes a node takes for itself: processes, spectra as far as they are kept, and the volumes of one search."""
+    from coview_stream.localization.search.retrieval import _CACHE_BYTES
+
+    config = base_map.descriptor_config
+    channels = len(config.channels)
+    spectra = len(base_map) * config.rings * (config.sectors // 2 + 1) * 8 * channels
+    volumes = (
+        len(base_map) * config.sectors * 4 * (channels + 1)
+    )  # one is held twice while it is put together
+    return LEAST_MEMORY + min(spectra, _CACHE_BYTES) + volumes + _learned_memory(base_map)
+
+
+def _learned_memory(base_map: BaseMap) -> float:
+    """Bytes that searching by learned features adds: libraries, the map's spectra as far as they are kept, volumes.
+
+    Coarse features and a query's scores fill the rectangle around the map, however little of it has points.
+    """
+    if check_reloc(base_map, "auto") is not None or base_map.learned is None:
+        return 0.0
+    from coview_stream.config import LearnedConfig
+    from coview_stream.localization.search.learned.feature_index import KEPT_BYTES
+
+    features, config = base_map.learned, LearnedConfig()
+    spectra = min(features.box_area * _SPECTRA, KEPT_BYTES)
+    coarse = features.box_area / config.cell**2 * (2 * features.channels + 4 * config.yaws)
+    return _NETWORK + spectra + coarse + 3 * len(base_map) * config.yaws * 4

@@ -1,0 +1,92 @@
+"""Greatest or smallest value in a square window around each cell of a raster.
+
+SciPy's filters do the same; importing them takes a quarter of a second, which a node that starts does not have.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from coview_stream.errors import ConfigError
+from coview_stream.geometry.transforms import Points
+
+Raster = npt.NDArray[np.float32]
+
+
+def lowest_around(raster: Raster, size: int) -> Raster:
+    """Smallest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
+    return _sliding(np.minimum, raster, size, np.float32(np.inf))
+
+
+def highest_around(raster: Raster, size: int) -> Raster:
+    """Greatest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
+    return _sliding(np.maximum, raster, size, np.float32(-np.inf))
+
+
+def _sliding(pick: np.ufunc, raster: Raster, size: int, nothing: np.float32) -> Raster:
+    """One axis after the other: the extreme of a square is that of its rows' extremes."""
+    if size < 1 or size % 2 == 0:
+        raise ValueError(f"size must be odd, so that a window has a middle, got {size}")
+    out = raster.astype(np.float32, copy=False)
+    for axis in range(2):
+        reach = [(0, 0), (0, 0)]
+        reach[axis] = (size // 2, size // 2)
+        padded = np.pad(out, reach, constant_values=nothing)
+        length = raster.shape[axis]
+        views = [padded[k : k + length] if axis == 0 else padded[:, k : k + length] for k in range(size)]
+        out = views[0].copy()
+        for view in views[1:]:
+            pick(out, view, out=out)
+    return out
+
+
+Heights = npt.NDArray[np.float32]
+
+_MAX_CELLS = 200_000_000
+"""A raster above this many cells (0.8 GB) means stray coordinates, not a map."""
+
+
+def cells(
+    points: Points, cell: float
+) -> tuple[npt.NDArray[np.float64], tuple[int, int], npt.NDArray[np.int64]]:
+    """Lower corner (2,), shape (rows, columns) and the flat cell index (N,) of each point.
+
+    Raises:
+        ConfigError: the raster would be absurdly large for a map.
+    """
+    corner = np.floor(points[:, :2].min(axis=0).astype(np.float64) / cell) * cell
+    index = [np.floor((points[:, axis] - corner[axis]) / cell).astype(np.int64) for axis in (0, 1)]
+    width, height = int(index[0].max()) + 1, int(index[1].max()) + 1
+    if width * height > _MAX_CELLS:
+        raise ConfigError(
+            f"a raster of {width} x {height} cells of {cell} m: remove stray points or raise the cell size"
+        )
+    return corner, (height, width), index[1] * width + index[0]
+
+
+def lowest_per_cell(points: Points, flat: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+    """Index of the lowest point of each occupied cell, in the order of the cells."""
+    order = np.lexsort((points[:, 2], flat))
+    ordered = flat[order]
+    return np.asarray(order[np.append(True, ordered[1:] != ordered[:-1])])
+
+
+def filled(z: Heights) -> Heights:
+    """``z`` (H, W) with every NaN filled from ever coarser averages of its surroundings (push-pull)."""
+    unknown = np.isnan(z)
+    if not unknown.any() or unknown.all():
+        return z
+    height, width = z.shape
+    padded = np.pad(z, ((0, height % 2), (0, width % 2)), constant_values=np.nan)
+    blocks = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
+    count = np.isfinite(blocks).sum(axis=(1, 3))
+    coarse = np.full(count.shape, np.nan, dtype=np.float32)
+    np.divide(np.nansum(blocks, axis=(1, 3)), count, out=coarse, where=count > 0)
+    coarse = filled(coarse)
+    rows = (np.arange(height) + 0.5) / 2 - 0.5
+    columns = (np.arange(width) + 0.5) / 2 - 0.5
+    grid = np.meshgrid(rows, columns, indexing="ij", sparse=False)
+    smooth = ndimage.map_coordinates(coarse, grid, order=1, mode="nearest", output=np.float32)
+    return np.where(unknown, smooth, z).astype(np.float32)

@@ -1,0 +1,1 @@
+"""The engine: frames and odometry in, fixes out. No clock, no network, no threads."""

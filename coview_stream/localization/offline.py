@@ -1,0 +1,238 @@
+"""Localize a recorded run offline and write down what came out: trajectory, evidence, timings, pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.descriptors.coview import Descriptor
+from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.geometry.transforms import pose_from, pose_from_tum
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.recordings.run import Frame, Run
+
+Progress = Callable[[int, int, Fix | None], None]
+"""Called with (frames done, frames, newest fix)."""
+
+
+_PICTURES = ("trajectory.png", "descriptors.png")
+
+
+@dataclass
+class Located:
+    """What localizing a run gave.
+
+    Attributes:
+        fixes: one per frame that could be used, in order.
+        keyframes: evidence of every keyframe.
+        skipped: file and reason of every frame that could not be used.
+        seconds: time each step took; empty if that is not known.
+        sources: who named places to look at: "coview", "learned"; empty if that is not known.
+        query: descriptors of the keyframe that won the first fix, if there was one.
+        winner: its evidence: station and shift.
+    """
+
+    frames: int
+    fixes: list[Fix] = field(default_factory=list)
+    keyframes: list[KeyframeEvidence] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    query: dict[Channel, Descriptor] = field(default_factory=dict)
+    winner: KeyframeEvidence | None = None
+    sources: tuple[str, ...] = ()
+
+    @property
+    def posed(self) -> list[Fix]:
+        """Fixes that have a pose."""
+        return [fix for fix in self.fixes if fix.T_map_body is not None]
+
+    @property
+    def state(self) -> State:
+        """The last frame's state; SEARCHING if there was none."""
+        return self.fixes[-1].state if self.fixes else State.SEARCHING
+
+    @property
+    def first(self) -> Fix | None:
+        """The first fix that has a pose."""
+        return next(iter(self.posed), None)
+
+    def to_json(self, base_map: BaseMap) -> dict[str, Any]:
+        """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres."""
+        last = self.posed[-1] if self.posed else None
+        latency = (
+            np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
+        )
+        return {
+            "state": self.state.value,
+            "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
+            "first_fix_stamp": None if self.first is None else self.first.stamp,
+            "frames": self.frames,
+            "posed": len(self.posed),
+            "skipped": self.skipped,
+            "sources": list(self.sources),
+            "map_sha256": base_map.sha256,
+            "timings_s": dict(zip(("p50", "p95", "p99"), latency, strict=True)),
+            "keyframes": [keyframe.to_json() for keyframe in self.keyframes],
+        }
+
+
+def locate(
+    base_map: BaseMap, run: Run, config: LocalizerConfig | None = None, progress: Progress | None = None
+) -> Located:
+    """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
+
+    A run of one frame is localized by the stationary path. A frame that cannot be read is skipped and noted.
+
+    Raises:
+        InputError: not one frame could be used; the message ends with the first frame's.
+    """
+    config = config or LocalizerConfig()
+    if len(run) == 1:
+        config = replace(config, stationary=True)
+    localizer = Localizer(base_map, config)
+    located = Located(len(run), sources=localizer.sources)
+    for index in range(len(run)):
+        try:
+            frame = run.read(index)
+            begin = time.perf_counter()
+            fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
+        except (CloudError, RunError) as error:
+            located.skipped.append(_named(str(error), run.frames_paths[index]))
+            if progress:
+                progress(index + 1, len(run), None)
+            continue
+        located.seconds.append(time.perf_counter() - begin)
+        _note(located, localizer, _in_file_frame(fix, frame))
+        if progress:
+            progress(index + 1, len(run), fix)
+    if not located.fixes:
+        raise InputError(
+            f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}"
+        )
+    return located
+
+
+def from_stream(
+    stamps: Sequence[float], poses: Sequence[dict[str, Any]], statuses: Sequence[dict[str, Any]]
+) -> Located:
+    """Sort what a node published (JSON poses and statuses) under a run's frames, by stamp in seconds.
+
+    A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. The others
+    have the state that the newest status before them names.
+    """
+    known = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
+    told = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
+    located = Located(len(stamps))
+    for stamp in stamps:
+        pose = known.get(round(stamp * 1e6))
+        if pose is None:
+            before = bisect_right(told, round(stamp * 1e9), key=lambda t: t[0])
+            located.fixes.append(Fix(stamp, State(told[before - 1][1]) if before else State.SEARCHING))
+        else:
+            T = pose_from_tum([*pose["position"], *pose["orientation"]])
+            covariance = np.array(pose["covariance"], dtype=np.float64).reshape(6, 6)
+            located.fixes.append(Fix(stamp, State.TRACKING, T, None, covariance, float(pose["confidence"])))
+    for status in statuses:
+        if status.get("evidence"):
+            evidence = KeyframeEvidence.from_json(status["evidence"])
+            if not located.keyframes or located.keyframes[-1].stamp != evidence.stamp:
+                located.keyframes.append(evidence)
+    return located
+
+
+def write(located: Located, base_map: BaseMap, out: str | os.PathLike[str], pictures: bool = True) -> None:
+    """Write ``trajectory.tum`` (posed frames only), ``result.json`` and, unless unwanted, pictures into ``out``.
+
+    Raises:
+        InputError: the directory cannot be written.
+    """
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in _PICTURES:  # of an earlier run: they would tell another story than the trajectory
+            (folder / name).unlink(missing_ok=True)
+        posed = located.posed
+        poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
+        write_tum(folder / "trajectory.tum", np.array([fix.stamp for fix in posed]), poses)
+        text = json.dumps(located.to_json(base_map), indent=1) + "\n"
+        temporary = folder / ".result.json.part"
+        temporary.write_text(text)
+        temporary.replace(folder / "result.json")
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot write the results ({error.strerror}); choose another place"
+        ) from error
+    if pictures:
+        draw(located, base_map, folder)
+
+
+def draw(located: Located, base_map: BaseMap, folder: Path, truth: Any = None) -> None:
+    """Draw ``trajectory.png`` and, after a fix, ``descriptors.png``."""
+    from coview_stream.report.plots import plot_descriptor_pair, plot_trajectory
+
+    nowhere = np.full(3, np.nan)
+    positions = np.array([nowhere if f.T_map_body is None else f.T_map_body[:3, 3] for f in located.fixes])
+    base = base_map.points.astype(np.float64) + base_map.origin
+    plot_trajectory(base, positions, [f.state.value for f in located.fixes], folder / "trajectory.png", truth)
+    winner = located.winner
+    if winner is not None and winner.station is not None and winner.shift is not None and located.query:
+        name = next(iter(located.query))
+        station = base_map.descriptors(name)[winner.station].astype(np.float32)
+        titles = (f"keyframe ({name})", f"winning station {winner.station}")
+        plot_descriptor_pair(located.query[name], station, winner.shift, folder / "descriptors.png", titles)
+
+
+def _named(message: str, path: Path) -> str:
+    """Lead the message with the file, which the localizer does not know."""
+    return message if path.name in message else f"{path}: {message}"
+
+
+def _note(located: Located, localizer: Localizer, fix: Fix) -> None:
+    if fix.evidence is not None and (not located.keyframes or located.keyframes[-1] is not fix.evidence):
+        located.keyframes.append(fix.evidence)
+    if fix.T_map_body is not None and located.winner is None:
+        located.winner = fix.evidence
+        located.query = localizer.last_query
+    located.fixes.append(fix)
+
+
+def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
+    """Express the pose in the file's own coordinates: a single scan may be stored far from its zero."""
+    if fix.T_map_body is None or not frame.origin.any():
+        return fix
+    away = pose_from(np.eye(3), -frame.origin)
+    T_map_odom = None if fix.T_map_odom is None else fix.T_map_odom @ away
+    return replace(fix, T_map_body=fix.T_map_body @ away, T_map_odom=T_map_odom)
+
+
+def summary(located: Located) -> str:
+    """Say it in a few lines for a person."""
+    posed = located.posed
+    lines = [
+        f"{'state':<18} {located.state.value}",
+        f"{'localised':<18} {len(posed)} of {located.frames} frames",
+    ]
+    if posed:
+        x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
+        lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
+        lines.append(f"{'confidence':<18} {posed[-1].confidence:.2f}")
+    elif located.keyframes:
+        lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
+    if located.skipped:
+        lines.append(f"{'skipped':<18} {len(located.skipped)} frames; first: {located.skipped[0]}")
+    if located.seconds:
+        p50, p99 = np.quantile(located.seconds, [0.5, 0.99]) * 1e3
+        lines.append(f"{'step time':<18} p50 {p50:.1f} ms, p99 {p99:.0f} ms")
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Registration of a scan to the map, its verification and its covariance."""

@@ -1,0 +1,124 @@
+"""What the localizer says after every frame: state, pose, covariance, and the evidence behind them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.registration.verification import Evidence
+from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.odometry_noise import Drift
+
+_SHARES = tuple(f.name for f in fields(Evidence))
+
+
+class State(StrEnum):
+    """What the localizer knows of its place."""
+
+    SEARCHING = "SEARCHING"
+    """No place explains what the robot sees well enough (or too little has been seen)."""
+    AMBIGUOUS = "AMBIGUOUS"
+    """A place does, but another does too, or it has not been confirmed yet."""
+    TRACKING = "TRACKING"
+    """The pose is known."""
+    LOST = "LOST"
+    """It was known; the evidence has gone. Searching again."""
+
+
+@dataclass(frozen=True)
+class KeyframeEvidence:
+    """Why a keyframe decided what it decided.
+
+    Attributes:
+        stamp: seconds.
+        state: the state it led to.
+        reason: one clause for people.
+        score: evidence score of the best hypothesis, 0 if there is none.
+        rival: score of the best distinct rival, 0 if there is none.
+        evidence: its parts, if a hypothesis could be registered.
+        station: winning station, if this keyframe searched.
+        shift: winning shift of the co-view descriptors; None if the place was found by learned features.
+        cause: what decided, while tracking; None from a search.
+        innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
+            from the ones before; None where nothing could be registered, and from a search.
+    """
+
+    stamp: float
+    state: State
+    reason: str
+    score: float = 0.0
+    rival: float = 0.0
+    evidence: Evidence | None = None
+    station: int | None = None
+    shift: int | None = None
+    cause: Cause | None = None
+    innovation: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for ``result.json`` and the status: always the same keys, None where a value is not known."""
+        shares = {} if self.evidence is None else vars(self.evidence)
+        parts = {n: round(shares[n], 4) if n in shares else None for n in _SHARES}
+        return {
+            "stamp": self.stamp,
+            "state": self.state.value,
+            "reason": self.reason,
+            "score": round(self.score, 4),
+            "rival": round(self.rival, 4),
+            **parts,
+            "station": self.station,
+            "shift": self.shift,
+            "cause": None if self.cause is None else self.cause.value,
+            "innovation": None if self.innovation is None else round(self.innovation, 2),
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
+        """Read back what :meth:`to_json` wrote; KeyError or ValueError if it is something else.
+
+        Earlier versions left out the shares that were not known, the cause and the innovation.
+        """
+        known = data.get(_SHARES[0]) is not None
+        parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if known else None
+        return cls(
+            float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
+            float(data["rival"]), parts, data["station"], data["shift"],
+            None if data.get("cause") is None else Cause(data["cause"]), data.get("innovation"),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Fix:
+    """The localizer's answer to one frame.
+
+    Attributes:
+        stamp: seconds, of the frame.
+        state: see :class:`State`.
+        T_map_body: (4, 4) float64 in the frame of the map's sources; None unless TRACKING.
+        T_map_odom: (4, 4) float64, the correction behind it; None unless TRACKING.
+        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2; None unless TRACKING. The angles are small
+            rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
+            map, whose georeferencing is not in it, and calibrated on simulated drives: see docs/tracking.md. One sigma
+            of x, y and z, metres, is ``numpy.sqrt(numpy.diag(fix.covariance))[:3]``.
+        confidence: in [0, 1]: the evidence score, less what the best rival has of it.
+        evidence: of the newest keyframe, None before the first.
+        drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
+    """
+
+    stamp: float
+    state: State
+    T_map_body: Pose | None = None
+    T_map_odom: Pose | None = None
+    covariance: npt.NDArray[np.float64] | None = None
+    confidence: float = 0.0
+    evidence: KeyframeEvidence | None = field(default=None)
+    drift: Drift | None = None
+
+    @property
+    def doubted(self) -> bool:
+        """Whether AMBIGUOUS means that a place that was found is in doubt, not that a search has yet to decide."""
+        return self.state is State.AMBIGUOUS and self.evidence is not None and self.evidence.cause is not None

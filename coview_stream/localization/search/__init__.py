@@ -1,0 +1,1 @@
+"""Global search: votes of keyframes, hypotheses, and when to believe one."""

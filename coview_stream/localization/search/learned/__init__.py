@@ -1,0 +1,1 @@
+"""Place recognition by learned features, on NumPy, SciPy and onnxruntime."""

@@ -1,0 +1,197 @@
+"""How alike a query is to every place of the map at every heading: dense correlation, by FFT in blocks."""
+
+# FOLDED coview_stream/localization/search/learned/correlation.py: """A query in cells, made coarser and turned about its middle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from coview_stream.localization.search.learned.feature_index import CoarseMap, transformed
+
+F32 = npt.NDArray[np.float32]
+
+C64 = npt.NDArray[np.complex64]
+
+Indices = npt.NDArray[np.int64]
+
+COVERED = 0.6
+"""Share of a query's weight that has to lie on surveyed cells."""
+
+_AT_ONCE = 32 << 20  # bytes of the products that are transformed back together
+
+_LEAST = 1e-6  # weight of nothing
+
+
+def correlate(
+    query: F32,
+    weight: F32,
+    coarse_map: CoarseMap,
+    yaws: npt.ArrayLike,
+    blocks: Indices | None = None,
+    covered: float | None = COVERED,
+) -> F32:
+    """Mean inner product of a query's cells with the map's, for its middle at every cell's centre, at every heading.
+
+    A query that reaches beyond the map has less to be compared with. Its sum over all weights would count what nobody
+    surveyed as cells that do not look alike, and lose the right place at the map's edge to a wrong one inside. With
+    ``covered``, the mean is over what lies on surveyed cells: the right place scores what it would score anywhere. A
+    mean of few cells scatters more, though, and chance would favour the map's rim; below a share of 0.6 a place is
+    not scored (at it, scatter has grown by 1.3). That is -inf, not 0: wrong places may well score less than 0, and no
+    evidence is none against it. Who adds up several queries takes -inf for their median.
+
+    Args:
+        query: (C, h, h), h even, each cell's features times its weight (see :func:`~.turning.coarser`); row along
+            y, column along x of the query's frame, the robot between the four cells in the middle.
+        weight: (h, h) not negative. What lies more than h / 2 cells from the middle is left out.
+        coarse_map: of the same cells and channels, with a margin of at least h / 2.
+        yaws: (K,) headings of the query's frame in the map, radians.
+        blocks: blocks of the map to score (all); see :meth:`CoarseMap.blocks_near`.
+        covered: least share of the weight on surveyed cells; None divides by all the weight, wherever it lies.
+
+    Returns:
+        (K, H, W); -inf where nothing was scored. The memory's order is (H, W, K): headings of a cell lie together.
+
+    Raises:
+        ValueError: query and map do not fit, or no cell has a weight.
+    """
+    headings = np.asarray(yaws, dtype=np.float64)
+    _check(query, weight, coarse_map, headings)
+    waves = _waves(query, weight, coarse_map, headings)
+    chosen = np.arange(len(coarse_map)) if blocks is None else np.unique(blocks)
+    scores = np.full((coarse_map.height, coarse_map.width, len(headings)), -np.inf, dtype=np.float32)
+    per_block = 8 * len(waves[0].spectra) * len(headings)
+    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _AT_ONCE))):
+        if len(group):
+            for wave, part in zip(waves, np.split(scores, len(waves), axis=2), strict=True):
+                _score(part, group, coarse_map, wave, covered)
+    return np.asarray(scores.transpose(2, 0, 1))
+
+
+@dataclass(frozen=True)
+class _Wave:
+    """Spectra (bins, K, C + 1) to multiply a map's with, and the row and column at which its margin's end is found."""
+
+    spectra: C64
+    first: int
+
+
+def _waves(
+    query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.float64]
+) -> tuple[_Wave] | tuple[_Wave, _Wave]:
+    """Spectra of a turned query, the weight's last, over the sum of the weights."""
+    half, size = len(weight) // 2, len(yaws) // 2
+    # a correlation with what is turned by half a turn is a convolution: the same spectra, not conjugate
+    twice = len(yaws) == 2 * size and np.allclose(
+        np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9
+    )
+    images = turned(np.concatenate([query, weight[None]]), yaws[:size] if twice else yaws)
+    total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
+    if not (total > _LEAST).all():
+        raise ValueError("no cell of the query has a weight")
+    images *= (1.0 / total)[:, None]
+    spectra = transformed(images, coarse_map.block, coarse_map.workers)
+    before = _Wave(np.conjugate(spectra), coarse_map.margin - half)
+    return (before, _Wave(spectra, coarse_map.margin + half)) if twice else (before,)
+
+
+def _check(query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.float64]) -> None:
+    if query.ndim != 3 or weight.shape != query.shape[1:] or yaws.ndim != 1 or not len(yaws):
+        raise ValueError(
+            f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit"
+        )
+    if len(query) != coarse_map.channels:
+        raise ValueError(f"the query has {len(query)} channels, the map {coarse_map.channels}")
+    if query.shape[1] > 2 * coarse_map.margin:
+        raise ValueError(
+            f"the query has {query.shape[1]} cells a side, the map allows for {2 * coarse_map.margin}"
+        )
+
+
+def _score(scores: F32, group: Indices, coarse_map: CoarseMap, wave: _Wave, covered: float | None) -> None:
+    """Fill in the places (H, W, K) that some blocks answer for."""
+    spectra = wave.spectra
+    mean = _back(np.matmul(coarse_map.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), coarse_map, wave)
+    if covered is not None:
+        gaps = np.flatnonzero(~coarse_map.whole(group))
+        if len(gaps):
+            share = _back(
+                coarse_map.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], coarse_map, wave
+            )
+            # a share of just so much must not depend on how the transforms round
+            enough = share >= max(covered - 1e-5, _LEAST)
+            mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _LEAST), -np.inf)
+    for k, block in enumerate(group):
+        rows, cols = coarse_map.place_of(block)
+        scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
+
+
+def _back(product: C64, coarse_map: CoarseMap, wave: _Wave) -> F32:
+    """Correlations (places, places, blocks, K) from products of spectra (bins, blocks, K)."""
+    size, last = coarse_map.block, wave.first + coarse_map.places
+    grid = product.reshape(size, -1, *product.shape[1:])
+    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=coarse_map.workers)[wave.first : last]
+    return np.asarray(fft.irfft(rows, size, axis=1, workers=coarse_map.workers)[:, wave.first : last])
+
+
+F64 = npt.NDArray[np.float64]
+
+
+def coarser(local: npt.NDArray[np.floating], weight: F32 | None = None, ratio: int = 2) -> tuple[F32, F32]:
+    """Mean of ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and of the weights.
+
+    Returns:
+        (C, H / ratio, W / ratio), (H / ratio, W / ratio): what :func:`~.correlation.correlate` takes.
+
+    Raises:
+        ValueError: the ratio does not divide the sides, or the weights have another shape.
+    """
+    channels, height, width = local.shape
+    if height % ratio or width % ratio:
+        raise ValueError(f"{height} x {width} cells cannot be taken together {ratio} by {ratio}")
+    if weight is None:
+        weight = np.ones((height, width), dtype=np.float32)
+    if weight.shape != (height, width):
+        raise ValueError(f"weights {weight.shape} for {height} x {width} cells")
+    parts = (height // ratio, ratio, width // ratio, ratio)
+    weighted = (local * weight).reshape(channels, *parts).mean(axis=(2, 4), dtype=np.float32)
+    return np.asarray(weighted), np.asarray(weight.reshape(parts).mean(axis=(1, 3), dtype=np.float32))
+
+
+def turned(images: F32, yaws: F64) -> F32:
+    """Sample images on a grid of odd size about their middle, turned by each heading.
+
+    Args:
+        images: (C, h, h), h even: the middle lies between cells. What is farther from it than h / 2 cells is left
+            out, as it would be there at some headings only; beyond the image is 0.
+        yaws: (K,) radians, counter-clockwise from x (columns) to y (rows).
+
+    Returns:
+        (h + 1, h + 1, K, C): at [h/2 + v, h/2 + u, k] the bilinear value at R(-yaw_k) (u, v) from the middle.
+
+    Raises:
+        ValueError: the images are not square, or have an odd number of cells.
+    """
+    channels, size, width = images.shape
+    if size != width or size % 2:
+        raise ValueError(f"a query of {size} x {width} cells: it has to be square, its sides even")
+    half = size // 2
+    v, u = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1), indexing="ij")
+    c, s = np.cos(yaws), np.sin(yaws)
+    # one more cell of zeros on every side takes the values beyond the image
+    col = u[..., None] * c + v[..., None] * s + (half + 0.5)
+    row = v[..., None] * c - u[..., None] * s + (half + 0.5)
+    inside = np.hypot(u, v) <= half
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).transpose(1, 2, 0).reshape(-1, channels)
+    i, j = (np.clip(np.floor(each), 0, size).astype(np.intp) for each in (row, col))
+    down, right = (row - i).astype(np.float32)[..., None], (col - j).astype(np.float32)[..., None]
+    at = i * (size + 2) + j
+    out = padded[at] * ((1 - down) * (1 - right))
+    out += padded[at + 1] * ((1 - down) * right)
+    out += padded[at + size + 2] * (down * (1 - right))
+    out += padded[at + size + 3] * (down * right)
+    out *= inside[..., None, None]
+    return np.asarray(out)

@@ -1,0 +1,143 @@
+"""From a place to within a few metres, to a pose: by keypoints that agree."""
+
+# FOLDED coview_stream/localization/search/learned/keypoint_registration.py: """Turn about the vertical and shift that lay points on their partners, in closed form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config.search import LearnedMatchConfig
+from coview_stream.geometry.transforms import wrap_angle
+from coview_stream.localization.search.learned.consistent_pairs import consistency, maximum_clique
+from coview_stream.localization.search.learned.keypoints import Keypoints, Pairs, nearest_pairs
+
+Start = tuple[float, float, float]
+"""x and y (metres) and heading (radians) of the query's frame in the map."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """``p_map = R(yaw) p_query + (x, y)``, and what it rests on."""
+
+    x: float
+    y: float
+    yaw: float
+    """Radians in (-pi, pi]."""
+    inliers: int
+    """Pairs of keypoints that agree with the pose."""
+    exact: bool
+    """Whether it is proved that no more pairs agree with each other."""
+    rms: float
+    """Root mean square of their residuals in the plane, metres."""
+
+
+def sharpen(
+    query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig | None = None
+) -> Match | None:
+    """Match the keypoints of a query with those of the map around ``start``.
+
+    Args:
+        query: keypoints in the query's frame, whose origin is the middle of what it has seen.
+        known: keypoints of the map, or of its part that matters, in the map's frame.
+        start: where the query's frame lies in the map, more or less.
+        config: tolerances and what a match has to be.
+
+    Returns:
+        None where too few pairs agree, or agree on something too far from ``start``.
+    """
+    config = config or LearnedMatchConfig()
+    near = known.around(start[:2], config.reach + config.most_shift)
+    possible = _meeting(query, near, start, config)
+    pairs, _ = nearest_pairs(query.descriptors, near.descriptors, most=config.pairs, possible=possible)
+    if len(pairs) < config.least_inliers:
+        return None
+    left, right = query.where(pairs[:, 0]), near.where(pairs[:, 1])
+    clique = maximum_clique(consistency(left.xy, right.xy, config), config.nodes)
+    members = pairs[clique.members]
+    while len(members) >= config.least_inliers:
+        found = _aligned(query, near, members)
+        fits = found.residuals < config.tolerance
+        if fits.all():
+            return _match(found, len(members), clique.exact) if _close(found, start, config) else None
+        # distances alone do not tell a place from its mirror image, and a long clique may bend
+        members = members[found.residuals < max(config.tolerance, float(np.median(found.residuals)))]
+    return None
+
+
+def _meeting(
+    query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig
+) -> npt.NDArray[np.bool_]:
+    """Mask (N, M) of the pairs that lie on each other in some pose that would be accepted."""
+    c, s = math.cos(start[2]), math.sin(start[2])
+    there = query.xy @ np.array([[c, s], [-s, c]]) + start[:2]
+    gap = np.hypot(there[:, None, 0] - known.xy[None, :, 0], there[:, None, 1] - known.xy[None, :, 1])
+    swing = 2.0 * math.sin(0.5 * min(config.most_turn, math.pi)) * np.hypot(query.xy[:, 0], query.xy[:, 1])
+    return np.asarray(gap <= config.most_shift + config.tolerance + swing[:, None])
+
+
+def _aligned(query: Keypoints, known: Keypoints, members: Pairs) -> Alignment:
+    """Lay the members (P, 2) on each other, the certain ones more firmly."""
+    left, right = query.where(members[:, 0]), known.where(members[:, 1])
+    weights = 1.0 / (left.sigma.astype(np.float64) ** 2 + right.sigma.astype(np.float64) ** 2)
+    return align(left.xy, right.xy, weights)
+
+
+def _close(found: Alignment, start: Start, config: LearnedMatchConfig) -> bool:
+    shift = math.hypot(found.x - start[0], found.y - start[1])
+    return shift <= config.most_shift and abs(wrap_angle(found.yaw - start[2])) <= config.most_turn
+
+
+def _match(found: Alignment, inliers: int, exact: bool) -> Match:
+    return Match(found.x, found.y, found.yaw, inliers, exact, found.rms)
+
+
+F64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """``p_map = R(yaw) p_query + (x, y)``."""
+
+    x: float
+    y: float
+    yaw: float
+    """Radians in (-pi, pi]."""
+    residuals: F64
+    """(N,) metres, in the plane."""
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals, metres."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+
+def align(query: F64, known: F64, weights: F64 | None = None) -> Alignment:
+    """Weighted least squares in the plane.
+
+    Args:
+        query: (N, 2) metres.
+        known: (N, 2) metres, the partners.
+        weights: (N,) not negative, not all zero (all 1).
+
+    Raises:
+        ValueError: fewer than 2 points, the sides differ in number, or no weight is left.
+    """
+    if query.shape != known.shape or query.shape[1:] != (2,) or len(query) < 2:
+        raise ValueError(f"points {query.shape} and {known.shape}: both have to be (N, 2), N at least 2")
+    share = np.ones(len(query)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if share.shape != (len(query),) or (share < 0).any() or np.count_nonzero(share) < 2:
+        raise ValueError("weights have to be (N,), not negative, and positive for at least 2 points")
+    share = share / share.sum()
+    middle, other = share @ query, share @ known
+    a, b = query - middle, known - other
+    sine = share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    cosine = share @ (a * b).sum(axis=1)
+    yaw = math.atan2(sine, cosine)
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    x, y = other - turn @ middle
+    missed = b - a @ turn.T
+    return Alignment(float(x), float(y), yaw, np.hypot(missed[:, 0], missed[:, 1]))

@@ -1,0 +1,217 @@
+"""Learned re-localization on one map: a scan's features compared with the map's, at every place and heading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config import LearnedConfig
+from coview_stream.config.search import LearnedMatchConfig
+from coview_stream.descriptors.birds_eye_view import CELL, bird_view
+from coview_stream.descriptors.feature_map import TILE, FeatureMap
+from coview_stream.descriptors.network import LOCAL_CELL, Features, Network, network
+from coview_stream.geometry.transforms import Points, pose_from, rot_z, transform, yaw_of
+from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
+from coview_stream.localization.search.learned.correlation import coarser, correlate
+from coview_stream.localization.search.learned.feature_index import CoarseMap
+from coview_stream.localization.search.learned.keypoint_registration import sharpen
+from coview_stream.localization.search.learned.keypoints import Keypoints, keypoints
+from coview_stream.localization.search.retrieval import Volume
+
+_SIZE = 64.0
+"""Metres along the edge of a query's image."""
+
+_STEEPEST = 1.0  # metres per metre that the ground rises along a storey
+_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away
+_ROUNDING = 1e-6  # cells
+_SAMPLE = 200_000  # numbers are enough for a median
+_TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # what a tile's blocks have to reach from its middle, corners and all
+
+
+@dataclass(frozen=True)
+class View:
+    """What the ground network saw around ``centre``.
+
+    Attributes:
+        features: of an image with ``centre`` in its middle, axes as the odometry frame's.
+        weight: (h, w) how much each cell of the local descriptors counts; zero beyond the reach.
+        centre: (3,) the robot, but on the ground; odometry frame, metres.
+    """
+
+    features: Features
+    weight: npt.NDArray[np.float32]
+    centre: npt.NDArray[np.float64]
+
+    @property
+    def corner(self) -> npt.NDArray[np.float64]:
+        """(2,) lower corner of the image, metres from the centre."""
+        return np.full(2, -0.5 * _SIZE)
+
+    @property
+    def place(self) -> npt.NDArray[np.float32]:
+        """(P,) global descriptor of unit norm: the mean of the four cells in the middle."""
+        middle = self.features.place.shape[1] // 2
+        mean = self.features.place[:, middle - 1 : middle + 1, middle - 1 : middle + 1].mean(axis=(1, 2))
+        return np.asarray(mean / (np.linalg.norm(mean) + 1e-9), dtype=np.float32)
+
+
+class LearnedMap:
+    """All that searches of one map share: the map's features, ready to be searched, and the ground network.
+
+    Nothing is loaded or made before the first query, or :meth:`prepare`.
+    """
+
+    def __init__(
+        self,
+        features: FeatureMap,
+        stations: npt.NDArray[np.float32],
+        config: LearnedConfig,
+        directory: Path | None = None,
+        *,
+        block: float = 2.0,
+    ) -> None:
+        """Search the features of a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
+
+        Raises:
+            MapError: they were made by other weights than those in ``directory`` (the package's).
+            InputError: there are no weights.
+        """
+        features.check(directory)
+        self.features = features
+        self.stations = stations
+        self.config = config
+        self.match = LearnedMatchConfig(reach=config.reach)
+        self._block = block
+        self._directory = directory
+
+    @cached_property
+    def network(self) -> Network:
+        """The ground encoder; one thread is enough for 64 m."""
+        return network("ground", self._directory, 1)
+
+    @cached_property
+    def coarse(self) -> CoarseMap:
+        """The map's features on coarse cells, with their spectra."""
+        whole, corner = self.features.coarse(self.config.cell)
+        margin = round(0.5 * _SIZE / self.config.cell)
+        surveyed = (whole != 0).any(axis=0)
+        # halves: the whole is kept beside its spectra, and its numbers come from single bytes anyway
+        return CoarseMap(whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin)
+
+    @cached_property
+    def _everywhere(self) -> npt.NDArray[np.int64]:
+        """Blocks of the coarse map that have features at all."""
+        return self.coarse.blocks_near(self.features.tile_centres, _TILE_RADIUS)
+
+    @property
+    def dense(self) -> bool:
+        """Whether the map is small enough to be searched all over."""
+        return self.features.tile_area <= self.config.dense_area
+
+    def prepare(self) -> None:
+        """Load the network and make the map's spectra now, rather than at the first query.
+
+        Raises:
+            InputError: the weights cannot be loaded. DependencyError: there is no onnxruntime, or a broken one.
+        """
+        _ = self.network, self._everywhere if self.dense else self.coarse
+
+    def view(self, points: Points, centre: npt.NDArray[np.float64]) -> View:
+        """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot.
+
+        Raises:
+            InputError, DependencyError: as :meth:`prepare`.
+        """
+        size = round(_SIZE / CELL)
+        features = self.network(bird_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
+        axis = (np.arange(features.sigma.shape[0]) + 0.5) * LOCAL_CELL - 0.5 * _SIZE
+        inside = np.hypot(axis[:, None], axis[None]) <= self.config.reach
+        weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
+        return View(features, weight, centre)
+
+    def distances(self, view: View, suggested: npt.ArrayLike = ()) -> Volume:
+        """(M, S) of all stations and headings, lower is more alike; shift n means yaw -2 pi n / S.
+
+        Where the map is too large to be searched all over, it is searched around ``suggested`` (N, 2) as well, metres.
+        Their median is 1, which is also the distance where nothing was compared: it speaks neither for nor against.
+        """
+        ratio = round(self.config.cell / LOCAL_CELL)
+        query, weight = coarser(view.features.local, view.weight, ratio)
+        yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
+        blocks = self._everywhere if self.dense else self._alike(view, suggested)
+        read = self._at_stations(correlate(query, weight, self.coarse, yaws, blocks))
+        compared = np.isfinite(read)
+        sample = read[:: max(1, read.size // _SAMPLE)]
+        sample = sample[np.isfinite(sample)]
+        usual = np.median(sample) if len(sample) else np.float32(0.0)
+        found: Volume = np.float32(1.0 + usual) - read
+        found[~compared] = 1.0
+        return found
+
+    def _at_stations(self, scores: npt.NDArray[np.float32]) -> Volume:
+        """Best (M, K) of the scores (K, H, W) whose cells have their middle in a station's block, -inf off the map.
+
+        A block smaller than a cell has the score of the cell around its station.
+        """
+        grid = scores.transpose(1, 2, 0)
+        xy = (self.stations[:, :2].astype(np.float64) - self.coarse.corner) / self.coarse.cell
+        half = 0.5 * self._block / self.coarse.cell
+        first, last = (np.ceil(xy + side - 0.5 - _ROUNDING).astype(np.int64) for side in (-half, half))
+        first = np.where(last > first, first, np.floor(xy).astype(np.int64))
+        size = np.maximum(last - first, 1)
+        read = np.full((len(xy), grid.shape[2]), -np.inf, dtype=np.float32)
+        for right, down in product(*(range(int(n)) for n in size.max(axis=0, initial=0))):
+            column, row = (first + np.array([right, down])).T
+            inside = ((right, down) < size).all(axis=1) & (row >= 0) & (row < grid.shape[0])
+            inside &= (column >= 0) & (column < grid.shape[1])
+            read[inside] = np.maximum(read[inside], grid[row[inside], column[inside]])
+        return read
+
+    def sharpened(self, hypotheses: list[Hypothesis], view: View) -> list[Hypothesis]:
+        """Move each hypothesis to where keypoints around it agree; where too few do, it stays."""
+        local, sigma = view.features.local, view.features.sigma
+        ours = keypoints(local, sigma, view.corner, mask=view.weight > 0, count=self.match.keypoints)
+        return [self._sharpened(each, ours, view.centre) for each in hypotheses]
+
+    def _sharpened(
+        self, hypothesis: Hypothesis, ours: Keypoints, centre: npt.NDArray[np.float64]
+    ) -> Hypothesis:
+        T = hypothesis.T_map_odom
+        x, y, z = transform(T, centre[None])[0].tolist()
+        patch = self.features.patch(np.array([x, y]), self.match.reach + self.match.most_shift)
+        known = (patch.local != 0).any(axis=0)
+        theirs = keypoints(patch.local, patch.sigma, patch.corner, mask=known, count=None)
+        found = sharpen(ours, theirs, (x, y, yaw_of(T)), self.match)
+        if found is None:
+            return hypothesis
+        z = self._ground(np.array([found.x, found.y]), np.array([x, y, z]))
+        there = pose_from(rot_z(found.yaw), np.array([found.x, found.y, z]))
+        return replace(hypothesis, T_map_odom=there @ pose_from(np.eye(3), -centre), exact=True)
+
+    def _ground(self, xy: npt.NDArray[np.float64], before: npt.NDArray[np.float64]) -> float:
+        """Height at ``xy`` (2,) of the storey that was at ``before`` (3,), metres; unchanged where it has none."""
+        away = np.hypot(*(self.stations[:, :2] - xy).T)
+        rise = np.abs(self.stations[:, 2] - before[2])
+        moved = float(np.hypot(*(xy - before[:2])))
+        same = np.flatnonzero((away <= 1.5 * self._block) & (rise <= _STEP + _STEEPEST * moved))
+        if not len(same):
+            return float(before[2])
+        nearest = same[np.lexsort((rise[same], np.round(away[same], 2)))[0]]
+        return float(self.stations[nearest, 2])
+
+    def _alike(self, view: View, suggested: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Blocks of the coarse map around suggestions, and around the tiles that look most like the view."""
+        likeness = self.features.place.astype(np.float32) @ view.place
+        tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
+        found, number = np.unique(tile, axis=0, return_inverse=True)
+        best = np.full(len(found), -np.inf, dtype=np.float32)
+        np.maximum.at(best, number.reshape(-1), likeness)
+        chosen = found[np.argsort(-best, kind="stable")[: self.config.shortlist]]
+        tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
+        near = np.vstack([tiles, np.asarray(suggested, dtype=np.float64).reshape(-1, 2)])
+        return self.coarse.blocks_near(near, _TILE_RADIUS)

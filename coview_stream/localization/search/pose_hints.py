@@ -1,0 +1,84 @@
+"""Places where the robot may be before anything has been searched for: hypotheses to verify, never trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform, yaw_of
+from coview_stream.localization.search.consensus import Hypothesis
+
+_TRIES = 5  # keyframes in a row that must refute all suggestions before they are tried less often
+_PAUSE = 4  # keyframes between two tries then
+
+FROM_THERE = " (from the last known place)"
+"""What an evidence's reason ends with where the best hypothesis began as a suggestion."""
+
+
+class Suggestions:
+    """What a localizer offers its search: poses ``T_map_odom`` in an odometry frame that keeps its origin.
+
+    The localizer's own odometry frame has its origin moved to an anchor; here it is undone, for after a loss there is
+    another anchor. Map coordinates are the map's own.
+    """
+
+    def __init__(self) -> None:
+        self._awaited: Pose | None = None  # T_map_body at the next frame
+        self._known: tuple[Pose, ...] = ()
+
+    def clear(self) -> None:
+        """Forget them all: a place has been accepted."""
+        self._awaited, self._known = None, ()
+
+    def robot_at(self, T_map_body: Pose) -> None:
+        """Suggest that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
+        self._awaited = T_map_body
+
+    def frames_were(self, T_map_odom: Pose, anchor: npt.NDArray[np.float64]) -> None:
+        """Suggest, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
+        self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
+
+    def about(self, anchor: npt.NDArray[np.float64], T_odom_body: Pose) -> tuple[Pose, ...]:
+        """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""
+        if self._awaited is not None:
+            T_map_body, self._awaited = self._awaited, None
+            # level, for both frames are: how the robot leans now is not how it leant then
+            turn = rot_z(yaw_of(T_map_body @ inverse(T_odom_body)))
+            T = pose_from(turn, T_map_body[:3, 3] - turn @ T_odom_body[:3, 3])
+            self._known = (*self._known, T @ pose_from(np.eye(3), -anchor))
+        return tuple(T @ pose_from(np.eye(3), anchor) for T in self._known)
+
+
+class Trials:
+    """Which suggestions a search tries at a keyframe: all, until a few keyframes in a row have refuted them.
+
+    Then at every fifth, not never: the sensor may only have been covered.
+    """
+
+    def __init__(self) -> None:
+        self._of: tuple[bytes, ...] = ()
+        self._refuted = 0
+        self._wait = 0
+
+    def due(self, suggested: Sequence[Pose]) -> list[Hypothesis]:
+        """Return those to be tried at this keyframe, as hypotheses with no station behind them."""
+        of = tuple(T.tobytes() for T in suggested)
+        if of != self._of:
+            self._of, self._refuted, self._wait = of, 0, 0
+        if self._wait:
+            self._wait -= 1
+            return []
+        return [Hypothesis(T, None, None, 0.0) for T in suggested]
+
+    def tried(self, refuted: bool) -> None:
+        """Take note of a keyframe at which they were tried, and whether it spoke against all of them."""
+        self._refuted = self._refuted + 1 if refuted else 0
+        if self._refuted >= _TRIES:
+            self._wait = _PAUSE
+
+
+def robot_in(T_map_odom: Pose, T_odom_body: Pose) -> npt.NDArray[np.float64]:
+    """Return where (1, 2) in the map a suggestion puts the robot."""
+    return transform(T_map_odom, T_odom_body[None, :3, 3])[:, :2]

@@ -1,0 +1,118 @@
+"""Where a search's hypotheses come from: each source lets keyframes vote for places, in its own way."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+from coview_stream.basemap.basemap import BaseMap, check_reloc
+from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.descriptors.coview import Descriptor, describe, on_ground
+from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.retrieval import Retrieval
+
+if TYPE_CHECKING:  # it brings half of SciPy along
+    from coview_stream.localization.search.learned.matcher import LearnedMap
+
+
+class Source(Protocol):
+    """Takes in keyframes and names the places they speak for."""
+
+    def vote(self, query: Query) -> None:
+        """Take in one keyframe; one with too few points says nothing."""
+        ...
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the best places, best first; none before the first vote."""
+        ...
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        ...
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        ...
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What all searches of one map share; None for what is not used.
+
+    Attributes:
+        retrieval: the stations' co-view descriptors.
+        learned: the map's learned features.
+    """
+
+    retrieval: Retrieval | None
+    learned: LearnedMap | None
+
+    @classmethod
+    def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> Knowledge:
+        """Choose by ``config.reloc``; the network is loaded if ``load``, the map's spectra are not made yet.
+
+        ``auto`` warns if the map has learned features that cannot be used, and goes without them.
+
+        Raises:
+            MapError, InputError, DependencyError: as :func:`~coview_stream.basemap.basemap.check_reloc`.
+        """
+        retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
+        missing = check_reloc(base_map, config.reloc, load)
+        if missing is not None:
+            warnings.warn(missing, stacklevel=2)
+        if missing is not None or config.reloc == "coview" or base_map.learned is None:
+            return cls(retrieval, None)
+        from coview_stream.localization.search.learned.matcher import LearnedMap
+
+        block = base_map.config.block
+        return cls(retrieval, LearnedMap(base_map.learned, base_map.stations, config.learned, block=block))
+
+    def prepare(self) -> None:
+        """Make now what would make the first query slow; raises :class:`CoViewError` if something is missing."""
+        if self.retrieval is not None:
+            self.retrieval.prepare()
+        if self.learned is not None:
+            self.learned.prepare()
+
+
+class CoView:
+    """Votes by the paper's descriptors (eqs 1-12).
+
+    Attributes:
+        last_query: descriptors (R, S) of the newest keyframe that voted, by channel.
+    """
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, retrieval: Retrieval, peaks: int) -> None:
+        self.base_map = base_map
+        self.config = config
+        self.retrieval = retrieval
+        self.consensus = Consensus(
+            base_map.stations, base_map.config.block, replace(config.consensus, peaks=peaks)
+        )
+        self.last_query: dict[Channel, Descriptor] = {}
+
+    def vote(self, query: Query) -> None:
+        """Compare the virtual local scan with every station's."""
+        descriptor = self.base_map.descriptor_config
+        if len(query.scan) < self.config.keyframe.min_points:
+            return
+        centre = on_ground(query.scan, query.position) if descriptor.ground_zero else query.position
+        self.last_query = describe(query.scan, centre, descriptor)
+        if self.config.consensus.mode == "single":
+            self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
+        else:
+            self.consensus.vote(centre, self.retrieval.distances(self.last_query))
+
+    def hypotheses(self) -> list[Hypothesis]:
+        """Return the consensus' peaks."""
+        return self.consensus.hypotheses()
+
+    def clear(self) -> None:
+        """Forget all votes."""
+        self.consensus.clear()
+
+    def __len__(self) -> int:
+        """Return how many keyframes have voted."""
+        return len(self.consensus)

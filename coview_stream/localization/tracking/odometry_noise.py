@@ -1,0 +1,117 @@
+"""How fast odometry drifts: what it is believed to do at first, and what registrations show that it does.
+
+A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. With one sigma for all, the poses of the
+first would be reported far too uncertain and those of the second too certain. So the rates are measured while tracking:
+the motion between two registrations, less the motion that odometry tells, is its drift and the noise of both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+
+from coview_stream.config import TrackingConfig
+from coview_stream.geometry.se3 import Matrix6, Vector6
+from coview_stream.localization.registration.covariance import angles_first
+
+_GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
+# of the configured rate; a scale error is no random walk, and needs a pull
+_LEAST_FACTOR, _MOST_FACTOR = 0.3, 20.0
+_OUTLIER = 16.0  # variances; a slip beyond counts as one so large, so that rates grow step by step
+# over less, drift cannot be told from the registrations' noise
+_LEAST_STEP, _LEAST_TURN = 0.2, np.radians(5.0)
+_LEAST_DRIVEN = 1e-3  # metres: standing still, a covariance of zero would be none
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Sigmas of odometry's errors, of a random walk: per square root of a metre driven.
+
+    Attributes:
+        position: metres, each of x and y.
+        height: metres.
+        tilt: radians, each of roll and pitch.
+        yaw: radians.
+        turn: radians of yaw per radian turned.
+    """
+
+    position: float
+    height: float
+    tilt: float
+    yaw: float
+    turn: float
+
+    @classmethod
+    def of(cls, config: TrackingConfig) -> Drift:
+        """Return what is believed before anything has been measured."""
+        return cls(
+            config.position_drift, config.height_drift, config.tilt_drift, config.yaw_drift, config.turn_drift
+        )
+
+    def variances(self, driven: float, turned: float) -> Vector6:
+        """Variances (6,) over (rx, ry, rz, x, y, z) that gather in metres driven and radians turned."""
+        rates = np.array([self.tilt, self.tilt, self.yaw, self.position, self.position, self.height])
+        gathered: Vector6 = rates**2 * max(driven, _LEAST_DRIVEN)
+        gathered[2] += (self.turn * turned) ** 2
+        return gathered
+
+    def covariance(self, driven: float, turned: float) -> Matrix6:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of the body's motion; positive definite even standing still."""
+        return np.diag(self.variances(driven, turned))
+
+    def reported(self, driven: float, turned: float) -> Matrix6:
+        """Return the same covariance over (x, y, z, roll, pitch, yaw)."""
+        return angles_first(self.covariance(driven, turned))
+
+
+class DriftEstimator:
+    """Measures the rates of the drift, forgetting by the metre, and beginning with the configured ones."""
+
+    def __init__(self, config: TrackingConfig) -> None:
+        self._config = config
+        self._nominal = Drift.of(config)
+        self._metres = np.full(len(_GROUPS), config.drift_trust)
+        self._sums = self._metres.copy()
+
+    @property
+    def drift(self) -> Drift:
+        """The rates as they seem to be now."""
+        factors = np.sqrt(np.clip(self._sums / self._metres, _LEAST_FACTOR**2, _MOST_FACTOR**2))
+        tilt, yaw, position, height = factors.tolist()
+        known = self._nominal
+        return Drift(
+            position * known.position, height * known.height, tilt * known.tilt, yaw * known.yaw, yaw * known.turn
+        )  # fmt: skip
+
+    def add(self, gap: Vector6, noise: Vector6, driven: float, turned: float) -> None:
+        """Take note of the motion between two registrations; see :func:`worth_learning`.
+
+        Args:
+            gap: (6,) over (rx, ry, rz, x, y, z): the later one, less where odometry leads from the earlier one.
+            noise: (6,) variances that the two registrations alone account for.
+            driven: metres between them.
+            turned: radians between them.
+        """
+        nominal = self._nominal.variances(driven, turned)
+        now = self.drift.variances(driven, turned)
+        # one by one less than nothing at times; only so is their mean right
+        seen = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
+        for group, axes in enumerate(_GROUPS):
+            rows = list(axes)
+            if driven < _LEAST_STEP and rows != [2]:
+                continue  # turning on the spot tells of the heading alone
+            # a turn on the spot says of the heading what metres of driving do
+            metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
+            # by how much it can tell: a registration that hardly knows a direction says nothing of its drift
+            weight = metres * float((now[rows] / (now[rows] + noise[rows])).mean()) ** 2
+            fade = exp(-weight / self._config.drift_memory)
+            ratio = float((seen[rows] / nominal[rows]).mean())
+            self._sums[group] = fade * self._sums[group] + weight * ratio
+            self._metres[group] = fade * self._metres[group] + weight
+
+
+def worth_learning(driven: float, turned: float) -> bool:
+    """Whether a motion of so many metres and radians tells drift from the registrations' noise."""
+    return driven >= _LEAST_STEP or turned >= float(_LEAST_TURN)

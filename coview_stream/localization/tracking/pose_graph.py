@@ -1,0 +1,249 @@
+"""The pose graph: a chain of keyframes, from odometry between them and registrations to the map, on gtsam's iSAM2.
+
+Unknown are the poses ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the difference of two poses in
+the tangent of the body, it holds the most probable ones given
+
+* a prior on the first: e(T_prior, X_0) ~ N(0, P)
+* odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
+* registrations: e(Y_k, X_k) ~ N(0, R_k), under Huber's kernel on the whitened residual
+
+Only the newest pose is asked for, where filtering and smoothing are the same; smoothing the ones before is what lets a
+registration be weighed again in the light of later ones.
+
+The memory is bounded: a graph that has grown to ``restart`` keyframes is begun anew with the newest ``window`` of them.
+In place of the past stands the *filtering* belief of the first that stays: what was known when that keyframe was the
+newest, from everything before and at it. For a chain this is exact up to linearisation: the past meets the future in
+that one pose. The smoothed belief would be wrong there, as it holds already the later measurements that stay in the
+graph, which would then count twice. (gtsam's own fixed-lag smoother is known to leak and to lose keys: gtsam issues
+1452, 1638 and 1935.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config import GraphConfig
+from coview_stream.errors import extra
+from coview_stream.geometry.se3 import (
+    Matrix6,
+    adjoint,
+    along_body,
+    along_map,
+    checked_covariance,
+    checked_pose,
+    difference,
+)
+from coview_stream.geometry.transforms import Pose, inverse, orthonormal
+
+_RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are weighed again
+_MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
+
+
+class Estimate(NamedTuple):
+    """Pose and covariance of the newest keyframe."""
+
+    T_map_body: Pose
+    """(4, 4) float64."""
+    covariance: Matrix6
+    """(6, 6) over (rx, ry, rz, x, y, z): a turn about the body, then a shift, along the map's axes."""
+
+
+class _Gaussian(NamedTuple):
+    """A pose and its covariance (6, 6) in the tangent of its own body."""
+
+    T: Pose
+    covariance: Matrix6
+
+
+@dataclass
+class _Keyframe:
+    """One pose of the chain.
+
+    Attributes:
+        T: (4, 4) ``T_map_body``, where it is linearised or first was.
+        between: this body in the frame of the one before; None for the first.
+        corrections: measured poses in the map.
+        filtered: what was believed when it was the newest; None while it is.
+    """
+
+    T: Pose
+    between: _Gaussian | None = None
+    corrections: list[_Gaussian] = field(default_factory=list)
+    filtered: _Gaussian | None = None
+
+
+class PoseGraph:
+    """Poses of a chain of keyframes, and how sure the newest is.
+
+    All covariances are (6, 6) over (rx, ry, rz, x, y, z), radians and metres, *along the map's axes*: the body turns
+    about its own origin, then it is shifted. Poses are (4, 4) float64. Not safe for use by two threads at once.
+
+    Every method that takes a pose or a covariance raises InputError, and changes nothing, where the pose is not rigid
+    or the covariance not positive definite; every one that needs a keyframe RuntimeError before the first ``start``.
+    """
+
+    def __init__(self, config: GraphConfig | None = None) -> None:
+        """Make an empty graph; gtsam is imported here and no earlier.
+
+        Raises:
+            DependencyError: gtsam is not installed, or cannot be loaded.
+        """
+        self.config = config or GraphConfig()
+        # gtsam has no types that mypy reads everywhere, hence Any
+        self._gtsam: Any = extra("gtsam", "gtsam>=4.3", "tracking")
+        self._kernel: Any = self._gtsam.noiseModel.mEstimator.Huber.Create(self.config.huber)
+        self.clear()
+
+    def __len__(self) -> int:
+        """Keyframes held: at most ``restart``, however long the robot drives; zero before ``start``."""
+        return len(self._keyframes)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._keyframes: list[_Keyframe] = []
+        self._newest_belief: _Gaussian | None = None
+        self._isam: Any = None
+        self._factors: Any = None  # not handed over to iSAM2 yet, nor are the values
+        self._values: Any = None
+
+    def start(self, T_map_body: Pose, covariance: Matrix6) -> None:
+        """Begin a new chain: all that is known is that the body is here.
+
+        After a (re-)localization, too: nothing of an older chain is carried over.
+
+        Args:
+            T_map_body: (4, 4) of the first keyframe.
+            covariance: of the prior.
+        """
+        T = checked_pose("T_map_body", T_map_body)
+        prior = _Gaussian(T, along_body(checked_covariance("covariance", covariance), T))
+        self.clear()
+        self._keyframes.append(_Keyframe(T))
+        self._build(prior)
+
+    def move(self, T_between: Pose, covariance: Matrix6) -> None:
+        """Add a keyframe: odometry has moved on.
+
+        Args:
+            T_between: (4, 4) the new body in the frame of the newest keyframe's, ``inverse(T_odom_last) @ T_odom_new``.
+            covariance: of the new pose if the last one were known, along the map's axes as the estimate has them now
+                (see :func:`coview_stream.localization.tracking.odometry_noise.Drift.covariance`).
+        """
+        step = checked_pose("T_between", T_between)
+        spread = checked_covariance("covariance", covariance)
+        before = self._belief()
+        T = orthonormal(before.T @ step)
+        moved = _Gaussian(step, along_body(spread, T))
+        self._keyframes[-1].filtered = before
+        self._keyframes.append(_Keyframe(T, moved))
+        # odometry alone teaches nothing about the past, so there is nothing to solve
+        Ad = adjoint(inverse(step))
+        self._newest_belief = _Gaussian(T, Ad @ before.covariance @ Ad.T + moved.covariance)
+        self._add_motion(len(self) - 1)
+        if len(self) > self.config.restart:
+            self._restart()
+
+    def correct(self, T_map_body: Pose, covariance: Matrix6) -> None:
+        """Tell where a registration found the newest keyframe, under Huber's kernel.
+
+        Args:
+            T_map_body: (4, 4) as the map alone has it: a pose in whose search the prediction took part counts it
+                twice (see :func:`coview_stream.localization.registration.covariance.without_prior`).
+            covariance: of that measurement alone (see :func:`coview_stream.localization.registration.covariance.registration_covariance`).
+        """
+        T = checked_pose("T_map_body", T_map_body)
+        spread = checked_covariance("covariance", covariance)
+        measured = _Gaussian(T, along_body(spread, T))
+        self._newest().corrections.append(measured)
+        self._newest_belief = None
+        self._add_correction(len(self) - 1, measured)
+
+    @property
+    def estimate(self) -> Estimate:
+        """Pose and covariance of the newest keyframe: the prediction after ``move``, corrected after ``correct``."""
+        belief = self._belief()
+        return Estimate(belief.T.copy(), along_map(belief.covariance, belief.T))
+
+    def innovation(self, T_map_body: Pose, covariance: Matrix6) -> float:
+        """Squared Mahalanobis distance of a measurement from the present estimate; ask before ``correct``.
+
+        If both covariances are right it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty,
+        22.5 by one in a thousand.
+
+        Args:
+            T_map_body: (4, 4) measured pose of the newest keyframe.
+            covariance: of that measurement alone.
+        """
+        T = checked_pose("T_map_body", T_map_body)
+        spread = checked_covariance("covariance", covariance)
+        expected = self.estimate
+        gap: npt.NDArray[np.float64] = difference(T, expected.T_map_body)
+        return float(gap @ np.linalg.solve(expected.covariance + spread, gap))
+
+    def _newest(self) -> _Keyframe:
+        if not self._keyframes:
+            raise RuntimeError("the graph is empty; call start first")
+        return self._keyframes[-1]
+
+    def _belief(self) -> _Gaussian:
+        """Return what is believed of the newest keyframe, solved for when asked the first time."""
+        self._newest()
+        if self._newest_belief is None:
+            self._update()
+            key = len(self) - 1
+            T = np.asarray(self._isam.calculateEstimatePose3(key).matrix())
+            self._newest_belief = _Gaussian(T, np.asarray(self._isam.marginalCovariance(key)))
+        return self._newest_belief
+
+    def _restart(self) -> None:
+        """Go on with the newest keyframes alone, from the filtering belief of the first of them."""
+        self._update()
+        values = self._isam.calculateEstimate()
+        for key, item in enumerate(self._keyframes):
+            item.T = np.asarray(values.atPose3(key).matrix())
+        del self._keyframes[: -self.config.window]
+        first = self._keyframes[0].filtered
+        assert first is not None  # a window holds two or more
+        self._build(first)
+
+    def _build(self, prior: _Gaussian) -> None:
+        """Make iSAM2 of the keyframes held; ``prior`` is all that is known of the first, its corrections included."""
+        gtsam = self._gtsam
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(_RELINEARIZE)
+        parameters.relinearizeSkip = 1
+        self._isam = gtsam.ISAM2(parameters)
+        self._factors, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._factors.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(prior.T), self._noise(prior)))
+        self._values.insert(0, gtsam.Pose3(self._keyframes[0].T))
+        for key, item in enumerate(self._keyframes[1:], start=1):
+            self._add_motion(key)
+            for measured in item.corrections:
+                self._add_correction(key, measured)
+        self._update()
+
+    def _update(self) -> None:
+        """Hand over what has gathered since the last time, and linearise again what that moves."""
+        self._isam.update(self._factors, self._values)
+        self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
+        for _ in range(_MAX_UPDATES):
+            if not self._isam.update().getVariablesRelinearized():
+                break
+
+    def _noise(self, measured: _Gaussian) -> Any:
+        return self._gtsam.noiseModel.Gaussian.Covariance(measured.covariance)
+
+    def _add_motion(self, key: int) -> None:
+        item = self._keyframes[key]
+        assert item.between is not None  # all but the first have one
+        pose = self._gtsam.Pose3(item.between.T)
+        self._values.insert(key, self._gtsam.Pose3(item.T))
+        self._factors.add(self._gtsam.BetweenFactorPose3(key - 1, key, pose, self._noise(item.between)))
+
+    def _add_correction(self, key: int, measured: _Gaussian) -> None:
+        robust = self._gtsam.noiseModel.Robust.Create(self._kernel, self._noise(measured))
+        self._factors.add(self._gtsam.PriorFactorPose3(key, self._gtsam.Pose3(measured.T), robust))

@@ -1,0 +1,116 @@
+"""What the pairs of a registration say of its error by disagreeing with one another, surface by surface.
+
+The inverse Hessian presumes that residuals are independent. They are not: a wall that the map has 3 cm off pulls with
+all of its points, and a tree's crown looks different from above, all of it. So pairs are gathered by place, and what
+counts is how far the *places* pull apart: the sandwich estimator, clustered, A^-1 B A^-1 with A the sum of J^T J and B
+the sum over clusters of the outer products of their gradients.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+import coview_kernels as kernels
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.se3 import Matrix6
+from coview_stream.geometry.transforms import Pose, transform
+from coview_stream.localization.registration.local_map import LocalMap, Source
+
+_CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 answer much alike
+_EVERY = 2  # of the points: more change nothing
+_HABIT = 0.3  # of a new covariance in that of late
+_LEAST_CLUSTERS = 8  # six unknowns need more
+
+
+class Shared:
+    """The error that neighbouring registrations share, and that does not average out over them."""
+
+    def __init__(self, config: RegistrationConfig) -> None:
+        self._config = config
+        self._clustered: Matrix6 | None = None
+
+    def clear(self) -> None:
+        """Forget what was seen: the place is another."""
+        self._clustered = None
+
+    def learn(
+        self, source: Source, T_map_source: Pose, target: LocalMap, pivot: npt.NDArray[np.float64]
+    ) -> None:
+        """Take note of a registration; arguments are those of :func:`clustered_covariance`."""
+        now = clustered_covariance(source, T_map_source, target, pivot, self._config)
+        if now is not None:
+            before = self._clustered
+            self._clustered = now if before is None else before + _HABIT * (now - before)
+
+    @property
+    def covariance(self) -> Matrix6:
+        """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the sigma of late, and what the pairs do not show.
+
+        That is how odometry's roll and pitch tremble from frame to frame, above all.
+        """
+        config = self._config
+        tilt, yaw, place, height = (
+            config.shared_tilt,
+            config.shared_yaw,
+            config.shared_position,
+            config.shared_height,
+        )
+        rest = np.diag(np.square([tilt, tilt, yaw, place, place, height]))
+        seen = np.zeros((6, 6)) if self._clustered is None else self._clustered
+        return np.asarray(config.shared**2 * seen + rest)
+
+
+def clustered_covariance(
+    source: Source,
+    T_map_source: Pose,
+    target: LocalMap,
+    pivot: npt.NDArray[np.float64],
+    config: RegistrationConfig,
+) -> Matrix6 | None:
+    """Covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, along the map's axes; None if too little was seen.
+
+    Args:
+        source: what was registered.
+        T_map_source: (4, 4) where.
+        target: the map around it.
+        pivot: (3,) source-frame point that rotations are about.
+        config: the one that the registration had.
+    """
+    source = source.every(_EVERY)
+    reach = config.track[-1]
+    moved = transform(T_map_source, source.points)
+    distance, partner = kernels.nearest(target.grid, moved, reach)
+    # none are trimmed: those that fit best disagree least
+    weights = _evened(distance < reach, source.above)
+    chosen = np.flatnonzero(weights)
+    q, n = target.points[partner[chosen]], target.normals[partner[chosen]]
+    residual = np.einsum("ij,ij->i", moved[chosen] - q, n).astype(np.float64)
+    weight = weights[chosen] / (1.0 + (residual / config.residual_scale) ** 2)
+    arm = moved[chosen] - transform(T_map_source, pivot[None])[0].astype(np.float32)
+    J = np.concatenate([np.cross(arm, n), n], axis=1).astype(np.float64)
+    cluster = _clusters(moved[chosen], source.above[chosen])
+    count = int(cluster.max()) + 1 if len(cluster) else 0
+    if count < _LEAST_CLUSTERS:
+        return None
+    pull = J * (weight * residual)[:, None]
+    pulls = np.stack([np.bincount(cluster, column, count) for column in pull.T], axis=1)
+    back = np.linalg.inv((J * weight[:, None]).T @ J + 1e-6 * np.eye(6))
+    # of as many clusters six are used up by the fit
+    return np.asarray(back @ (pulls.T @ pulls) @ back * count / (count - 6))
+
+
+def _evened(found: npt.NDArray[np.bool_], above: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    """Weights (N,) of points: 0 for those without a partner, and equal sums for both kinds."""
+    weights = np.zeros(len(found))
+    for kind in (above, ~above):
+        some = kind & found
+        weights[some] = 1.0 / max(1, int(some.sum()))
+    return weights
+
+
+def _clusters(points: npt.NDArray[np.floating], above: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Return the number (M,) of the cluster of each point: its cell of the ground plan, structure apart from ground."""
+    cell = np.floor(points[:, :2] / _CELL).astype(np.int64)
+    key = (cell[:, 0] * 100_003 + cell[:, 1]) * 2 + above
+    return np.unique(key, return_inverse=True)[1]

@@ -1,0 +1,150 @@
+"""Bytes to messages and back: one table of codecs for each channel.
+
+============  ===========================================  ===================================================
+codec         in                                           out
+============  ===========================================  ===================================================
+``xyz``       clouds: float32 rows, stamp beside them      the same
+``xyzi``      the same with a fourth column                the same
+``json``      odometry, poses                              odometry, poses
+``cdr``       PointCloud2, Odometry,                       the same
+              PoseWithCovarianceStamped
+``foxglove``  PointCloud; PoseInFrame or FrameTransform    PointCloud; PoseInFrame
+``keelson``   the same, each in a core.Envelope            PointCloud; FrameTransform, each in a core.Envelope
+============  ===========================================  ===================================================
+
+Stamps are nanoseconds of the sensor's clock, lengths metres; poses are 4x4 and map the body into odometry or map.
+Whatever bytes come in, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too
+large, :class:`EncodingError` if no codec knows the encoding or it cannot carry what the channel needs). An ``option``
+or ``hint`` that names no codec of the channel is a :class:`ConfigError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+from coview_stream.errors import ConfigError, MessageError
+from coview_stream.messages import (
+    foxglove,
+    json_messages,
+    keelson,
+    raw,
+    ros2,
+)
+from coview_stream.messages.choose import Channel, codec_for
+from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.validation import (
+    MAX_PAYLOAD,
+    MAX_POINTS,
+    OversizedError,
+    check_size,
+    read_attachment,
+)
+
+__all__ = [
+    "CLOUD_CODECS",
+    "MAX_PAYLOAD",
+    "MAX_POINTS",
+    "ODOMETRY_CODECS",
+    "POSE_CODECS",
+    "OversizedError",
+    "decode_cloud",
+    "decode_odometry",
+    "decode_pose",
+    "encode_cloud",
+    "encode_odometry",
+    "encode_pose",
+    "prepare",
+]
+
+M = TypeVar("M")
+
+
+@dataclass(frozen=True)
+class Codec(Generic[M]):
+    """The two directions of one encoding on one channel."""
+
+    decode: Callable[[Sample], M]
+    encode: Callable[[M], Encoded]
+
+
+CLOUD_CODECS: Mapping[str, Codec[CloudMessage]] = {
+    "xyz": Codec(raw.decode_xyz, raw.encode_xyz),
+    "xyzi": Codec(raw.decode_xyzi, raw.encode_xyzi),
+    "foxglove": Codec(foxglove.decode_cloud, foxglove.encode_cloud),
+    "cdr": Codec(ros2.decode_cloud, ros2.encode_cloud),
+    "keelson": Codec(keelson.decode_cloud, keelson.encode_cloud),
+}
+ODOMETRY_CODECS: Mapping[str, Codec[OdometryMessage]] = {
+    "json": Codec(json_messages.decode_odometry, json_messages.encode_odometry),
+    "foxglove": Codec(foxglove.decode_odometry, foxglove.encode_odometry),
+    "cdr": Codec(ros2.decode_odometry, ros2.encode_odometry),
+    "keelson": Codec(keelson.decode_odometry, keelson.encode_odometry),
+}
+POSE_CODECS: Mapping[str, Codec[PoseMessage]] = {
+    "json": Codec(json_messages.decode_pose, json_messages.encode_pose),
+    "foxglove": Codec(foxglove.decode_pose, foxglove.encode_pose),
+    "cdr": Codec(ros2.decode_pose, ros2.encode_pose),
+    "keelson": Codec(keelson.decode_pose, keelson.encode_pose),
+}
+_PREPARE: Mapping[str, Callable[[], object]] = {
+    "foxglove": foxglove.schemas,
+    "keelson": foxglove.schemas,
+    "cdr": ros2.store,
+}
+
+
+def decode_cloud(sample: Sample, option: str | None = None, hint: str | None = None) -> CloudMessage:
+    """Read a lidar frame; ``sequence`` is set where the attachment is rmw_zenoh's."""
+    message = _decode("cloud", CLOUD_CODECS, sample, option, hint)
+    _, sequence = read_attachment(sample.attachment)
+    return message if sequence is None else replace(message, sequence=sequence)
+
+
+def decode_odometry(sample: Sample, option: str | None = None, hint: str | None = None) -> OdometryMessage:
+    """Read an odometry sample."""
+    return _decode("odometry", ODOMETRY_CODECS, sample, option, hint)
+
+
+def decode_pose(sample: Sample, option: str | None = None, hint: str | None = None) -> PoseMessage:
+    """Read a published pose; formats other than JSON leave robot, confidence, map and age empty or NaN."""
+    return _decode("pose", POSE_CODECS, sample, option, hint)
+
+
+def encode_cloud(message: CloudMessage, name: str) -> Encoded:
+    """Write a lidar frame by the codec ``name`` of :data:`CLOUD_CODECS`."""
+    return _named("cloud", CLOUD_CODECS, name).encode(message)
+
+
+def encode_odometry(message: OdometryMessage, name: str) -> Encoded:
+    """Write an odometry sample by the codec ``name`` of :data:`ODOMETRY_CODECS`."""
+    return _named("odometry", ODOMETRY_CODECS, name).encode(message)
+
+
+def encode_pose(message: PoseMessage, name: str) -> Encoded:
+    """Write a pose by the codec ``name`` of :data:`POSE_CODECS`; JSON refuses NaN (MessageError)."""
+    return _named("pose", POSE_CODECS, name).encode(message)
+
+
+def prepare(*names: str) -> None:
+    """Import now what the named codecs need, so that no frame waits 0.25 s for it."""
+    for name in names:
+        _PREPARE.get(name, lambda: None)()
+
+
+def _named(channel: Channel, codecs: Mapping[str, Codec[M]], name: str) -> Codec[M]:
+    if name not in codecs:
+        raise ConfigError(f"encoding {name!r} for {channel}; it must be one of {', '.join(codecs)}")
+    return codecs[name]
+
+
+def _decode(
+    channel: Channel, codecs: Mapping[str, Codec[M]], sample: Sample, option: str | None, hint: str | None
+) -> M:
+    name = codec_for(channel, codecs, sample, option, hint)
+    try:
+        check_size(sample.payload)
+        return codecs[name].decode(sample)
+    except MessageError as error:
+        raise type(error)(f"{sample.key}: {error}") from error

@@ -1,0 +1,122 @@
+"""Which codec reads a sample: option > Encoding > key > hint of the preset > what the bytes look like."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from functools import lru_cache
+from typing import Literal
+
+from coview_stream.errors import ConfigError, EncodingError
+from coview_stream.messages.types import Sample
+
+Channel = Literal["cloud", "odometry", "pose"]
+
+_MIMES: dict[
+    str, tuple[str, ...]
+] = {  # the codecs that a MIME type may stand for; the first if no schema is named
+    "": (),
+    "application/octet-stream": ("xyz", "xyzi"),
+    "zenoh/bytes": ("xyz", "xyzi"),
+    "zenoh/string": (),
+    "application/cdr": ("cdr",),
+    "application/protobuf": ("foxglove", "keelson"),
+    "application/x-protobuf": ("foxglove", "keelson"),
+    "application/json": ("json",),
+    "text/json": ("json",),
+}
+_MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # without a schema they say nothing
+_WITHOUT_SCHEMA = ("application/json", "text/json")  # what follows is a charset or the like
+_SCHEMAS: dict[str, tuple[str, tuple[Channel, ...]]] = {
+    "xyz": ("xyz", ("cloud",)),
+    "xyzi": ("xyzi", ("cloud",)),
+    "sensor_msgs.pointcloud2": ("cdr", ("cloud",)),
+    "nav_msgs.odometry": ("cdr", ("odometry",)),
+    "geometry_msgs.posewithcovariancestamped": ("cdr", ("pose",)),
+    "foxglove.pointcloud": ("foxglove", ("cloud",)),
+    "foxglove.poseinframe": ("foxglove", ("odometry", "pose")),
+    "foxglove.frametransform": ("foxglove", ("odometry", "pose")),
+    "core.envelope": ("keelson", ("cloud", "odometry", "pose")),
+}
+_KEELSON: dict[str, tuple[Channel, ...]] = {
+    "point_cloud": ("cloud",),
+    "frame_transform": ("odometry", "pose"),
+}
+_MAGIC = ((b"\0\0\0\0", "cdr"), (b"\0\1\0\0", "cdr"), (b"{", "json"))
+_RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
+_KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
+_LONGEST = 256  # characters of an encoding that are looked at
+
+
+def codec_for(
+    channel: Channel, names: Collection[str], sample: Sample, option: str | None, hint: str | None
+) -> str:
+    """Name of the codec, one of ``names``; ConfigError for a wrong option or hint, EncodingError if none fits."""
+    for setting, name in (("option", option), ("hint", hint)):
+        if name is not None and name not in names:
+            raise ConfigError(
+                f"encoding {setting} {name!r} for {channel}; it must be one of {', '.join(names)}"
+            )
+    if option is not None:
+        return option
+    said, by_key = _claims(channel, sample.encoding[: _LONGEST + 1], sample.key)
+    if said:
+        name = next((name for name in (by_key, hint) if name in said), said[0])
+    else:
+        name = by_key or hint or _by_magic(sample)
+    if name not in names:
+        raise EncodingError(
+            f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {channel}"
+        )
+    return name
+
+
+@lru_cache(maxsize=256)
+def _claims(channel: Channel, encoding: str, key: str) -> tuple[tuple[str, ...], str]:
+    """Codecs that the encoding allows, best first (none: it says nothing), and the one that the key names or ''."""
+    mime, _, parameters = encoding.partition(";")
+    mime = mime.strip().lower()
+    if len(encoding) > _LONGEST or mime not in _MIMES:
+        raise EncodingError(f"{key}: unknown encoding {encoding[:80]!r}; see the table of encodings")
+    schema = _schema(parameters)
+    if schema and mime not in _WITHOUT_SCHEMA:
+        codec = _of_schema(channel, schema, f"{key}: encoding {encoding[:80]!r}")
+        if codec not in _MIMES[mime]:
+            raise EncodingError(f"{key}: encoding {encoding[:80]!r} contradicts itself")
+        return (codec,), ""
+    return (() if mime in _MUTE else _MIMES[mime]), _by_key(channel, key)
+
+
+def _schema(parameters: str) -> str:
+    """``a/msg/B``, ``a::msg::dds_::B_``, ``schema=a.B`` and the like as ``a.b``."""
+    text = parameters.split(";")[0].split("=")[-1].strip(" \t\"'").lower()
+    parts = [part.rstrip("_") for part in re.split(r"[/:.]+", text)]
+    return ".".join(part for part in parts if part not in ("msg", "dds", ""))
+
+
+def _of_schema(channel: Channel, schema: str, source: str) -> str:
+    codec, channels = _SCHEMAS.get(schema, ("", ()))
+    if not codec:
+        raise EncodingError(f"{source}: no codec knows {schema!r}")
+    if channel not in channels:
+        raise EncodingError(f"{source}: {schema!r} cannot carry {channel}")
+    return codec
+
+
+def _by_key(channel: Channel, key: str) -> str:
+    if rmw := _RMW_KEY.search(key):
+        return _of_schema(channel, _schema(rmw[1]), f"{key}: key")
+    if keelson := _KEELSON_KEY.search(key):
+        if channel not in _KEELSON.get(keelson[1], (channel,)):
+            raise EncodingError(f"{key}: subject {keelson[1]!r} cannot carry {channel}")
+        return "keelson"
+    return ""
+
+
+def _by_magic(sample: Sample) -> str:
+    for start, codec in _MAGIC:
+        if sample.payload.startswith(start):
+            return codec
+    raise EncodingError(
+        f"{sample.key}: no encoding is set, and the payload is neither CDR nor JSON; set one, or name it by option"
+    )

@@ -1,0 +1,151 @@
+"""Foxglove's protobuf schemas: PointCloud; PoseInFrame and FrameTransform; rows are little-endian."""
+
+# FOLDED coview_stream/messages/foxglove.py: """Foxglove's protobuf schemas, written: PointCloud, PoseInFrame, FrameTransform."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from coview_stream.errors import MessageError
+from coview_stream.geometry.transforms import Pose, pose_to_tum, transform
+from coview_stream.messages import protobuf_wire
+from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
+from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.validation import bare_pose, pose_checked, stamp_join, stamp_split
+
+KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
+
+DATA = 6  # PointCloud.data
+
+_ROTATION = 5  # FrameTransform.rotation; PoseInFrame ends before
+
+
+@lru_cache(maxsize=1)
+def schemas() -> Any:
+    """Import the schema classes, on first use: it takes 50 ms."""
+    from foxglove_schemas_protobuf import FrameTransform_pb2, PointCloud_pb2, PoseInFrame_pb2
+
+    return SimpleNamespace(
+        FrameTransform=FrameTransform_pb2.FrameTransform,
+        PointCloud=PointCloud_pb2.PointCloud,
+        PoseInFrame=PoseInFrame_pb2.PoseInFrame,
+    )
+
+
+def _parse(schema: Any, payload: bytes) -> Any:
+    from google.protobuf.message import DecodeError
+
+    try:
+        return schema.FromString(payload)
+    except (DecodeError, ValueError) as error:
+        raise MessageError(f"not a {schema.DESCRIPTOR.full_name}: {str(error)[:80]}") from error
+
+
+def _stamp(message: Any) -> int:
+    if not message.HasField("timestamp"):
+        raise MessageError(f"the {message.DESCRIPTOR.full_name} has no timestamp")
+    return stamp_join(message.timestamp.seconds, message.timestamp.nanos)
+
+
+def _pose(p: Any, q: Any) -> Pose:
+    return pose_checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def read_cloud(payload: bytes | memoryview) -> CloudMessage:
+    """PointCloud; ``pose``, where it is set, is applied to the points. They are a view where packed and unmoved."""
+    head, data = protobuf_wire.split(payload, DATA, MAX_FIELDS)
+    cloud = _parse(schemas().PointCloud, head)
+    fields = tuple((f.name, KINDS[f.type], f.offset) for f in cloud.fields if f.type in KINDS)
+    step = cloud.point_stride
+    if step == 0 or len(data) % step:
+        raise MessageError(f"{len(data)} bytes of points are no whole number of rows of {step} bytes")
+    message = read_table(Table(data, fields, step, len(data) // step), _stamp(cloud))
+    if not cloud.HasField("pose") or not cloud.pose.ByteSize():
+        return message
+    T = _pose(cloud.pose.position, cloud.pose.orientation)
+    if np.array_equal(T, np.eye(4)):
+        return message
+    with np.errstate(over="ignore", invalid="ignore"):  # points at infinity
+        return replace(message, points=transform(T, message.points))
+
+
+def read_pose(payload: bytes | memoryview) -> tuple[int, Pose, str]:
+    """Stamp, pose and name of the parent frame of a PoseInFrame or a FrameTransform, told apart by what is in them."""
+    numbers = {entry.number for entry in protobuf_wire.entries(payload, MAX_FIELDS)}
+    if _ROTATION in numbers:
+        moved = _parse(schemas().FrameTransform, bytes(payload))
+        return _stamp(moved), _pose(moved.translation, moved.rotation), moved.parent_frame_id
+    placed = _parse(schemas().PoseInFrame, bytes(payload))
+    return _stamp(placed), _pose(placed.pose.position, placed.pose.orientation), placed.frame_id
+
+
+def decode_cloud(sample: Sample) -> CloudMessage:
+    """Read a foxglove.PointCloud."""
+    return read_cloud(sample.payload)
+
+
+def decode_odometry(sample: Sample) -> OdometryMessage:
+    """Read a foxglove.PoseInFrame or foxglove.FrameTransform."""
+    stamp_ns, T, _ = read_pose(sample.payload)
+    return OdometryMessage(stamp_ns, T)
+
+
+def decode_pose(sample: Sample) -> PoseMessage:
+    """Read what :func:`decode_odometry` does; what the schema cannot say is NaN or empty."""
+    return bare_pose(*read_pose(sample.payload))
+
+
+_ENCODING = "application/protobuf;foxglove."
+
+_NUMBERS = {kind: number for number, kind in KINDS.items()}
+
+
+def _fill(message: Any, stamp_ns: int, position: Any, quaternion: Any, T: Pose) -> bytes:
+    message.timestamp.seconds, message.timestamp.nanos = stamp_split(stamp_ns)
+    row = pose_to_tum(T).tolist()
+    for part, names, values in ((position, "xyz", row[:3]), (quaternion, "xyzw", row[3:])):
+        for name, value in zip(names, values, strict=True):
+            setattr(part, name, value)
+    return bytes(message.SerializeToString())
+
+
+def write_cloud(message: CloudMessage, frame_id: str = "base_link") -> bytes:
+    """Write a PointCloud without a pose: the points are in the body frame already."""
+    table = write_table(message)
+    cloud = schemas().PointCloud(frame_id=frame_id, point_stride=table.step)
+    cloud.timestamp.seconds, cloud.timestamp.nanos = stamp_split(message.stamp_ns)
+    for name, kind, offset in table.fields:
+        cloud.fields.add(name=name, offset=offset, type=_NUMBERS[kind])
+    return bytes(cloud.SerializeToString()) + protobuf_wire.sized_field(DATA, bytes(table.data))
+
+
+def write_transform(stamp_ns: int, T: Pose, parent: str, child: str) -> bytes:
+    """Write a FrameTransform parent <- child."""
+    message = schemas().FrameTransform(parent_frame_id=parent, child_frame_id=child)
+    return _fill(message, stamp_ns, message.translation, message.rotation, T)
+
+
+def _in_frame(stamp_ns: int, T: Pose, frame_id: str) -> Encoded:
+    message = schemas().PoseInFrame(frame_id=frame_id)
+    payload = _fill(message, stamp_ns, message.pose.position, message.pose.orientation, T)
+    return Encoded(payload, _ENCODING + "PoseInFrame")
+
+
+def encode_cloud(message: CloudMessage) -> Encoded:
+    """Write a foxglove.PointCloud."""
+    return Encoded(write_cloud(message), _ENCODING + "PointCloud")
+
+
+def encode_odometry(message: OdometryMessage) -> Encoded:
+    """Write a foxglove.PoseInFrame in frame ``odom``."""
+    return _in_frame(message.stamp_ns, message.T_odom_body, "odom")
+
+
+def encode_pose(message: PoseMessage) -> Encoded:
+    """Write a foxglove.PoseInFrame; it carries neither covariance nor confidence."""
+    return _in_frame(message.stamp_ns, message.T_map_body, message.frame_id)

@@ -1,0 +1,66 @@
+"""Keelson (RISE, maritime): a ``core.Envelope`` with one of Foxglove's messages inside.
+
+Envelope: field 1 ``enclosed_at`` (google.protobuf.Timestamp), field 2 ``payload`` (bytes). The stamp that counts is the
+inner message's: when it was enclosed is no sensor time.
+"""
+
+from __future__ import annotations
+
+from coview_stream.errors import MessageError
+from coview_stream.messages import foxglove, protobuf_wire
+from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.validation import bare_pose, stamp_split
+
+_ENCODING = "application/protobuf;core.Envelope"
+_ENCLOSED_AT = 1
+_PAYLOAD = 2
+_MAX_ENTRIES = 64
+
+
+def _open(envelope: bytes) -> memoryview:
+    _, payload = protobuf_wire.split(envelope, _PAYLOAD, _MAX_ENTRIES)
+    if not payload:
+        raise MessageError("the core.Envelope has no payload")
+    return payload
+
+
+def _close(stamp_ns: int, payload: bytes) -> Encoded:
+    """Enclose at the sensor's time: a codec has no clock."""
+    enclosed_at = protobuf_wire.timestamp(*stamp_split(stamp_ns))
+    envelope = protobuf_wire.sized_field(_ENCLOSED_AT, enclosed_at) + protobuf_wire.sized_field(
+        _PAYLOAD, payload
+    )
+    return Encoded(envelope, _ENCODING)
+
+
+def decode_cloud(sample: Sample) -> CloudMessage:
+    """Read a foxglove.PointCloud in an envelope."""
+    return foxglove.read_cloud(_open(sample.payload))
+
+
+def decode_odometry(sample: Sample) -> OdometryMessage:
+    """Read a foxglove.FrameTransform or PoseInFrame in an envelope."""
+    stamp_ns, T, _ = foxglove.read_pose(_open(sample.payload))
+    return OdometryMessage(stamp_ns, T)
+
+
+def decode_pose(sample: Sample) -> PoseMessage:
+    """Read what :func:`decode_odometry` does; what the schema cannot say is NaN or empty."""
+    return bare_pose(*foxglove.read_pose(_open(sample.payload)))
+
+
+def encode_cloud(message: CloudMessage) -> Encoded:
+    """Write a foxglove.PointCloud in an envelope."""
+    return _close(message.stamp_ns, foxglove.write_cloud(message))
+
+
+def encode_odometry(message: OdometryMessage) -> Encoded:
+    """Write a foxglove.FrameTransform ``odom`` <- ``base_link`` in an envelope."""
+    inner = foxglove.write_transform(message.stamp_ns, message.T_odom_body, "odom", "base_link")
+    return _close(message.stamp_ns, inner)
+
+
+def encode_pose(message: PoseMessage) -> Encoded:
+    """Write a foxglove.FrameTransform map frame <- robot in an envelope."""
+    inner = foxglove.write_transform(message.stamp_ns, message.T_map_body, message.frame_id, message.robot)
+    return _close(message.stamp_ns, inner)

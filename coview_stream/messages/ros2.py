@@ -1,0 +1,166 @@
+"""ROS 2 messages as CDR with its 4-byte encapsulation header, through rosbags; both byte orders.
+
+The layouts of these types are the same from Humble to Rolling.
+"""
+
+# FOLDED coview_stream/messages/ros2.py: """ROS 2 messages written as little-endian CDR, through rosbags."""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from coview_stream.errors import MessageError
+from coview_stream.geometry.transforms import Pose, pose_to_tum
+from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
+from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
+from coview_stream.messages.validation import bare_pose, pose_checked, stamp_join, stamp_split
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+@lru_cache(maxsize=1)
+def store() -> Any:
+    """Import the message types and generate their code, on first use: it takes 0.25 s."""
+    from rosbags.typesys import Stores, get_typestore
+
+    found = get_typestore(Stores.ROS2_HUMBLE)
+    for name in (CLOUD, ODOMETRY, POSE):
+        found.get_msgdef(name)
+    return found
+
+
+def _read(payload: bytes, name: str) -> Any:
+    try:
+        return store().deserialize_cdr(memoryview(payload), name)
+    except Exception as error:  # generated code on hostile bytes; what it raises differs between versions
+        raise MessageError(f"not a {name} in CDR: {type(error).__name__}: {str(error)[:80]}") from error
+
+
+def _stamp(message: Any) -> int:
+    return stamp_join(message.header.stamp.sec, message.header.stamp.nanosec)
+
+
+def _pose(message: Any) -> Pose:
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    return pose_checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def _refuse_many_fields(payload: bytes) -> None:
+    """Look ahead at the number of PointFields: rosbags would build millions of objects for a hostile one."""
+    order = "<" if payload[1:2] == b"\1" else ">"
+    try:
+        (name,) = struct.unpack_from(order + "I", payload, 12)
+        (count,) = struct.unpack_from(order + "I", payload, 16 + (name + 3 & ~3) + 8)
+    except struct.error as error:
+        raise MessageError(f"not a {CLOUD} in CDR: truncated") from error
+    if count > MAX_FIELDS:
+        raise MessageError(f"a point cloud with {count} fields; at most {MAX_FIELDS} are taken")
+
+
+def decode_cloud(sample: Sample) -> CloudMessage:
+    """Read a PointCloud2 of any layout. The points are a view on a little-endian payload where packed float32 x y z."""
+    _refuse_many_fields(sample.payload)
+    cloud = _read(sample.payload, CLOUD)
+    order = ">" if cloud.is_bigendian else "<"
+    fields = tuple((f.name, order + KINDS[f.datatype], f.offset) for f in cloud.fields if f.datatype in KINDS)
+    table = Table(cloud.data, fields, cloud.point_step, cloud.width, cloud.height, cloud.row_step)
+    return read_table(table, _stamp(cloud))
+
+
+def decode_odometry(sample: Sample) -> OdometryMessage:
+    """Read an Odometry; its frames and covariances are not looked at."""
+    message = _read(sample.payload, ODOMETRY)
+    return OdometryMessage(_stamp(message), _pose(message))
+
+
+def decode_pose(sample: Sample) -> PoseMessage:
+    """Read a PoseWithCovarianceStamped; what the type cannot say is NaN or empty."""
+    message = _read(sample.payload, POSE)
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    return bare_pose(_stamp(message), _pose(message), message.header.frame_id, covariance)
+
+
+_NUMBERS = {f"<{kind}": number for number, kind in KINDS.items()}
+
+
+def _new(type_name: str, /, **fields: Any) -> Any:
+    return store().types[type_name](**fields)
+
+
+def _write(message: Any, name: str) -> Encoded:
+    payload = bytes(store().serialize_cdr(message, name, little_endian=True))
+    return Encoded(payload, f"application/cdr;{name}")
+
+
+def _header(stamp_ns: int, frame_id: str) -> Any:
+    sec, nanosec = stamp_split(stamp_ns)
+    if not -(2**31) <= sec < 2**31:
+        raise MessageError(f"stamp {stamp_ns} ns exceeds the 32-bit seconds of a ROS header")
+    stamp = _new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return _new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def _pose_out(T: Pose, covariance: Any) -> Any:
+    x, y, z, qx, qy, qz, qw = pose_to_tum(T).tolist()
+    position = _new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    orientation = _new("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
+    pose = _new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+    rows = np.ascontiguousarray(covariance, dtype=np.float64).ravel()
+    return _new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=rows)
+
+
+def encode_cloud(message: CloudMessage) -> Encoded:
+    """Write a PointCloud2 in frame ``base_link``."""
+    table = write_table(message)
+    field = "sensor_msgs/msg/PointField"
+    return _write(
+        _new(
+            CLOUD,
+            header=_header(message.stamp_ns, "base_link"),
+            height=1,
+            width=table.width,
+            fields=[_new(field, name=n, offset=o, datatype=_NUMBERS[k], count=1) for n, k, o in table.fields],
+            is_bigendian=False,
+            point_step=table.step,
+            row_step=table.step * table.width,
+            data=np.frombuffer(table.data, np.uint8),
+            is_dense=bool(np.isfinite(message.points).all()),
+        ),
+        CLOUD,
+    )
+
+
+def encode_odometry(message: OdometryMessage) -> Encoded:
+    """Write an Odometry ``odom`` <- ``base_link``; covariances and velocities are zero: not known."""
+    zero = dict.fromkeys("xyz", 0.0)
+    twist = _new(
+        "geometry_msgs/msg/Twist",
+        linear=_new("geometry_msgs/msg/Vector3", **zero),
+        angular=_new("geometry_msgs/msg/Vector3", **zero),
+    )
+    return _write(
+        _new(
+            ODOMETRY,
+            header=_header(message.stamp_ns, "odom"),
+            child_frame_id="base_link",
+            pose=_pose_out(message.T_odom_body, np.zeros(36)),
+            twist=_new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        ),
+        ODOMETRY,
+    )
+
+
+def encode_pose(message: PoseMessage) -> Encoded:
+    """Write a PoseWithCovarianceStamped in the map frame; covariance order x, y, z, roll, pitch, yaw, as there."""
+    header = _header(message.stamp_ns, message.frame_id)
+    return _write(_new(POSE, header=header, pose=_pose_out(message.T_map_body, message.covariance)), POSE)

@@ -1,0 +1,189 @@
+"""A robot's odometry of the last seconds: what continues it, what does not, and the pose at a frame's stamp."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.geometry.rotations import between
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rotation_angle, yaw_of
+from coview_stream.messages.types import OdometryMessage
+
+_NS = 1_000_000_000
+_STEADY = 5  # samples that must run on before a clock counts as restarted
+_SLACK = 0.5  # metres that a sample may always be off: corrections by a lidar odometry, rough stamps
+_SLACK_SPEED = 3.0  # metres per second by which any robot may have sped up meanwhile
+_SPEED_FACTOR = 3.0  # times its speed of the last seconds
+_RECENT = 2 * _NS
+_JUMP_ANGLE = np.radians(20.0)
+
+
+class Intake(StrEnum):
+    """What an odometry sample was to the samples before it."""
+
+    CONTINUES = "continues"
+    GAP = "gap"
+    """It comes after a short pause: the place has to be verified again."""
+    OUTAGE = "outage"
+    """It comes after a long pause: the robot may have been carried anywhere."""
+    JUMP = "jump"
+    """It is farther away than the robot can have driven: odometry started anew."""
+    RESTART = "restart"
+    """The sender's clock started anew."""
+    DUPLICATE = "duplicate"
+    OUT_OF_ORDER = "out_of_order"
+
+
+@dataclass(frozen=True)
+class _Entry:
+    sample: OdometryMessage
+    travelled: float
+    turned: float
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.sample.stamp_ns
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Odometry around a frame: stamps (K,) int64 ns and poses (K, 4, 4) odometry <- body."""
+
+    stamps: np.ndarray
+    poses: np.ndarray
+
+
+class OdometryBuffer:
+    """The newest samples in order of their stamps (sensor time).
+
+    Attributes:
+        newest: the newest sample, None before the first.
+        arrived: local time (seconds) at which it came.
+        travelled: metres driven since the first sample.
+        turned: radians turned since the first sample.
+    """
+
+    def __init__(self, config: NodeConfig) -> None:
+        self.config = config
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.newest: OdometryMessage | None = None
+        self.arrived = float("-inf")
+        self.travelled = self.turned = 0.0
+        self._samples: deque[_Entry] = deque()
+        self._strange: deque[tuple[float, int]] = deque(maxlen=_STEADY)  # local time, stamp
+        self._strange_since = float("inf")
+
+    def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> Intake:
+        """Take in a sample that came at local time ``now``; only duplicates and strays leave no trace.
+
+        ``unreachable``: none could have come since the last one, for nobody was connected.
+        """
+        longest = self.config.max_network_outage if unreachable else self.config.max_outage
+        verdict = self._classify(sample, now, longest)
+        if verdict in (Intake.DUPLICATE, Intake.OUT_OF_ORDER):
+            return verdict
+        if verdict in (Intake.JUMP, Intake.RESTART, Intake.OUTAGE):
+            self.clear()
+        elif self.newest is not None:
+            step = inverse(self.newest.T_odom_body) @ sample.T_odom_body
+            self.travelled += float(np.linalg.norm(step[:3, 3]))
+            self.turned += abs(yaw_of(step))  # as the engine counts it
+        self.newest, self.arrived = sample, now
+        self._samples.append(_Entry(sample, self.travelled, self.turned))
+        self._strange.clear()
+        self._strange_since = float("inf")
+        oldest = sample.stamp_ns - round(self.config.horizon * _NS)
+        while self._samples[0].stamp_ns < oldest:
+            self._samples.popleft()
+        return verdict
+
+    def _classify(self, sample: OdometryMessage, now: float, longest: float) -> Intake:
+        last = self.newest
+        if last is None:
+            return Intake.CONTINUES
+        if sample.stamp_ns == last.stamp_ns:
+            return Intake.DUPLICATE
+        seconds = (sample.stamp_ns - last.stamp_ns) / _NS
+        # a single stray stamp must not shut out all that follow, so one far ahead has to be confirmed as well
+        ahead = seconds > self.config.horizon + 2.0 * (now - self.arrived)
+        if seconds < 0 or ahead:
+            if not self._runs_on(sample.stamp_ns, now):
+                return Intake.OUT_OF_ORDER
+            return Intake.RESTART if seconds < 0 else Intake.OUTAGE
+        if seconds > longest:
+            return Intake.OUTAGE
+        step = inverse(last.T_odom_body) @ sample.T_odom_body
+        if self._impossible(step, seconds):
+            return Intake.JUMP
+        return Intake.GAP if seconds > self.config.odometry_timeout else Intake.CONTINUES
+
+    def _runs_on(self, stamp_ns: int, now: float) -> bool:
+        """Whether the samples that did not continue the buffer continue each other, for long enough."""
+        if self._strange and stamp_ns <= self._strange[-1][1]:
+            self._strange.clear()
+        if not self._strange:
+            self._strange_since = now
+        self._strange.append((now, stamp_ns))
+        return len(self._strange) == _STEADY and now - self._strange_since >= self.config.restart_after
+
+    def _impossible(self, step: Pose, seconds: float) -> bool:
+        far = _SLACK + min(self.config.max_speed, self._usual_speed()) * seconds
+        wide = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
+        return bool(np.linalg.norm(step[:3, 3]) > far or rotation_angle(step) > wide)
+
+    def _usual_speed(self) -> float:
+        """Metres per second that the robot may be driving now, by what it did lately; infinite while unknown."""
+        newest = self._samples[-1]
+        past = next(s for s in self._samples if s.stamp_ns >= newest.stamp_ns - _RECENT)
+        seconds = (newest.stamp_ns - past.stamp_ns) / _NS
+        if seconds < 0.2:
+            return float("inf")
+        return _SLACK_SPEED + _SPEED_FACTOR * (newest.travelled - past.travelled) / seconds
+
+    def covers(self, stamp_ns: int) -> int:
+        """-1 if the buffer starts after ``stamp_ns``, 1 if it has not come that far yet, 0 if the stamp lies within."""
+        if self.newest is None or stamp_ns > self.newest.stamp_ns:
+            return 1
+        return -1 if stamp_ns < self._samples[0].stamp_ns else 0
+
+    def at(self, stamp_ns: int) -> Pose | None:
+        """Pose (4, 4) odometry <- body at a stamp within, interpolated; None outside or in a gap."""
+        if self.covers(stamp_ns) != 0:
+            return None
+        k = bisect_left(self._samples, stamp_ns, key=lambda s: s.stamp_ns)
+        after = self._samples[k]
+        if after.stamp_ns == stamp_ns:
+            return after.sample.T_odom_body
+        before = self._samples[k - 1]
+        if after.stamp_ns - before.stamp_ns > self.config.max_gap * _NS:
+            return None
+        return _between(before.sample, after.sample, stamp_ns)
+
+    def driven_since(self, stamp_ns: int) -> tuple[float, float]:
+        """Metres driven and radians turned from a stamp, or the oldest sample that is remembered, until now."""
+        if not self._samples:
+            return 0.0, 0.0
+        k = max(0, bisect_left(self._samples, stamp_ns + 1, key=lambda s: s.stamp_ns) - 1)
+        return self.travelled - self._samples[k].travelled, self.turned - self._samples[k].turned
+
+    def around(self, begin_ns: int, end_ns: int) -> Segment:
+        """Return the samples from the last one before ``begin_ns`` to the first one after ``end_ns``."""
+        stamps = [s.stamp_ns for s in self._samples]
+        first = max(0, bisect_left(stamps, begin_ns + 1) - 1)
+        last = min(len(stamps), bisect_left(stamps, end_ns) + 1)
+        poses = [self._samples[k].sample.T_odom_body for k in range(first, last)]
+        return Segment(np.array(stamps[first:last], dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
+
+
+def _between(a: OdometryMessage, b: OdometryMessage, stamp_ns: int) -> Pose:
+    share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+    turn = between(a.T_odom_body[:3, :3], b.T_odom_body[:3, :3], share)
+    return pose_from(turn, (1 - share) * a.T_odom_body[:3, 3] + share * b.T_odom_body[:3, 3])

@@ -1,0 +1,67 @@
+"""The one place that imports kiss-icp (MIT; Vizzo et al., RA-L 2023), and what keeps it from ending the process.
+
+Its deskewing normalises the time stamps of a frame and takes the result for a rotation, unchecked: where all are equal,
+or one is not finite, 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``). So it never gets a time stamp from us,
+deskewing is off, and the frames come deskewed by our own :func:`~coview_stream.odometry.deskew.deskew`, which refers them
+to the frame's stamp as well: kiss-icp's refers them to the sweep's end, or its middle, by version.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.errors import extra
+from coview_stream.geometry.transforms import Pose, inverse
+
+_NO_TIMES = np.zeros(0)
+
+
+class Registration(Protocol):
+    """Places frames in a local map that grows with them."""
+
+    def register(self, points: npt.NDArray[np.float64], guess: Pose) -> Pose:
+        """Return the pose (4, 4) of a deskewed frame (N, 3), local map <- body, from a guess near it; add the frame."""
+        ...
+
+    def clear(self) -> None:
+        """Forget the local map; the next frame is placed where it is guessed to be."""
+        ...
+
+
+class KissRegistration:
+    """kiss-icp's point-to-point ICP against its voxel map, with its adaptive threshold."""
+
+    def __init__(self, config: LidarOdometryConfig) -> None:
+        self._kiss_icp, self._settings = _settings(config)
+        self.clear()
+
+    def register(self, points: npt.NDArray[np.float64], guess: Pose) -> Pose:
+        """As of :class:`Registration`."""
+        icp = self._icp
+        # it predicts by the last motion, whatever the time between
+        icp.last_delta = inverse(icp.last_pose) @ guess
+        icp.register_frame(points, _NO_TIMES)
+        return np.array(icp.last_pose, dtype=np.float64)
+
+    def clear(self) -> None:
+        """As of :class:`Registration`."""
+        self._icp = self._kiss_icp(self._settings)
+
+
+def _settings(config: LidarOdometryConfig) -> tuple[Any, Any]:
+    """Return the class ``KissICP`` and its configuration; DependencyError where there is no kiss-icp."""
+    pipeline, configuration = (
+        extra(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry") for module in ("kiss_icp", "config")
+    )
+    settings = configuration.KISSConfig()
+    settings.data.min_range, settings.data.max_range = config.min_range, config.max_range
+    settings.data.deskew = False
+    settings.mapping.voxel_size = config.voxel
+    settings.registration.max_num_threads = config.threads
+    settings.registration.convergence_criterion = config.convergence
+    settings.registration.max_num_iterations = config.iterations
+    return pipeline.KissICP, settings

@@ -1,0 +1,232 @@
+"""Odometry from lidar frames alone: each frame is registered to a local map of those before it."""
+
+# FOLDED coview_stream/odometry/lidar_odometry.py: """What a frame must be before anything is registered: a wrong one costs an error here, and the local map beyond."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.config.odometry import LidarOdometryConfig, down
+from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry.rotations import between, exp_so3
+from coview_stream.geometry.transforms import (
+    Points,
+    Pose,
+    inverse,
+    is_pose,
+    lengths,
+    orthonormal,
+    pose_from,
+    rotation_angle,
+)
+from coview_stream.odometry.buffer import Segment
+from coview_stream.odometry.deskew import deskew
+from coview_stream.odometry.gravity import Ground, aligned, find_ground, upright
+from coview_stream.odometry.kiss_icp import KissRegistration, Registration
+
+_NS = 1e9
+
+_BRIEF = 0.02  # seconds: a motion over less is mostly noise and predicts nothing
+
+_SLACK = 0.5  # metres that a registration may always move: the first motion cannot be predicted
+
+_SLACK_ANGLE = np.radians(20.0)
+
+_DRIFT = float(np.radians(1.5))  # one sigma by which registration tilts a frame against the one before
+
+
+class LidarOdometry:
+    """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
+
+    The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
+    then, level. It drifts, but not in tilt where there are walls. The motion between two frames is predicted from that
+    before, over the time between their stamps; it deskews the frame, too. Costs: see ``docs/odometry.md``; kiss-icp
+    holds the interpreter lock.
+
+    Attributes:
+        config: see there.
+        ground: the plane that gravity was taken from; None before it is found, and where gravity was given.
+        points: (N, 3) float32, the finite points of the newest frame, deskewed: what to give to a ``Localizer``.
+        restarts: how often the local map was begun anew, after a gap or an impossible motion: what the robot drove
+            meanwhile is missing from the odometry then.
+    """
+
+    def __init__(
+        self, config: LidarOdometryConfig | None = None, registration: Registration | None = None
+    ) -> None:
+        """Begin with nothing; ``registration`` replaces kiss-icp.
+
+        Raises:
+            DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
+        """
+        self.config = config or LidarOdometryConfig()
+        self._registration = registration or KissRegistration(self.config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next frame begins another odometry frame."""
+        self.ground: Ground | None = None
+        self.points: Points = np.empty((0, 3), dtype=np.float32)
+        self.restarts = 0
+        self._pose: Pose | None = None
+        self._local = np.eye(4)  # the same in the local map, whose tilt drifts
+        self._stamp = 0.0
+        self._rest()
+        self._registration.clear()
+
+    def step(self, points: Points, point_times: npt.NDArray[np.float64] | None, stamp: float) -> Pose:
+        """Take in one frame and say where it was taken.
+
+        Args:
+            points: (N, 3) body frame (x forward, z up), metres; rows with NaN are dropped.
+            point_times: (N,) seconds after ``stamp`` (before: negative) at which each point was measured; None for
+                a deskewed frame. Where they do not differ nothing is deskewed; where they are not finite that point
+                stays as it is.
+            stamp: seconds, later than that of the frame before.
+
+        Returns:
+            ``T_odom_body`` (4, 4) at ``stamp``.
+
+        Raises:
+            CloudError: too few points in range, another shape, no ground to take gravity from, or a motion that no
+                robot makes. RunError: the stamp is not finite, or not later than the one before. The odometry is as
+                good as before: skip the frame and go on.
+        """
+        finite, times = checked(points, point_times, self.config)
+        if not np.isfinite(stamp):
+            raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
+        if self._pose is None:
+            return self._begin(finite, stamp)
+        seconds = stamp - self._stamp
+        if seconds <= 0:
+            raise RunError(
+                f"stamp {stamp:.6f} does not come after {self._stamp:.6f}, the one before; sort the frames, or "
+                "begin anew where a clock did"
+            )
+        if seconds > self.config.max_gap:
+            self._restart()
+        guess = self._local @ self._motion(seconds)
+        if times is not None:
+            finite = self._deskewed(finite, times)
+        local = self._registration.register(finite.astype(np.float64), guess)
+        step = inverse(self._local) @ local
+        self._check(step, seconds)
+        if seconds >= _BRIEF:
+            self._step, self._step_seconds = step, seconds
+        self._pose = orthonormal(self._pose @ step)
+        if self.config.plumb:
+            self._plumb(finite)
+        self._local, self._stamp, self.points = orthonormal(local), stamp, finite
+        return np.array(self._pose)
+
+    def _begin(self, points: Points, stamp: float) -> Pose:
+        """Take gravity, and place the first frame."""
+        if self.config.gravity == "ground":
+            found = find_ground(points)
+            if isinstance(found, str):
+                raise CloudError(
+                    f"no ground to take gravity from: {found}; start where the ground is open, or give gravity "
+                    "(--gravity level, or --gravity=X,Y,Z in the body frame)"
+                )
+            self.ground, up = found, found.up
+        else:
+            up = -down(self.config.gravity)
+        start = pose_from(aligned(up), np.zeros(3))
+        self._local = self._registration.register(points.astype(np.float64), start)
+        self._pose, self._stamp, self.points = start, stamp, points
+        return np.array(start)
+
+    def _plumb(self, points: Points) -> None:
+        """Turn the pose about where it is until walls stand upright again, as far as they are believed."""
+        assert self._pose is not None
+        up = self._pose[2, :3]
+        better, _ = upright(points, up, _DRIFT)
+        axis = np.cross(better, up)
+        sine = float(np.linalg.norm(axis))
+        if sine > 0.0:
+            turn = exp_so3(axis * (np.arcsin(min(1.0, sine)) / sine))
+            self._pose[:3, :3] = self._pose[:3, :3] @ turn
+
+    def _motion(self, seconds: float) -> Pose:
+        """Motion over ``seconds``, which may be negative, if it goes on like the last one."""
+        share = seconds / self._step_seconds
+        turn = between(np.eye(3), self._step[:3, :3], share)
+        return pose_from(turn, share * self._step[:3, 3])
+
+    def _deskewed(self, points: Points, times: npt.NDArray[np.float64]) -> Points:
+        ends = dated(times)
+        if ends is None:
+            return points
+        stamps = np.array([round(_NS * t) for t in ends], dtype=np.int64)
+        sweep = Segment(stamps, np.array([self._motion(t) for t in ends]))
+        return deskew(points, times, sweep, 0, np.eye(4))
+
+    def _check(self, step: Pose, seconds: float) -> None:
+        """Refuse what no robot drives. The local map holds the frame already, at the wrong place: begin it anew."""
+        far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
+        most = _SLACK + self.config.max_speed * seconds
+        if is_pose(step) and far <= most and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
+            return
+        self._restart()
+        raise CloudError(
+            f"lidar odometry lost its way: {far:.1f} m and {np.degrees(wide):.0f} deg in {seconds:.2f} s; "
+            "it goes on from the frame before"
+        )
+
+    def _restart(self) -> None:
+        assert self._pose is not None
+        self.restarts += 1
+        self._local = self._pose
+        self._registration.clear()
+        self._rest()
+
+    def _rest(self) -> None:
+        self._step, self._step_seconds = np.eye(4), 1.0
+
+
+Times = npt.NDArray[np.float64]
+
+_INSTANT = 1e-4  # seconds: times that differ by less are one
+
+_LONGEST_SWEEP = 1.0  # seconds from the stamp: points farther away in time have another clock
+
+
+def checked(points: Points, times: Times | None, config: LidarOdometryConfig) -> tuple[Points, Times | None]:
+    """Finite points (N, 3) float32, and their times (N,).
+
+    Raises:
+        CloudError: another shape, times that are not one per point, or too few points in range.
+    """
+    try:
+        with np.errstate(over="ignore"):
+            rows = np.asarray(points).astype(np.float32)  # a copy: the caller may write the next frame there
+        at = None if times is None else np.asarray(times, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CloudError(f"frame is not an array of numbers ({error}); expected (N, 3) float32") from error
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise CloudError(f"frame has shape {rows.shape}; expected (N, 3)")
+    if at is not None and at.shape != (len(rows),):
+        raise CloudError(
+            f"frame has {len(rows)} points and times of shape {at.shape}; give one time per point"
+        )
+    finite: npt.NDArray[np.bool_] = np.all(np.isfinite(rows), axis=1)
+    if not finite.all():
+        rows, at = rows[finite], None if at is None else at[finite]
+    with np.errstate(over="ignore"):
+        ranges = lengths(rows)
+    usable = int(((ranges > config.min_range) & (ranges < config.max_range)).sum())
+    if usable < config.least_points:
+        raise CloudError(
+            f"frame has {usable} of {len(finite)} points between {config.min_range:g} and {config.max_range:g} m; "
+            f"lidar odometry needs {config.least_points}: is the sensor covered, or the cloud not in its frame?"
+        )
+    return rows, at
+
+
+def dated(times: Times) -> tuple[float, float] | None:
+    """First and last of times (N,) in seconds around the stamp; None if they do not differ, or are no such times."""
+    known = times[np.isfinite(times)]
+    if not len(known) or np.abs(known).max() > _LONGEST_SWEEP or np.ptp(known) < _INSTANT:
+        return None
+    return float(known.min()), float(known.max())

@@ -1,1 +1,0 @@
-"""Where am I, exactly, and how sure: registration and verification."""

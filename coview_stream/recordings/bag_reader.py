@@ -1,0 +1,113 @@
+"""Recordings as ROS writes them: which topics there are, and their messages as CDR in order of arrival."""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coview_stream.errors import CoViewError, InputError, MessageError, RunError
+from coview_stream.messages import ros2
+from coview_stream.messages.validation import stamp_join
+
+_REMEDIES = (  # the first whose word occurs in the reason
+    ("ompression", "write it again with zstd or without compression (ros2 bag convert)"),
+    ("rofile", "record or export it as ROS 2 (CDR) messages"),
+    ("empty", "copy or record it again"),
+    ("denied", "check its permissions"),
+    ("metadata", "repair it with: ros2 bag reindex"),
+    ("", "repair it (mcap recover, ros2 bag reindex, rosbag reindex) or copy it again"),
+)
+
+
+@contextmanager
+def explained(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
+    """Turn whatever rosbags raises on a damaged recording into one line that names it and the remedy."""
+    try:
+        yield
+    except CoViewError:
+        raise
+    except Exception as error:  # a parser of others' bytes: KeyError, TypeError, AssertionError and more
+        words = " ".join(str(error).split())[:200].rstrip(".")
+        reason = words if " " in words else f"{type(error).__name__} {words}".rstrip()
+        remedy = next(text for word, text in _REMEDIES if word in reason)
+        raise kind(f"{name}: cannot be read ({reason}); {remedy}") from error
+
+
+class BagReader:
+    """A recording, open until it is collected; messages are read while they are asked for.
+
+    rosbag2 directories (sqlite3 and mcap, several files, compressed or not), single ``.mcap`` and ``.db3`` files, and
+    ROS 1 ``.bag`` files, whose messages are turned into CDR.
+
+    Raises:
+        RunError: it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._ros1 = path.suffix == ".bag" and path.is_file()
+        with explained(path):
+            self._reader = _reader_of(path, self._ros1)
+            self._reader.open()
+        weakref.finalize(self, self._reader.close)
+
+    def counts(self) -> dict[tuple[str, str], int]:
+        """Return how many messages each (type, topic) has."""
+        found: dict[tuple[str, str], int] = {}
+        for connection in self._reader.connections:
+            key = (connection.msgtype, connection.topic)
+            found[key] = found.get(key, 0) + connection.msgcount
+        return found
+
+    def messages(
+        self, topics: Mapping[str, str], start: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Yield (topic, arrival in ns, CDR) of the topics (name: type), in order of arrival, from ``start`` on.
+
+        Arrival is the recorder's clock, good for finding a message again and for nothing else.
+
+        Raises:
+            Exception: whatever rosbags raises; see :func:`explained`.
+        """
+        wanted = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
+        for connection, arrived, data in self._reader.messages(wanted, start=start):
+            payload = ros2.store().ros1_to_cdr(data, connection.msgtype) if self._ros1 else data
+            yield connection.topic, arrived, bytes(payload)
+
+
+def _reader_of(path: Path, ros1: bool) -> Any:
+    if ros1:
+        from rosbags.rosbag1 import Reader as Ros1Reader
+
+        return Ros1Reader(path)
+    from rosbags.rosbag2 import Reader
+
+    return Reader(path)
+
+
+def header_stamp(payload: bytes) -> int:
+    """Nanoseconds of the header that a CDR message starts with, without reading the rest; else MessageError."""
+    return stamp_join(*_unpack("iI", payload, 4))
+
+
+def frame_id(payload: bytes, skip: int = 0) -> str:
+    """Return the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
+    offset = 12
+    for _ in range(skip):
+        (length,) = _unpack("I", payload, offset)
+        offset += 4 + length + 3 & ~3
+    (length,) = _unpack("I", payload, offset)
+    return payload[offset + 4 : offset + 4 + length].rstrip(b"\0").decode("utf-8", "replace").lstrip("/")
+
+
+def _unpack(kinds: str, payload: bytes, offset: int) -> tuple[int, ...]:
+    if payload[:2] not in (b"\0\0", b"\0\1"):
+        raise MessageError("not a message in CDR")
+    try:
+        return struct.unpack_from((">", "<")[payload[1]] + kinds, payload, offset)
+    except struct.error as error:
+        raise MessageError("the message is truncated") from error

@@ -1,0 +1,295 @@
+"""Clouds of a recording, read when they are asked for and deskewed by its odometry."""
+
+# FOLDED coview_stream/recordings/bags.py: """Runs out of recordings: PointCloud2 frames, each with the odometry at its stamp, deskewed where points have times.
+#
+# A bag is a recorded stream, so its messages go through the decoders and the deskewing of the live one; this is the one
+# place where ``clouds`` builds on ``stream``, and :mod:`coview_stream.recordings.run` imports it only once a bag is met.
+# """
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.cloud import ABSURD, Cloud, CloudBuilder
+from coview_stream.clouds.trajectory import Poses, read_tum
+from coview_stream.errors import CloudError, MessageError, RunError
+from coview_stream.geometry.transforms import Points
+from coview_stream.messages import ros2
+from coview_stream.messages.types import CloudMessage, Sample
+from coview_stream.odometry.deskew import deskew
+from coview_stream.recordings.bag_reader import BagReader, explained, frame_id, header_stamp
+from coview_stream.recordings.odometry_track import SAME_NS, StampsNs, Track
+
+_NS = 1e-9
+
+
+class BagClouds:
+    """Clouds of a recording by index; in order, the recording is read once, and otherwise sought by arrival."""
+
+    def __init__(
+        self, reader: BagReader, topic: str, stamps: StampsNs, arrivals: StampsNs, track: Track, poses: Poses
+    ) -> None:
+        self.reader, self.topic, self.track = reader, topic, track
+        self.stamps, self.arrivals, self.poses = stamps, arrivals, poses
+        self._lock = threading.Lock()  # a replay reads on another thread
+        self._coming: Iterator[tuple[str, int, bytes]] = iter(())
+        self._next = -1
+
+    def read(self, index: int) -> Cloud:
+        """Frame ``index`` in the body frame at its stamp; CloudError if it is damaged or holds no usable point."""
+        message = self.message(index)
+        # false for NaN as well
+        usable: npt.NDArray[np.bool_] = np.all(np.abs(message.points) < ABSURD, axis=1)
+        builder = CloudBuilder(dropped=int((~usable).sum()))
+        builder.add(self._deskewed(index, message, usable))
+        return builder.finish(self._name(index))
+
+    def message(self, index: int) -> CloudMessage:
+        """Frame ``index`` as it was recorded; CloudError if it is damaged."""
+        name = self._name(index)
+        with self._lock, explained(name, CloudError):
+            payload = self._payload(index)
+        try:
+            return ros2.decode_cloud(Sample(self.topic, payload))
+        except MessageError as error:
+            raise CloudError(f"{name}: {error}; skip it, or repair the recording") from error
+
+    def _name(self, index: int) -> str:
+        return f"{self.reader.path}: cloud of {self.topic} at {_NS * int(self.stamps[index]):.6f}"
+
+    def _payload(self, index: int) -> bytes:
+        reads_on = index == self._next and self.arrivals[index] > self.arrivals[index - 1]
+        self._next = -1  # should this fail, the next one is sought
+        for _ in range(2):
+            if not reads_on:
+                start = int(self.arrivals[index])
+                self._coming = self.reader.messages({self.topic: ros2.CLOUD}, start)
+            for _, arrived, payload in self._coming:
+                if arrived == self.arrivals[index] and _is_of(payload, int(self.stamps[index])):
+                    self._next = index + 1
+                    return payload
+            reads_on = False
+        raise ValueError("it is not there any more")
+
+    def _deskewed(self, index: int, message: CloudMessage, usable: npt.NDArray[np.bool_]) -> Points:
+        points = message.points[usable]
+        if message.times is None or not len(points):
+            return points
+        stamp, times = message.stamp_ns, message.times[usable]
+        begin, end = (stamp + round(t / _NS) for t in (min(0.0, times.min()), max(0.0, times.max())))
+        return deskew(points, times, self.track.around(begin, end, stamp), stamp, self.poses[index])
+
+
+def _is_of(payload: bytes, stamp_ns: int) -> bool:
+    try:
+        return header_stamp(payload) == stamp_ns
+    except MessageError:
+        return False
+
+
+_LONGEST_WAY_BACK = 5_000_000_000  # ns of stamps going back: less is messages overtaking each other
+
+_STRAY = 0.01  # share of stamps that may go back farther, and are left out
+
+
+FromClouds = Callable[[BagClouds], Track]
+"""Makes odometry of nothing but the clouds, which are not deskewed."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """What a run of a bag consists of: stamps (N,) in ns, poses (N, 4, 4) and who reads the clouds."""
+
+    stamps: StampsNs
+    poses: Poses
+    source: BagClouds
+    notes: tuple[str, ...]
+
+
+@dataclass
+class _Survey:
+    """What one pass over a bag found: clouds' stamps and arrivals, odometry by stamp, names of the frames."""
+
+    stamps: list[int] = field(default_factory=list)
+    arrivals: list[int] = field(default_factory=list)
+    odometry: list[tuple[int, npt.NDArray[np.float64]]] = field(default_factory=list)
+    damaged: int = 0
+    lidar: str = ""
+    body: str = ""
+
+
+def open_bag(
+    path: Path,
+    explicit: Path | None = None,
+    cloud_topic: str | None = None,
+    odometry_topic: str | None = None,
+    from_clouds: FromClouds | None = None,
+) -> Opened:
+    """Read all stamps and odometry of a recording in one pass, and keep where each cloud is.
+
+    Clouds pass through memory one at a time; 16 bytes of each stay, and 150 of each odometry sample.
+
+    Args:
+        path: as :func:`~coview_stream.recordings.layouts.find_bag` found it.
+        explicit: TUM file to be taken for the odometry, with any stamps; None takes the recording's.
+        cloud_topic: needed where there is more than one topic with PointCloud2.
+        odometry_topic: likewise with Odometry.
+        from_clouds: makes the odometry, whatever the recording has.
+
+    Raises:
+        RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
+    """
+    reader = BagReader(path)
+    counts = reader.counts()
+    clouds = _choose(path, counts, ros2.CLOUD, cloud_topic, "--cloud-topic")
+    topics = {clouds: ros2.CLOUD}
+    if from_clouds is not None:
+        survey = _survey(reader, topics)
+        return _pair(reader, clouds, survey, from_clouds(_bare(reader, clouds, survey)))
+    if explicit is not None and odometry_topic is not None:
+        raise RunError(
+            f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them"
+        )
+    # a single scan needs no odometry, as among files
+    lone = counts[ros2.CLOUD, clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
+    if explicit is None and not lone:
+        topics[_choose(path, counts, ros2.ODOMETRY, odometry_topic, "--odometry-topic")] = ros2.ODOMETRY
+    survey = _survey(reader, topics)
+    return _pair(reader, clouds, survey, _track(path, survey, explicit, lone))
+
+
+def _choose(
+    path: Path, counts: dict[tuple[str, str], int], kind: str, wanted: str | None, option: str
+) -> str:
+    """Return the only topic of the type, or the wanted one."""
+    all_of_kind = {topic: count for (found, topic), count in counts.items() if found == kind}
+    full = {topic: count for topic, count in all_of_kind.items() if count} or all_of_kind
+    listed = ", ".join(f"{topic} ({count} messages)" for topic, count in sorted(all_of_kind.items()))
+    if wanted is not None:
+        if wanted not in all_of_kind:
+            raise RunError(f"{path}: no topic {wanted!r} with {kind}; {option} may be {listed or 'none'}")
+        return wanted
+    if len(full) > 1:
+        raise RunError(f"{path}: {len(full)} topics with {kind}; choose by {option}: {listed}")
+    if not full:
+        others = ", ".join(f"{topic} ({found})" for found, topic in sorted(counts)[:8]) or "no topics at all"
+        remedy = "give --odometry FILE, or " if kind == ros2.ODOMETRY else ""
+        raise RunError(f"{path}: no topic with {kind}; {remedy}record one: it has {others}")
+    return next(iter(full))
+
+
+def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
+    survey = _Survey()
+    with explained(reader.path):
+        for topic, arrived, payload in reader.messages(topics):
+            try:
+                if topics[topic] == ros2.CLOUD:
+                    survey.stamps.append(header_stamp(payload))
+                    survey.arrivals.append(arrived)
+                    survey.lidar = survey.lidar or frame_id(payload)
+                else:
+                    sample = ros2.decode_odometry(Sample(topic, payload))
+                    survey.odometry.append((sample.stamp_ns, sample.T_odom_body))
+                    survey.body = survey.body or frame_id(payload, 1)
+            except MessageError:
+                survey.damaged += 1
+    if not survey.stamps:
+        raise RunError(f"{reader.path}: not one cloud in its topic; choose another one or record again")
+    return survey
+
+
+def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Track:
+    if explicit is not None:
+        seconds, poses = read_tum(explicit)
+        if not len(seconds):
+            raise RunError(f"{explicit}: no poses; give the odometry of {path}")
+        return Track(np.rint(1e9 * seconds).astype(np.int64), poses)
+    if lone:
+        return Track(np.array(survey.stamps, np.int64), np.tile(np.eye(4), (len(survey.stamps), 1, 1)))
+    if not survey.odometry:
+        raise RunError(f"{path}: not one usable odometry message; give --odometry FILE")
+    stamps = np.array([stamp for stamp, _ in survey.odometry], np.int64)
+    kept = _steady(path, stamps, "odometry")
+    return Track(stamps[kept], np.array([T for _, T in survey.odometry])[kept])
+
+
+def _steady(path: Path, stamps: StampsNs, what: str) -> npt.NDArray[np.bool_]:
+    """(N,) whether each stamp comes after those before it; RunError if the clock started anew."""
+    back = np.maximum.accumulate(stamps) - stamps
+    strays = back > _LONGEST_WAY_BACK
+    if strays.sum() > _STRAY * len(stamps):
+        at = int(np.argmax(strays))
+        raise RunError(
+            f"{path}: stamps of {what} go back by {_NS * back[at]:.1f} s at message {at}: the clock started anew; "
+            "split the recording there"
+        )
+    return ~strays
+
+
+@dataclass(frozen=True)
+class _Order:
+    """Clouds by stamp (K,), of those whose stamp is ``steady`` (N,); ``fresh`` (K,) if none before has the same one."""
+
+    stamps: StampsNs
+    arrivals: StampsNs
+    fresh: npt.NDArray[np.bool_]
+    steady: npt.NDArray[np.bool_]
+
+
+def _in_order(path: Path, survey: _Survey) -> _Order:
+    stamps, arrivals = np.array(survey.stamps, np.int64), np.array(survey.arrivals, np.int64)
+    steady = _steady(path, stamps, "clouds")
+    order = np.argsort(stamps[steady], kind="stable")
+    in_order = stamps[steady][order]
+    fresh = np.diff(in_order, prepend=in_order[0] - SAME_NS - 1) > SAME_NS
+    return _Order(in_order, arrivals[steady][order], fresh, steady)
+
+
+def _bare(reader: BagReader, topic: str, survey: _Survey) -> BagClouds:
+    """All clouds that have a stamp of their own, without odometry."""
+    order = _in_order(reader.path, survey)
+    stamps, arrivals = order.stamps[order.fresh], order.arrivals[order.fresh]
+    nowhere = np.tile(np.eye(4), (len(stamps), 1, 1))
+    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, nowhere), nowhere)
+
+
+def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opened:
+    """Frames in order of their stamps, those without odometry left out."""
+    path = reader.path
+    order = _in_order(path, survey)
+    fresh, steady, stamps = order.fresh, order.steady, order.stamps
+    poses, known = track.at(stamps)
+    kept = fresh & known
+    if not kept.any():
+        raise RunError(
+            f"{path}: not one of {len(steady)} clouds has odometry at its stamp: clouds are stamped "
+            f"{_span(stamps)}, odometry {_span(track.stamps)}; are their clocks the same, and their headers stamped?"
+        )
+    reasons = (
+        (int((fresh & ~known).sum()), "without odometry around their stamps"),
+        (int((~fresh).sum()), "with a stamp that was there before"),
+        (int((~steady).sum()), "with a stamp that goes far back"),
+    )
+    notes = []
+    if not kept.all() or not steady.all():
+        text = ", ".join(f"{count} {reason}" for count, reason in reasons if count)
+        notes.append(f"{path}: {len(steady) - int(kept.sum())} of {len(steady)} clouds left out: {text}")
+    if survey.damaged:
+        notes.append(f"{path}: {survey.damaged} damaged messages left out")
+    if survey.lidar and survey.body and survey.lidar != survey.body:
+        notes.append(
+            f"{path}: clouds are in frame {survey.lidar!r}, odometry moves {survey.body!r}: taken for one; "
+            "if the lidar is mounted away from it, write the odometry of the lidar (--odometry FILE)"
+        )
+    source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept])
+    return Opened(source.stamps, source.poses, source, tuple(notes))
+
+
+def _span(stamps: StampsNs) -> str:
+    return f"{_NS * stamps.min():.3f} to {_NS * stamps.max():.3f} s"

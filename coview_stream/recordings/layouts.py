@@ -1,0 +1,191 @@
+"""Where a run keeps its frames and its odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
+from coview_stream.clouds.trajectory import (
+    Poses,
+    Stamps,
+    columns_of,
+    read_kitti_poses,
+    read_times,
+    read_tum,
+)
+from coview_stream.errors import RunError
+from coview_stream.geometry.transforms import Pose, inverse
+
+_KITTI_COLUMNS = 12
+_BAGS = (".mcap", ".db3", ".bag")
+_LAYOUTS = (
+    "frames/NNNNNN.pcd with odometry.tum, KITTI's velodyne/*.bin with times.txt and poses.txt, "
+    "or a ROS recording (rosbag2 directory, .mcap, .bag)"
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Files of a run: ``frames`` in order, ``odometry`` (TUM or KITTI poses) and ``times`` if present."""
+
+    path: Path
+    frames: tuple[Path, ...]
+    odometry: Path | None = None
+    times: Path | None = None
+
+
+def find_layout(path: Path) -> Layout:
+    """Files of the run at ``path``, a directory or a single cloud file.
+
+    Raises:
+        RunError: nothing there, no layout that is known, or no frames; the message says what is expected.
+    """
+    if not path.exists():
+        raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
+    if path.is_file():
+        if not is_cloud_name(path):
+            raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
+        return Layout(path, (path,))
+    for folder in ("frames", "velodyne"):
+        if (path / folder).is_dir():
+            frames = _frames(path / folder)
+            # KITTI poses belong to the velodyne folder; a TUM file says what it is
+            names = ("odometry.tum", "poses.txt") if folder == "velodyne" else ("odometry.tum",)
+            odometry = next((path / name for name in names if (path / name).exists()), None)
+            times = path / "times.txt"
+            return Layout(path, frames, odometry, times if times.exists() else None)
+    if any(is_cloud_name(file) for file in path.iterdir()):
+        raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
+    raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
+
+
+def find_bag(path: Path) -> Path | None:
+    """Return the recording at ``path``: a file, or a rosbag2 directory; None if it is something else.
+
+    Raises:
+        RunError: a directory holds several recordings, and no ``metadata.yaml`` says that they belong together.
+    """
+    if not path.is_dir():
+        return path if path.suffix in _BAGS and path.is_file() else None
+    if (path / "frames").is_dir() or (path / "velodyne").is_dir():
+        return None
+    if (path / "metadata.yaml").is_file():
+        return path
+    files = sorted(file for file in path.iterdir() if file.suffix in _BAGS and file.is_file())
+    if len(files) > 1:
+        names = ", ".join(file.name for file in files[:5])
+        raise RunError(
+            f"{path}: several recordings ({names}) without metadata.yaml; name one file, or run: ros2 bag reindex"
+        )
+    return files[0] if files else None
+
+
+def _frames(folder: Path) -> tuple[Path, ...]:
+    """Cloud files of a folder by number, or by name where a name is no number.
+
+    Raises:
+        RunError: none at all, two files of one number, or one that is no file.
+    """
+    files = [file for file in folder.iterdir() if is_cloud_name(file)]
+    if not files:
+        raise RunError(
+            f"{folder}: no frames ({', '.join(sorted(CLOUD_SUFFIXES))}); put one cloud per scan there"
+        )
+    for file in files:
+        if not file.is_file():
+            raise RunError(f"{file}: is no file (a directory or a broken link); put the cloud itself there")
+    if all(file.stem.isdecimal() for file in files):
+        files.sort(key=lambda file: int(file.stem))
+        numbers = [int(file.stem) for file in files]
+        for before, after, first, second in zip(files, files[1:], numbers, numbers[1:], strict=False):
+            if first == second:
+                raise RunError(f"{folder}: {before.name} and {after.name} are the same frame; remove one")
+    else:
+        files.sort(key=lambda file: file.name)
+    return tuple(files)
+
+
+def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Stamps, Poses]:
+    """Stamps (N,) in seconds and poses (N, 4, 4), odometry <- body, one per frame.
+
+    Raises:
+        RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
+    """
+    file = explicit or layout.odometry
+    assert file is not None
+    if columns_of(file) == _KITTI_COLUMNS:
+        stamps, poses = _kitti(layout, file)
+    else:
+        stamps, poses = read_tum(file)
+    _check_count(file, len(poses), "poses", layout)
+    return stamps, poses
+
+
+def read_stamps(layout: Layout) -> Stamps | None:
+    """Stamps (N,) in seconds, one per frame, of a run whose odometry is not asked for; None if it has none.
+
+    Raises:
+        RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
+    """
+    file, stamps = layout.times, None
+    if file is not None:
+        stamps = read_times(file)
+    elif layout.odometry is not None and columns_of(layout.odometry) != _KITTI_COLUMNS:
+        file, stamps = layout.odometry, read_tum(layout.odometry)[0]
+    if file is not None and stamps is not None:
+        _check_count(file, len(stamps), "stamps", layout)
+    return stamps
+
+
+def _check_count(file: Path, count: int, what: str, layout: Layout) -> None:
+    if count != len(layout.frames):
+        relation = "too short" if count < len(layout.frames) else "too long"
+        raise RunError(
+            f"{file}: {relation}, {count} {what} for {len(layout.frames)} frames; give one line per frame"
+        )
+
+
+def _kitti(layout: Layout, file: Path) -> tuple[Stamps, Poses]:
+    if layout.times is None:
+        raise RunError(f"{layout.path / 'times.txt'}: no such file; KITTI poses need one stamp per frame")
+    stamps = read_times(layout.times)
+    _check_count(layout.times, len(stamps), "stamps", layout)
+    poses = read_kitti_poses(file)
+    T_camera_body = _calibration(layout.path / "calib.txt")
+    if T_camera_body is not None:
+        return stamps, inverse(T_camera_body) @ poses @ T_camera_body
+    _refuse_camera_poses(poses, file)
+    return stamps, poses
+
+
+def _calibration(path: Path) -> Pose | None:
+    """T_camera_velodyne (4, 4) of a KITTI ``calib.txt``; None without the file or without a Tr line."""
+    if not path.is_file():
+        return None
+    try:
+        for number, line in enumerate(path.read_text(encoding="ascii").splitlines(), start=1):
+            name, _, rest = line.partition(":")
+            if name.strip() in ("Tr", "Tr_velo_to_cam"):
+                T = np.eye(4)
+                T[:3] = np.array([float(word) for word in rest.split()]).reshape(3, 4)
+                if not np.isfinite(T).all() or abs(np.linalg.det(T) - 1.0) > 0.1:
+                    raise RunError(f"{path}:{number}: Tr is no rigid transform; restore the file")
+                return T
+    except (ValueError, OSError) as error:
+        if isinstance(error, RunError):
+            raise
+        raise RunError(f"{path}: unreadable calibration ({error}); restore the file") from error
+    return None
+
+
+def _refuse_camera_poses(poses: Poses, file: Path) -> None:
+    """Refuse KITTI's camera poses, whose z points forward: as body poses they would fly into the sky."""
+    steps = np.einsum("nij,ni->nj", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
+    x, _, z = np.abs(steps).sum(axis=0)
+    if z > 5.0 and z > 5.0 * x:
+        raise RunError(
+            f"{file}: poses drive along z, so they are the camera's; add KITTI's calib.txt with Tr"
+        )

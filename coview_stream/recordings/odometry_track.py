@@ -1,0 +1,72 @@
+"""Odometry of a whole recording: the poses at many stamps at once, and what was driven during a sweep."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.trajectory import Poses
+from coview_stream.config.node import NodeConfig
+from coview_stream.geometry.rotations import between
+from coview_stream.odometry.buffer import Segment
+
+StampsNs = npt.NDArray[np.int64]
+
+SAME_NS = 1000
+"""Stamps this close are one moment: text files and float64 seconds are good to a microsecond."""
+
+_NS = 1e-9
+_JUMP_DISTANCE = 1.0  # metres: as for live odometry
+
+
+class Track:
+    """Odometry by stamp. What the node would not interpolate across (gaps, jumps) is not interpolated across here.
+
+    Attributes:
+        stamps: (K,) nanoseconds, increasing.
+        poses: (K, 4, 4) odometry <- body, metres.
+    """
+
+    def __init__(self, stamps: StampsNs, poses: Poses, config: NodeConfig | None = None) -> None:
+        """Sort the samples; of equal stamps the first counts. At least one sample."""
+        config = config or NodeConfig()
+        self.stamps, first = np.unique(stamps, return_index=True)
+        self.poses = poses[first]
+        seconds = _NS * np.diff(self.stamps)
+        driven = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
+        steady = (seconds <= config.max_gap) & (
+            driven <= np.maximum(_JUMP_DISTANCE, config.max_speed * seconds)
+        )
+        self._part = np.concatenate([[0], np.cumsum(~steady)])
+
+    def at(self, stamps: StampsNs) -> tuple[Poses, npt.NDArray[np.bool_]]:
+        """Poses (N, 4, 4) at the stamps (N,), interpolated, and (N,) whether each is known."""
+        last = len(self.stamps) - 1
+        after = np.clip(np.searchsorted(self.stamps, stamps), 0, last)
+        before = np.clip(after - 1, 0, last)
+        share = (stamps - self.stamps[before]) / np.maximum(self.stamps[after] - self.stamps[before], 1)
+        known = (share >= 0) & (share <= 1) & (self._part[before] == self._part[after]) & (before < after)
+        share = np.clip(share, 0.0, 1.0)
+        for side, value in ((before, 0.0), (after, 1.0)):
+            same = np.abs(stamps - self.stamps[side]) <= SAME_NS
+            share, known = np.where(same, value, share), known | same
+        return _between(self.poses[before], self.poses[after], share), known
+
+    def around(self, begin_ns: int, end_ns: int, stamp_ns: int) -> Segment:
+        """Return the samples from the last before ``begin_ns`` to the first after ``end_ns``.
+
+        Only such as belong to one steady piece with ``stamp_ns``.
+        """
+        first = np.searchsorted(self.stamps, begin_ns + 1) - 1
+        last = np.searchsorted(self.stamps, end_ns) + 1
+        part = self._part[max(0, int(np.searchsorted(self.stamps, stamp_ns + SAME_NS, side="right")) - 1)]
+        low, high = np.searchsorted(self._part, part, "left"), np.searchsorted(self._part, part, "right")
+        chosen = slice(max(0, first, low), min(last, high))
+        return Segment(self.stamps[chosen], self.poses[chosen])
+
+
+def _between(a: Poses, b: Poses, share: npt.NDArray[np.float64]) -> Poses:
+    poses = np.array(a)
+    poses[:, :3, :3] = between(a[:, :3, :3], b[:, :3, :3], share)
+    poses[:, :3, 3] += share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
+    return poses

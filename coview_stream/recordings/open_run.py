@@ -1,0 +1,81 @@
+"""MODULE DOCSTRING."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coview_stream.errors import RunError
+from coview_stream.recordings.layouts import find_bag, find_layout, read_odometry
+from coview_stream.recordings.run import Run, of_bag, single
+
+if TYPE_CHECKING:
+    from coview_stream.odometry.lidar_odometry import LidarOdometry
+    from coview_stream.recordings.lidar_runs import Progress
+
+
+KISS_ICP = "kiss-icp"
+"""In place of an odometry file: make the odometry out of the clouds."""
+
+
+def open_run(
+    path: str | os.PathLike[str],
+    odometry: str | os.PathLike[str] = "auto",
+    cloud_topic: str | None = None,
+    odometry_topic: str | None = None,
+    lidar: LidarOdometry | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """Open a run and validate all but the clouds themselves.
+
+    Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
+    ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); one cloud file, or
+    one frame without odometry, is a run of one frame with stamp 0 and the identity; a recording with PointCloud2 and
+    Odometry (rosbag2 directory, ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry at the stamps
+    in their headers, interpolated, and are deskewed by it where their points have times.
+
+    Args:
+        path: directory, cloud file or recording.
+        odometry: ``"auto"`` takes what the layout brings; otherwise a TUM file, or KITTI poses (12 columns)
+            where the run has a ``times.txt``. For a recording a TUM file with poses at any stamps. ``"kiss-icp"``
+            makes odometry out of the clouds, each of which is read for that: :mod:`coview_stream.odometry`.
+        cloud_topic: which clouds of a recording, if it has several topics with PointCloud2.
+        odometry_topic: which odometry of a recording, if it has several topics with Odometry.
+        lidar: makes the odometry that ``"kiss-icp"`` asks for, instead of a ``LidarOdometry()``.
+        progress: called with (frames done, frames) while it does.
+
+    Raises:
+        RunError: no frames, no odometry or odometry that does not fit; the message names file and line.
+        DependencyError: kiss-icp is missing.
+    """
+    path = Path(path)
+    if odometry == KISS_ICP:
+        from coview_stream.recordings.lidar_runs import open_lidar_run
+
+        return open_lidar_run(path, lidar, cloud_topic, odometry_topic, progress)
+    if (bag := find_bag(path)) is not None:
+        return _recorded(bag, None if odometry == "auto" else Path(odometry), cloud_topic, odometry_topic)
+    if path.exists() and (cloud_topic is not None or odometry_topic is not None):
+        raise RunError(
+            f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out"
+        )
+    layout = find_layout(path)
+    count = len(layout.frames)
+    explicit = None if odometry == "auto" else Path(odometry)
+    if explicit is None and layout.odometry is None:
+        if count == 1:
+            return single(layout)
+        raise RunError(
+            f"{path}: {count} frames but no odometry; add {path / 'odometry.tum'} "
+            "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
+        )
+    stamps, poses = read_odometry(layout, explicit)
+    return Run(path, layout.frames, stamps, poses)
+
+
+def _recorded(bag: Path, explicit: Path | None, cloud_topic: str | None, odometry_topic: str | None) -> Run:
+    # imported here, for bags are read by the decoders of live messages, and those read no runs
+    from coview_stream.recordings.bags import open_bag
+
+    return of_bag(bag, open_bag(bag, explicit, cloud_topic, odometry_topic))

@@ -1,0 +1,117 @@
+"""Runs: a robot's frames with their odometry, read one frame at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.cloud import Cloud
+from coview_stream.clouds.files import read_cloud
+from coview_stream.clouds.trajectory import Poses, Stamps
+from coview_stream.errors import CloudError
+from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.recordings.layouts import Layout
+
+if TYPE_CHECKING:
+    from coview_stream.recordings.bags import Opened
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One scan of a run.
+
+    Attributes:
+        index: position in the run, from 0.
+        stamp: seconds.
+        points: (N, 3) float32 in the body frame (x forward, z up), metres, relative to ``origin``.
+        T_odom_body: (4, 4), odometry <- body.
+        origin: (3,) float64 metres. Zeros, except for a single terrestrial scan in map-like coordinates.
+        path: the file it came from.
+        dropped: rows of the file that were not usable.
+    """
+
+    index: int
+    stamp: float
+    points: Points
+    T_odom_body: Pose
+    origin: npt.NDArray[np.float64]
+    path: Path
+    dropped: int = 0
+
+
+class CloudSource(Protocol):
+    """Where the clouds of a run come from, if not from one file each."""
+
+    def read(self, index: int) -> Cloud:
+        """Frame ``index`` in the body frame at its stamp, metres; CloudError if it cannot be had."""
+        ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """A validated run. Iterating reads lazily: one frame is in memory at a time.
+
+    Attributes:
+        path: the directory, the single cloud file, or the recording.
+        frames_paths: (N) files in order; of a recording its path, N times.
+        stamps: (N,) seconds, strictly increasing.
+        poses: (N, 4, 4), odometry <- body, metres.
+        source: reads the clouds of a recording; None if each is a file.
+        notes: what was left out or taken for granted when the run was opened, a line each.
+    """
+
+    path: Path
+    frames_paths: tuple[Path, ...]
+    stamps: Stamps
+    poses: Poses
+    source: CloudSource | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.frames_paths)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield every frame in order; raises like ``read`` (use ``read`` to skip a damaged frame)."""
+        return (self.read(index) for index in range(len(self)))
+
+    def read(self, index: int) -> Frame:
+        """Read frame ``index``.
+
+        Raises:
+            IndexError: there is no such frame.
+            CloudError: the file is unreadable, has no usable point, or is not in the body frame.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.path}: no frame {index} among {len(self)}")
+        path = self.frames_paths[index]
+        cloud = read_cloud(path) if self.source is None else self.source.read(index)
+        if len(self) > 1 and cloud.origin.any():
+            raise CloudError(
+                f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "
+                "write frames relative to the sensor"
+            )
+        return Frame(
+            index,
+            float(self.stamps[index]),
+            cloud.points,
+            self.poses[index],
+            cloud.origin,
+            path,
+            cloud.dropped,
+        )
+
+
+def single(layout: Layout) -> Run:
+    """Run of one frame, which needs no odometry."""
+    return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None])
+
+
+def of_bag(bag: Path, opened: Opened) -> Run:
+    """Run of a recording that has been opened."""
+    paths = (bag,) * len(opened.stamps)
+    return Run(bag, paths, opened.stamps / 1e9, opened.poses, opened.source, opened.notes)

@@ -1,0 +1,1 @@
+"""The robot's side: send frames, receive poses, replay recordings."""

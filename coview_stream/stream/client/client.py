@@ -1,0 +1,305 @@
+"""A robot's side of the node, for Python: NumPy clouds and odometry out, poses in."""
+
+# FOLDED coview_stream/stream/client/client.py: """A bounded queue between a network thread and a reader who may be slow: the newest win."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import ConfigError, MessageError, TransportError
+from coview_stream.geometry.transforms import Pose
+from coview_stream.messages.json_messages import read_status
+from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.stream.client.fleet import STALE
+from coview_stream.stream.client.sender import Sender, nanoseconds
+from coview_stream.stream.transport.keys import RobotKeys, robot_keys
+from coview_stream.stream.transport.rpc import open_client
+from coview_stream.stream.transport.transport import Transport
+
+_log = logging.getLogger(__name__)
+
+_Item = TypeVar("_Item")
+
+POSES_KEPT = 100  # ten seconds of unread poses
+
+STATUSES_KEPT = 100
+
+
+class RobotClient:
+    """Streams one robot to a node and receives its poses; a context manager.
+
+    >>> with RobotClient("rover1", "tcp/127.0.0.1:7447") as robot:     # doctest: +SKIP
+    ...     robot.wait_for_node(10)                                    # what is sent before it is there is lost
+    ...     robot.send_odometry(T_odom_body, stamp)                    # before the cloud that it belongs to
+    ...     robot.send_cloud(points, stamp)
+    ...     for pose in robot.poses():
+    ...         print(pose.T_map_body)
+
+    Sending and reading may happen on different threads. Unread poses are kept up to a limit; then the newest win.
+
+    Args:
+        robot: its name, as given to ``coview-stream serve --robot``.
+        endpoint: zenoh endpoint (or several) of the router or node; if neither this nor ``listen`` nor ``config`` nor
+            ``transport`` is given, ``tcp/127.0.0.1:7447``.
+        listen: endpoint (or several) to wait for connections on.
+        config: zenoh configuration file (JSON5).
+        base: first part of the keys.
+        preset: key convention, see :mod:`coview_stream.stream.transport.keys`.
+        cloud_encoding: ``xyz``, ``xyzi``, ``foxglove``, ``cdr`` or ``keelson``; None takes the preset's.
+        odometry_encoding: ``json``, ``cdr``, ``foxglove`` or ``keelson``; None takes the preset's.
+        transport: one that is open already; it stays the caller's to close.
+
+    Raises:
+        ConfigError: a name, preset or encoding is not valid.
+        TransportError: the session cannot be opened. A router that is not there yet is no error: it is waited for in
+            the background.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        endpoint: str | Sequence[str] | None = None,
+        *,
+        listen: str | Sequence[str] | None = None,
+        config: str | Path | None = None,
+        base: str = "coview",
+        preset: str = "native",
+        cloud_encoding: str | None = None,
+        odometry_encoding: str | None = None,
+        transport: Transport | None = None,
+    ) -> None:
+        self.keys: RobotKeys = robot_keys(preset, base, robot)
+        self._owned = transport is None
+        self._transport = transport if transport is not None else open_client(endpoint, listen, config)
+        self._poses: Mailbox[PoseMessage] = Mailbox(POSES_KEPT)
+        self._statuses: Mailbox[dict[str, Any]] = Mailbox(STATUSES_KEPT)
+        self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
+        self._latest_status: dict[str, Any] | None = None
+        self._malformed = 0
+        self._closed = False
+        try:
+            self._sender = Sender(self._transport, self.keys, cloud_encoding, odometry_encoding)
+            self._transport.subscribe(self.keys.pose, self._on_pose, "all")
+            self._transport.subscribe(self.keys.status, self._on_status, "all")
+        except BaseException:
+            if self._owned:
+                self._transport.close()
+            raise
+
+    @property
+    def robot(self) -> str:
+        """The robot's name."""
+        return self.keys.robot
+
+    @property
+    def latest_pose(self) -> PoseMessage | None:
+        """The newest pose received, while it holds.
+
+        None before the first, as soon as a status says another state than TRACKING, and when none has come for 2 s of
+        local time: a robot that is lost, or has lost its node, must not drive by where it once was.
+        """
+        newest = self._latest_pose
+        if newest is None or monotonic() - newest[0] >= STALE or not self._tracking():
+            return None
+        return newest[1]
+
+    @property
+    def latest_status(self) -> dict[str, Any] | None:
+        """The newest status received; None before the first. Its ``stamp_ns`` is the node's clock, since 1970."""
+        return self._latest_status
+
+    @property
+    def malformed(self) -> int:
+        """How many poses and statuses could not be decoded."""
+        return self._malformed
+
+    def send_cloud(
+        self, points: npt.ArrayLike, stamp: float, times: npt.NDArray[np.float64] | None = None
+    ) -> None:
+        """Publish one lidar frame; it is dropped if the link is busy with the one before, or nobody listens.
+
+        Args:
+            points: (N, 3), or (N, 4) with an intensity that is not used: body frame (x forward, z up), metres.
+            stamp: sensor time, seconds; the same clock as the odometry's.
+            times: (N,) seconds after ``stamp`` at which each point was measured; None if the frame is deskewed. Raw
+                rows cannot carry them: a client without an explicit encoding sends such a frame as foxglove.PointCloud.
+
+        Raises:
+            InputError: an array has the wrong shape, no point is finite, or the stamp is not in seconds.
+            TransportError: the client is closed.
+        """
+        self._check_open()
+        self._sender.put_cloud(self._sender.cloud(points, nanoseconds(stamp), times))
+
+    def send_odometry(self, T_odom_body: Pose, stamp: float) -> None:
+        """Publish one odometry sample: (4, 4) odometry <- body, metres, gravity aligned; ``stamp`` in seconds.
+
+        Raises:
+            InputError: the matrix is no rigid transform, or the stamp is not in seconds.
+            TransportError: the client is closed.
+        """
+        self._check_open()
+        self._sender.put_odometry(self._sender.odometry(T_odom_body, nanoseconds(stamp)))
+
+    def poses(self, timeout: float | None = None) -> Iterator[PoseMessage]:
+        """Yield poses as they arrive, oldest unread first.
+
+        Ends when the client is closed, or when no pose came for ``timeout`` seconds (None: waits for ever). Each pose
+        is given once, even to several iterators.
+        """
+        return _drain(self._poses, timeout)
+
+    def statuses(self, timeout: float | None = None) -> Iterator[dict[str, Any]]:
+        """Yield the node's statuses as they arrive; ends like :meth:`poses`."""
+        return _drain(self._statuses, timeout)
+
+    def wait_for_node(self, seconds: float) -> bool:
+        """Wait until somebody subscribes to this robot's clouds; False if nobody did for ``seconds``.
+
+        What is sent before is lost.
+
+        Raises:
+            TransportError: the client is closed.
+        """
+        self._check_open()
+        return self._transport.await_subscriber(self._sender.cloud_key, seconds)
+
+    def relocalize(self, timeout: float = 5.0) -> dict[str, Any]:
+        """Make the node forget the pose and search again; returns its reply.
+
+        Raises:
+            TransportError: nobody answered within ``timeout`` seconds, the node refused, or the client is closed.
+        """
+        self._check_open()
+        return self._transport.query(self.keys.relocalize, timeout=timeout)
+
+    def reset(self, timeout: float = 5.0) -> dict[str, Any]:
+        """Make the node forget everything about this robot; returns its reply. Errors as :meth:`relocalize`."""
+        self._check_open()
+        return self._transport.query(self.keys.reset, timeout=timeout)
+
+    def close(self) -> None:
+        """Undeclare, end all iterators and close the session unless it was handed in; idempotent."""
+        self._poses.close()
+        self._statuses.close()
+        if self._owned and not self._closed:
+            self._sender.settle()
+        self._closed = True
+        self._sender.close()
+        if self._owned:
+            self._transport.close()
+
+    def __enter__(self) -> RobotClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise TransportError(f"the client of robot {self.robot!r} is closed: open another one")
+
+    def _tracking(self) -> bool:
+        """Whether poses may be believed; True without a status, which access rules may keep from us."""
+        status = self._latest_status
+        return status is None or status.get("state", "TRACKING") == "TRACKING"
+
+    def _on_pose(self, sample: Sample) -> None:
+        from coview_stream.messages import decode_pose
+
+        try:
+            pose = decode_pose(sample, hint=self.keys.pose_hint)
+        except MessageError as error:
+            self._reject(sample, error)
+            return
+        if not pose.robot:
+            pose = replace(pose, robot=self.robot)
+        self._latest_pose = monotonic(), pose
+        self._poses.put(pose)
+
+    def _on_status(self, sample: Sample) -> None:
+        try:
+            status = read_status(sample)
+        except MessageError as error:
+            self._reject(sample, error)
+            return
+        self._latest_status = status
+        if not self._tracking():
+            self._latest_pose = None  # also for the time after: only a new pose brings it back
+        self._statuses.put(status)
+
+    def _reject(self, sample: Sample, error: MessageError) -> None:
+        self._malformed += 1
+        if self._malformed == 1:  # once: a sender that is wrong is wrong ten times a second
+            _log.warning("%s: %s", sample.key, error)
+
+
+def _drain(box: Mailbox[_Item], timeout: float | None) -> Iterator[_Item]:
+    while (item := box.get(timeout)) is not None:
+        yield item
+
+
+class Mailbox(Generic[_Item]):
+    """Holds up to ``size`` items in order of arrival; when it is full, the oldest goes.
+
+    ``put`` never blocks, so that a subscription is never held up by its reader.
+
+    Args:
+        size: most items kept, at least 1.
+
+    Raises:
+        ConfigError: ``size`` is below 1.
+    """
+
+    def __init__(self, size: int) -> None:
+        if size < 1:
+            raise ConfigError(f"mailbox size: {size} is out of range; use at least 1")
+        self._items: deque[_Item] = deque(maxlen=size)
+        self._arrived = threading.Condition()
+        self._closed = False
+        self._dropped = 0
+
+    @property
+    def dropped(self) -> int:
+        """How many items went unread because newer ones needed the place."""
+        return self._dropped
+
+    def put(self, item: _Item) -> None:
+        """Add an item; after :meth:`close` it is ignored."""
+        with self._arrived:
+            if self._closed:
+                return
+            self._dropped += len(self._items) == self._items.maxlen
+            self._items.append(item)
+            self._arrived.notify()
+
+    def get(self, timeout: float | None = None) -> _Item | None:
+        """Take the oldest item; None when none came for ``timeout`` seconds (None: for ever) or it is closed."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with self._arrived:
+            while not self._items and not self._closed:
+                left = None if deadline is None else deadline - time.monotonic()
+                if left is not None and left <= 0:
+                    return None
+                self._arrived.wait(left)
+            return self._items.popleft() if self._items else None
+
+    def close(self) -> None:
+        """Wake every reader; what is still inside can be taken."""
+        with self._arrived:
+            self._closed = True
+            self._arrived.notify_all()

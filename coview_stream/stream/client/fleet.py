@@ -1,0 +1,140 @@
+"""What is known of the robots on the network, and a table of it. Pure: time is handed in."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from coview_stream.geometry.transforms import yaw_of
+from coview_stream.messages.types import PoseMessage
+
+WINDOW = 5.0  # seconds over which the rate of poses is measured
+STALE = 2.0  # seconds without a pose after which the last one is no longer shown
+SILENT = 5.0  # seconds without any message: a node says something every second
+
+_COLUMNS = (
+    ("robot", -12),
+    ("state", -12),
+    ("x", 12),
+    ("y", 13),
+    ("z", 9),
+    ("yaw deg", 8),
+    ("age s", 6),
+    ("Hz", 5),
+    ("conf", 5),
+    ("ms p50/p99", 12),
+    ("dropped", 8),
+    ("reason", 0),
+)
+
+
+@dataclass
+class RobotView:
+    """The newest of one robot, with the times (steady, seconds) at which it arrived."""
+
+    robot: str
+    heard: float
+    pose: PoseMessage | None = None
+    status: dict[str, Any] = field(default_factory=dict)
+    status_heard: float = -math.inf
+    arrivals: deque[float] = field(default_factory=deque)
+
+    def pose_rate(self, now: float) -> float:
+        """Poses per second over the last seconds."""
+        while self.arrivals and self.arrivals[0] < now - WINDOW:
+            self.arrivals.popleft()
+        span = now - self.arrivals[0] if self.arrivals else 0.0
+        return (len(self.arrivals) - 1) / span if span > 0 else 0.0
+
+    def fresh_pose(self, now: float) -> PoseMessage | None:
+        """Return the pose, unless it is stale or the state since is another: who is lost must not look localised."""
+        if not self.arrivals or now - self.arrivals[-1] >= STALE:
+            return None
+        lost = self.status.get("state", "TRACKING") != "TRACKING" and self.status_heard > self.arrivals[-1]
+        return None if lost else self.pose
+
+
+class Fleet:
+    """All robots heard of so far."""
+
+    def __init__(self) -> None:
+        self.views: dict[str, RobotView] = {}
+
+    def add_pose(self, message: PoseMessage, now: float) -> None:
+        """Take in a pose that arrived at ``now``."""
+        view = self._view(message.robot, now)
+        view.pose = message
+        view.arrivals.append(now)
+
+    def add_status(self, robot: str, status: dict[str, Any], now: float) -> None:
+        """Take in a status that arrived at ``now``; no field of it is required."""
+        view = self._view(robot, now)
+        view.status, view.status_heard = status, now
+
+    def table(self, now: float, header: bool = True) -> list[str]:
+        """Lines of text, one per robot, sorted by name."""
+        rows = [_row(self.views[name], now) for name in sorted(self.views)]
+        if header:
+            rows.insert(0, [title for title, _ in _COLUMNS])
+        return ["  ".join(map(_cell, row, (width for _, width in _COLUMNS))).rstrip() for row in rows]
+
+    def _view(self, robot: str, now: float) -> RobotView:
+        view = self.views.setdefault(robot, RobotView(robot, now))
+        view.heard = now
+        return view
+
+
+def printable(text: object) -> str:
+    """Text from the network, fit for a terminal: no control characters, one line."""
+    return "".join(c if c.isprintable() else " " for c in str(text))
+
+
+def _row(view: RobotView, now: float) -> list[str]:
+    silence = now - view.heard
+    state = view.status.get("state") or (view.pose.state if view.fresh_pose(now) and view.pose else "-")
+    if silence > SILENT:
+        state = f"silent {silence:.0f} s"
+    latency, counters = _mapping(view.status, "latency_ms"), _mapping(view.status, "counters")
+    return [
+        printable(view.robot),
+        printable(state),
+        *_pose_cells(view.fresh_pose(now), view.pose_rate(now)),
+        f"{_number(latency.get('p50'), 0)}/{_number(latency.get('p99'), 0)}",
+        _number(counters.get("dropped"), 0),
+        printable(view.status.get("reason") or ""),
+    ]
+
+
+def _pose_cells(pose: PoseMessage | None, rate: float) -> list[str]:
+    if pose is None:
+        return ["-"] * 5 + [f"{rate:.1f}", "-"]
+    x, y, z = pose.T_map_body[:3, 3]
+    yaw = math.degrees(yaw_of(pose.T_map_body))
+    return [
+        f"{x:.2f}",
+        f"{y:.2f}",
+        f"{z:.2f}",
+        f"{yaw:.1f}",
+        _number(pose.age, 2),
+        f"{rate:.1f}",
+        _number(pose.confidence, 2),
+    ]
+
+
+def _cell(text: str, width: int) -> str:
+    return text.ljust(-width) if width < 0 else text.rjust(width)
+
+
+def _mapping(status: dict[str, Any], name: str) -> dict[str, Any]:
+    value = status.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _number(value: object, digits: int) -> str:
+    try:
+        known = isinstance(value, (int, float)) and math.isfinite(value)
+        return f"{value:.{digits}f}" if known else "-"
+    except OverflowError:  # the integers of JSON know no limit
+        return "-"

@@ -1,0 +1,281 @@
+"""A lane to an engine: in this process, or in a process of its own that is started again when it dies.
+
+Native code (registration, BLAS, tree building) may hold the interpreter lock for long; a process of its own is the only
+thing that keeps the pose clock of this one steady. The child is started anew rather than forked or spawned by
+multiprocessing: a fork after zenoh has been opened deadlocks, and a spawn would import the host's main module.
+"""
+
+# FOLDED coview_stream/stream/node/engine_process.py: """Acts when something takes too long, whatever the thread that does it is stuck in."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Any, Protocol
+
+from coview_stream.errors import CoViewError
+
+if TYPE_CHECKING:
+    from coview_stream.config import RegistrationMethod, Reloc
+    from coview_stream.stream.node.engines import Engine
+    from coview_stream.stream.node.jobs import Job, Result
+
+
+_GLANCE = 0.1  # seconds between two looks at whether the opening has been cancelled
+
+
+class RejectedError(Exception):
+    """The engine could not use a job; its robot's state is as before."""
+
+
+class FailedError(Exception):
+    """The engine failed at a job; it has forgotten the job's robot."""
+
+
+class DiedError(Exception):
+    """The engine's process died or hung; it has forgotten all robots."""
+
+
+class CancelledError(Exception):
+    """Whoever waited for the engine no longer wants it."""
+
+
+class Lane(Protocol):
+    """Runs jobs one at a time. Raises RejectedError, FailedError or DiedError."""
+
+    def run(self, job: Job) -> Result:
+        """Do one job and wait for it."""
+        ...
+
+    def close(self) -> None:
+        """End the engine; a job under way raises DiedError."""
+        ...
+
+
+class ProcessLane:
+    """Runs jobs in a child process. A child that hangs, wherever, is killed.
+
+    Args:
+        kind: ``track``, ``search`` or ``odometry``.
+        map_path: the map's file, which every process maps for itself.
+        sha256: what the map has to be; if the file was replaced meanwhile, poses would be of another map than is said.
+        nice: how far the child stands back from us, so that the clock here is never late.
+        registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
+        reloc: who names the places that a search looks at.
+        patience: seconds after which a job counts as hung.
+        opening: seconds after which opening the map, or preparing for the first job, does.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        map_path: str,
+        sha256: str,
+        nice: int = 0,
+        patience: float = 30.0,
+        opening: float = 120.0,
+        registration: RegistrationMethod = "trimmed-icp",
+        reloc: Reloc = "auto",
+    ) -> None:
+        self.kind = kind
+        self.map_path = map_path
+        self.sha256 = sha256
+        self.nice = nice
+        self.patience = patience
+        self.opening = opening
+        self.registration = registration
+        self.reloc = reloc
+        self._closed = False
+        self._lock = threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._pipe: Connection | None = None
+        self._awaited: list[str] = []  # what a fresh child has yet to say
+        self._watchdog = Watchdog(f"coview-watch-{kind}", self._kill)
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child, None while there is none."""
+        return self._child.pid if self._child else None
+
+    def start(self) -> None:
+        """Start the child without waiting until it is ready."""
+        with self._lock:
+            if self._closed:
+                raise DiedError(f"the {self.kind} engine has been closed")
+            ours, theirs = socket.socketpair()
+            with theirs:
+                self._child = subprocess.Popen(
+                    [sys.executable, "-m", "coview_stream.stream.node.worker", str(theirs.fileno()), self.kind,
+                     self.map_path, self.sha256, str(self.nice), self.registration,
+                     self.reloc],
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    env=_environment(),
+                    start_new_session=True,  # an interrupt at the terminal is for us to pass on
+                )  # fmt: skip
+            self._pipe = Connection(ours.detach())
+            self._awaited = ["ready", "prepared"]
+
+    def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
+        """Wait until the child has opened the map.
+
+        Args:
+            cancelled: asked ten times a second whether to give up.
+
+        Raises:
+            CoViewError: it could not, and says why. DiedError: it died or hung. CancelledError: as asked.
+        """
+        if "ready" in self._awaited:
+            self._await("ready", cancelled)
+
+    def run(self, job: Job) -> Result:
+        """Do one job; a child that died before is started again first."""
+        if self._pipe is None:
+            self.start()
+        try:
+            for word in list(self._awaited):
+                self._await(word)
+        except CoViewError as error:
+            self._end()
+            raise DiedError(str(error)) from error
+        return unwrap(*self._exchange(lambda pipe: pipe.send(job), self.patience))
+
+    def close(self) -> None:
+        """Kill the child at once; it keeps nothing that would have to be saved."""
+        with self._lock:
+            self._closed = True
+        self._end()
+        self._watchdog.close()
+
+    def _await(self, word: str, cancelled: Callable[[], bool] = lambda: False) -> None:
+        def look(pipe: Connection) -> None:
+            while not pipe.poll(_GLANCE):
+                if cancelled():
+                    raise CancelledError(f"the {self.kind} engine is no longer wanted")
+
+        kind, value = self._exchange(look, self.opening)
+        if kind == "error":
+            raise CoViewError(value)
+        self._awaited.remove(word)
+
+    def _exchange(self, begin: Callable[[Connection], object], seconds: float) -> tuple[str, Any]:
+        """Do ``begin`` and receive; sending, waiting and receiving may all hang, and together have ``seconds``."""
+        pipe = self._pipe
+        try:
+            if pipe is None:
+                raise EOFError
+            with self._watchdog.limit(seconds):
+                begin(pipe)
+                kind, value = pipe.recv()
+        except (EOFError, OSError, TypeError) as error:  # the last one: closed by another thread meanwhile
+            self._end()
+            hung = f" had no answer for {seconds:g} s and was ended"
+            raise DiedError(f"the {self.kind} engine{hung if self._watchdog.acted else ' died'}") from error
+        return str(kind), value
+
+    def _kill(self) -> None:
+        child = self._child
+        if child is not None:
+            child.kill()
+
+    def _end(self) -> None:
+        with self._lock:
+            child, self._child = self._child, None
+            pipe, self._pipe = self._pipe, None
+        if child is not None:
+            child.kill()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(timeout=1.0)
+        if pipe is not None:
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+
+def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
+    """Do a job; say how it went: ``done`` and the result, or ``rejected`` or ``failed`` and why."""
+    try:
+        return "done", engine.run(job)
+    except CoViewError as error:
+        return "rejected", str(error)
+    except Exception:
+        with contextlib.suppress(Exception):
+            engine.forget(job.robot)
+        return "failed", traceback.format_exc(limit=-6)
+
+
+def unwrap(kind: str, value: Any) -> Result:
+    """Return the result or raise what :func:`attempt` caught."""
+    if kind == "done":
+        result: Result = value
+        return result
+    raise (RejectedError if kind == "rejected" else FailedError)(str(value))
+
+
+def _environment() -> dict[str, str]:
+    """Ours, with this package in reach and one BLAS thread: two engines share the cores."""
+    paths = [p for p in sys.path if p]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
+
+
+class Watchdog:
+    """Guards one thing at a time, with one thread that sleeps through all that goes well.
+
+    Args:
+        name: of its thread.
+        act: called, once, when the time of what is guarded is over; meanwhile the guarded block cannot end.
+    """
+
+    def __init__(self, name: str, act: Callable[[], None]) -> None:
+        self._name = name
+        self._act = act
+        self._condition = threading.Condition()
+        self._deadline: float | None = None
+        self._sleeps_until: float | None = None
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self.acted = False
+
+    @contextmanager
+    def limit(self, seconds: float) -> Iterator[None]:
+        """Allow the block ``seconds``; :attr:`acted` says afterwards whether it needed more."""
+        self._arm(time.monotonic() + seconds)
+        try:
+            yield
+        finally:
+            with self._condition:
+                self._deadline = None
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify_all()
+
+    def _arm(self, deadline: float) -> None:
+        with self._condition:
+            self._deadline, self.acted = deadline, False
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._watch, name=self._name, daemon=True)
+                self._thread.start()
+            # a thread that wakes too early looks at the new deadline: most jobs cost no switch of threads
+            if self._sleeps_until is None or self._sleeps_until > deadline:
+                self._condition.notify_all()
+
+    def _watch(self) -> None:
+        with self._condition:
+            while not self._closed:
+                now = time.monotonic()
+                if self._deadline is not None and now >= self._deadline:
+                    self._deadline, self.acted = None, True
+                    self._act()
+                self._sleeps_until = self._deadline
+                self._condition.wait(None if self._deadline is None else self._deadline - now)

@@ -1,0 +1,164 @@
+"""From a map file and options to a running node."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coview_stream.basemap.basemap import BaseMap, check_reloc
+from coview_stream.config import RegistrationMethod, Reloc
+from coview_stream.config.node import NodeConfig
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.errors import MapError, TransportError
+from coview_stream.stream.node.engine_process import CancelledError, DiedError, ProcessLane
+from coview_stream.stream.transport.keys import RobotKeys, check_apart
+from coview_stream.stream.transport.transport import Transport
+
+if TYPE_CHECKING:
+    from coview_stream.stream.node.node import Node
+    from coview_stream.stream.node.session import Session
+
+log = logging.getLogger("coview_stream.node")
+
+_ODOMETRY_NICE = 2  # every pose waits for it
+_TRACK_NICE = 4  # the engines stand back: the pose clock and the receiving threads are in this process
+_SEARCH_NICE = 10
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """What ``serve`` was asked for.
+
+    Attributes:
+        map_path: a ``.coview`` file.
+        keys: of each robot.
+        connect: endpoints to connect to.
+        listen: endpoints to listen on.
+        zenoh_config: a zenoh JSON5 file, or None.
+        node: rates and limits.
+        cloud_codec: of all clouds, whatever they say; None believes them.
+        odometry_codec: likewise.
+        pose_codec: of the poses; None is the preset's.
+        lidar: how odometry is made of the clouds; None if the robots send theirs.
+        registration: how scans are registered to the map.
+        state: directory that keeps where robots were last known to be; None for none.
+        reloc: who names the places that a search looks at.
+    """
+
+    map_path: Path
+    keys: Sequence[RobotKeys]
+    connect: Sequence[str] = ()
+    listen: Sequence[str] = ()
+    zenoh_config: Path | None = None
+    node: NodeConfig = field(default_factory=NodeConfig)
+    cloud_codec: str | None = None
+    odometry_codec: str | None = None
+    pose_codec: str | None = None
+    lidar: LidarOdometryConfig | None = None
+    registration: RegistrationMethod = "trimmed-icp"
+    state: Path | None = None
+    reloc: Reloc = "auto"
+
+
+def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
+    """Load the map in the engines, open the network and start; what fails leaves nothing running.
+
+    Args:
+        options: what to serve, and where.
+        cancelled: asked now and then whether to give up.
+
+    Raises:
+        MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
+        CancelledError: as asked. CoViewError: a library that the options ask for is missing.
+    """
+    check_apart(options.keys)
+    names = [k.robot for k in options.keys]
+    begin = time.monotonic()
+    base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
+    missing = check_reloc(base_map, options.reloc)
+    if missing is not None:
+        log.warning("%s: %s", options.map_path, missing)
+    path, method = str(options.map_path), options.registration
+    reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
+    lanes = [
+        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
+        search := ProcessLane(
+            "search", path, base_map.sha256, _SEARCH_NICE, registration=method, reloc=reloc
+        ),
+    ]
+    odometry = None
+    if options.lidar is not None:
+        odometry = ProcessLane("odometry", path, base_map.sha256, _ODOMETRY_NICE)
+        lanes.append(odometry)
+    transport = None
+    try:
+        for lane in lanes:
+            lane.start()
+        # imported while the engines start, which takes longer
+        from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
+        from coview_stream.stream.node.last_pose_keeper import Memory
+        from coview_stream.stream.node.node import Node
+        from coview_stream.stream.transport.zenoh_transport import open_transport
+
+        transport = open_transport(
+            options.connect, options.listen, options.zenoh_config, options.node.max_payload
+        )
+        warn_of_others(transport, options.keys)
+        sessions = make_sessions(options, base_map.sha256)
+        prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
+        if odometry is not None:
+            odometry.wait_ready(cancelled)
+        track.wait_ready(cancelled)  # the other one has until the first keyframe
+        if cancelled():
+            raise CancelledError("the node is no longer wanted")
+        aside = {} if options.state is None else {"memory": Memory(options.state, sessions).run}
+        node = Node(sessions, transport, track, search, options.node, options.pose_codec, odometry, aside)
+        node.start()
+    except BaseException as error:
+        for lane in lanes:
+            lane.close()
+        if transport is not None:
+            transport.close()
+        if isinstance(error, DiedError):
+            raise MapError(f"{options.map_path}: {error} while it opened the map") from error
+        raise
+    log.info(
+        "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
+    )
+    return node
+
+
+def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
+    """Return a session for each robot, that makes its odometry if that is asked for."""
+    from coview_stream.stream.node.lidar_session import LidarSession
+    from coview_stream.stream.node.session import Session
+
+    codecs = (options.cloud_codec, options.odometry_codec)
+    if options.lidar is None:
+        return [Session(keys, map_sha256, options.node, options=codecs) for keys in options.keys]
+    return [
+        LidarSession(keys, map_sha256, options.node, options=codecs, lidar=options.lidar)
+        for keys in options.keys
+    ]
+
+
+def warn_of_others(transport: Transport, keys: Sequence[RobotKeys]) -> None:
+    """Say which of the robots another node serves as well, as far as can be seen from here."""
+    try:
+        # one question for all robots of a base: chunks of the key are base, name and "alive"
+        everybody = {k.alive.rsplit("/", 2)[0] + "/*/alive" for k in keys}
+        held = {token for expression in everybody for token in transport.tokens(expression)}
+    except TransportError as error:
+        log.warning("cannot see whether another node is there: %s", error)
+        return
+    for robot, token in ((k.robot, k.alive) for k in keys):
+        if token in held:
+            log.warning(
+                "another node serves %s already (it holds %s): poses of both go to one key; end one of them",
+                robot,
+                token,
+            )

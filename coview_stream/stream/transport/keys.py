@@ -1,0 +1,256 @@
+"""Which keys a robot speaks on: presets for the conventions in use, one table.
+
+``native`` is ours; ``ros2dds`` follows zenoh-bridge-ros2dds, ``rmw_zenoh`` ROS 2's own zenoh middleware and
+``keelson`` RISE's maritime protocol. Status, liveliness and rpc stay native in all of them: no one else has them.
+"""
+
+# FOLDED coview_stream/stream/transport/keys.py: """Whether robots can be told apart by their keys: what one sends must be nobody else's, and no pose anybody's input."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from coview_stream.errors import ConfigError
+from coview_stream.stream.transport.key_expressions import (
+    check_chunk,
+    check_expression,
+    check_prefix,
+    matches,
+)
+from coview_stream.stream.transport.rmw import dds_type, type_hash
+
+POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+_CLOUD_DDS = dds_type("sensor_msgs/msg/PointCloud2")
+
+_ODOMETRY_DDS = dds_type("nav_msgs/msg/Odometry")
+
+_POSE_DDS = dds_type(POSE_TYPE)
+
+_RMW_KEY = re.compile(r"\d+(/[^/]+)+/[^/]+/[^/]+")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One row of the table: key templates and what flows on them.
+
+    Attributes:
+        cloud: key expression of lidar frames; here and below ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}``
+            are filled in.
+        odometry: key expression of odometry.
+        pose: key of our poses.
+        cloud_hint: codec to try where Encoding and key do not say; None leaves it to the payload.
+        odometry_hint: the same for odometry.
+        pose_hint: the same for a reader of our poses.
+        pose_format: codec that poses are written with.
+        bare: poses go out without Encoding, as the convention does.
+        rmw: poses need rmw_zenoh's attachment and liveliness tokens.
+    """
+
+    cloud: str
+    odometry: str
+    pose: str
+    cloud_hint: str | None = None
+    odometry_hint: str | None = None
+    pose_hint: str | None = None
+    pose_format: str = "json"
+    bare: bool = False
+    rmw: bool = False
+
+
+PRESETS: dict[str, Preset] = {
+    "native": Preset(
+        cloud="{base}/{robot}/in/cloud",
+        odometry="{base}/{robot}/in/odom",
+        pose="{base}/{robot}/out/pose",
+    ),
+    "ros2dds": Preset(
+        cloud="{robot}/points",
+        odometry="{robot}/odom",
+        pose="{robot}/coview/pose",
+        cloud_hint="cdr",
+        odometry_hint="cdr",
+        pose_hint="cdr",
+        pose_format="cdr",
+        bare=True,
+    ),
+    # the last part of an input is the type's hash: '*' takes every ROS 2 release's, Humble's too
+    "rmw_zenoh": Preset(
+        cloud=f"{{domain}}/{{robot}}/points/{_CLOUD_DDS}/*",
+        odometry=f"{{domain}}/{{robot}}/odom/{_ODOMETRY_DDS}/*",
+        pose=f"{{domain}}/{{robot}}/coview/pose/{_POSE_DDS}/{{pose_hash}}",
+        cloud_hint="cdr",
+        odometry_hint="cdr",
+        pose_hint="cdr",
+        pose_format="cdr",
+        bare=True,
+        rmw=True,
+    ),
+    # keelson has no subject for a pose in a map frame, only foxglove.FrameTransform: ours is map -> body, from the
+    # source 'coview'; odometry therefore must name its source, or it would match our own poses
+    "keelson": Preset(
+        cloud="{base}/@v0/{robot}/pubsub/point_cloud/**",
+        odometry="{base}/@v0/{robot}/pubsub/frame_transform/odometry/**",
+        pose="{base}/@v0/{robot}/pubsub/frame_transform/coview",
+        cloud_hint="keelson",
+        odometry_hint="keelson",
+        pose_hint="keelson",
+        pose_format="keelson",
+        bare=True,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class RobotKeys:
+    """Everything one robot's traffic needs: where it flows and in which format. Fields as in :class:`Preset`.
+
+    Attributes:
+        robot: its name.
+        cloud: key expression to subscribe to.
+        odometry: key expression to subscribe to.
+        pose: key to publish poses on.
+        status: key to publish the status on.
+        alive: key of the liveliness token.
+        relocalize: key that answers queries to forget the pose and search again.
+        reset: key that answers queries to forget everything.
+        cloud_hint: codec to try where Encoding and key do not say.
+        odometry_hint: the same for odometry.
+        pose_hint: the same for a reader of poses.
+        pose_format: codec to write poses with, unless the user asks for another.
+        rmw: poses need rmw_zenoh's attachment and liveliness tokens.
+        bare: poses go out without Encoding.
+    """
+
+    robot: str
+    cloud: str
+    odometry: str
+    pose: str
+    status: str
+    alive: str
+    relocalize: str
+    reset: str
+    cloud_hint: str | None = None
+    odometry_hint: str | None = None
+    pose_hint: str | None = None
+    pose_format: str = "json"
+    rmw: bool = False
+    bare: bool = False
+
+
+def robot_keys(
+    preset: str,
+    base: str,
+    robot: str,
+    cloud: str | None = None,
+    odometry: str | None = None,
+    pose: str | None = None,
+    domain: int = 0,
+    humble: bool = False,
+) -> RobotKeys:
+    """Fill a preset in for one robot.
+
+    Args:
+        preset: ``native``, ``ros2dds``, ``rmw_zenoh`` or ``keelson``.
+        base: first part of our own keys, one chunk or several (``site/hall3``).
+        robot: the robot's name, one chunk; in ROS its namespace.
+        cloud: key expression instead of the preset's; ``{base}``, ``{robot}`` and ``{domain}`` are filled in.
+        odometry: the same for odometry.
+        pose: the same for poses; a plain key, without wildcards; with ``rmw_zenoh`` it keeps
+            the convention's form, and ``{pose_hash}`` is filled in too.
+        domain: ROS domain id, 0 to 232.
+        humble: name types as ROS 2 Humble does, without a hash.
+
+    Raises:
+        ConfigError: if the preset is unknown, or a name or key is not valid in zenoh.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f"--preset {preset!r} is unknown: choose one of {', '.join(PRESETS)}")
+    if not 0 <= domain <= 232:
+        raise ConfigError(f"--domain {domain} is not a ROS domain id: 0 to 232")
+    row = PRESETS[preset]
+    values = {
+        "base": check_prefix(base, "--base"),
+        "robot": check_chunk(robot, "--robot"),
+        "domain": str(domain),
+    }
+    if row.rmw:
+        values["pose_hash"] = type_hash(POSE_TYPE, humble)
+    own = f"{base}/{robot}"
+    pose_key = _filled(pose or row.pose, values, "--pose-key", wildcards=False)
+    if row.rmw and not _RMW_KEY.fullmatch(pose_key):
+        raise ConfigError(
+            f"--pose-key {pose_key!r} is no rmw_zenoh key: <domain>/<topic>/<type>/<hash>, such as {row.pose!r}"
+        )
+    return RobotKeys(
+        robot=robot,
+        cloud=_filled(cloud or row.cloud, values, "--cloud-key"),
+        odometry=_filled(odometry or row.odometry, values, "--odometry-key"),
+        pose=pose_key,
+        status=f"{own}/out/status",
+        alive=f"{own}/alive",
+        relocalize=f"{own}/rpc/relocalize",
+        reset=f"{own}/rpc/reset",
+        cloud_hint=row.cloud_hint,
+        odometry_hint=row.odometry_hint,
+        pose_hint=row.pose_hint,
+        pose_format=row.pose_format,
+        rmw=row.rmw,
+        bare=row.bare,
+    )
+
+
+def _filled(template: str, values: dict[str, str], option: str, wildcards: bool = True) -> str:
+    def value(found: re.Match[str]) -> str:
+        name = found.group(1)
+        if name not in values:
+            raise ConfigError(
+                f"{option} {template!r}: unknown placeholder {{{name}}}: there are {', '.join(values)}"
+            )
+        return values[name]
+
+    return check_expression(re.sub(r"\{([^{}]*)\}", value, template), option, wildcards)
+
+
+_OPTIONS = ("--cloud-key", "--odometry-key")
+
+
+def check_apart(keys: Sequence[RobotKeys]) -> None:
+    """Check the keys of all robots that one node serves.
+
+    Raises:
+        ConfigError: a name is given twice, two robots would read the same messages or write poses on one key, or a
+            pose would come back as input.
+    """
+    names = [k.robot for k in keys]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--robot: {', '.join(names)}: each name once")
+    for one, other in combinations(keys, 2):
+        _check_inputs(one, other)
+        if one.pose == other.pose:
+            raise ConfigError(
+                f"--pose-key: poses of robots {one.robot} and {other.robot} would both go to {one.pose!r}: "
+                "use {robot} in --pose-key"
+            )
+    for writer in keys:
+        for reader in keys:
+            for option, expression in zip(_OPTIONS, (reader.cloud, reader.odometry), strict=True):
+                if matches(expression, writer.pose):
+                    raise ConfigError(
+                        f"--pose-key: the poses of robot {writer.robot} on {writer.pose!r} would be read as input of "
+                        f"{reader.robot}, which is {expression!r}: choose a --pose-key or {option} apart from that"
+                    )
+
+
+def _check_inputs(one: RobotKeys, other: RobotKeys) -> None:
+    for first, a in zip(_OPTIONS, (one.cloud, one.odometry), strict=True):
+        for second, b in zip(_OPTIONS, (other.cloud, other.odometry), strict=True):
+            if matches(a, b):
+                both = first if first == second else f"{first} and {second}"
+                raise ConfigError(
+                    f"{first} {a!r} of robot {one.robot} and {second} {b!r} of {other.robot} have messages in common: "
+                    f"use {{robot}} in {both}"
+                )

@@ -1,0 +1,156 @@
+"""A network in memory: no threads, no clock, every call finished when it returns. For tests of what streams."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from coview_stream.errors import TransportError
+from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.key_expressions import check_expression, matches
+from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
+
+_log = logging.getLogger(__name__)
+
+
+class FakePublisher:
+    """Publishes on one key of a :class:`FakeTransport`."""
+
+    def __init__(self, transport: FakeTransport, key: str, urgency: Urgency) -> None:
+        self.key = key
+        self.urgency = urgency
+        self.closed = False
+        self._transport = transport
+
+    def put(self, message: Encoded) -> None:
+        """Record the message and hand it to matching subscriptions; lost while the network is away."""
+        if not self.closed:
+            self._transport.publish(Sample(self.key, message.payload, message.encoding, message.attachment))
+
+    def close(self) -> None:
+        """Undeclare: later messages are ignored."""
+        self.closed = True
+
+
+class FakeTransport:
+    """An in-memory transport and the network around it: the test plays robot, client and router.
+
+    Attributes:
+        published: every sample that reached the network, in order, from publishers and from :meth:`publish`.
+        publishers: all that were declared.
+        lost: number of samples published while the network was away.
+        raised: what handlers raised, in order.
+        closed: whether :meth:`close` was called.
+    """
+
+    def __init__(self) -> None:
+        self.published: list[Sample] = []
+        self.publishers: list[FakePublisher] = []
+        self.lost = 0
+        self.raised: list[Exception] = []
+        self.closed = False
+        self._here = True
+        self._tokens: list[str] = []
+        self._subscriptions: list[tuple[str, Callable[[Sample], None], Policy]] = []
+        self._answers: dict[str, Callable[[dict[str, str]], dict[str, Any]]] = {}
+        self._guard = Guard(_log)
+
+    # what the node under test uses
+
+    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
+        """Call ``handler`` within each matching publication; nothing is ever queued, so both policies are the same."""
+        self._subscriptions.append((check_expression(key, "key"), handler, policy))
+
+    def publisher(self, key: str, urgency: Urgency) -> Publisher:
+        """Declare a publisher; it stays readable in :attr:`publishers`."""
+        publisher = FakePublisher(self, check_expression(key, "key", wildcards=False), urgency)
+        self.publishers.append(publisher)
+        return publisher
+
+    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
+        """Answer :meth:`query`."""
+        self._answers[check_expression(key, "key")] = handler
+
+    def announce(self, key: str) -> None:
+        """Hold a token until :meth:`close`."""
+        self._tokens.append(check_expression(key, "key", wildcards=False))
+
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Ask what :meth:`answer` declared; there is nothing to wait for.
+
+        Raises:
+            TransportError: if nobody answers on ``key``, the network is away, or the handler raises.
+        """
+        handler = next((handler for name, handler in self._answers.items() if matches(name, key)), None)
+        if handler is None or not self._here:
+            raise TransportError(f"{key}: nobody answers")
+        try:
+            return handler(dict(parameters or {}))
+        except Exception as error:
+            self.raised.append(error)
+            raise TransportError(f"{key}: the node refused: {error}") from error
+
+    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+        """Those of :attr:`announced` that match, sorted, each once."""
+        return sorted({token for token in self.announced if matches(expression, token)})
+
+    def await_subscriber(
+        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
+    ) -> bool:
+        """Return True at once: every publication counts as heard, as :attr:`published` keeps it."""
+        return True
+
+    def connection(self) -> Connection:
+        """One router, ``fake``, unless the network is away."""
+        return Connection(routers=("fake",)) if self._here and not self.closed else Connection()
+
+    def close(self) -> None:
+        """Drop subscriptions, publishers, answers and tokens."""
+        self.closed = True
+        for publisher in self.publishers:
+            publisher.close()
+        self._subscriptions.clear()
+        self._answers.clear()
+        self._tokens.clear()
+
+    # what the test uses
+
+    @property
+    def announced(self) -> tuple[str, ...]:
+        """Liveliness tokens that others can see right now, in the order in which they were announced."""
+        return tuple(self._tokens) if self._here else ()
+
+    @property
+    def subscribed(self) -> dict[str, Policy]:
+        """Key expressions subscribed to, with their policies."""
+        return {key: policy for key, _, policy in self._subscriptions}
+
+    def publish(self, sample: Sample) -> None:
+        """Publish as anybody on the network: every matching handler has run when this returns."""
+        if not self._here:
+            self.lost += 1
+            return
+        self.published.append(sample)
+        for key, handler, _ in list(self._subscriptions):
+            if matches(key, sample.key):
+                error = self._guard.run(key, partial(handler, sample))
+                if error is not None:
+                    self.raised.append(error)
+
+    def samples(self, key: str) -> list[Sample]:
+        """Return what was published on keys that match ``key``, oldest first."""
+        return [sample for sample in self.published if matches(key, sample.key)]
+
+    def go_away(self) -> None:
+        """Let the router vanish: publications are lost, queries fail, tokens are gone; declarations stay."""
+        self._here = False
+
+    def come_back(self) -> None:
+        """Let the router return, and with it everything declared."""
+        self._here = True

@@ -1,0 +1,93 @@
+"""What rmw_zenoh (ROS 2 over zenoh) expects beside the payload: type names, attachments and liveliness tokens.
+
+A ROS 2 subscription drops samples without the attachment, and ``ros2 topic list`` shows only topics whose publisher
+holds a token. Formats as in ROS 2 Jazzy and newer; Humble differs in the type hash alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Callable
+
+from coview_stream.messages.types import Encoded
+from coview_stream.stream.transport.transport import Publisher
+
+NO_HASH = "TypeHashNotSupported"
+"""In place of the type hash, from ROS 2 Humble."""
+
+_GID = 16
+_ATTACHMENT = struct.Struct("<qqB16s")  # sequence, source time in ns, length of the gid, gid
+_QOS = "::,10:,:,:,,"  # empty fields mean rmw_zenoh's defaults: reliable, volatile; keep the last 10
+_ROOT = "%"  # a '/' in a name, and so the root enclave and the root namespace
+
+
+def dds_type(name: str) -> str:
+    """``sensor_msgs/msg/PointCloud2`` as DDS spells it: ``sensor_msgs::msg::dds_::PointCloud2_``."""
+    package, kind, message = name.split("/")
+    return f"{package}::{kind}::dds_::{message}_"
+
+
+def type_hash(name: str, humble: bool = False) -> str:
+    """RIHS01 hash of a ROS 2 message type, or what Humble writes instead."""
+    if humble:
+        return NO_HASH
+    from rosbags.typesys import Stores, get_typestore
+
+    return str(get_typestore(Stores.ROS2_JAZZY).hash_rihs01(name))
+
+
+def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
+    """33 bytes: running number from 1, source time in nanoseconds, and the publisher's 16-byte identity."""
+    return _ATTACHMENT.pack(sequence, stamp_ns, _GID, gid)
+
+
+def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
+    """Sequence, source time in nanoseconds and publisher identity; None if ``data`` is not such an attachment."""
+    if len(data) != _ATTACHMENT.size or data[_ATTACHMENT.size - _GID - 1] != _GID:
+        return None
+    sequence, stamp_ns, _, gid = _ATTACHMENT.unpack(data)
+    return sequence, stamp_ns, gid
+
+
+def gid_of(token: str) -> bytes:
+    """Return a 16-byte publisher identity. ROS compares it, never recomputes it: any hash of the token will do."""
+    return hashlib.blake2b(token.encode(), digest_size=_GID).digest()
+
+
+def node_token(domain: int, zid: str, node: str, node_id: int = 0) -> str:
+    """Liveliness token of a ROS 2 node in the root namespace; ``zid`` is our zenoh session's identity."""
+    return f"@ros2_lv/{domain}/{zid}/{node_id}/{node_id}/NN/{_ROOT}/{_ROOT}/{node}"
+
+
+def publisher_token(key: str, zid: str, node: str, entity_id: int, node_id: int = 0) -> str:
+    """Token of a publisher on ``key``, ``domain/topic.../type/hash``; no other entity has its ``entity_id``."""
+    domain, *topic, kind, digest = key.split("/")
+    name = _ROOT + _ROOT.join(topic)
+    return f"@ros2_lv/{domain}/{zid}/{node_id}/{entity_id}/MP/{_ROOT}/{_ROOT}/{node}/{name}/{kind}/{digest}/{_QOS}"
+
+
+class RmwPublisher:
+    """Publishes as a ROS 2 node would: adds the attachment and takes the Encoding away, as rmw_zenoh sets none.
+
+    Args:
+        inner: where the messages go.
+        token: the publisher's liveliness token; its identity is derived from it.
+        now_ns: wall clock, nanoseconds, for the source time that ROS tools measure latency with.
+    """
+
+    def __init__(self, inner: Publisher, token: str, now_ns: Callable[[], int]) -> None:
+        self._inner = inner
+        self._gid = gid_of(token)
+        self._now_ns = now_ns
+        self._sequence = 0
+
+    def put(self, message: Encoded) -> None:
+        """Publish with the next sequence number; one thread at a time."""
+        self._sequence += 1
+        extra = attachment(self._sequence, self._now_ns(), self._gid)
+        self._inner.put(Encoded(message.payload, "", extra))
+
+    def close(self) -> None:
+        """Undeclare."""
+        self._inner.close()

@@ -1,0 +1,242 @@
+"""What a zenoh session is configured with: the user's file first, our defaults where it is silent."""
+
+# FOLDED coview_stream/stream/transport/zenoh_config.py: """What zenoh says when it refuses something, in one short line that ends with the remedy."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coview_stream.errors import TransportError
+from coview_stream.stream.transport.error_guard import is_panic
+
+_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
+
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
+
+_HOST_PORT = re.compile(r"(\[[^\]]+\]|[^:\[\]]+):(\d+)")
+
+_DEFAULTS: dict[str, Any] = {
+    # explicit endpoints only: a robot must not join whatever the next desk is testing
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
+    # zenoh's own waits grow to 4 s; a robot that stands still waiting for poses wants its router back within 2 s
+    "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2.0},
+    # a host that is off does not refuse: each attempt waits this long, and so, at worst, does the end of the process.
+    # Enough for five round trips over a satellite. connect/timeout_ms would bound the wait too, but with it a client
+    # never tries its second endpoint (zenoh#1602)
+    "transport/unicast/open_timeout": 3000,
+    # poses are express, a batch each, and dropped after a millisecond without a free one: room for a fleet's at once
+    "transport/link/tx/queue/size/real_time": 16,
+}
+
+# zenoh switches shared memory on by itself. It saves 0.5 ms of 1.5 ms on a 1 MB cloud between processes of one machine,
+# and costs: messages lost without a word when the receiver stalls for 100 ms (zenoh#2628), segments left behind by
+# killed processes (zenoh#2571), and an error line where memory locking is limited, as it is for ordinary users.
+_SHARED_MEMORY = "transport/shared_memory/enabled"
+
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.S)
+
+_FILES = (
+    *(
+        f"transport/link/tls/{name}"
+        for name in (
+            "root_ca_certificate",
+            "listen_certificate",
+            "listen_private_key",
+            "connect_certificate",
+            "connect_private_key",
+        )
+    ),
+    "transport/auth/usrpwd/dictionary_file",
+)
+
+
+@contextmanager
+def zenoh_errors(what: str) -> Iterator[None]:
+    """Turn zenoh's errors, and the panics of its Rust core, into :class:`TransportError` about ``what``."""
+    import zenoh
+
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise TransportError(f"{what}: {reason(error)}") from error
+    except BaseException as error:
+        if not is_panic(error):
+            raise
+        raise TransportError(f"{what}: zenoh failed inside: {reason(error)}") from error
+
+
+def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None) -> Any:
+    """Build a ``zenoh.Config``.
+
+    The file decides whatever it sets; ``connect`` and ``listen`` replace its endpoints. Without a mode in the file we
+    are a client if there is something to connect to and nothing to listen on, else a peer: two peers do not see each
+    other through a router, a client is seen by all.
+
+    Args:
+        connect: endpoints to connect to, for example ``tcp/10.0.0.1:7447``.
+        listen: endpoints to listen on.
+        path: a zenoh configuration, JSON5 or YAML.
+
+    Raises:
+        TransportError: if the file cannot be read, is no zenoh configuration, names a missing file, or an endpoint is
+            malformed.
+    """
+    for endpoint in connect:
+        _check_endpoint(endpoint, "--connect")
+    for endpoint in listen:
+        _check_endpoint(endpoint, "--listen")
+    config, text = _load(path)
+    if connect:
+        _insert(config, "connect/endpoints", list(connect))
+    _set_listen(config, listen)
+    if _get(config, "mode") is None:
+        has_listen, has_connect = (
+            bool(_get(config, "listen/endpoints")),
+            bool(_get(config, "connect/endpoints")),
+        )
+        _insert(config, "mode", "client" if has_connect and not has_listen else "peer")
+    for key, value in _DEFAULTS.items():
+        if _is_unset(config, key):
+            _insert(config, key, value)
+    if "shared_memory" not in _COMMENT.sub("", text):  # set or not, it reads the same: ask the file's text
+        _insert(config, _SHARED_MEMORY, False)
+    _check(config, path)
+    return config
+
+
+def mode_of(config: Any) -> str:
+    """``client``, ``peer`` or ``router``."""
+    return str(_get(config, "mode"))
+
+
+def endpoints_of(config: Any) -> str:
+    """List the endpoints to connect to, for messages."""
+    found = _get(config, "connect/endpoints")
+    if isinstance(found, dict):
+        found = found.get(mode_of(config)) or []
+    return ", ".join(map(str, found)) or "no endpoint"
+
+
+def _load(path: Path | None) -> tuple[Any, str]:
+    import zenoh
+
+    if path is None:
+        return zenoh.Config(), ""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        what = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise TransportError(
+            f"zenoh configuration {path}: {what}: give a JSON5 file that can be read"
+        ) from error
+    with zenoh_errors(f"zenoh configuration {path}"):
+        return zenoh.Config.from_file(str(path)), text
+
+
+def _is_unset(config: Any, key: str) -> bool:
+    import zenoh
+
+    # zenoh does not tell what a file set; what reads as in an empty configuration counts as not set
+    return bool(_get(config, key) == _get(zenoh.Config(), key))
+
+
+def _set_listen(config: Any, listen: Sequence[str]) -> None:
+    if listen:
+        _insert(config, "listen/endpoints", list(listen))
+    elif mode_of(config) != "router" and _is_unset(config, "listen/endpoints"):
+        _insert(config, "listen/endpoints", [])  # unset, a peer would listen on all interfaces
+
+
+def _check(config: Any, path: Path | None) -> None:
+    if _get(config, "transport/unicast/lowlatency"):
+        raise TransportError(
+            f"zenoh configuration {path}: transport/unicast/lowlatency loses messages over 64 KB: take it out"
+        )
+    for key in _FILES:
+        name = _get(config, key)
+        # zenoh would retry for ever without a word
+        if name is not None and not Path(name).is_file():
+            raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is no file")
+
+
+def _check_endpoint(endpoint: str, option: str) -> None:
+    protocol, slash, rest = endpoint.partition("/")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if protocol not in _PROTOCOLS or not slash or not address:
+        raise TransportError(
+            f"{option} {endpoint!r} is not <protocol>/<address>, such as tcp/127.0.0.1:7447; "
+            f"protocols: {', '.join(_PROTOCOLS)}"
+        )
+    if protocol in _WITH_PORT:
+        found = _HOST_PORT.fullmatch(address)
+        if not found:
+            raise TransportError(
+                f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447"
+            )
+        lowest = 0 if option == "--listen" else 1  # listening on 0 takes any that is free
+        if not lowest <= int(found.group(2)) <= 65535:
+            raise TransportError(f"{option} {endpoint!r}: port must be 1..65535, such as 7447")
+
+
+def _get(config: Any, key: str) -> Any:
+    return json.loads(config.get_json(key))
+
+
+def _insert(config: Any, key: str, value: Any) -> None:
+    with zenoh_errors(f"zenoh setting {key} = {value!r}"):
+        config.insert_json5(key, json.dumps(value))
+
+
+_REMEDIES = {
+    "Address already in use": "another node or router holds the port: --connect to it, or another --listen",
+    "Cannot assign requested address": "no address of this machine: --listen on one that it has, or --connect to the "
+    "machine that has it",
+}
+
+_MESSAGE = re.compile(
+    r'JSON error: Message \{ msg: "((?:[^"\\]|\\.)*)", location: (?:Some\(.*?line: (\d+),.*|None.*)'
+)
+
+_SYNTAX = re.compile(r"^--> (\d+):(\d+) \|.*\| = (.*)$")
+
+_FIELD = re.compile(r"unknown field `([^`]*)`(?:, (?:expected (?:one of )?)?(.*?))?(?=$| at line )")
+
+_PLACE = re.compile(r" at line (\d+) column \d+")
+
+
+def reason(error: BaseException) -> str:
+    """Return what zenoh says, on one line, without the places in its source, with a remedy where we know one."""
+    text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
+    text = _mistake(text.strip()) or type(error).__name__
+    for cause, remedy in _REMEDIES.items():
+        if cause in text:
+            return f"{text}; {remedy}"
+    return text
+
+
+def _mistake(text: str) -> str:
+    """Shorten a complaint about a configuration file, which names all keys that there could have been."""
+    if found := _MESSAGE.fullmatch(text):
+        line = f"line {found[2]}: " if found[2] else ""
+        return line + _field(re.sub(r"\\(.)", r"\1", found[1]))
+    if found := _SYNTAX.match(text):
+        return f"line {found[1]}, column {found[2]}: {found[3]}"
+    return _field(text)
+
+
+def _field(text: str) -> str:
+    found: Any = _FIELD.search(text)
+    if found is None:
+        return text
+    place = _PLACE.search(text)
+    known = re.findall(r"`([^`]+)`", found[2] or "")
+    near = difflib.get_close_matches(found[1], known, 1)
+    line = f"line {place[1]}: " if place else ""
+    return f"{line}unknown key {found[1]!r}" + (f"; did you mean {near[0]!r}?" if near else "; take it out")

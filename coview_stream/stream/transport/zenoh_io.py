@@ -1,0 +1,162 @@
+"""Samples in and out of zenoh's own types, and with which quality of service they travel."""
+
+# FOLDED coview_stream/stream/transport/zenoh_io.py: """Queries in zenoh: answers to those of others, for all keys on one thread, and the first reply to one of ours."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from queue import SimpleQueue
+from typing import Any
+
+from coview_stream.errors import TransportError
+from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.transport import Urgency
+
+_UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
+
+
+class ZenohPublisher:
+    """A publisher that may exist before the session does."""
+
+    def __init__(self, key: str, guard: Guard) -> None:
+        self._key = key
+        self._guard = guard
+        self._publisher: Any = None
+        self._closed = False
+
+    def attach(self, publisher: Any) -> None:
+        """Take zenoh's publisher, once there is a session to declare it on."""
+        self._publisher = publisher
+        if self._closed:
+            self.close()
+
+    def put(self, message: Encoded) -> None:
+        """Publish; lost while there is no session yet or nobody to send to."""
+        publisher = self._publisher
+        if publisher is not None and not self._closed:
+            encoding = message.encoding or _UNSET
+            self._guard.run(
+                self._key,
+                lambda: publisher.put(message.payload, encoding=encoding, attachment=message.attachment),
+            )
+
+    def close(self) -> None:
+        """Undeclare; later messages are ignored."""
+        self._closed = True
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            self._guard.run(self._key, publisher.undeclare)
+
+
+def plain(sample: Any, max_payload: int | None = None) -> Sample:
+    """Return a zenoh sample as plain data. Copies the payload once: zenoh's Python types share no memory.
+
+    Payload and attachment that are together larger than ``max_payload`` are not copied, which would hold up every other
+    thread, but for their size.
+    """
+    key, encoding = str(sample.key_expr), str(sample.encoding)
+    encoding = "" if encoding == _UNSET else encoding
+    attachment = sample.attachment
+    size = len(sample.payload) + (0 if attachment is None else len(attachment))
+    if max_payload is not None and size > max_payload:
+        return Sample(key, b"", encoding, size=size)
+    return Sample(
+        key, sample.payload.to_bytes(), encoding, None if attachment is None else attachment.to_bytes()
+    )
+
+
+def quality(urgency: Urgency) -> dict[str, Any]:
+    """Return the options to declare a publisher with."""
+    import zenoh
+
+    congestion, priority = zenoh.CongestionControl, zenoh.Priority
+    if (
+        urgency == "realtime"
+    ):  # express: not batched; 0.2 ms beside a flood of clouds on the same link instead of 8
+        return {"express": True, "priority": priority.REAL_TIME, "congestion_control": congestion.DROP}
+    if urgency == "report":
+        return {"congestion_control": congestion.DROP}
+    if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link
+        return {"congestion_control": congestion.BLOCK}
+    # BLOCK_FIRST hands one frame to a background task and drops newer ones meanwhile: put never waits. DROP gives up a
+    # big frame half sent after 50 ms, so on a slow link none arrives
+    return {"congestion_control": getattr(congestion, "BLOCK_FIRST", congestion.DROP)}
+
+
+_JSON = "application/json"
+
+Answer = Callable[[dict[str, str]], dict[str, Any]]
+
+
+class Answers:
+    """Queries that wait for their answer, and the thread's work on them."""
+
+    def __init__(self, guard: Guard) -> None:
+        self._guard = guard
+        self._queries: SimpleQueue[tuple[str, Any, Answer] | None] = SimpleQueue()
+
+    def callback(self, key: str, handler: Answer) -> Callable[[Any], None]:
+        """Return what zenoh is to call with queries on ``key``; it returns at once."""
+
+        def enqueue(query: Any) -> None:
+            self._queries.put((key, query, handler))
+
+        return enqueue
+
+    def run(self) -> None:
+        """Answer until :meth:`end`."""
+        while (entry := self._queries.get()) is not None:
+            key, query, handler = entry
+            self._guard.run(key, partial(self._answer, key, query, handler))
+            del entry, query  # a query is finished for its sender when nobody holds it
+
+    def end(self) -> None:
+        """Let :meth:`run` return."""
+        self._queries.put(None)
+
+    def _answer(self, key: str, query: Any, handler: Answer) -> None:
+        try:
+            reply = json.dumps(handler({str(name): str(value) for name, value in query.parameters}))
+        except Exception as error:
+            self._guard.report(key, error)
+            query.reply_err(json.dumps({"error": str(error)}), encoding=_JSON)
+        else:
+            query.reply(key, reply, encoding=_JSON)
+
+
+def first_reply(session: Any, key: str, parameters: dict[str, str], timeout: float) -> dict[str, Any] | None:
+    """Query ``key`` and return the first JSON reply, None where nobody answers within ``timeout`` seconds.
+
+    Raises:
+        TransportError: the answer is an error, or no JSON object.
+    """
+    import zenoh
+
+    for reply in session.get(zenoh.Selector(key, parameters), timeout=timeout):
+        if reply.ok is None:
+            raise TransportError(f"{key}: the node refused: {_error_of(reply.err.payload.to_bytes())}")
+        return _json_object(key, reply.ok.payload.to_bytes())
+    return None
+
+
+def _json_object(key: str, payload: bytes) -> dict[str, Any]:
+    try:
+        answer = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise TransportError(
+            f"{key}: the answer is no JSON ({error}); is this a coview_stream node?"
+        ) from error
+    if not isinstance(answer, dict):
+        raise TransportError(f"{key}: the answer is no JSON object; is this a coview_stream node?")
+    return answer
+
+
+def _error_of(payload: bytes) -> str:
+    """Text of an error reply: the ``error`` of its JSON, or the bytes as text."""
+    try:
+        return str(json.loads(payload)["error"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return payload[:200].decode("utf-8", "replace")

@@ -1,0 +1,305 @@
+"""The network: a zenoh session behind the interface of :mod:`coview_stream.stream.transport`."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from coview_stream.errors import TransportError
+from coview_stream.messages.types import Sample
+from coview_stream.stream.transport import zenoh_config
+from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
+from coview_stream.stream.transport.zenoh_config import zenoh_errors
+from coview_stream.stream.transport.zenoh_io import Answers, ZenohPublisher, first_reply, plain, quality
+
+_log = logging.getLogger(__name__)
+
+_POLL = 0.02  # seconds; a look at the matching status costs microseconds
+_RETRY = 0.5  # seconds between two attempts to find the first router
+_PATIENCE = 2.0  # seconds that opening waits for the first attempt: a host that is off does not even refuse
+_NO_ROUTER = (
+    "Unable to connect"  # zenoh's words; anything else at opening is a mistake that time does not heal
+)
+_QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's receiving thread, for all keys
+_JOIN = 0.4  # seconds for all our threads to end at close; they notice within 0.1
+_EXIT = 10.0  # seconds for each to end when the process does: longer than any attempt to open
+
+
+def open_transport(
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    config: Path | None = None,
+    max_payload: int | None = None,
+) -> ZenohTransport:
+    """Open a zenoh session.
+
+    As a client it may start before its router: whatever is declared meanwhile takes effect once the router is there,
+    and what is published until then is lost. It comes back by itself whenever the router does.
+
+    Args:
+        connect: endpoints to connect to, for example ``tcp/127.0.0.1:7447``.
+        listen: endpoints to listen on.
+        config: zenoh configuration file; it wins over our defaults, ``connect`` and ``listen`` win over it.
+        max_payload: of a larger message, in bytes, only the size is handed on; None takes in all.
+
+    Raises:
+        TransportError: if the configuration is wrong or an endpoint cannot be listened on.
+    """
+    import zenoh
+
+    # RUST_LOG=zenoh=warn says why a router refuses us; without it this is silent
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
+    return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload)
+
+
+class ZenohTransport:
+    """A zenoh session; made by :func:`open_transport`. All methods may be called from any thread."""
+
+    def __init__(self, config: Any, max_payload: int | None = None) -> None:
+        self._config = config
+        self._max_payload = max_payload
+        self._waits = zenoh_config.mode_of(config) == "client"
+        self._guard = Guard(_log)
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._declared: list[Any] = []  # zenoh undeclares what nobody holds
+        self._pending: list[Callable[[Any], None]] = []
+        self._answers = Answers(self._guard)
+        self._session: Any = None
+        # a thread inside zenoh while the interpreter goes down aborts the process: see that none is left
+        atexit.register(self._at_exit)
+        self._open()
+
+    def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
+        """Call ``handler`` on a thread of its own; ``newest`` keeps one unread sample, ``all`` queues 1024.
+
+        Raises:
+            TransportError: if ``key`` is no key expression or the transport is closed.
+        """
+        import zenoh
+
+        size = 1 if policy == "newest" else _QUEUE
+        channel = zenoh.handlers.RingChannel if policy == "newest" else zenoh.handlers.FifoChannel
+
+        def declare(session: Any) -> None:
+            subscriber = session.declare_subscriber(key, channel(size))
+            self._declared.append(subscriber)
+            self._start(f"subscriber {key}", lambda: self._receive(key, subscriber, handler))
+
+        self._declare(key, declare)
+
+    def publisher(self, key: str, urgency: Urgency) -> Publisher:
+        """Declare a publisher. Errors as in :meth:`subscribe`."""
+        publisher = ZenohPublisher(key, self._guard)
+        self._declare(
+            key, lambda session: publisher.attach(session.declare_publisher(key, **quality(urgency)))
+        )
+        return publisher
+
+    def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
+        """Answer queries with JSON; all handlers of a transport share one thread. Errors as in :meth:`subscribe`."""
+        import zenoh
+
+        def declare(session: Any) -> None:
+            callback = zenoh.handlers.Callback(self._answers.callback(key, handler), indirect=False)
+            self._declared.append(session.declare_queryable(key, callback))
+            if not any(thread.name == "coview answers" for thread in self._threads):
+                self._start("answers", self._answers.run)
+
+        self._declare(key, declare)
+
+    def announce(self, key: str) -> None:
+        """Hold a liveliness token until :meth:`close`. Errors as in :meth:`subscribe`."""
+        self._declare(key, lambda session: self._declared.append(session.liveliness().declare_token(key)))
+
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Ask on ``key``, where need be after waiting for the first router, and return the first JSON reply.
+
+        Raises:
+            TransportError: nobody answered within ``timeout`` seconds, or the answer was an error or no JSON object.
+        """
+        deadline = time.monotonic() + timeout
+        while (session := self._session) is None and time.monotonic() < deadline:
+            time.sleep(_POLL)
+        if session is not None:
+            left = max(_POLL, deadline - time.monotonic())
+            answer = first_reply(session, key, parameters or {}, left)
+            if answer is not None:
+                return answer
+        raise TransportError(
+            f"{key}: nobody answered within {timeout:g} s; is the node running and connected?"
+        )
+
+    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+        """Keys of the liveliness tokens that match right now, sorted; none while there is no session.
+
+        Raises:
+            TransportError: if ``expression`` is no key expression or zenoh fails.
+        """
+        session = self._session
+        if session is None:
+            return []
+        with zenoh_errors(f"tokens {expression!r}"):
+            replies = [reply.ok for reply in session.liveliness().get(expression, timeout=timeout)]
+        return sorted({str(sample.key_expr) for sample in replies if sample is not None})
+
+    def await_subscriber(
+        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
+    ) -> bool:
+        """Wait up to ``seconds`` until somebody subscribes to ``key``; False if nobody did.
+
+        ``wait(seconds)`` passes the time between two looks; what it returns as true ends the waiting early.
+        """
+        probe: Any = None
+        deadline = time.monotonic() + seconds
+        try:
+            while True:
+                if probe is None and (session := self._session) is not None:
+                    probe = session.declare_publisher(key)
+                if probe is not None and probe.matching_status.matching:
+                    return True
+                if time.monotonic() >= deadline or wait(_POLL):
+                    return False
+        finally:
+            if probe is not None:
+                probe.undeclare()
+
+    @property
+    def session(self) -> Any:
+        """The zenoh session; None while closed or waiting for the first router."""
+        return self._session
+
+    def connection(self) -> Connection:
+        """Whom we are connected to right now; nobody while closed or waiting for the first router."""
+        with self._lock:
+            if self._session is None:
+                return Connection()
+            others = [(str(o.whatami), str(o.zid)) for o in self._session.info.transports()]
+        return Connection(
+            tuple(sorted(zid for kind, zid in others if kind == "router")),
+            tuple(sorted(zid for kind, zid in others if kind != "router")),
+            tuple(sorted(zid for kind, zid in others if kind == "client")),
+        )
+
+    def close(self) -> None:
+        """Undeclare everything and end the threads; takes well under a second. Idempotent."""
+        with self._lock:
+            if self._closing.is_set():
+                return
+            self._closing.set()
+            session, self._session = self._session, None
+            self._pending.clear()
+        if session is not None:
+            self._guard.run("closing", session.close)
+        self._answers.end()
+        end = time.monotonic() + _JOIN
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, end - time.monotonic()))
+        self._declared.clear()
+        if not any(thread.is_alive() for thread in self._threads):
+            atexit.unregister(self._at_exit)
+
+    def _at_exit(self) -> None:
+        self.close()
+        for thread in self._threads:
+            thread.join(_EXIT)
+
+    # opening
+
+    def _open(self) -> None:
+        """Open now, so that a wrong configuration is the caller's error; a missing router is only waited for."""
+        if not self._waits:
+            try:
+                self._attempt()
+            except TransportError:
+                self.close()
+                raise
+            return
+        first: SimpleQueue[TransportError | None] = SimpleQueue()
+        self._start("opening", lambda: self._keep_trying(first))
+        where = zenoh_config.endpoints_of(self._config)
+        try:
+            error = first.get(timeout=_PATIENCE)
+        except Empty:
+            _log.warning("no answer from a router at %s yet: going on without", where)
+            return
+        if error is not None and _NO_ROUTER not in str(error):
+            self.close()
+            raise error
+        if error is not None:
+            _log.warning(
+                "no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where
+            )
+
+    def _keep_trying(self, first: SimpleQueue[TransportError | None]) -> None:
+        while not self._closing.is_set():
+            try:
+                self._attempt()
+            except TransportError as error:
+                first.put(error)
+                self._closing.wait(_RETRY)
+            else:
+                first.put(None)
+                _log.info("connected to %s", zenoh_config.endpoints_of(self._config))
+                return
+
+    def _attempt(self) -> None:
+        import zenoh
+
+        with zenoh_errors("zenoh session"):
+            session: Any = zenoh.open(self._config)
+        with self._lock:
+            if not self._closing.is_set():
+                self._session = session
+                for declare in self._pending:
+                    self._guard.run("declaring", partial(declare, session))
+                self._pending.clear()
+                return
+        session.close()
+
+    def _declare(self, key: str, declare: Callable[[Any], None]) -> None:
+        import zenoh
+
+        with zenoh_errors(f"key {key!r}"):
+            zenoh.KeyExpr(key)
+        with self._lock:
+            if self._closing.is_set():
+                raise TransportError(f"key {key!r}: the transport is closed")
+            if self._session is None:
+                self._pending.append(declare)
+                return
+            with zenoh_errors(f"key {key!r}"):
+                declare(self._session)
+
+    # threads
+
+    def _start(self, name: str, target: Callable[[], None]) -> None:
+        thread = threading.Thread(target=target, name=f"coview {name}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _receive(self, key: str, subscriber: Any, handler: Callable[[Sample], None]) -> None:
+        import zenoh
+
+        for sample in subscriber:  # ends when the session closes
+            if self._closing.is_set():
+                return
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._guard.run(key, partial(_hand, sample, self._max_payload, handler))
+            del sample  # however large, it need not live until the next one comes
+
+
+def _hand(sample: Any, max_payload: int | None, handler: Callable[[Sample], None]) -> None:
+    handler(plain(sample, max_payload))

@@ -1,0 +1,128 @@
+"""Batches: pieces of maps, and what robots saw in them, turned, mirrored and spoilt at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.descriptors.birds_eye_view import CELL, Image
+from coview_stream.training.augment import augmented
+from coview_stream.training.dataset import QUERY_CELLS, WorldViews
+
+Floats = npt.NDArray[np.float64]
+
+PIECE = 272
+"""Cells of a piece of the map: 136 m."""
+
+_REACH = 36.0  # metres from a piece's middle at which queries may stand: their 30 m must lie on it
+_TURNED = 0.5  # share of the pieces that are turned by any angle, not only by quarters
+_NARROWED = 0.4  # share of the queries that lose what is beyond a random radius
+_CUT = 0.25  # share that lose a sector
+_WHOLE = 0.1  # share that are cut from the map: who was carried all around saw crowns whole as well
+_RADIUS = 30.0
+_TRIES = 50
+
+
+@dataclass(frozen=True)
+class Batch:
+    """G pieces of maps of different worlds and Q queries.
+
+    Attributes:
+        pieces: (G, LAYERS, PIECE, PIECE).
+        queries: (Q, LAYERS, 128, 128).
+        piece_of: (Q,) which piece a query stands in.
+        poses: (Q, 3) x, y and heading of the queries in their piece's frame, whose origin is its middle.
+    """
+
+    pieces: Image
+    queries: Image
+    piece_of: npt.NDArray[np.int64]
+    poses: Floats
+
+
+def draw_batch(
+    worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator, spoil: bool = True
+) -> Batch:
+    """Draw ``pieces`` maps of as many worlds, with ``each`` queries in every one; ``spoil`` augments the images."""
+    images, queries, owners, poses = [], [], [], []
+    for owner, k in enumerate(rng.choice(len(worlds), pieces, replace=False)):
+        world = worlds[int(k)]
+        centre, chosen = _somewhere(world, each, rng)
+        turn = rng.uniform(-np.pi, np.pi) if rng.random() < _TURNED else 0.5 * np.pi * rng.integers(4)
+        mirrored = bool(rng.random() < 0.5)
+        piece = _piece(world, centre, turn, mirrored)
+        images.append(augmented(piece, True, rng) if spoil else piece)
+        for index in chosen:
+            x, y, yaw = world.poses[index]
+            at = _rotated(np.array([x, y]) - centre, -turn)
+            seen = world.queries[index]
+            if rng.random() < _WHOLE:
+                seen = _piece(world, world.poses[index, :2], yaw, False, QUERY_CELLS)
+            image, quarter = _query(seen, mirrored, rng)
+            heading = yaw - turn
+            if mirrored:
+                at, heading = at * (1.0, -1.0), -heading
+            poses.append([*at, heading + quarter])
+            queries.append(augmented(image, False, rng) if spoil else image)
+            owners.append(owner)
+    return Batch(np.stack(images), np.stack(queries), np.array(owners), np.array(poses))
+
+
+def _somewhere(
+    world: WorldViews, count: int, rng: np.random.Generator
+) -> tuple[Floats, npt.NDArray[np.intp]]:
+    """Middle (2,) of a piece and ``count`` queries near it; the same one twice where there are too few."""
+    best: tuple[Floats, npt.NDArray[np.intp]] | None = None
+    for _ in range(_TRIES):
+        centre = world.poses[rng.integers(len(world.poses)), :2] + rng.uniform(-0.7, 0.7, 2) * _REACH
+        near = np.flatnonzero(np.linalg.norm(world.poses[:, :2] - centre, axis=1) < _REACH)
+        if best is None or len(near) > len(best[1]):
+            best = centre, near
+        if len(near) >= count:
+            break
+    assert best is not None
+    centre, near = best
+    if not len(near):
+        near = np.array([int(np.linalg.norm(world.poses[:, :2] - centre, axis=1).argmin())])
+        centre = world.poses[near[0], :2]
+    return centre, rng.choice(near, count, replace=len(near) < count)
+
+
+def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size: int = PIECE) -> Image:
+    """Cut a piece whose frame stands at ``centre``, turned: ``p_world = R(turn) p_piece + centre``."""
+    at = (np.arange(size) + 0.5 - size / 2) * CELL
+    x, y = np.meshgrid(at, -at if mirrored else at, indexing="xy")
+    column = (np.cos(turn) * x - np.sin(turn) * y + centre[0] - world.corner[0]) / CELL
+    row = (np.sin(turn) * x + np.cos(turn) * y + centre[1] - world.corner[1]) / CELL
+    column, row = np.floor(column + 1e-6).astype(np.intp), np.floor(row + 1e-6).astype(np.intp)
+    height, width = world.aerial.shape[1:]
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    piece = world.aerial[:, row.clip(0, height - 1), column.clip(0, width - 1)] * inside
+    piece[-1][~inside] = 128
+    return np.asarray(piece.astype(np.uint8))
+
+
+def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Image, float]:
+    """Mirror and turn a query by quarters, and hide some of it; the turn is what its heading gains, radians."""
+    if mirrored:
+        image = image[:, ::-1]
+    quarters = int(rng.integers(4))
+    image = np.rot90(image, quarters, axes=(1, 2)).copy()
+    at = (np.arange(QUERY_CELLS) + 0.5 - QUERY_CELLS / 2) * CELL
+    distance = np.hypot(at[:, None], at[None])
+    hidden = distance > (rng.uniform(12.0, _RADIUS) if rng.random() < _NARROWED else _RADIUS)
+    if rng.random() < _CUT:
+        direction = np.arctan2(at[:, None], at[None]) - rng.uniform(-np.pi, np.pi)
+        hidden |= np.abs((direction + np.pi) % (2 * np.pi) - np.pi) < rng.uniform(0.2, 1.0)
+    image[:, hidden] = 0
+    image[-1][hidden] = 128
+    # the array is turned towards lower rows, i.e. clockwise as seen from above: the heading makes up for it
+    return image, 0.5 * np.pi * quarters
+
+
+def _rotated(vector: Floats, angle: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])

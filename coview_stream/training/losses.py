@@ -1,0 +1,188 @@
+"""What the encoders are trained for: that a query correlates with its map where it stands, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL
+
+_COARSE = 2  # local cells to a coarse one: the dense search runs on 2 m
+_RADIUS = 29.0  # metres about a query's middle whose cells count
+_SHARP = 20.0  # scores in [-1, 1] are multiplied by this before they compete (dense search)
+_LOCAL_TEMPERATURE = 0.07
+_PLACE_TEMPERATURE = 0.08
+_SAMPLES = 128  # corresponding points of a query and its map
+_TOO_NEAR = 2.5  # metres: other points within are neither right nor wrong
+_SAME_PLACE = 12.0  # metres: likewise for global descriptors
+_LEAST_SIGMA = 0.05
+_NO = -1e4
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The three losses (scalars), and the share of a batch's queries that the dense search puts right."""
+
+    dense: Tensor
+    local: Tensor
+    place: Tensor
+    recall: float
+
+    @property
+    def total(self) -> Tensor:
+        """What is minimised."""
+        return self.dense + 0.5 * self.local + 0.5 * self.place
+
+
+Encoded = tuple[Tensor, Tensor, Tensor]
+
+
+def losses(
+    query: Encoded,
+    piece: Encoded,
+    piece_of: Tensor,
+    poses: Tensor,
+    wrong_yaws: Tensor,
+    seen: tuple[Tensor, Tensor],
+) -> Losses:
+    """Compare Q encoded queries with G encoded pieces.
+
+    Args:
+        query: local (Q, C, h, h), sigma (Q, 1, h, h), place (Q, P, ., .).
+        piece: the same of G pieces of (H, H) local cells.
+        piece_of: (Q,) the piece of each query.
+        poses: (Q, 3) x, y (metres), heading (radians) in the piece's frame about its middle.
+        wrong_yaws: (Q, N) headings that are wrong, radians: they compete too.
+        seen: (Q, 1, h, h) and (G, 1, H, H), 1 for local cells in which anything was seen, else 0.
+    """
+    dense, recall = dense_loss(query, piece, piece_of, poses, wrong_yaws)
+    local = local_loss(query, piece, piece_of, poses, seen)
+    return Losses(dense, local, place_loss(query, piece, piece_of, poses), recall)
+
+
+def dense_loss(
+    query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, wrong_yaws: Tensor
+) -> tuple[Tensor, float]:
+    """Cross-entropy over all pieces, coarse cells and the headings tried; (Q queries, right ones' share)."""
+    local, sigma, _ = query
+    weight = _round(local.shape[-1], _RADIUS).to(local) / sigma
+    coarse = functional.avg_pool2d(torch.cat([local * weight, weight], 1), _COARSE)
+    yaws = torch.cat([poses[:, 2:], wrong_yaws], 1)
+    count, tried = yaws.shape
+    turned = turn(coarse.repeat_interleave(tried, 0), yaws.reshape(-1))
+    values, mass = turned[:, :-1], turned[:, -1:].sum((2, 3), keepdim=True)
+    values = values / mass.clamp(min=1e-6)
+    maps = functional.avg_pool2d(piece[0], _COARSE)
+    size, half = maps.shape[-1], values.shape[-1] // 2
+    spectrum = torch.fft.rfft2(values, s=(size, size)).conj()
+    product = torch.einsum("qcyx,gcyx->qgyx", spectrum, torch.fft.rfft2(maps))
+    # a query whose upper left cell lies at (i, j) has its middle at the corner of cell (i + half, j + half)
+    last = size - 2 * half + 1
+    scores = torch.fft.irfft2(product, s=(size, size))[..., :last, :last]
+    logits = _SHARP * scores.reshape(count, -1)
+    cell = LOCAL_CELL * _COARSE
+    at = poses[:, :2] / cell + (size / 2 - half)
+    target = _soft_target(at, piece_of, tried, len(maps), last).to(logits)
+    found = logits.detach().argmax(1)
+    right = target.reshape(count, -1).gather(1, found[:, None])[:, 0] > 0.05
+    loss = -(target.reshape(count, -1) * functional.log_softmax(logits, 1)).sum(1).mean()
+    return loss, float(right.float().mean())
+
+
+def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: int) -> Tensor:
+    """Weights (Q, tried, G, size, size) of the four cells about ``at`` (Q, 2) x, y; the first heading is true."""
+    target = torch.zeros(len(at), tried, pieces, size, size)
+    low = at.floor()
+    rows = torch.arange(len(at))
+    for dx in (0, 1):
+        for dy in (0, 1):
+            x, y = low[:, 0] + dx, low[:, 1] + dy
+            share = (1 - (at[:, 0] - x).abs()) * (1 - (at[:, 1] - y).abs())
+            x, y = x.long().clamp(0, size - 1), y.long().clamp(0, size - 1)
+            target[rows, 0, piece_of, y, x] += share
+    return target
+
+
+def local_loss(
+    query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Corresponding cells are alike and others are not; sigma learns how far they can be told apart.
+
+    A cross-entropy e over corresponding points, each way, and e / sigma + log sigma, in which e is given: it must not
+    get cheaper to call a cell uncertain than to describe it well. Only points count that both have seen.
+    """
+    count = len(poses)
+    radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
+    angle = 2 * torch.pi * torch.rand(count, _SAMPLES)
+    there = torch.stack([radius * angle.cos(), radius * angle.sin()], -1)
+    here = _moved(there, poses)
+    ours, sigma_q = _at(query[0], there), _at(query[1], there)[..., 0]
+    theirs, sigma_p = _at(piece[0][piece_of], here), _at(piece[1][piece_of], here)[..., 0]
+    similar = ours @ theirs.transpose(1, 2) / _LOCAL_TEMPERATURE
+    near = (torch.cdist(here, here) < _TOO_NEAR) & ~torch.eye(_SAMPLES, dtype=torch.bool)
+    similar = similar.masked_fill(near, _NO)
+    wanted = torch.arange(_SAMPLES).expand(count, -1)
+    both = (_at(seen[0], there)[..., 0] > 0.5) & (_at(seen[1][piece_of], here)[..., 0] > 0.5)
+    weight = both.float() / both.sum().clamp(min=1)
+    loss = torch.zeros(())
+    for logits, sigma in ((similar, sigma_q), (similar.transpose(1, 2), sigma_p)):
+        error = functional.cross_entropy(logits.transpose(1, 2), wanted, reduction="none")
+        sigma = sigma.clamp(min=_LEAST_SIGMA)  # beyond the images it is 0
+        loss = loss + 0.5 * (weight * (error + error.detach() / sigma + sigma.log())).sum()
+    return loss
+
+
+def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
+    """Demand that a query's global descriptor is most like that of the map around its place."""
+    own = _middle(query[2])
+    maps = piece[2]
+    size = maps.shape[-1]
+    flat = maps.flatten(2).transpose(1, 2).reshape(-1, maps.shape[1])
+    logits = own @ flat.T / _PLACE_TEMPERATURE
+    axis = (torch.arange(size) + 0.5 - size / 2) * PLACE_CELL
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    cells = torch.stack([x.flatten(), y.flatten()], -1)
+    apart = torch.cdist(poses[:, :2], cells)
+    same = (torch.arange(len(maps))[None] == piece_of[:, None]).repeat_interleave(size * size, 1)
+    distance = apart.repeat(1, len(maps)).masked_fill(~same, torch.inf)
+    wanted = distance.argmin(1)
+    near = distance < _SAME_PLACE
+    near[torch.arange(len(own)), wanted] = False
+    return functional.cross_entropy(logits.masked_fill(near, _NO), wanted)
+
+
+def turn(images: Tensor, yaws: Tensor) -> Tensor:
+    """Turn square images (N, C, n, n), row along y, about their middles by (N,) radians: ``p_out = R(yaw) p_in``."""
+    c, s = yaws.cos(), yaws.sin()
+    zero = torch.zeros_like(c)
+    inverse = torch.stack([torch.stack([c, s, zero], -1), torch.stack([-s, c, zero], -1)], 1)
+    grid = functional.affine_grid(inverse, list(images.shape), align_corners=False)
+    return functional.grid_sample(images, grid, align_corners=False)
+
+
+def _moved(points: Tensor, poses: Tensor) -> Tensor:
+    """Points (Q, K, 2) of the queries in their pieces' frames."""
+    c, s = poses[:, 2].cos()[:, None], poses[:, 2].sin()[:, None]
+    x, y = points[..., 0], points[..., 1]
+    return torch.stack([c * x - s * y, s * x + c * y], -1) + poses[:, None, :2]
+
+
+def _at(images: Tensor, points: Tensor) -> Tensor:
+    """Bilinear values (Q, K, C) of local images (Q, C, n, n) at (Q, K, 2) metres about their middles."""
+    grid = (points / (0.5 * LOCAL_CELL * images.shape[-1]))[:, :, None]
+    return functional.grid_sample(images, grid, align_corners=False)[..., 0].transpose(1, 2)
+
+
+def _middle(place: Tensor) -> Tensor:
+    """Global descriptor (Q, P) of the four middle cells."""
+    half = place.shape[-1] // 2
+    return functional.normalize(place[:, :, half - 1 : half + 1, half - 1 : half + 1].mean((2, 3)), dim=1)
+
+
+def _round(size: int, radius: float) -> Tensor:
+    """1 within ``radius`` metres of the middle of (size, size) local cells."""
+    at = (torch.arange(size) + 0.5 - size / 2) * LOCAL_CELL
+    return (torch.hypot(at[:, None], at[None]) < radius).float()

@@ -1,0 +1,181 @@
+"""The two encoders, of the map seen from above and of what a robot saw from below; PyTorch, for training only."""
+
+# FOLDED coview_stream/training/networks.py: """Trained networks as ONNX files, which need no PyTorch to run."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from coview_stream.descriptors.birds_eye_view import LAYERS, Image
+from coview_stream.descriptors.network import CARD, OUTPUTS, Features, file_sha256, weights_name
+
+VIEWS = ("aerial", "ground")
+
+LOCAL = 32
+"""Numbers in a local descriptor (one per square metre)."""
+
+PLACE = 128
+"""Numbers in a global descriptor."""
+
+PLACE_REACH = 7
+"""Cells of 4 m about the middle that a global descriptor sums up, under a Gaussian window of 14 m: up to 28 m."""
+
+_PLACE_SIGMA = 3.5
+
+_LEAST_SIGMA = 0.05
+
+_LEAST = 1e-4  # of what is raised to GeM's power
+
+
+class _Conv(nn.Module):
+    """A 3 x 3 convolution that both views share, and a normalisation that they do not: their statistics differ."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.norm = nn.ModuleList([nn.BatchNorm2d(outputs) for _ in VIEWS])
+
+    def forward(self, x: Tensor, view: int) -> Tensor:
+        return self.norm[view](self.conv(x))
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first, self.second = _Conv(channels, channels), _Conv(channels, channels)
+
+    def forward(self, x: Tensor, view: int) -> Tensor:
+        return functional.relu(x + self.second(functional.relu(self.first(x, view)), view))
+
+
+class _Entry(nn.Module):
+    """What a view does alone, at 1 m: crowns above and stems below are found differently."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.stem = _Conv(4 * LAYERS, width)
+        self.block = _Residual(width)
+
+    def forward(self, x: Tensor, view: int) -> Tensor:
+        return self.block(functional.relu(self.stem(functional.pixel_unshuffle(x, 2), view)), view)
+
+
+class PlaceNet(nn.Module):
+    """Bird views in; local descriptors, their uncertainty and global descriptors out, all fully convolutional.
+
+    Input (B, LAYERS, H, W) in [0, 1], H and W multiples of 8; cells of 0.5 m. Output: local (B, LOCAL, H/2, W/2) of
+    unit norm, sigma (B, 1, H/2, W/2) > 0, place (B, PLACE, H/8, W/8) of unit norm.
+    """
+
+    def __init__(self, width: int = 24) -> None:
+        super().__init__()
+        self.width = width
+        self.entry = nn.ModuleList([_Entry(width) for _ in VIEWS])
+        self.down2, self.down4 = _Conv(width, 2 * width, 2), _Conv(2 * width, 4 * width, 2)
+        self.at2 = nn.ModuleList([_Residual(2 * width) for _ in range(2)])
+        self.at4 = nn.ModuleList([_Residual(4 * width) for _ in range(2)])
+        self.lateral = nn.ModuleList([nn.Conv2d(k * width, LOCAL, 1) for k in (1, 2, 4)])
+        self.local = nn.Conv2d(LOCAL, LOCAL, 3, 1, 1)
+        self.sigma = nn.Conv2d(LOCAL, 1, 1)
+        self.power = nn.Parameter(torch.tensor(3.0))
+        self.place = nn.Conv2d(4 * width, PLACE, 1)
+        self.window: Tensor
+        self.register_buffer("window", _window().repeat(4 * width, 1, 1, 1), persistent=False)
+
+    def forward(self, x: Tensor, view: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Encode images of one view, an index into ``VIEWS``."""
+        at1 = self.entry[view](x, view)
+        at2 = functional.relu(self.down2(at1, view))
+        for block in self.at2:
+            at2 = block(at2, view)
+        at4 = functional.relu(self.down4(at2, view))
+        for block in self.at4:
+            at4 = block(at4, view)
+        merged = self.lateral[1](at2) + _doubled(self.lateral[2](at4))
+        merged = functional.relu(self.lateral[0](at1) + _doubled(merged))
+        local = functional.normalize(self.local(merged), dim=1)
+        sigma = functional.softplus(self.sigma(merged)) + _LEAST_SIGMA
+        return local, sigma, self._place(at4)
+
+    def _place(self, at4: Tensor) -> Tensor:
+        """Generalised mean (GeM) under a round window about every cell, then a linear layer."""
+        raised = at4.clamp(min=_LEAST).pow(self.power)
+        down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
+        across = self.window.transpose(2, 3)
+        raised = functional.conv2d(down, across, padding=(0, PLACE_REACH), groups=4 * self.width)
+        return functional.normalize(self.place(raised.clamp(min=1e-12).pow(1.0 / self.power)), dim=1)
+
+
+class OneView(nn.Module):
+    """A network for one view, as it is exported."""
+
+    def __init__(self, net: PlaceNet, view: int) -> None:
+        super().__init__()
+        self.net, self.view = net, view
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Encode images of this view."""
+        encoded: tuple[Tensor, Tensor, Tensor] = self.net(x, self.view)
+        return encoded
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+
+def _window() -> Tensor:
+    at = torch.arange(-PLACE_REACH, PLACE_REACH + 1, dtype=torch.float32)
+    weight = torch.exp(-0.5 * (at / _PLACE_SIGMA) ** 2)
+    return (weight / weight.sum())[:, None]
+
+
+_OPSET = 17
+
+_SAMPLE = 128  # cells of the image that is traced; all sizes that are multiples of 8 work
+
+
+def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
+    """Write one ONNX file per view and the card that says how they were made; a file is complete or not there.
+
+    The card also names the files' hashes, by which one view's weights are told from the other's.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    written = []
+    for view, name in enumerate(VIEWS):
+        single = OneView(net, view).eval()
+        path = directory / weights_name(name)
+        partial = path.with_suffix(f".{os.getpid()}.part")
+        image = torch.zeros(1, LAYERS, _SAMPLE, _SAMPLE)
+        sizes = {"image": {2: "height", 3: "width"}}
+        sizes |= {output: {2: f"{output}_height", 3: f"{output}_width"} for output in OUTPUTS}
+        torch.onnx.export(
+            single, (image,), str(partial), input_names=["image"], output_names=list(OUTPUTS),
+            dynamic_axes=sizes, opset_version=_OPSET, dynamo=False,
+        )  # fmt: skip
+        partial.replace(path)
+        written.append(path)
+    card = card | {"sha256": {path.name: file_sha256(path) for path in written}}
+    text = json.dumps(card, indent=1, sort_keys=True) + "\n"
+    (directory / CARD).write_text(text)
+    return written
+
+
+def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
+    """Return a network in training as what :class:`~.network.Network` is once it has been exported."""
+
+    def encode(image: Image) -> Features:
+        with torch.no_grad():
+            local, sigma, place = net(
+                torch.from_numpy(image[None].astype("float32") / 255.0), VIEWS.index(view)
+            )
+        return Features(local[0].numpy(), sigma[0, 0].numpy(), place[0].numpy())
+
+    return encode

@@ -1,0 +1,96 @@
+"""How often the dense search finds where a query stands, in worlds that were not trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.descriptors.birds_eye_view import Image
+from coview_stream.descriptors.network import Features
+from coview_stream.localization.search.learned.correlation import coarser, correlate
+from coview_stream.localization.search.learned.feature_index import CoarseMap
+from coview_stream.training.dataset import WorldViews
+
+HEADINGS = 36
+"""Headings that the dense search tries."""
+
+_CELL = 2.0  # metres of the dense search
+_BEST = 5
+_APART = 10.0  # metres between two places that are counted as two
+_RADIUS = 29.0
+
+Encoder = Callable[[Image], Features]
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sought:
+    """One query and where the search put it.
+
+    Attributes:
+        world: its number among the worlds asked.
+        sensor: of the robot.
+        travelled: metres driven for it.
+        found: (5, 3) x, y (metres) and heading (radians) of the best places, best first.
+        pose: (3,) the true ones.
+        scores: (5,) of the places.
+    """
+
+    world: int
+    sensor: str
+    travelled: float
+    found: Floats
+    pose: Floats
+    scores: Floats
+
+    def right(self, best: int = 1, within: float = 10.0) -> bool:
+        """Whether one of the ``best`` places lies ``within`` metres of the truth."""
+        apart = np.linalg.norm(self.found[:best, :2] - self.pose[:2], axis=1)
+        return bool((apart < within).any())
+
+
+def seek(
+    worlds: Sequence[WorldViews], aerial: Encoder, ground: Encoder, most: int | None = None
+) -> list[Sought]:
+    """Search every query (at most ``most`` of a world) in its world's map, at all places and headings."""
+    yaws = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    sought = []
+    for number, world in enumerate(worlds):
+        features, _ = coarser(aerial(_even(world.aerial)).local)
+        coarse = CoarseMap(features, world.corner, _CELL)
+        for k in range(len(world.queries))[:most]:
+            query = ground(world.queries[k])
+            volume = correlate(*coarser(query.local, weights(query.sigma)), coarse, yaws)
+            found, scores = best_places(volume, yaws, world.corner)
+            sought.append(
+                Sought(number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores)
+            )
+    return sought
+
+
+def weights(sigma: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Weight (h, h) of a query's cells from their uncertainty (h, h): 1 / sigma within 29 m of the middle."""
+    at = np.arange(len(sigma)) + 0.5 - len(sigma) / 2
+    return np.asarray((np.hypot(at[:, None], at[None]) < _RADIUS) / sigma, dtype=np.float32)
+
+
+def best_places(volume: npt.NDArray[np.float32], yaws: Floats, corner: Floats) -> tuple[Floats, Floats]:
+    """Places (5, 3) and scores (5,) of the highest peaks of (K, H, W), 10 m or more apart."""
+    top = volume.max(axis=0)
+    places, scores = [], []
+    rows, columns = np.indices(top.shape)
+    for _ in range(_BEST):
+        row, column = np.unravel_index(int(top.argmax()), top.shape)
+        yaw = yaws[int(volume[:, row, column].argmax())]
+        places.append([*(corner + (np.array([column, row]) + 0.5) * _CELL), yaw])
+        scores.append(float(top[row, column]))
+        top = np.where(np.hypot(rows - row, columns - column) * _CELL < _APART, -np.inf, top)
+    return np.array(places), np.array(scores)
+
+
+def _even(image: Image) -> Image:
+    """Cut an image to whole cells of 4 m."""
+    return image[:, : image.shape[1] // 8 * 8, : image.shape[2] // 8 * 8]

@@ -1,0 +1,155 @@
+"""What training worlds are drawn from: the range of everything that differs between them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from coview_stream.errors import ConfigError
+from coview_stream.sim.kinds import KINDS
+from coview_stream.training.sensors import TRAINED_SENSORS
+
+Range = tuple[float, float]
+
+_BOUNDS: dict[str, Range] = {
+    "built": (0.0, 1.0),
+    "submaps": (1, 1000),
+    "rays": (5_000, 2_000_000),
+    "leaf_off": (0.0, 1.0),
+    "standing": (0.0, 1.0),
+    "size": (80.0, 400.0),
+    "changed": (0.0, 0.5),
+    "stems": (20.0, 3000.0),
+    "tree_height": (2.0, 60.0),
+    "crown_width": (0.03, 0.6),
+    "crown_base": (0.0, 0.9),
+    "crown_offset": (0.0, 3.0),
+    "stem_radius": (0.03, 1.0),
+    "mortality": (0.0, 0.5),
+    "dead": (0.0, 0.5),
+    "understory": (0.0, 0.3),
+    "slope": (0.0, 35.0),
+    "roughness": (0.0, 0.5),
+    "wind": (0.0, 1.0),
+    "aerial_porosity": (0.0, 0.95),
+    "ground_porosity": (0.0, 0.95),
+    "leaf_depth": (0.0, 2.0),
+    "pulses": (1.0, 200.0),
+    "altitude": (150.0, 1000.0),
+    "swath": (5.0, 45.0),
+    "strip_shift": (0.0, 1.0),
+    "strip_lift": (0.0, 1.0),
+    "aerial_noise": (0.0, 0.3),
+    "ground_noise": (0.0, 0.3),
+    "sensor_height": (0.3, 5.0),
+    "travel": (0.0, 60.0),
+    "frame_step": (0.1, 5.0),
+    "tilt": (0.0, 20.0),
+    "gravity_error": (0.0, 3.0),
+    "scale_error": (0.0, 0.2),
+    "yaw_walk": (0.0, 2.0),
+}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Ranges (least, most) of what each world, tree or submap draws; single numbers are shares or counts.
+
+    Attributes:
+        built: share of worlds with buildings, of ``kinds``; the others are forests.
+        size: side of the square map, metres.
+        submaps: queries of a world, evenly of ``sensors``.
+        changed: built worlds: share of trees, cars and poles that are others now.
+        stems: trees per hectare.
+        tree_height: metres.
+        crown_width, crown_base: diameter, and height of the lowest leaves, in shares of the tree's height.
+        crown_offset: metres between a crown's middle and its stem's foot.
+        stem_radius: metres.
+        mortality: share of trees that stood, or had leaves, at one of the two epochs only.
+        dead: share of bare trees.
+        leaf_off: probability that an epoch lies in winter.
+        understory: bushes and saplings per square metre.
+        slope: steepest slopes of a world, degrees; roughness: of its ground, metres.
+        wind: shift of each crown between the epochs, metres, one sigma.
+        aerial_porosity, ground_porosity: probability that a pulse passes a surface of leaves.
+        leaf_depth: how far below a crown's surface leaves are hit on average, metres.
+        pulses, altitude, swath, aerial_noise: airborne pulses per square metre, metres, degrees, metres.
+        strip_shift, strip_lift: errors of a strip's position, metres, one sigma.
+        ground_noise: of the robot's ranges, metres.
+        sensor_height: metres above the ground.
+        travel: metres that the robot drives; ``standing`` is the share of submaps with less than 3 m.
+        frame_step: metres between the frames of a submap.
+        tilt, gravity_error: degrees, one sigma: how the robot leans, and how wrong its odometry is about that.
+        scale_error, yaw_walk: odometry drift: share, degrees per square root of a metre.
+        rays: most beams cast for a submap; beams are thinned evenly where there would be more.
+
+    Raises:
+        ConfigError: a value out of its range, or an unknown kind or sensor.
+    """
+
+    built: float = 0.25
+    kinds: tuple[str, ...] = ("town", "campus", "village", "industrial")
+    size: Range = (160.0, 200.0)
+    submaps: int = 60
+    changed: Range = (0.0, 0.2)
+    stems: Range = (150.0, 1200.0)
+    tree_height: Range = (4.0, 35.0)
+    crown_width: Range = (0.08, 0.5)
+    crown_base: Range = (0.1, 0.75)
+    crown_offset: Range = (0.0, 1.5)
+    stem_radius: Range = (0.05, 0.5)
+    mortality: Range = (0.0, 0.15)
+    dead: Range = (0.0, 0.1)
+    leaf_off: float = 0.2
+    understory: Range = (0.0, 0.1)
+    slope: Range = (0.0, 30.0)
+    roughness: Range = (0.0, 0.15)
+    wind: Range = (0.0, 0.3)
+    aerial_porosity: Range = (0.2, 0.7)
+    ground_porosity: Range = (0.1, 0.6)
+    leaf_depth: Range = (0.05, 0.6)
+    pulses: Range = (5.0, 60.0)
+    altitude: Range = (180.0, 400.0)
+    swath: Range = (12.0, 30.0)
+    strip_shift: Range = (0.0, 0.1)
+    strip_lift: Range = (0.0, 0.05)
+    aerial_noise: Range = (0.02, 0.06)
+    ground_noise: Range = (0.01, 0.04)
+    sensors: tuple[str, ...] = ("vlp16", "os64", "mid360", "vlp16-inclined")
+    sensor_height: Range = (0.6, 2.2)
+    travel: Range = (3.0, 25.0)
+    standing: float = 0.2
+    frame_step: Range = (0.7, 2.0)
+    tilt: Range = (0.3, 1.5)
+    gravity_error: Range = (0.0, 0.4)
+    scale_error: Range = (0.0, 0.02)
+    yaw_walk: Range = (0.0, 0.2)
+    rays: int = 160_000
+
+    def __post_init__(self) -> None:
+        for name, bounds in _BOUNDS.items():
+            _require_within(name, getattr(self, name), bounds)
+        for name, known in (("kinds", tuple(KINDS)), ("sensors", TRAINED_SENSORS)):
+            values = getattr(self, name)
+            if not values or not set(values) <= set(known):
+                raise ConfigError(f"{name}: {values!r}; use one or more of {', '.join(known)}")
+
+    def draw(self, rng: np.random.Generator, name: str) -> float:
+        """Draw one value of the range ``name``, evenly."""
+        low, high = getattr(self, name)
+        return float(rng.uniform(low, high))
+
+    def to_dict(self) -> dict[str, Any]:
+        """All fields as plain values, for JSON."""
+        return asdict(self)
+
+
+def _require_within(name: str, value: Any, bounds: Range) -> None:
+    """Refuse a number or range that leaves its bounds."""
+    low, high = bounds
+    single = {field.name for field in fields(Recipe) if field.type in ("int", "float")}
+    ends = (value, value) if name in single else tuple(value)
+    if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
+        raise ConfigError(f"{name}: {value!r} is out of range; stay, least first, within {low:g} to {high:g}")

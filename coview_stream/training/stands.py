@@ -1,0 +1,148 @@
+"""Forest stands at two epochs: when the map was flown, and when the robot comes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coview_stream.sim.mesh import Floats, Mesh, join
+from coview_stream.sim.scenes import Epoch
+from coview_stream.training import tree_meshes
+from coview_stream.training.mesh_copies import Flags, Ints, Part, standing
+from coview_stream.training.recipe import Recipe
+from coview_stream.training.terrain import Terrain
+from coview_stream.training.trees import PATTERNS, Trees, draw_species, draw_stems, draw_trees, opened
+
+_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly and steep land, shares of the recipe's range
+
+
+class Stand(NamedTuple):
+    """A forest.
+
+    Attributes:
+        mapped, now: what stands there at the two epochs.
+        terrain: the ground.
+        trees: all that stand at either epoch.
+        obstacles: (N, 3) x, y and radius of what a robot cannot drive through now, metres.
+        drawn: what was drawn for the stand, plain values.
+    """
+
+    mapped: Epoch
+    now: Epoch
+    terrain: Terrain
+    trees: Trees
+    obstacles: Floats
+    drawn: dict[str, Any]
+
+
+def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
+    """Draw a forest of +-``half`` metres."""
+    land = _STEEPNESS[int(rng.integers(len(_STEEPNESS)))]
+    low, high = recipe.slope
+    slope = low + (high - low) * rng.uniform(*land)
+    terrain = Terrain(rng, half + 10.0, slope, recipe.draw(rng, "roughness"))
+    pattern = str(rng.choice(PATTERNS))
+    density = float(rng.uniform(*np.sqrt(recipe.stems)) ** 2)
+    xy = draw_stems(rng, pattern, density, half)
+    xy = xy[opened(rng, xy, half)]
+    species = draw_species(rng, recipe)
+    trees = draw_trees(rng, recipe, terrain, xy, species)
+    winters = _winters(rng, recipe)
+    mortality, wind = recipe.draw(rng, "mortality"), recipe.draw(rng, "wind")
+    understory = recipe.draw(rng, "understory") * float(rng.random() < 0.8)
+    leaves = tree_meshes.crowns(rng, trees)
+    bushes = tree_meshes.bushes(rng, terrain, understory)
+    solid = [terrain.mesh(), *_litter(rng, terrain)]
+    woody = [
+        tree_meshes.stems(trees),
+        tree_meshes.branches(rng, trees, _branchiness(rng, trees, any(winters))),
+    ]
+    there, leafed = _fates(rng, len(xy), mortality)
+    shifts = (None, rng.normal(0, wind, (len(xy), 2)))
+    epochs = [
+        _epoch(
+            rng,
+            solid,
+            woody,
+            leaves,
+            bushes,
+            there[k],
+            leafed[k] & tree_meshes.leafy(trees, winters[k]),
+            shifts[k],
+        )
+        for k in range(2)
+    ]
+    drawn = {
+        "pattern": pattern,
+        "stems": round(1e4 * len(xy) / (2 * half) ** 2),
+        "height": round(float(trees.height.mean()), 1) if len(xy) else 0.0,
+        "species": [each._asdict() for each in species],
+        "slope": round(slope, 1),
+        "winter": [bool(each) for each in winters],
+        "mortality": mortality,
+        "understory": understory,
+        "wind": wind,
+    }
+    return Stand(epochs[0], epochs[1], terrain, trees, _obstacles(trees, there[1]), drawn)
+
+
+def tags(drawn: dict[str, Any]) -> str:
+    """Say in a few words what a stand is, for tables by forest type."""
+    families = sorted({each["family"] for each in drawn["species"]})
+    season = "leaf-off" if any(drawn["winter"]) else "leaf-on"
+    land = "flat" if drawn["slope"] < 3 else "hilly" if drawn["slope"] < 12 else "steep"
+    stems = "sparse" if drawn["stems"] < 300 else "medium" if drawn["stems"] < 700 else "dense"
+    return " ".join(["forest", drawn["pattern"], stems, land, season, "+".join(families)])
+
+
+def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
+    """Whether it is winter when the map is flown, and when the robot comes: the same season in half of the cases."""
+    first, second = (bool(each) for each in rng.random(2) < recipe.leaf_off)
+    return (first, first) if rng.random() < 0.5 else (first, second)
+
+
+def _fates(
+    rng: np.random.Generator, count: int, mortality: float
+) -> tuple[tuple[Flags, Flags], tuple[Flags, Flags]]:
+    """Which trees stand, and which of them have leaves, at each epoch; ``mortality`` is the share that differs."""
+    fate = np.where(rng.random(count) < mortality, rng.integers(1, 4, count), 0)
+    everyone = np.ones(count, dtype=bool)
+    return (fate != 2, fate != 1), (everyone, fate != 3)
+
+
+def _branchiness(rng: np.random.Generator, trees: Trees, winter: bool) -> Ints:
+    """How many branches each tree (N,) shows."""
+    living, bare = rng.integers(0, 7), rng.integers(8, 22)
+    seen = trees.dead | (winter & ~trees.evergreen)
+    return rng.poisson(np.where(seen, bare, living))
+
+
+def _litter(rng: np.random.Generator, terrain: Terrain) -> list[Mesh]:
+    area, everything = (2 * terrain.half) ** 2, np.ones(1, dtype=bool)
+    many = rng.random(2) < 0.6
+    logs = tree_meshes.logs(rng, terrain, int(area * rng.uniform(0, 0.006) * many[0]))
+    rocks = tree_meshes.rocks(rng, terrain, int(area * rng.uniform(0, 0.006) * many[1]))
+    return [standing([logs, rocks], everything)]
+
+
+def _epoch(
+    rng: np.random.Generator,
+    solid: list[Mesh],
+    woody: list[Part],
+    leaves: list[Part],
+    bushes: Part,
+    there: Flags,
+    leafed: Flags,
+    shift: Floats | None,
+) -> Epoch:
+    grown = rng.random(len(bushes.owner)) < 0.85  # the understory changes most
+    foliage = [standing(leaves, there & leafed, shift), standing([bushes], grown)]
+    return Epoch(join([*solid, standing(woody, there)]), join(foliage))
+
+
+def _obstacles(trees: Trees, there: Flags) -> Floats:
+    # nobody drives through leaves that hang to the ground
+    low = trees.base < 1.6
+    radius = np.where(low & ~trees.dead, np.maximum(0.6 * trees.crown, trees.radius), trees.radius)
+    return np.column_stack([trees.x, trees.y, radius])[there]

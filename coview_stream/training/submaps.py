@@ -1,0 +1,152 @@
+"""What a robot has gathered: frames along a short drive, put together by a drifting odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from coview_stream.clouds.filters import voxel_grid
+from coview_stream.geometry.transforms import Points, transform
+from coview_stream.sim.caster import Caster
+from coview_stream.sim.layout import directions
+from coview_stream.sim.mesh import Floats
+from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
+from coview_stream.sim.sensors import FRAME_PERIOD
+from coview_stream.training.paths import STEP
+from coview_stream.training.recipe import Recipe
+from coview_stream.training.sensors import trained_sensor
+
+RADIUS = 30.0
+"""Metres about the newest position within which points are kept."""
+
+VOXEL = 0.25
+"""Metres: clouds are thinned as those of the map are."""
+
+_SPEED = 1.2  # metres per second
+_WHEELBASE = 1.0
+_PAUSE = 3  # frames between two that are kept while the robot stands
+_OFTEN = {"vlp16-inclined": 0.4}  # a share of the usual step: one frame of it sees a narrow band only
+_FEWEST = {"mid360": (5, 12), "vlp16-inclined": (8, 20)}  # least frames, drawn in between
+
+
+class Submap(NamedTuple):
+    """A query.
+
+    Attributes:
+        points: (N, 3) metres, odometry's axes, origin at the newest position of the sensor.
+        pose: (3,) x, y and yaw: ``p_world = R(yaw) p + (x, y)``.
+        travelled: metres driven.
+    """
+
+    points: Points
+    pose: Floats
+    travelled: float
+
+
+class Frames(NamedTuple):
+    """What a robot saw along a drive, oldest first.
+
+    Attributes:
+        truth: (F, 4, 4) map <- sensor.
+        odometry: (F, 4, 4) odometry <- sensor, drifting.
+        clouds: (N, 3) of each frame, the sensor's axes, metres.
+        lean: (2,) roll and pitch by which the odometry's gravity is off, radians.
+        travelled: metres driven.
+    """
+
+    truth: Floats
+    odometry: Floats
+    clouds: tuple[Points, ...]
+    lean: Floats
+    travelled: float
+
+
+def scanned(
+    rng: np.random.Generator,
+    recipe: Recipe,
+    caster: Caster,
+    ground: Callable[[Floats, Floats], Floats],
+    path: Floats,
+    sensor: str,
+    porosity: float,
+) -> Frames:
+    """Drive a path (N, 2) over the ``ground`` with a sensor, to its end."""
+    along, frames = _moments(rng, recipe, path, sensor)
+    T = _poses(rng, recipe, path[along], _headings(path, rng)[along], ground)
+    lidar = trained_sensor(sensor, lambda beams: int(np.ceil(beams * len(along) / recipe.rays)))
+    noise = recipe.draw(rng, "ground_noise")
+    config = OdometryConfig(
+        yaw_walk=np.radians(recipe.draw(rng, "yaw_walk")),
+        scale_error=recipe.draw(rng, "scale_error"),
+        tilt_noise=np.radians(0.3 * recipe.gravity_error[1]),
+        offset=0.0,
+    )
+    odometry = drifting_odometry(T, config, rng)
+    clouds = tuple(
+        lidar.scan(caster, true, int(frame), rng, porosity=porosity, noise=noise)
+        for frame, true in zip(frames, T, strict=True)
+    )
+    lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
+    return Frames(T, odometry, clouds, lean, (len(path) - 1) * STEP)
+
+
+def gathered(frames: Frames) -> Submap:
+    """Put a drive's frames together by its odometry."""
+    newest = frames.odometry[-1, :3, 3]
+    parts = []
+    for told, cloud in zip(frames.odometry, frames.clouds, strict=True):
+        points = transform(told, cloud) - newest.astype(np.float32)
+        parts.append(points[(points[:, :2] ** 2).sum(axis=1) < RADIUS**2])
+    leaning = Rotation.from_rotvec([*frames.lean, 0.0]).as_matrix()
+    cloud = np.concatenate(parts) @ leaning.T.astype(np.float32)
+    last = frames.truth[-1]
+    yaw = Rotation.from_matrix(last[:3, :3] @ frames.odometry[-1, :3, :3].T).as_euler("ZYX")[0]
+    x, y = last[:2, 3]
+    return Submap(voxel_grid(cloud, VOXEL), np.array([x, y, yaw]), frames.travelled)
+
+
+def _moments(
+    rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Draw which points of the path (K,) have a frame, and the numbers of the sensor's frames (K,) there."""
+    spacing = recipe.draw(rng, "frame_step") * _OFTEN.get(sensor, 1.0)
+    last = len(path) - 1
+    along = last - (np.arange(0, last + 1, spacing / STEP)[::-1]).astype(np.int64)
+    # a robot that has hardly moved has looked about longer
+    stood = max(0, int(rng.integers(*_FEWEST.get(sensor, (2, 6)))) - len(along))
+    frames = np.round((along - along[0]) * STEP / _SPEED / FRAME_PERIOD).astype(np.int64) + _PAUSE * stood
+    along = np.concatenate([np.full(stood, along[0]), along])
+    frames = np.concatenate([np.arange(stood) * _PAUSE, frames])
+    return along, frames + int(rng.integers(0, 10_000))
+
+
+def _headings(path: Floats, rng: np.random.Generator) -> Floats:
+    """Headings (N,) of a path (N, 2), radians."""
+    return directions(path) if len(path) > 2 else np.full(len(path), rng.uniform(0, 2 * np.pi))
+
+
+def _poses(
+    rng: np.random.Generator,
+    recipe: Recipe,
+    xy: Floats,
+    heading: Floats,
+    ground: Callable[[Floats, Floats], Floats],
+) -> Floats:
+    """Poses (K, 4, 4) of the sensor at (K, 2), which leans with the ground under the robot and sways."""
+    x, y = xy.T
+    cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
+    ahead = ground(x + cx, y + cy) - ground(x - cx, y - cy)
+    left = ground(x - cy, y + cx) - ground(x + cy, y - cx)
+    lean = np.arctan2(np.column_stack([left, -ahead]), _WHEELBASE)
+    lean += np.radians(recipe.draw(rng, "tilt")) * rng.normal(size=lean.shape)
+    poses = np.tile(np.eye(4), (len(xy), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler(
+        "ZYX", np.column_stack([heading, lean[:, 1], lean[:, 0]])
+    ).as_matrix()
+    height = recipe.draw(rng, "sensor_height")
+    poses[:, :3, 3] = np.column_stack([x, y, ground(x, y) + height])
+    return poses

@@ -1,0 +1,156 @@
+"""Training: batches through both encoders until the budget is spent; nothing here depends on what is in the worlds."""
+
+# FOLDED coview_stream/training/training.py: """How the encoders are trained, in numbers."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from coview_stream.config.checks import counts, positive
+from coview_stream.errors import InputError
+from coview_stream.training.batches import draw_batch
+from coview_stream.training.dataset import WorldViews
+from coview_stream.training.losses import Losses, losses
+from coview_stream.training.networks import VIEWS, PlaceNet
+
+_WARM_UP = 0.03  # share of the steps over which the learning rate rises
+
+_LAST = 0.01  # share of the learning rate at the end
+
+_GRADIENT = 5.0  # largest norm
+
+
+Report = Callable[[int, Losses], None]
+
+
+def train(
+    worlds: Sequence[WorldViews],
+    config: TrainingConfig,
+    report: Report | None = None,
+    checkpoint: Path | None = None,
+    every: int = 100,
+) -> PlaceNet:
+    """Train from scratch, or go on from ``checkpoint`` if that file is there; it is written ``every`` so many steps.
+
+    Raises:
+        InputError: the loss is not finite any more, or the checkpoint is none, or one of another configuration.
+    """
+    torch.manual_seed(config.seed)
+    net: PlaceNet = PlaceNet(config.width)
+    net.to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(net.parameters(), config.rate, weight_decay=config.decay)
+    first = _restore(checkpoint, net, optimiser, config)
+    net.train()
+    for step in range(first, config.steps):
+        for group in optimiser.param_groups:
+            group["lr"] = config.rate * _schedule(step, config.steps)
+        torch.manual_seed(config.seed + step)  # a training that is resumed goes on as if it had not stopped
+        found = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
+        if not torch.isfinite(found.total):
+            raise InputError(f"step {step}: the loss is not finite; train with a lower rate")
+        optimiser.zero_grad()
+        found.total.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), _GRADIENT)
+        optimiser.step()
+        if report is not None:
+            report(step, found)
+        if checkpoint is not None and (step + 1) % every == 0:
+            _keep(checkpoint, net, optimiser, step + 1, config)
+    net.eval()
+    return net
+
+
+def _step(
+    net: PlaceNet, worlds: Sequence[WorldViews], config: TrainingConfig, rng: np.random.Generator
+) -> Losses:
+    batch = draw_batch(worlds, min(config.pieces, len(worlds)), config.each, rng)
+    encoded = [
+        net(_tensor(images), VIEWS.index(view))
+        for view, images in (("ground", batch.queries), ("aerial", batch.pieces))
+    ]
+    wrong = rng.uniform(math.radians(12), 2 * math.pi - math.radians(12), (len(batch.queries), config.wrong))
+    poses = torch.from_numpy(batch.poses).float()
+    wrong_yaws = torch.from_numpy(batch.poses[:, 2:] + wrong).float()
+    seen = _seen(batch.queries), _seen(batch.pieces)
+    return losses(encoded[0], encoded[1], torch.from_numpy(batch.piece_of), poses, wrong_yaws, seen)
+
+
+def _seen(images: Any) -> torch.Tensor:
+    """Local cells (B, 1, H / 2, W / 2) in which anything but relief, which is filled in, was seen."""
+    anything = torch.from_numpy(images[:, :-1].any(axis=1, keepdims=True)).float()
+    return torch.nn.functional.max_pool2d(anything, 2)
+
+
+def _tensor(images: Any) -> torch.Tensor:
+    scaled = torch.from_numpy(images).float() / 255.0
+    return scaled.contiguous(memory_format=torch.channels_last)
+
+
+def _schedule(step: int, steps: int) -> float:
+    rise = min(1.0, (step + 1) / max(1.0, _WARM_UP * steps))
+    return rise * (_LAST + (1 - _LAST) * 0.5 * (1 + math.cos(math.pi * step / steps)))
+
+
+def _keep(
+    path: Path, net: PlaceNet, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig
+) -> None:
+    partial = path.with_suffix(".part")
+    state = {
+        "net": net.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "step": step,
+        "config": asdict(config),
+    }
+    torch.save(state, partial)
+    partial.replace(path)
+
+
+def _restore(
+    path: Path | None, net: PlaceNet, optimiser: torch.optim.Optimizer, config: TrainingConfig
+) -> int:
+    if path is None or not path.is_file():
+        return 0
+    try:
+        state = torch.load(path, weights_only=True)
+        same = state["config"] == asdict(config)
+    except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        raise InputError(f"{path}: not the state of a training ({error}); delete it to start anew") from error
+    if not same:
+        raise InputError(
+            f"{path}: a training of other numbers; delete it to start anew, or choose another folder"
+        )
+    net.load_state_dict(state["net"])
+    optimiser.load_state_dict(state["optimiser"])
+    return int(state["step"])
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How the encoders are trained.
+
+    ``steps`` batches of ``pieces`` maps (136 m) with ``each`` queries in every one; AdamW with a learning rate that
+    falls along a cosine from ``rate``. ``width`` is the encoder's channels at 1 m. ``wrong`` headings compete with each
+    query's true one.
+    """
+
+    steps: int = 600
+    pieces: int = 4
+    each: int = 5
+    rate: float = 3e-3
+    decay: float = 1e-4
+    width: int = 24
+    wrong: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts(self, "steps", "pieces", "each", "width", "wrong")
+        counts(self, "seed", least=0)
+        positive(self, "rate", "decay")

@@ -1,0 +1,201 @@
+"""The trees of a stand as columns, and how their sizes and species are drawn."""
+
+# FOLDED coview_stream/training/trees.py: """Where trees stand: at random, in clusters, apart from each other or in rows; gaps and a trail."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from coview_stream.sim.mesh import Floats
+from coview_stream.training.mesh_copies import Flags, Ints
+from coview_stream.training.recipe import Recipe
+from coview_stream.training.terrain import Terrain, waves
+
+FAMILIES = ("lumpy", "cone", "storeys", "umbrella", "clumps", "column")
+
+_EVERGREEN = {"cone": 0.9, "storeys": 0.95, "umbrella": 0.5, "column": 0.6}  # chance, else never
+
+
+class Species(NamedTuple):
+    """Its crowns' family, their width and base in shares of the height, stem thickness, and whether it keeps leaves."""
+
+    family: str
+    width: float
+    base: float
+    thick: float
+    evergreen: bool
+
+
+class Trees(NamedTuple):
+    """(N,) each, metres: foot, height, stem radius, crown radius and base over the foot; family and species by index.
+
+    ``lean`` (N, 2) metres per metre of height; ``offset`` (N, 2) of the crown's middle from the stem's axis.
+    """
+
+    x: Floats
+    y: Floats
+    z: Floats
+    height: Floats
+    radius: Floats
+    crown: Floats
+    base: Floats
+    lean: Floats
+    offset: Floats
+    family: Ints
+    evergreen: Flags
+    dead: Flags
+
+    def axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
+        """Points (M, 3) of the stems' axes ``up`` (M,) metres over their feet; the crowns' weight bends them."""
+        bent = self.offset[of] * (0.7 * np.clip(up / self.height[of], 0, 1) ** 1.5)[:, None]
+        xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + bent
+        return np.column_stack([xy, self.z[of] + up])
+
+    def crown_axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
+        """Points (M, 3) in the middle of the crowns, ``up`` (M,) metres over their feet."""
+        xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + self.offset[of]
+        return np.column_stack([xy, self.z[of] + up])
+
+
+def draw_species(rng: np.random.Generator, recipe: Recipe) -> list[Species]:
+    """Draw the one to four species of a stand."""
+    species = []
+    for _ in range(int(rng.choice([1, 2, 3, 4], p=[0.35, 0.3, 0.2, 0.15]))):
+        family = str(rng.choice(FAMILIES))
+        evergreen = bool(rng.random() < _EVERGREEN.get(family, 0.0))
+        width, base = recipe.draw(rng, "crown_width"), recipe.draw(rng, "crown_base")
+        species.append(Species(family, width, base, rng.uniform(0.006, 0.016), evergreen))
+    return species
+
+
+def draw_trees(
+    rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: Floats, species: list[Species]
+) -> Trees:
+    """Draw the sizes of trees that stand at (N, 2)."""
+    count = len(xy)
+    kind = _mixed(rng, xy, len(species))
+    height = _heights(rng, recipe, xy)
+    pick = {name: np.array([getattr(each, name) for each in species])[kind] for name in Species._fields}
+    crown = _crowns(rng, recipe, pick["width"], height, (2 * terrain.half) ** 2)
+    base = np.clip(pick["base"] + rng.normal(0, 0.06, count), *recipe.crown_base) * height
+    radius = np.clip(pick["thick"] * height * rng.lognormal(0, 0.25, count), *recipe.stem_radius)
+    far = recipe.draw(rng, "crown_offset") * np.sqrt(rng.random(count)) * np.minimum(1, crown / 1.5)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return Trees(
+        x=xy[:, 0],
+        y=xy[:, 1],
+        z=terrain.z(*xy.T),
+        height=height,
+        radius=radius,
+        crown=crown,
+        base=base,
+        lean=rng.normal(0, rng.uniform(0.0, 0.05), (count, 2)),
+        offset=far[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]),
+        family=np.array([FAMILIES.index(str(name)) for name in pick["family"]], dtype=np.int64),
+        evergreen=pick["evergreen"].astype(bool),
+        dead=rng.random(count) < recipe.draw(rng, "dead"),
+    )
+
+
+def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Floats, area: float) -> Floats:
+    """Radii (N,) of crowns, metres, from their usual ``share`` of the height; half of the stands are closed."""
+    low, high = (each * height / 2 for each in recipe.crown_width)
+    wide = share * rng.lognormal(0, 0.15, len(height)) * height / 2
+    if rng.random() < 0.5:
+        wide = wide * np.sqrt(rng.uniform(0.7, 2.0) * area / max(float((np.pi * wide**2).sum()), 1.0))
+    # where trees are dense their crowns stay narrow
+    room = max(0.6, rng.uniform(0.8, 1.8) * float(np.sqrt(area / max(len(height), 1))) / 2)
+    return np.minimum(np.clip(wide, low, high), room * rng.uniform(0.85, 1.15, len(height)))
+
+
+def _mixed(rng: np.random.Generator, xy: Floats, kinds: int) -> npt.NDArray[np.intp]:
+    """Species (N,) by index: in patches, or one here one there."""
+    scores = [
+        waves(rng, rng.uniform(30, 100))(*xy.T) * rng.uniform(0, 2) + rng.gumbel(size=len(xy)) + rng.normal()
+        for _ in range(kinds)
+    ]
+    return np.asarray(np.argmax(np.array(scores), axis=0))
+
+
+def _heights(rng: np.random.Generator, recipe: Recipe, xy: Floats) -> Floats:
+    low, high = recipe.tree_height
+    mean = rng.uniform(low + 0.05 * (high - low), low + 0.9 * (high - low))
+    height = mean * (1 + rng.uniform(0, 0.2) * waves(rng, rng.uniform(40, 150))(*xy.T))
+    if rng.random() < 0.4:  # uneven-aged
+        height = height * (1 - rng.uniform(0.3, 0.8) * rng.beta(1.0, rng.uniform(1.0, 2.5), len(xy)))
+    return np.clip(height * (1 + rng.normal(0, rng.uniform(0.03, 0.12), len(xy))), low, high)
+
+
+PATTERNS = ("random", "clustered", "hard-core", "rows")
+
+_APART = 0.8  # metres: no two stems stand nearer
+
+
+def draw_stems(rng: np.random.Generator, pattern: str, per_hectare: float, half: float) -> Floats:
+    """Draw positions (N, 2) of stems within +-``half`` metres, in one of ``PATTERNS``."""
+    area = (2 * half) ** 2
+    count = int(per_hectare * area / 1e4)
+    spacing = np.sqrt(1e4 / per_hectare)
+    if pattern == "rows":
+        return _rows(rng, spacing, half)
+    if pattern == "clustered":
+        per = rng.uniform(3, 15)
+        parents = rng.uniform(-half, half, (max(1, int(count / per)), 2))
+        xy = parents[rng.integers(0, len(parents), count)] + rng.normal(0, rng.uniform(1.5, 5.0), (count, 2))
+        return xy[_thinned(rng, xy, _APART) & (np.abs(xy) < half).all(axis=1)]
+    dense = rng.uniform(-half, half, (int(1.6 * count) if pattern == "hard-core" else count, 2))
+    apart = rng.uniform(0.45, 0.7) * spacing if pattern == "hard-core" else _APART
+    return dense[_thinned(rng, dense, apart)][:count]
+
+
+def _rows(rng: np.random.Generator, spacing: float, half: float) -> Floats:
+    stretch = rng.uniform(1.0, 1.6)
+    across, along = spacing * np.sqrt(stretch), spacing / np.sqrt(stretch)
+    u, v = np.arange(-1.5 * half, 1.5 * half, across), np.arange(-1.5 * half, 1.5 * half, along)
+    xy = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    xy = xy + rng.normal(0, rng.uniform(0.05, 0.2) * along, xy.shape)
+    yaw = rng.uniform(0, np.pi)
+    xy = xy @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    kept = (np.abs(xy) < half).all(axis=1) & (rng.random(len(xy)) > rng.uniform(0, 0.25))
+    return np.asarray(xy[kept])
+
+
+def _thinned(rng: np.random.Generator, xy: Floats, apart: float) -> npt.NDArray[np.bool_]:
+    """Keep (N,) such that of each pair nearer than ``apart`` the one of lower rank goes."""
+    keep = np.ones(len(xy), dtype=bool)
+    pairs = cKDTree(xy).query_pairs(apart, output_type="ndarray")
+    rank = rng.random(len(xy))
+    keep[np.where(rank[pairs[:, 0]] < rank[pairs[:, 1]], pairs[:, 0], pairs[:, 1])] = False
+    return keep
+
+
+def opened(rng: np.random.Generator, xy: Floats, half: float) -> npt.NDArray[np.bool_]:
+    """Which stems (N,) remain where the stand has thin parts, gaps and perhaps a trail."""
+    keep = np.ones(len(xy), dtype=bool)
+    if rng.random() < 0.6:
+        uneven = waves(rng, rng.uniform(40, 120))(xy[:, 0], xy[:, 1])
+        keep &= rng.random(len(xy)) < 1 / (1 + np.exp(-2.0 - rng.uniform(0, 1.5) * uneven))
+    for _ in range(rng.poisson(rng.choice([0.0, 2.0, 6.0]))):
+        middle, radii = rng.uniform(-half, half, 2), rng.uniform(4, 16, 2)
+        keep &= ((xy - middle) ** 2 / radii**2).sum(axis=1) > 1
+    if rng.random() < 0.7:
+        keep &= _aside(xy, _trail(rng, half)) > rng.uniform(1.0, 2.5)
+    return keep
+
+
+def _trail(rng: np.random.Generator, half: float) -> Floats:
+    along = np.arange(-1.5 * half, 1.5 * half, 1.0)
+    sideways = rng.uniform(-0.4, 0.4) * half + rng.uniform(0, 12) * waves(rng, rng.uniform(60, 140))(
+        along, np.zeros_like(along)
+    )
+    yaw = rng.uniform(0, 2 * np.pi)
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.asarray(np.column_stack([along, sideways]) @ np.array([[c, s], [-s, c]]))
+
+
+def _aside(xy: Floats, line: Floats) -> Floats:
+    return np.asarray(cKDTree(line).query(xy)[0])

@@ -1,0 +1,245 @@
+"""The ``.coview`` file: what was saved comes back, and nothing else is taken for it."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from coview_stream.basemap import file_format
+from coview_stream.errors import MapError
+
+PARAMETERS = {"config": {"block": 2.0}, "crs": 'PROJCS["Zürich"]', "sources": {"a.laz": "00ff"}}
+
+
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "origin": np.array([5e5, 5.4e6, 300.0]),
+        "points": rng.normal(size=(40, 3)).astype(np.float32),
+        "descriptor.coview": rng.normal(size=(3, 4, 6)).astype(np.float16),
+        "tile_index": np.arange(8).reshape(2, 4),
+        "normals": rng.integers(-127, 128, (40, 3)).astype(np.int8),
+        "surveyed": np.ones((3, 5), np.uint8),
+        "empty": np.empty((0, 3), np.float32),
+    }
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "site.coview"
+    file_format.save(path, arrays(), PARAMETERS)
+    return path
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A saved map's bytes, and a name to write damaged copies to."""
+    path = tmp_path_factory.mktemp("damage") / "site.coview"
+    file_format.save(path, arrays(), PARAMETERS)
+    return path.read_bytes(), path.with_name("damaged.coview")
+
+
+def test_round_trip(path):
+    loaded, parameters, digest = file_format.load(path)
+    assert parameters == PARAMETERS
+    assert set(loaded) == set(arrays())
+    for name, array in arrays().items():
+        assert loaded[name].dtype == array.dtype
+        np.testing.assert_array_equal(loaded[name], array)
+    assert len(digest) == 64
+
+
+def test_arrays_are_memory_mapped_and_read_only(path):
+    loaded, _, _ = file_format.load(path)
+    for name, array in loaded.items():
+        if name != "empty":
+            assert isinstance(array, np.memmap)
+            with pytest.raises(ValueError, match="read-only"):
+                array[...] = 0
+
+
+def test_equal_content_has_an_equal_hash(tmp_path):
+    backwards = dict(reversed(arrays().items()))
+    shuffled = dict(reversed(PARAMETERS.items()))
+    one = file_format.save(tmp_path / "one.coview", arrays(), PARAMETERS)
+    two = file_format.save(tmp_path / "two.coview", backwards, shuffled)
+    assert one == two == file_format.load(tmp_path / "two.coview")[2]
+
+
+@pytest.mark.parametrize("name", ["points", "origin", "descriptor.coview"])
+def test_other_content_has_another_hash(path, tmp_path, name):
+    changed = arrays()
+    changed[name] = changed[name].copy()
+    changed[name].flat[0] += 1
+    assert file_format.save(tmp_path / "other.coview", changed, PARAMETERS) != file_format.load(path)[2]
+    assert (
+        file_format.save(tmp_path / "more.coview", arrays(), PARAMETERS | {"crs": None})
+        != file_format.load(path)[2]
+    )
+
+
+def test_layout_in_memory_does_not_matter(path, tmp_path):
+    turned = {name: np.asfortranarray(array) for name, array in arrays().items()}
+    assert file_format.save(tmp_path / "turned.coview", turned, PARAMETERS) == file_format.load(path)[2]
+    np.testing.assert_array_equal(
+        file_format.load(tmp_path / "turned.coview")[0]["points"], arrays()["points"]
+    )
+
+
+@given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@example(where=0.0, bit=0)
+@example(where=0.9999999, bit=7)
+@settings(max_examples=300, deadline=None)
+def test_a_flipped_bit_anywhere_is_noticed(shared, where, bit):
+    content, target = shared
+    at = int(where * len(content))
+    target.write_bytes(content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :])
+    with pytest.raises(MapError, match=r"damaged\.coview"):
+        file_format.load(target)
+
+
+@pytest.mark.parametrize("length", range(8))
+def test_any_byte_at_the_end_of_the_header_is_noticed(tmp_path, length):
+    """Also the blanks between header and arrays, which JSON would not mind; there are 0 to 7 of them."""
+    path = tmp_path / "site.coview"
+    file_format.save(path, {"origin": np.arange(3.0)}, {"crs": "x" * length})
+    content = path.read_bytes()
+    end = 8 + int.from_bytes(content[:8], "little")
+    for at in range(end - 10, end):
+        for byte in {ord(" "), ord("\n"), ord("0")} - {content[at]}:
+            path.write_bytes(content[:at] + bytes([byte]) + content[at + 1 :])
+            with pytest.raises(MapError):
+                file_format.load(path)
+
+
+@given(share=st.floats(0, 1, exclude_max=True))
+@example(share=0.0)
+@settings(max_examples=60, deadline=None)
+def test_truncation_is_noticed(shared, share):
+    content, target = shared
+    target.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(MapError, match=r"damaged\.coview"):
+        file_format.load(target)
+
+
+def rewrite_header(path, change):
+    content = path.read_bytes()
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + size])
+    change(header)
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + size :])
+
+
+def test_another_version_is_named(path):
+    rewrite_header(path, lambda header: header["__metadata__"].update(version="2"))
+    with pytest.raises(MapError, match=r"format 2, this program reads 1; build the map again"):
+        file_format.load(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda h: h["points"].update(dtype="F99"),
+        lambda h: h["points"].update(shape=[40, -3]),
+        lambda h: h["points"].update(shape="40x3"),
+        lambda h: h["points"].update(data_offsets=[0, 10**12]),
+        lambda h: h["points"].update(data_offsets=[-8, 472]),
+        lambda h: h["points"].update(data_offsets=None),
+        lambda h: h.update(points=None),
+        lambda h: h.update(more=[1, 2]),
+        lambda h: h["__metadata__"].pop("parameters"),
+        lambda h: h["__metadata__"].update(parameters="{"),
+        lambda h: h["__metadata__"].pop("sha256"),
+        lambda h: h["__metadata__"].pop("format"),
+        lambda h: h.update(__metadata__=7),
+    ],
+)
+def test_a_forged_header_is_refused(path, change):
+    rewrite_header(path, change)
+    with pytest.raises(MapError, match=r"site\.coview"):
+        file_format.load(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\x00" * 8,
+        b"LASF" + b"\x00" * 400,
+        b"{}",
+        b"\x02" + b"\x00" * 7 + b"{}",
+        b"\xff" * 100,
+        b"7 text\n" * 50,
+    ],
+)
+def test_what_is_not_a_map_is_refused(tmp_path, content):
+    path = tmp_path / "other.coview"
+    path.write_bytes(content)
+    with pytest.raises(MapError, match=r"other\.coview: not a coview map"):
+        file_format.load(path)
+
+
+def test_a_missing_file_and_a_directory(tmp_path):
+    for path in (tmp_path / "none.coview", tmp_path):
+        with pytest.raises(MapError, match="cannot read the map"):
+            file_format.load(path)
+
+
+def test_a_failed_save_leaves_the_old_map_and_no_leftovers(path, monkeypatch):
+    before = path.read_bytes()
+
+    def no_space(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(MapError, match="No space left on device"):
+        file_format.save(path, {"points": np.zeros((5, 3), np.float32)}, {})
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == ["site.coview"]
+
+
+def test_an_interrupted_save_leaves_the_old_map_and_no_leftovers(path, monkeypatch):
+    before = path.read_bytes()
+
+    def interrupted(handle):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        file_format.save(path, {"points": np.zeros((5, 3), np.float32)}, {})
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == ["site.coview"]
+
+
+def test_saving_over_a_loaded_map_leaves_the_loaded_one_readable(path):
+    loaded, _, _ = file_format.load(path)
+    file_format.save(path, {"points": np.zeros((5, 3), np.float32)}, {})
+    np.testing.assert_array_equal(loaded["points"], arrays()["points"])
+    assert file_format.load(path)[0]["points"].shape == (5, 3)
+
+
+def test_a_directory_that_does_not_exist(tmp_path):
+    with pytest.raises(MapError, match=r"a directory that exists"):
+        file_format.save(tmp_path / "no" / "site.coview", arrays(), PARAMETERS)
+
+
+def test_the_file_is_valid_safetensors(tmp_path):
+    from safetensors.numpy import load_file
+
+    arrays = {
+        "a": np.arange(5, dtype=np.int8),
+        "b": np.arange(6, dtype=np.float64).reshape(2, 3),
+        "c": np.zeros((0, 3), dtype=np.float32),
+    }
+    path = tmp_path / "site.coview"
+    file_format.save(path, arrays, {"answer": 42})
+    loaded = load_file(path)
+    assert sorted(loaded) == sorted(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(loaded[name], array)

@@ -1,0 +1,214 @@
+"""Learned features that cannot be used: ``auto`` goes without them and says so once, ``learned`` refuses."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import sys
+import warnings
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap, check_reloc
+from coview_stream.config import LocalizerConfig
+from coview_stream.descriptors import network
+from coview_stream.descriptors.feature_map import weights_sha256
+from coview_stream.descriptors.network import CARD, VIEW_NAMES, Network, file_sha256, weights_file
+from coview_stream.doctor.map_checks import node_memory, site_findings
+from coview_stream.errors import ConfigError, CoViewError, InputError, TransportError
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.search.recognizers import Knowledge
+from coview_stream.stream.node import serve
+from coview_stream.stream.node.engines import SearchEngine, TrackEngine
+from coview_stream.stream.transport.keys import robot_keys
+
+RELEARN = "build it again"
+
+
+def forget():
+    network.network.cache_clear()
+    weights_sha256.cache_clear()
+
+
+@pytest.fixture
+def weights(tmp_path, monkeypatch):
+    """A folder of weights that the package takes for its own; nothing of before is remembered."""
+    for view in VIEW_NAMES:
+        shutil.copy(weights_file(view), tmp_path)
+    monkeypatch.setattr(network, "shipped", lambda: tmp_path)
+    forget()
+    yield tmp_path
+    forget()
+
+
+def without_ground(folder, patch):
+    (folder / "ground.onnx").unlink()
+
+
+def without_any(folder, patch):
+    for view in VIEW_NAMES:
+        (folder / f"{view}.onnx").unlink()
+
+
+def other_ground(folder, patch):
+    (folder / "ground.onnx").write_bytes((folder / "ground.onnx").read_bytes() + b"\0")
+
+
+def drawn_otherwise(folder, patch):
+    patch.setattr("coview_stream.descriptors.feature_map.BIRD_VIEW_VERSION", 0)
+
+
+def not_of_the_card(folder, patch):
+    (folder / CARD).write_text(json.dumps({"sha256": {"aerial.onnx": "0" * 64, "ground.onnx": "0" * 64}}))
+
+
+def no_onnxruntime(folder, patch):
+    patch.setitem(sys.modules, "onnxruntime", None)
+
+
+def rest_of_onnxruntime(folder, patch):
+    patch.setitem(sys.modules, "onnxruntime", ModuleType("onnxruntime"))
+
+
+SPOILT = [
+    (without_ground, "no weights of the ground network; install the package again"),
+    (without_any, "no weights of the aerial network; install the package again"),
+    (other_ground, RELEARN),
+    (drawn_otherwise, RELEARN),
+    (not_of_the_card, "not the weights that card.json beside it names; install"),
+    (no_onnxruntime, "pip install 'onnxruntime>=1.18'"),
+    (rest_of_onnxruntime, "pip install --force-reinstall 'onnxruntime>=1.18'"),
+]
+
+
+def judged(base_map, text):
+    """Every way to hear of features that cannot be used."""
+    said = check_reloc(base_map, "auto")
+    assert said.startswith("going without learned features: ")
+    assert text in said
+    assert check_reloc(base_map, "coview") is None
+    with pytest.raises(CoViewError) as caught:
+        check_reloc(base_map, "learned")
+    assert text in str(caught.value)
+    with pytest.raises(type(caught.value)):
+        Localizer(base_map, LocalizerConfig(reloc="learned"))
+    with pytest.warns(UserWarning, match="going without") as warned:
+        known = Knowledge.of(base_map, LocalizerConfig())
+    assert len(warned) == 1
+    assert known.learned is None
+    assert known.retrieval is not None
+    findings = {f.what: f for f in site_findings(base_map, int(1e6), None)}
+    assert findings["map features"].verdict == "warn"
+    assert findings["map features"].remedy == said.partition("; ")[2]
+    assert findings["map features"].remedy
+    assert findings["map memory"].verdict == "ok"
+
+
+@pytest.mark.parametrize(("spoil", "text"), SPOILT)
+def test_what_the_installation_lacks(learned_map, weights, monkeypatch, spoil, text):
+    spoil(weights, monkeypatch)
+    judged(learned_map, text)
+
+
+def test_features_that_are_damaged(learned_map, weights):
+    arrays = {n: v for n, v in learned_map._arrays.items() if n != "learned.sigma"}
+    judged(BaseMap(arrays, learned_map.parameters), RELEARN)
+
+
+def test_all_is_well(learned_map, world_map, weights):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Knowledge.of(learned_map, LocalizerConfig()).learned is not None
+        assert Knowledge.of(learned_map, LocalizerConfig(reloc="coview")).learned is None
+        assert Knowledge.of(world_map, LocalizerConfig()).learned is None
+    for base_map, text in ((learned_map, "of the installed networks"), (world_map, "none")):
+        assert check_reloc(base_map, "auto") is None
+        (finding,) = [f for f in site_findings(base_map, int(1e6), None) if f.what == "map features"]
+        assert finding.verdict == "ok"
+        assert text in finding.found
+
+
+def test_who_only_tracks_loads_no_network(learned_map, weights):
+    engine = TrackEngine(learned_map)
+    assert engine._knowledge.learned is not None
+    assert network.network.cache_info().currsize == 0
+    assert SearchEngine(learned_map)._knowledge.learned is not None
+    assert network.network.cache_info().currsize == 1
+
+
+def test_serve_says_so_once_and_its_engines_go_without(learned_map, tmp_path, monkeypatch, caplog):
+    parameters = {
+        **learned_map.parameters,
+        "learned": {**learned_map.parameters["learned"], "weights": "0" * 64},
+    }
+    BaseMap(learned_map._arrays, parameters).save(tmp_path / "old.coview")
+    relocs = []
+
+    class Lane(serve.ProcessLane):
+        def __init__(self, *given, **named):
+            super().__init__(*given, **named)
+            relocs.append(self.reloc)
+
+        def start(self):
+            raise TransportError("that is enough")
+
+    monkeypatch.setattr(serve, "EngineProcess", Lane)
+    options = serve.ServeOptions(tmp_path / "old.coview", [robot_keys("native", "coview", "r1")])
+    with caplog.at_level(logging.WARNING), pytest.raises(TransportError, match="that is enough"):
+        serve.open_node(options)
+    assert relocs == ["coview", "coview"]
+    assert len(caplog.records) == 1
+    assert RELEARN in caplog.text
+
+
+def test_memory_counts_the_rectangle_around_a_map(learned_map, world_map):
+    """Two tiles at the ends of a diagonal of 3 km."""
+    arrays = dict(learned_map._arrays)
+    arrays["learned.tiles"] = arrays["learned.tiles"].copy()
+    arrays["learned.tiles"][-1] = arrays["learned.tiles"][0] + 100
+    sparse = BaseMap(arrays, learned_map.parameters)
+    near, far = node_memory(learned_map), node_memory(sparse)
+    assert near > node_memory(world_map)
+    assert far - near == pytest.approx(1.08e9, rel=0.05)  # 101 x 101 tiles, 208 bytes on 4 m2, and spectra
+
+
+def test_a_network_that_is_none_of_ours(weights, monkeypatch):
+    inputs = []
+
+    class Session:
+        def __init__(self, *given, **named):
+            pass
+
+        def get_inputs(self):
+            return inputs
+
+        def get_outputs(self):
+            return []
+
+    runtime = SimpleNamespace(SessionOptions=SimpleNamespace, InferenceSession=Session)
+    monkeypatch.setitem(sys.modules, "onnxruntime", runtime)
+    for wrong in ([], [SimpleNamespace(name="x", shape=[])]):
+        inputs[:] = wrong
+        with pytest.raises(InputError, match="cannot be loaded as weights"):
+            Network("ground", weights)
+    inputs[:] = [SimpleNamespace(name="x", shape=[1, 3, 8, 8])]
+    with pytest.raises(InputError, match=r"another version \(3 layers\)"):
+        Network("ground", weights)
+
+
+def test_the_card_tells_views_apart(weights):
+    hashes = {f"{view}.onnx": file_sha256(weights / f"{view}.onnx") for view in VIEW_NAMES}
+    (weights / CARD).write_text(json.dumps({"sha256": hashes}))
+    for view in VIEW_NAMES:
+        Network(view, weights)
+    shutil.copy(weights / "aerial.onnx", weights / "ground.onnx")
+    with pytest.raises(InputError, match=r"ground\.onnx: not the weights"):
+        Network("ground", weights)
+
+
+def test_threads_have_to_be_a_number(weights, monkeypatch):
+    monkeypatch.setenv("COVIEW_THREADS", "two")
+    with pytest.raises(ConfigError, match="COVIEW_THREADS is 'two'"):
+        network.network("aerial")

@@ -1,0 +1,123 @@
+"""``coview-stream build``: a map or one line, never half a map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.cli import main
+from coview_stream.clouds.files import write_cloud
+
+
+@pytest.fixture
+def cloud(map_points, tmp_path):
+    path = tmp_path / "site.ply"
+    write_cloud(path, map_points[(np.abs(map_points[:, :2]) < 9.0).all(axis=1)].astype(np.float32))
+    return path
+
+
+def one_line(capsys):
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("coview-stream: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_a_map_is_built_and_described(cloud, tmp_path, capsys):
+    target = tmp_path / "site.coview"
+    assert main(["build", str(cloud), "-o", str(target), "--radius", "20", "--block-size", "3"]) == 0
+    out = capsys.readouterr().out
+    built = BaseMap.load(target)
+    assert built.config.block == 3.0
+    assert built.descriptor_config.radius == 20.0
+    for fact in (
+        f"{len(built)} stations",
+        f"{len(built.points)} kept",
+        f"{target.stat().st_size} bytes",
+        " s,",
+    ):
+        assert fact in out
+
+
+def test_preset_channels_and_descriptor_options(cloud, tmp_path):
+    target = tmp_path / "site.coview"
+    options = ["--preset", "tls", "--rings", "5", "--sectors", "8"]
+    options += ["--channels", "coview_strict, scan_context"]
+    assert main(["build", str(cloud), "-o", str(target), *options]) == 0
+    config = BaseMap.load(target).descriptor_config
+    assert config.radius == 100.0
+    assert config.channels == ("coview_strict", "scan_context")
+    assert (config.rings, config.sectors) == (5, 8)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--radius", "-3"], "radius"),
+        (["--radius", "wide"], "--radius"),
+        (["--block-size", "0"], "block"),
+        (["--channels", "colour"], "channels"),
+        (["--preset", "indoor"], "--preset"),
+        (["--rings", "2"], "rings"),
+        (["--no-such-option"], "--no-such-option"),
+    ],
+)
+def test_bad_options(cloud, tmp_path, capsys, options, text):
+    assert main(["build", str(cloud), "-o", str(tmp_path / "site.coview"), *options]) == 2
+    assert text in one_line(capsys)
+    assert [p.name for p in tmp_path.iterdir()] == ["site.ply"]
+
+
+@pytest.mark.parametrize("name", ["none.laz", "text.ply", "empty.las", "few.npy", "nan.npy"])
+def test_bad_input(tmp_path, capsys, name):
+    (tmp_path / "text.ply").write_text("no cloud\nat all\n")
+    (tmp_path / "empty.las").write_bytes(b"")
+    np.save(tmp_path / "few.npy", np.zeros((50, 3)))
+    np.save(tmp_path / "nan.npy", np.full((5000, 3), np.nan))
+    before = sorted(tmp_path.iterdir())
+    assert main(["build", str(tmp_path / name), "-o", str(tmp_path / "site.coview")]) == 2
+    error = one_line(capsys)
+    assert name in error or "points are left" in error
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_one_bad_tile_among_good_ones(cloud, tmp_path, capsys):
+    (tmp_path / "bad.ply").write_text("nonsense")
+    assert main(["build", str(cloud), str(tmp_path / "bad.ply"), "-o", str(tmp_path / "site.coview")]) == 2
+    assert "bad.ply" in one_line(capsys)
+    assert not (tmp_path / "site.coview").exists()
+
+
+def test_a_failed_build_leaves_the_old_map(cloud, tmp_path, capsys):
+    target = tmp_path / "site.coview"
+    target.write_bytes(b"the old map")
+    assert main(["build", str(tmp_path / "none.las"), "-o", str(target)]) == 2
+    one_line(capsys)
+    assert target.read_bytes() == b"the old map"
+
+
+def test_a_place_that_does_not_exist_is_refused_before_the_work(tmp_path, capsys):
+    for target in (tmp_path / "no" / "site.coview", tmp_path):
+        assert main(["build", str(tmp_path / "none.las"), "-o", str(target)]) == 2
+        assert "not a place for a file" in one_line(capsys)
+
+
+def test_nothing_but_a_map_is_ever_replaced(cloud, tmp_path, capsys):
+    before = cloud.read_bytes()
+    assert main(["build", str(cloud), "-o", str(cloud)]) == 2
+    assert "one of the scans" in one_line(capsys)
+    other = tmp_path / "thesis.txt"
+    other.write_text("years of work")
+    assert main(["build", str(cloud), "-o", str(other)]) == 2
+    assert "no coview map" in one_line(capsys)
+    assert main(["build", str(cloud), "-o", "/dev/null"]) == 2
+    assert "not a regular file" in one_line(capsys)
+    assert cloud.read_bytes() == before
+    assert other.read_text() == "years of work"
+
+
+def test_a_source_given_twice_is_refused(cloud, tmp_path, capsys):
+    assert main(["build", str(cloud), str(cloud), "-o", str(tmp_path / "site.coview")]) == 2
+    assert "given twice" in one_line(capsys)

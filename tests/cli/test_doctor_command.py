@@ -1,0 +1,147 @@
+"""``coview-stream doctor``: lines, JSON and exit codes; a real robot on loopback."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import numpy as np
+import pytest
+from sockets import free_endpoint
+
+from coview_stream.cli import main
+from coview_stream.doctor import machine_checks as machine
+from coview_stream.doctor import network_checks as network
+from coview_stream.doctor.finding import Finding
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.messages import encode_cloud, encode_odometry
+from coview_stream.messages.types import CloudMessage, OdometryMessage
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.zenoh_transport import open_transport
+
+KEYS = robot_keys("native", "coview", "r1")
+POINTS = np.random.default_rng(2).uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """The machine has tests of its own, and takes seconds."""
+    monkeypatch.setattr(machine, "machine_findings", lambda: iter([Finding("ok", "machine", "fine")]))
+
+
+class Robot:
+    """A router-like peer that sends clouds at 10 Hz, and odometry at 50 Hz, 100 s ahead if told so."""
+
+    def __init__(self, ahead=0.0):
+        self.endpoint = free_endpoint()
+        self._net = open_transport(listen=[self.endpoint])
+        self._net.announce(KEYS.alive)
+        self._ahead, self._ended = round(ahead * 1e9), threading.Event()
+        self._clouds = self._net.publisher(KEYS.cloud, "bulk")
+        self._odometry = self._net.publisher(KEYS.odometry, "data")
+        self._thread = threading.Thread(target=self._send)
+
+    def _send(self):
+        stamp = 10**18
+        while not self._ended.wait(0.02):
+            stamp += 20_000_000
+            T = pose_from(np.eye(3), [stamp * 1e-9 - 1e9, 0.0, 0.0])
+            self._odometry.put(encode_odometry(OdometryMessage(stamp + self._ahead, T), "json"))
+            if stamp % 100_000_000 == 0:
+                self._clouds.put(encode_cloud(CloudMessage(stamp, POINTS), "cdr"))
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc):
+        self._ended.set()
+        self._thread.join()
+        self._net.close()
+
+
+def findings_of(capsys, *argv):
+    code = main(["doctor", "--json", *argv])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_a_robot_over_zenoh(capsys):
+    with Robot() as robot:
+        options = ("--robot", "r1", "--connect", robot.endpoint, "--seconds", "1.5")
+        for _ in range(4):  # on a busy machine the robot itself may pause, and that is a finding
+            code, found = findings_of(capsys, *options)
+            if code == 0:
+                break
+    verdicts = {f["what"]: f["verdict"] for f in found if f["robot"] == "r1"}
+    assert code == 0, found
+    paced = ("clouds", "odometry", "cloud stamps", "odometry stamps", "pairing")
+    assert {what: verdicts.pop(what) in ("ok", "warn") for what in paced} == dict.fromkeys(paced, True)
+    assert verdicts == {"gravity": "ok", "one clock": "ok", "node": "warn"}
+    assert "says nothing" in found[-1]["found"]  # the token was seen, a status was not
+    assert [f["found"] for f in found if f["what"] == "network"] == ["connected: 1 peer"]
+
+
+def test_a_fault_is_exit_code_one(capsys):
+    with Robot(ahead=100.0) as robot:
+        code = main(["doctor", "--robot", "r1", "--connect", robot.endpoint, "--seconds", "1"])
+    clocks = [line for line in capsys.readouterr().out.splitlines() if "r1 one clock" in line]
+    assert code == 1
+    assert len(clocks) == 1
+    assert clocks[0].startswith("FAIL")
+    assert "ahead of the clouds'" in clocks[0]
+    assert clocks[0].endswith("(put both on one clock)")
+
+
+def test_a_wrong_name_is_told_the_right_one(capsys):
+    with Robot() as robot:
+        code, found = findings_of(capsys, "--robot", "rover", "--connect", robot.endpoint, "--seconds", "0.2")
+    assert code == 1
+    assert found[-3]["remedy"] == "clouds come on coview/r1/in/cloud: try --robot r1"
+    assert found[-2]["remedy"] == "odometry comes on coview/r1/in/odom: try --robot r1"
+
+
+def test_nobody_there(capsys, monkeypatch):
+    monkeypatch.setattr(network, "_PATIENCE", 0.2)
+    endpoint = free_endpoint()
+    code, found = findings_of(capsys, "--robot", "r1", "--connect", endpoint)
+    assert code == 1
+    assert [f["verdict"] for f in found] == ["ok", "FAIL"]  # nothing more to say of the robot
+    assert f"{endpoint} refuses" in found[1]["found"]
+
+
+def test_an_endpoint_in_use(capsys):
+    with Robot() as robot:
+        code, found = findings_of(capsys, "--listen", robot.endpoint)
+    assert code == 1
+    assert found[-1]["what"] == "network"
+    assert "in use" in found[-1]["found"].lower()
+
+
+def test_the_machine_alone_and_a_map(world_file, tmp_path, capsys):
+    assert main(["doctor"]) == 0
+    assert capsys.readouterr().out == "ok    machine                 fine\n"
+    code, found = findings_of(capsys, str(world_file))
+    assert [f["what"] for f in found] == ["machine", "map", "map sha256", "map features", "map memory"]
+    assert code == (found[-1]["verdict"] == "FAIL")
+    assert main(["doctor", str(tmp_path / "none.coview")]) == 1
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--seconds", "0"],
+        ["--seconds", "nan"],
+        ["--robot", "a/b"],
+        ["--preset", "ros1"],
+        ["--connect", "localhost"],
+        ["--config", "/no/such/file.json5"],
+        ["--cloud-encoding", "json"],
+        ["--odometry-encoding", "xyz"],
+    ],
+)
+def test_bad_usage_is_one_line_before_anything_slow(argv, capsys):
+    assert main(["doctor", *argv]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert argv[0] in captured.err or "/no/such/file.json5" in captured.err

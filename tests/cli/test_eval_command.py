@@ -1,0 +1,52 @@
+"""``coview-stream eval`` on files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coview_stream.cli import main
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.geometry.transforms import pose_from
+
+
+@pytest.fixture
+def truth(tmp_path):
+    path = tmp_path / "truth.tum"
+    write_tum(path, 0.1 * np.arange(10), [pose_from(np.eye(3), [k, 0, 0]) for k in range(10)])
+    return path
+
+
+def test_table_and_json(truth, tmp_path, capsys):
+    estimate = tmp_path / "est.tum"
+    write_tum(estimate, 0.1 * np.arange(4, 10), [pose_from(np.eye(3), [k, 0.25, 0]) for k in range(4, 10)])
+    assert main(["eval", str(estimate), str(truth)]) == 0
+    out = capsys.readouterr().out
+    assert "60.0% of 10 frames" in out
+    assert "after 4.0 m" in out
+    assert "mean 0.250" in out
+    assert main(["eval", str(estimate), str(truth), "--json"]) == 0
+    verdict = json.loads(capsys.readouterr().out)
+    assert verdict["success"] is True
+    assert verdict["translation"]["mean"] == 0.25
+
+
+def test_an_empty_trajectory_is_not_localised(truth, tmp_path, capsys):
+    empty = tmp_path / "est.tum"
+    empty.write_text("")
+    assert main(["eval", str(empty), str(truth), "--plot", str(tmp_path / "errors.png")]) == 0
+    assert "never" in capsys.readouterr().out
+    assert (tmp_path / "errors.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("content", ["", "1 2 3\n", "nonsense\n", None])
+def test_a_bad_truth_is_one_line(truth, tmp_path, capsys, content):
+    bad = tmp_path / "bad.tum"
+    if content is not None:
+        bad.write_text(content)
+    assert main(["eval", str(truth), str(bad)]) == 2
+    err = capsys.readouterr().err
+    assert "bad.tum" in err
+    assert err.count("\n") == 1

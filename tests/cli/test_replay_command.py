@@ -1,0 +1,186 @@
+"""``coview-stream replay`` over real sockets, and what it refuses."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sockets import free_endpoint, until
+
+from coview_stream.cli import main
+from coview_stream.clouds.files import write_cloud
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.messages import decode_cloud, decode_odometry
+from coview_stream.stream.client import replay
+from coview_stream.stream.transport.zenoh_transport import open_transport
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("replay") / "run"
+    (folder / "frames").mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    for k in range(6):
+        write_cloud(folder / "frames" / f"{k:06d}.pcd", rng.normal(size=(500, 3)).astype(np.float32))
+    write_tum(
+        folder / "odometry.tum", 20.0 + np.arange(6), [pose_from(np.eye(3), [k, 0, 0]) for k in range(6)]
+    )
+    return folder
+
+
+class Node:
+    """Takes down what a replay sends."""
+
+    def __init__(self):
+        self.endpoint = free_endpoint()
+        self.transport = open_transport(listen=[self.endpoint])
+        self.sent = []
+
+    def subscribe(self, cloud="coview/r1/in/cloud", odometry="coview/r1/in/odom", hint=None):
+        self.transport.subscribe(cloud, lambda s: self.sent.append(decode_cloud(s, hint=hint)), "all")
+        self.transport.subscribe(odometry, lambda s: self.sent.append(decode_odometry(s, hint=hint)), "all")
+
+    def clouds(self):
+        return [m for m in self.sent if hasattr(m, "points")]
+
+    def odometry(self):
+        return [m for m in self.sent if hasattr(m, "T_odom_body")]
+
+
+@pytest.fixture
+def node():
+    made = Node()
+    yield made
+    made.transport.close()
+
+
+def test_a_run_arrives_whole(node, run_folder, capsys):
+    node.subscribe()
+    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint]
+    assert main([*command, "--rate", "20", "--odometry-rate", "60"]) == 0
+    until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 16)
+    assert sorted(m.stamp_ns for m in node.clouds()) == [(20 + k) * 10**9 for k in range(6)]
+    assert [m.stamp_ns for m in node.odometry()] == sorted({m.stamp_ns for m in node.odometry()})
+    captured = capsys.readouterr()
+    assert captured.out.startswith("6 frames (")
+    assert "16 odometry samples sent" in captured.out
+    assert "put p50" in captured.out
+    assert captured.err == ""
+
+
+def test_clouds_alone(node, run_folder, tmp_path, capsys):
+    bare = tmp_path / "run"
+    shutil.copytree(run_folder / "frames", bare / "frames")
+    node.subscribe()
+    command = ["--robot", "r1", "--connect", node.endpoint, "--rate", "50", "--odometry", "none"]
+    assert main(["replay", str(bare), *command]) == 0
+    until(lambda: len(node.clouds()) == 6)
+    assert sorted(m.stamp_ns for m in node.clouds()) == [k * 10**8 for k in range(6)]
+    captured = capsys.readouterr()
+    assert "and 0 odometry samples sent" in captured.out
+    assert captured.err == f"{bare}: no times.txt; frames are taken for 0.1 s apart\n"
+    assert main(["replay", str(run_folder), *command]) == 0
+    until(lambda: len(node.clouds()) == 12)
+    assert max(m.stamp_ns for m in node.clouds()) == 25 * 10**9
+    assert node.odometry() == []
+
+
+@pytest.mark.parametrize("encoding", ["xyzi", "foxglove", "cdr"])
+def test_other_encodings(node, run_folder, encoding, capsys):
+    node.subscribe()
+    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "50"]
+    assert main([*command, "--encoding", encoding, "--odometry-encoding", "cdr"]) == 0
+    until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 6)
+    assert all(m.points.shape == (500, 3) for m in node.clouds())
+
+
+def test_as_a_ros_bridge_would(node, run_folder, capsys):
+    node.subscribe("r1/points", "r1/odom", "cdr")
+    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "50"]
+    assert main([*command, "--preset", "ros2dds"]) == 0
+    until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 6)
+
+
+def test_nobody_there(node, run_folder, capsys):
+    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "100"]
+    assert main([*command, "--wait", "0.1"]) == 1
+    captured = capsys.readouterr()
+    assert "nobody subscribes to coview/r1/in/cloud" in captured.err
+    assert "6 frames" in captured.out
+    assert captured.out.splitlines()[-1].startswith("nobody listened: ")
+    assert "one odometry sample in 1.00 s is too few" in captured.err
+
+
+def test_somebody_who_came_late_has_listened(node, run_folder, capsys, monkeypatch):
+    def subscribe_late(*arguments):
+        node.subscribe()
+        return inner(*arguments)
+
+    inner = replay.replay
+    monkeypatch.setattr(replay, "replay", subscribe_late)
+    command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "20"]
+    assert main([*command, "--wait", "0"]) == 0
+    captured = capsys.readouterr()
+    assert "nobody subscribes" in captured.err
+    assert "nobody listened" not in captured.out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_loop_cleanly(node, run_folder, number):
+    node.subscribe()
+    command = [sys.executable, "-m", "coview_stream", "replay", str(run_folder), "--robot", "r1"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    process = subprocess.Popen(
+        [*command, "--connect", node.endpoint, "--loop", "--rate", "50", "--odometry-rate", "200"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment,
+        text=True,
+    )
+    try:
+        until(lambda: len(node.clouds()) > 8, 30)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 0
+    assert "ended early" in out
+    assert err == ""
+    stamps = [m.stamp_ns for m in node.clouds()]
+    assert stamps == sorted(stamps)
+    assert stamps[-1] > 26 * 10**9  # beyond the first lap
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--rate", "0"], "--rate"),
+        (["--rate", "5", "--speed", "2"], "one of them"),
+        (["--preset", "ros1"], "--preset"),
+        (["--encoding", "zip"], "zip"),
+        (["--connect", "nonsense"], "nonsense"),
+        (["--config", "none.json5"], "none.json5"),
+        (["--odometry", "none.tum"], "none.tum"),
+        (["--odometry", "kiss-icp"], "`serve --odometry kiss-icp`"),
+        (["--odometry", "kiss-icp"], "`replay --odometry none`"),
+        (["--odometry", "none", "--odometry-rate", "9"], "--odometry-rate"),
+        (["--odometry", "none", "--odometry-topic", "/odom"], "--odometry-topic"),
+        (["--robot", "a/b"], "--robot"),
+        (["--base", "x*"], "--base"),
+        (["--wait", "-1"], "--wait"),
+    ],
+)
+def test_bad_usage_is_one_line(run_folder, capsys, options, text):
+    endpoint = free_endpoint()
+    assert main(["replay", str(run_folder), "--robot", "r1", "--listen", endpoint, *options]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("coview-stream: error: ")
+    assert captured.err.count("\n") == 1
+    assert text in captured.err

@@ -1,0 +1,196 @@
+"""``coview-stream serve`` ends on a signal, whatever it waits for, and refuses robots that it could not tell apart."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+import pytest
+from sockets import free_endpoint, until
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.cli import main
+from coview_stream.cli import serve as command
+from coview_stream.errors import ConfigError
+from coview_stream.stream.node import serve
+from coview_stream.stream.node.engine_process import CancelledError
+from coview_stream.stream.transport import zenoh_transport
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+PROMISED = 2.0
+SLACK = 2.0  # for the processes of a busy machine
+
+
+def serving(*args):
+    paths = os.pathsep.join(p for p in sys.path if p)
+    return subprocess.Popen(
+        [sys.executable, "-m", "coview_stream", "serve", *map(str, args)],
+        env=os.environ | {"PYTHONPATH": paths},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ends(process):
+    """Exit code and what it said, after SIGTERM."""
+    process.send_signal(signal.SIGTERM)
+    try:
+        code = process.wait(PROMISED + SLACK)
+    finally:
+        process.kill()
+    return code, process.stderr.read()
+
+
+def heard(process, text):
+    return next((line for line in process.stderr if text in line), None)
+
+
+def test_a_signal_ends_it(world_file):
+    endpoint = free_endpoint()
+    process = serving(world_file, "--robot", "r1", "--listen", endpoint, "--humble", "--max-speed", "20")
+    assert heard(process, "ready")
+    code, said = ends(process)
+    assert code == 0
+    assert "Traceback" not in said
+
+
+def test_a_signal_ends_what_waits_for_a_host_that_says_nothing(world_file):
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        process = serving(world_file, "--robot", "r1", "--connect", endpoint, "--listen", free_endpoint())
+        silent.accept()
+        code, said = ends(process)
+    assert code == 0
+    assert "Traceback" not in said
+
+
+def test_opening_is_given_up_when_nobody_wants_it_any_more(world_file):
+    keys = [robot_keys("native", "coview", "r1")]
+    options = serve.ServeOptions(world_file, keys, listen=[free_endpoint()])
+    with pytest.raises(CancelledError):
+        serve.open_node(options, lambda: True)
+    ours = ("coview ", "coview-watch")
+    until(lambda: not [t for t in threading.enumerate() if t.name.startswith(ours)])
+
+
+class Stop:
+    """Asked to stop from the start, or never."""
+
+    def __init__(self, requested):
+        self.requested = requested
+
+    def now(self):
+        return 0.0
+
+    def wait(self, seconds):
+        return self.requested
+
+
+def test_a_node_that_does_not_end_is_left(monkeypatch):
+    class Stuck:
+        def close(self, patience):
+            return False
+
+    monkeypatch.setattr(serve, "open_node", lambda options, cancelled: Stuck())
+    assert command._serve(None, Stop(True)) is False
+
+
+def test_what_goes_wrong_in_opening_is_the_callers(monkeypatch):
+    def fail(options, cancelled):
+        raise ConfigError("no such thing")
+
+    monkeypatch.setattr(serve, "open_node", fail)
+    with pytest.raises(ConfigError, match="no such thing"):
+        command._serve(None, Stop(False))
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--robot", "a", "b", "--cloud-key", "points"], "use {robot} in --cloud-key"),
+        (["--robot", "a", "a"], "each name once"),
+        (["--robot", "a", "--pose-key", "coview/a/in/cloud"], "--pose-key"),
+        (["--robot", "a", "--max-speed", "0"], "max_speed"),
+        (["--robot", "a", "--max-outage", "-1"], "max_outage"),
+        (["--robot", "a", "--gravity", "level"], "--gravity goes with --odometry kiss-icp"),
+        (["--robot", "a", "--odometry", "kiss-icp", "--gravity", "0,0,9.8"], "accelerometer"),
+        (["--robot", "a", "--odometry", "kiss-icp", "--odometry-key", "k"], "reads no odometry"),
+    ],
+)
+def test_refused(args, message, world_file, capsys):
+    assert main(["serve", str(world_file), *args]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_without_kiss_icp(tmp_path, monkeypatch, world_file, capsys):
+    (tmp_path / "kiss_icp").mkdir()
+    (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
+    monkeypatch.syspath_prepend(tmp_path)
+    command = ["serve", str(world_file), "--robot", "r1", "--listen", free_endpoint(), "--quiet"]
+    assert main([*command, "--odometry", "kiss-icp"]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'kiss-icp>=1.2'" in said
+    assert said.count("\n") == 1
+
+
+def test_a_map_that_cannot_be_read(tmp_path, capsys):
+    path = tmp_path / "broken.coview"
+    path.write_bytes(b"no map")
+    assert main(["serve", str(path), "--robot", "r1", "--listen", free_endpoint()]) == 2
+    assert "broken.coview" in capsys.readouterr().err
+
+
+def test_what_is_asked_for_arrives(monkeypatch, world_file):
+    asked = []
+
+    class Node:
+        def close(self, patience):
+            return True
+
+    def open_node(options, cancelled):
+        asked.append(options)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return Node()
+
+    monkeypatch.setattr(serve, "open_node", open_node)
+    options = ["--odometry-timeout", "1.5", "--max-speed", "9", "--max-outage", "7", "--max-payload", "99"]
+    options += ["--odometry", "kiss-icp", "--gravity", "0,0.1,-9.8"]
+    names = ["--preset", "rmw_zenoh", "--humble", "--robot", "r1"]
+    assert main(["serve", str(world_file), *names, *options]) == 0
+    node = asked[0].node
+    assert (node.odometry_timeout, node.max_gap, node.max_speed, node.max_outage) == (1.5, 1.5, 9.0, 7.0)
+    assert node.max_payload == 99
+    assert asked[0].keys[0].pose.endswith("/TypeHashNotSupported")
+    lidar = asked[0].lidar
+    assert (lidar.gravity, lidar.max_speed) == ((0.0, 0.1, -9.8), 9.0)
+    assert [s.odometry_source for s in serve.make_sessions(asked[0], "")] == ["kiss-icp"]
+    assert serve.make_sessions(asked[0], "")[0].lidar is lidar
+
+
+def test_another_node_of_the_same_robot_is_named(caplog):
+    net = FakeTransport()
+    net.announce("coview/r2/alive")
+    net.announce("coview/other/alive")
+    serve.warn_of_others(net, [robot_keys("native", "coview", name) for name in ("r1", "r2")])
+    (line,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert "r2" in line
+    assert "coview/r2/alive" in line
+
+
+def test_the_largest_payload_reaches_the_transport(monkeypatch, world_file):
+    def open_transport(*args):
+        raise ConfigError(f"asked with {args}")
+
+    monkeypatch.setattr(zenoh_transport, "open_transport", open_transport)
+    keys = [robot_keys("native", "coview", "r1")]
+    options = serve.ServeOptions(world_file, keys, node=serve.NodeConfig(max_payload=1234))
+    assert BaseMap.load(world_file).sha256
+    with pytest.raises(ConfigError, match="1234"):
+        serve.open_node(options)

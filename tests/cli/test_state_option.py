@@ -1,0 +1,102 @@
+"""``serve --state`` and ``--no-state``: where the last poses go, by default and by word."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from coview_stream.cli import main, serve
+from coview_stream.cli import options as state
+from coview_stream.stream.node import serve as opening
+from coview_stream.stream.node.engine_process import ProcessLane
+from coview_stream.stream.transport import zenoh_transport
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+
+def folder(*args):
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    return state.state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+
+
+def test_the_users_state_directory_unless_told_otherwise(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert folder() == tmp_path / "coview-stream"
+    assert folder("--state", "here/there") == Path("here/there")
+    assert folder("--no-state") is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_both_at_once_make_no_sense(capsys):
+    with pytest.raises(SystemExit):
+        folder("--state", "x", "--no-state")
+    assert "not allowed with" in capsys.readouterr().err
+
+
+def test_a_service_without_a_home_keeps_nothing(monkeypatch, caplog):
+    def homeless():
+        raise RuntimeError("no home")
+
+    monkeypatch.delenv("XDG_STATE_HOME", raising=False)
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert folder() is None
+    assert "--state DIR" in caplog.text
+    assert folder("--state", "/var/lib/coview") == Path("/var/lib/coview")
+
+
+def ready(*args):
+    parser = argparse.ArgumentParser()
+    serve.add_arguments(parser)
+    return state.ready_state(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+
+
+def test_the_directory_is_made_tried_and_named(tmp_path, caplog):
+    caplog.set_level("INFO")
+    place = tmp_path / "new" / "place"
+    assert ready("--state", str(place)) == place
+    assert list(place.iterdir()) == []
+    assert [r.getMessage() for r in caplog.records] == [f"the last poses are kept in {place}"]
+    assert ready("--no-state") is None
+
+
+def test_what_was_asked_for_and_cannot_be_used_is_refused_at_once(world_file, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for name, text in (
+        (str(tmp_path / "file"), "file"),
+        (str(tmp_path / "file" / "in"), "Not a directory"),
+        ("", "''"),
+    ):
+        assert main(["serve", str(world_file), "--robot", "r1", "--listen", "x", "--state", name]) == 2
+        said = capsys.readouterr().err
+        assert "--state" in said
+        assert text in said
+        assert said.count("\n") == 1
+
+
+def test_a_default_that_cannot_be_used_is_a_warning(monkeypatch, tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    assert ready() == tmp_path / "file" / "coview-stream"
+    (line,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert "cannot be kept" in line
+    assert "--state DIR or --no-state" in line
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_node_runs_it_beside_its_clocks(monkeypatch, world_file, tmp_path, kept):
+    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: FakeTransport())
+    monkeypatch.setattr(opening, "warn_of_others", lambda *args: None)
+    for name in ("start", "wait_ready", "close"):
+        monkeypatch.setattr(ProcessLane, name, lambda self, *args: None)
+    options = opening.ServeOptions(
+        world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None
+    )
+    node = opening.open_node(options)
+    try:
+        assert ("coview-memory" in [t.name for t in node._threads]) == kept
+    finally:
+        node.close(5.0)

@@ -1,0 +1,269 @@
+"""``coview-stream watch``: table, JSON lines, viewer; signals, closed pipes and silence."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import types
+
+import numpy as np
+import pytest
+from sockets import free_endpoint
+
+from coview_stream.cli import main
+from coview_stream.cli.watch import _Watch
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.messages import encode_pose
+from coview_stream.messages.types import Encoded, PoseMessage
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.zenoh_transport import open_transport
+
+T = pose_from(rot_z(0.5), [12.34, -5.0, 1.7])
+STATUS = {"state": "TRACKING", "reason": "fine", "counters": {"dropped": 3}}
+
+
+class Node:
+    """Publishes poses and statuses of some robots, twenty times a second, until closed."""
+
+    def __init__(self, robots=("r1", "r2"), pose_format=None, preset="native", extra=()):
+        self.endpoint = free_endpoint()
+        self.transport = open_transport(listen=[self.endpoint])
+        self._ended = threading.Event()
+        self._extra = [(self.transport.publisher(key, "data"), message) for key, message in extra]
+        self._robots = []
+        for robot in robots:
+            keys = robot_keys(preset, "coview", robot)
+            pose = PoseMessage(7, robot, "TRACKING", T, np.eye(6), 0.9, "ab", 0.1)
+            self._robots.append(
+                (
+                    self.transport.publisher(keys.pose, "realtime"),
+                    encode_pose(pose, pose_format or keys.pose_format),
+                    self.transport.publisher(keys.status, "data"),
+                    Encoded(json.dumps({"robot": robot, **STATUS}).encode(), "application/json"),
+                )
+            )
+        self._thread = threading.Thread(target=self._publish)
+        self._thread.start()
+
+    def _publish(self):
+        while not self._ended.wait(0.05):
+            for pose_out, pose, status_out, status in self._robots:
+                pose_out.put(pose)
+                status_out.put(status)
+            for publisher, message in self._extra:
+                publisher.put(message)
+
+    def close(self):
+        self._ended.set()
+        self._thread.join()
+        self.transport.close()
+
+
+@pytest.fixture
+def node():
+    made = Node()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def watch(monkeypatch):
+    """Run the command until it took, drew or said something so many times; 20 s at most."""
+
+    def run(endpoint, *options, after="_take", times=1):
+        inner, left = getattr(_Watch, after), [times]
+
+        def counted(self, *arguments):
+            inner(self, *arguments)
+            left[0] -= 1
+            if left[0] <= 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        monkeypatch.setattr(_Watch, after, counted)
+        code = main(["watch", "--connect", endpoint, "--seconds", "20", *options])
+        assert left[0] <= 0, "it ran into its time limit"
+        return code
+
+    return run
+
+
+def test_json_lines_of_all_robots(node, watch, capsys):
+    assert watch(node.endpoint, "--json", times=24) == 0
+    captured = capsys.readouterr()
+    records = [json.loads(line) for line in captured.out.splitlines()]
+    assert {r["key"] for r in records} == {
+        f"coview/{n}/out/{w}" for n in ("r1", "r2") for w in ("pose", "status")
+    }
+    pose = next(r for r in records if r["key"] == "coview/r1/out/pose")
+    assert pose["robot"] == "r1"
+    assert pose["stamp_ns"] == 7
+    assert pose["position"] == pytest.approx([12.34, -5.0, 1.7])
+    assert len(pose["covariance"]) == 36
+    status = next(r for r in records if r["key"] == "coview/r2/out/status")
+    assert status == {"key": "coview/r2/out/status", "robot": "r2", **STATUS}
+    assert captured.err == ""
+
+
+def test_lines_where_there_is_no_terminal(node, watch, capsys):
+    assert watch(node.endpoint, "--robot", "r1", after="_draw") == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    cells = line.split()
+    assert cells[:6] == ["r1", "TRACKING", "12.34", "-5.00", "1.70", "28.6"]
+    assert float(cells[7]) > 1.0
+    assert cells[8:] == ["0.90", "-/-", "3", "fine"]
+
+
+def test_a_terminal_is_redrawn_in_place(node, watch, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "60")
+    assert watch(node.endpoint, after="_draw", times=2) == 0
+    out = capsys.readouterr().out
+    frames = out.split("\x1b[J")[1:]
+    assert len(frames) == 2
+    assert frames[0].endswith("\x1b[3F")  # back over the header and two robots
+    for frame in frames:
+        lines = frame.removesuffix("\x1b[3F").splitlines()
+        assert [line.split()[0] for line in lines] == ["robot", "r1", "r2"]
+        assert max(map(len, lines)) < 60
+
+
+@pytest.mark.parametrize("name", ["cdr", "foxglove"])
+def test_poses_in_other_formats(name, watch, capsys):
+    node = Node(pose_format=name)
+    try:
+        assert watch(node.endpoint, "--json", "--robot", "r1", "r2", times=12) == 0
+    finally:
+        node.close()
+    records = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    poses = [r for r in records if r["key"].endswith("pose")]
+    assert {r["robot"] for r in poses} == {"r1", "r2"}
+    assert poses[0]["position"] == pytest.approx([12.34, -5.0, 1.7])
+    assert poses[0]["confidence"] is None
+
+
+def test_the_poses_of_a_preset(watch, capsys):
+    node = Node(("r1",), preset="ros2dds")
+    try:
+        assert watch(node.endpoint, "--json", "--robot", "r1", "--preset", "ros2dds", times=6) == 0
+    finally:
+        node.close()
+    keys = {json.loads(line)["key"] for line in capsys.readouterr().out.splitlines()}
+    assert keys == {"r1/coview/pose", "coview/r1/out/status"}
+
+
+def test_rubbish_is_reported_once_per_key(watch, capsys):
+    bad = [("coview/r1/out/pose", Encoded(b"\xff\x00")), ("coview/r1/out/status", Encoded(b"[]"))]
+    node = Node((), extra=bad)
+    try:
+        assert watch(node.endpoint, "--json", times=8) == 0
+    finally:
+        node.close()
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 2
+    assert "coview/r1/out/pose" in captured.err
+
+
+def test_silence_is_explained(watch, capsys, monkeypatch):
+    monkeypatch.setattr("coview_stream.cli.watch._PATIENCE", 0.2)
+    node = Node(())
+    try:
+        assert watch(node.endpoint, "--base", "site/a", after="_say_where") == 0
+    finally:
+        node.close()
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert "nothing yet on site/a/*/out/pose, site/a/*/out/status; connected to 1 other(s)" in captured.err
+    assert node.endpoint in captured.err
+
+
+def process(endpoint, *options):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.Popen(
+        [sys.executable, "-m", "coview_stream", "watch", "--connect", endpoint, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it(node, number):
+    running = process(node.endpoint, "--json")
+    try:
+        assert json.loads(running.stdout.readline())["key"].startswith("coview/r")
+        running.send_signal(number)
+        _, err = running.communicate(timeout=20)
+    finally:
+        running.kill()
+    assert (running.returncode, err) == (0, "")
+
+
+def test_a_closed_pipe_is_no_traceback(node):
+    running = process(node.endpoint, "--json")
+    try:
+        running.stdout.readline()
+        running.stdout.close()
+        assert running.wait(timeout=20) == 141
+        assert running.stderr.read() == ""
+    finally:
+        running.kill()
+
+
+def test_the_viewer_gets_every_pose(node, watch, monkeypatch):
+    logged = []
+    viewer = types.ModuleType("rerun")
+    viewer.init = lambda name, spawn: logged.append(("init", name))
+    viewer.set_time = lambda timeline, timestamp: logged.append((timeline, timestamp))
+    viewer.log = lambda path, entity, static=False: logged.append((path, entity))
+    viewer.Arrows3D = lambda vectors, colors: vectors
+    viewer.Quaternion = lambda xyzw: xyzw
+    viewer.Transform3D = lambda **fields: fields
+    viewer.LineStrips3D = lambda strips: strips
+    monkeypatch.setitem(sys.modules, "rerun", viewer)
+    assert watch(node.endpoint, "--rerun", "--robot", "r1", "--json", times=8) == 0
+    assert logged[0] == ("init", "coview_stream")
+    assert ("sensor", pytest.approx(7e-9)) in logged
+    axes, *bodies = [entity for path, entity in logged if path == "robots/r1/body"]
+    np.testing.assert_array_equal(axes, np.eye(3))
+    ways = [entity for path, entity in logged if path == "robots/r1/way/0"]
+    assert bodies[0]["translation"] == pytest.approx([0, 0, 0])  # the first place is the origin: float32
+    assert len(ways) == len(bodies) - 1 > 0
+    assert ways[-1][0].shape == (len(bodies), 3)
+
+
+def test_it_ends_when_the_time_is_over(node, capsys):
+    assert main(["watch", "--connect", node.endpoint, "--seconds", "0.2", "--json"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_without_the_viewer_installed(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["watch", "--listen", free_endpoint(), "--rerun"]) == 2
+    assert "--rerun: rerun is not installed; pip install 'rerun-sdk>=0.20'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--seconds", "0"], "--seconds"),
+        (["--seconds", "nan"], "--seconds"),
+        (["--preset", "ros2dds"], "--robot"),
+        (["--preset", "ros1", "--robot", "r1"], "ros1"),
+        (["--robot", "*"], "--robot"),
+        (["--base", "a//b"], "--base"),
+        (["--connect", "nonsense"], "nonsense"),
+    ],
+)
+def test_bad_usage_is_one_line(capsys, options, text):
+    assert main(["watch", "--listen", free_endpoint(), *options]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert text in captured.err

@@ -1,0 +1,201 @@
+"""A map's learned features: made in windows that leave no trace, stored in tiles, read back where they belong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.descriptors.feature_build import feature_arrays
+from coview_stream.descriptors.feature_map import (
+    TILE,
+    FeatureMap,
+    packed,
+    packed_sigma,
+    unpacked,
+    unpacked_sigma,
+)
+from coview_stream.descriptors.network import Features, network
+from coview_stream.errors import MapError
+
+MOST_BYTES_PER_KM2 = 64e6
+
+
+def wood(seed=3, low=(-40.0, -70.0), size=(110.0, 90.0)):
+    """Points of a slope with posts on it, somewhere about the origin."""
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform(low, np.add(low, size), (30_000, 2))
+    posts = np.repeat(rng.uniform(low, np.add(low, size), (120, 2)), 60, axis=0)
+    xy = np.concatenate([ground, posts + rng.normal(0.0, 0.4, posts.shape)])
+    up = np.concatenate([np.zeros(len(ground)), rng.uniform(0.0, 14.0, len(posts))])
+    return np.column_stack([xy, 0.05 * xy[:, 0] + up]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return wood()
+
+
+@pytest.fixture(scope="module")
+def built(points):
+    return feature_arrays(points)
+
+
+@pytest.fixture(scope="module")
+def features(built):
+    return FeatureMap(*built)
+
+
+def by_place(arrays):
+    """The same arrays with tiles and descriptors in the order of their places."""
+    tiles = np.lexsort(arrays["learned.tiles"].T)
+    places = np.lexsort(arrays["learned.place_at"].T)
+    return {name: values[places if ".place" in name else tiles] for name, values in arrays.items()}
+
+
+def test_bytes_hold_vectors_and_sigmas():
+    vectors = np.linspace(-1.0, 1.0, 501, dtype=np.float32)
+    assert np.abs(unpacked(packed(vectors)) - vectors).max() <= 0.5 / 127 + 1e-6
+    sigma = np.geomspace(0.02, 50.0, 300).astype(np.float32)
+    assert np.abs(np.log(unpacked_sigma(packed_sigma(sigma)) / sigma)).max() < 0.016
+    beyond = unpacked_sigma(packed_sigma(np.array([1e-6, 1e6], dtype=np.float32)))
+    np.testing.assert_allclose(beyond, [0.02, 50.0], rtol=1e-5)
+
+
+def far_sighted(image):
+    """Stands in for the network: what it gives of a cell depends on all of its receptive field, to the same extent."""
+    height, width = (n // 2 for n in image.shape[1:])
+    shown = image[:-1].mean(axis=0).reshape(height, 2, width, 2).mean(axis=(1, 3))
+    near = 0.7 * ndimage.uniform_filter(shown, 61, mode="constant")
+    far = 0.7 * ndimage.uniform_filter(shown, 117, mode="constant")[2::4, 2::4]
+    local, place = (np.stack([np.cos(each), np.sin(each)]).astype(np.float32) for each in (near, far))
+    return Features(local, (1.0 + near).astype(np.float32), place)
+
+
+def differing(one, other, name):
+    """Share of the numbers that differ by more than int8 rounding."""
+    assert one[name].shape == other[name].shape
+    return (np.abs(one[name].astype(np.float64) - other[name]) > 1).mean()
+
+
+@pytest.mark.parametrize("encoder", ["aerial", "far-sighted"])
+def test_windows_leave_no_trace(points, monkeypatch, encoder):
+    """Many windows make of a map what one does: drawing and network see enough around each."""
+    encode = network("aerial") if encoder == "aerial" else far_sighted
+    monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: encode)
+    one, many = (by_place(feature_arrays(points, window=window)[0]) for window in (256, 64))
+    for name in one:  # a rare point lies so near a layer's bound that rounding puts it to either side
+        assert differing(one, many, name) < 1e-3, name
+
+
+def test_what_lies_beside_a_window_matters(points, monkeypatch):
+    """Or the test above could not fail."""
+    monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: far_sighted)
+    whole = by_place(feature_arrays(points)[0])
+    for margin, name in ((24, "learned.local"), (48, "learned.place")):
+        monkeypatch.setattr("coview_stream.descriptors.feature_build._NET_MARGIN", margin)
+        assert differing(whole, by_place(feature_arrays(points, window=64)[0]), name) > 0.01
+
+
+def test_tiles_lie_on_a_fixed_grid_and_only_where_the_map_has_points(points, built):
+    tiles = {tuple(t) for t in built[0]["learned.tiles"].tolist()}
+    own = {tuple(t) for t in np.floor(points[:, :2] / TILE).astype(int).tolist()}
+    assert own <= tiles
+    low, high = points[:, :2].min(axis=0) - 4.0, points[:, :2].max(axis=0) + 4.0
+    for tile in tiles:  # none farther than the known surroundings of points
+        assert ((np.add(tile, 1) * TILE > low) & (np.multiply(tile, TILE) < high)).all()
+
+
+def test_features_follow_the_map_when_it_is_moved_by_a_tile(points, features):
+    moved = FeatureMap(*feature_arrays(points + np.float32([TILE, -2 * TILE, 0.0])))
+    here, there = features.patch(np.array([5.0, -20.0]), 12.0), moved.patch(np.array([37.0, -84.0]), 12.0)
+    np.testing.assert_allclose(there.corner - here.corner, [TILE, -2 * TILE])
+    assert np.abs(here.local).max() > 0.1
+    assert np.abs(here.local - there.local).max() <= 1.01 / 127
+
+
+def test_a_patch_is_of_unit_vectors_or_nothing(points, features):
+    patch = features.patch(np.array([60.0, 10.0]), 40.0)  # beyond a corner of the map
+    assert patch.local.shape == (features.channels, 80, 80)
+    assert patch.sigma.shape == (80, 80)
+    np.testing.assert_array_equal(patch.corner, [20.0, -30.0])
+    norms = np.linalg.norm(patch.local, axis=0)
+    known = norms > 0
+    assert np.abs(norms[known] - 1.0).max() < 0.03
+    x, y = np.meshgrid(patch.corner[0] + np.arange(80) + 0.5, patch.corner[1] + np.arange(80) + 0.5)
+    high = points[:, :2].max(axis=0)
+    assert known[(x < high[0]) & (y < high[1])].all()
+    assert not known[(x > high[0] + 5.0) | (y > high[1] + 5.0)].any()
+
+
+def test_a_patch_far_away_is_empty(features):
+    patch = features.patch(np.array([5e3, 5e3]), 10.0)
+    assert patch.local.shape == (features.channels, 20, 20)
+    assert not patch.local.any()
+
+
+@pytest.mark.parametrize("cell", [1, 2, 4])
+def test_coarse_cells_are_means(features, cell):
+    coarse, corner = features.coarse(float(cell))
+    assert not np.mod(corner, TILE).any()
+    patch = features.patch(np.array([0.0, -32.0]), 16.0)
+    column, row = ((patch.corner - corner) / cell).astype(int)
+    side = 32 // cell
+    expected = patch.local.reshape(features.channels, side, cell, side, cell).mean(axis=(2, 4))
+    np.testing.assert_allclose(coarse[:, row : row + side, column : column + side], expected, atol=1e-6)
+
+
+def test_places_are_of_unit_norm_and_lie_in_the_map(points, features):
+    assert np.abs(np.linalg.norm(unpacked(features.place), axis=1) - 1.0).max() < 0.05
+    assert len(features.place) == len(np.unique(features.place_at, axis=0))
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    assert ((features.place_at > low - 8.0) & (features.place_at < high + 8.0)).all()
+
+
+def test_it_is_small(features):
+    assert features.bytes / (len(features.index.tiles) * TILE**2) * 1e6 < 0.6 * MOST_BYTES_PER_KM2
+    assert features.area == pytest.approx(118.0 * 98.0, rel=0.03)  # the map and four metres around it
+
+
+def with_features(base_map, built):
+    arrays, parameters = built
+    return BaseMap({**base_map._arrays, **arrays}, {**base_map.parameters, "learned": parameters})
+
+
+def test_a_map_file_keeps_them(world_map, built, tmp_path):
+    with_features(world_map, built).save(tmp_path / "site.coview")
+    again = BaseMap.load(tmp_path / "site.coview").learned
+    here, there = FeatureMap(*built).patch(np.zeros(2), 30.0), again.patch(np.zeros(2), 30.0)
+    np.testing.assert_array_equal(here.local, there.local)
+    np.testing.assert_array_equal(here.sigma, there.sigma)
+    assert again.weights == built[1]["weights"] != ""
+
+
+def test_a_map_without_them_has_none(world_map):
+    assert world_map.learned is None
+
+
+def test_maps_from_before_can_still_be_read(world_map):
+    before = {n: v for n, v in world_map.parameters.items() if n != "learned"}
+    before["config"] = {n: v for n, v in before["config"].items() if n != "learned"}
+    old = BaseMap(dict(world_map._arrays), before)
+    assert old.learned is None
+    assert old.config.learned is False
+
+
+def test_those_of_other_weights_are_refused(built):
+    arrays, parameters = built
+    FeatureMap(arrays, parameters).check()
+    with pytest.raises(MapError, match=r"other weights .* build it again"):
+        FeatureMap(arrays, {**parameters, "weights": "0" * 64}).check()
+
+
+@pytest.mark.parametrize("name", ["local", "sigma", "tiles", "place", "place_at"])
+def test_incomplete_ones_are_refused(world_map, built, name):
+    arrays = {n: v for n, v in built[0].items() if n != f"learned.{name}"}
+    with pytest.raises(MapError, match="build it again"):
+        _ = with_features(world_map, (arrays, built[1])).learned
+    short = {**built[0], f"learned.{name}": built[0][f"learned.{name}"][1:]}
+    with pytest.raises(MapError, match="do not fit together"):
+        FeatureMap(short, built[1])

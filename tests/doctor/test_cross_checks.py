@@ -1,0 +1,102 @@
+"""Clouds and odometry beside each other, and the node beside both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from captured_robot import SWEEP, cloud, heard, ns, odometry, steps, usual
+
+from coview_stream import __version__
+from coview_stream.doctor.cross_checks import node_finding, together_findings
+from coview_stream.geometry.transforms import pose_from
+
+SHA = "ab" * 32
+STATUS = {
+    "state": "TRACKING",
+    "reason": "verified",
+    "version": __version__,
+    "map_sha256": SHA,
+    "stamp_ns": ns(0),
+    "errors": [],
+}
+
+
+def found_of(robot):
+    return {f.what: f for f in together_findings(robot)}
+
+
+def test_one_clock_and_all_paired():
+    found = found_of(usual(times=np.linspace(0.0, 0.1, len(SWEEP))))
+    assert [f.verdict for f in found.values()] == ["ok", "ok"]
+    assert "27 of 27" in found["pairing"].found
+
+
+def test_nothing_to_compare():
+    assert found_of(heard()) == {}
+    assert found_of(heard(clouds=[(0.0, cloud(0.0))])) == {}
+
+
+@pytest.mark.parametrize(
+    ("shifts", "part", "remedy"),
+    [
+        ((1.0 - ns(0) * 1e-9, 0.0), "1.7e+09 s ahead of", "from 1970"),
+        ((0.0, 1.0 - ns(0) * 1e-9), "1.7e+09 s behind", "from 1970"),
+        ((0.0, 37.0), "37.05 s ahead", "TAI"),
+        ((18.0, 0.0), "17.95 s behind", "GPS"),
+        ((0.0, 9.5), "9.55 s ahead", "one clock"),
+        ((1.0, 0.0), "0.95 s behind", "one clock"),
+    ],
+)
+def test_two_clocks(shifts, part, remedy):
+    found = found_of(usual(*shifts))
+    assert found.keys() == {"one clock"}  # pairing could only repeat it
+    assert found["one clock"].verdict == "FAIL"
+    assert part in found["one clock"].found
+    assert remedy in found["one clock"].remedy
+
+
+def test_a_slow_driver_is_a_warning_and_pairs_all_the_same():
+    found = found_of(usual(cloud_shift=-1.5))
+    assert found["one clock"].verdict == "warn"
+    assert found["pairing"].verdict == "ok"
+
+
+def test_sparse_odometry_pairs_with_nothing():
+    robot = heard([(t, cloud(t)) for t in steps(10)], [(t, odometry(t)) for t in (0.0, 0.9, 1.8, 2.7)])
+    found = found_of(robot)["pairing"]
+    assert found.verdict == "FAIL"
+    assert "no_odometry" in found.found
+
+
+def test_odometry_that_jumps():
+    places = [pose_from(np.eye(3), [40.0 * (k % 10 == 9), 0.0, 0.0]) for k in range(150)]
+    pairs = [(k / 50, odometry(k / 50, T)) for k, T in enumerate(places)]
+    found = found_of(heard([(t, cloud(t)) for t in steps(10)], pairs))["pairing"]
+    assert found.verdict == "FAIL"
+    assert "jumps" in found.found
+
+
+def test_too_short_to_say():
+    found = found_of(heard([(2.9, cloud(2.9))], [(t, odometry(t)) for t in steps(50)]))["pairing"]
+    assert found.verdict == "warn"
+    assert "--seconds" in found.remedy
+
+
+@pytest.mark.parametrize(
+    ("status", "alive", "verdict", "part"),
+    [
+        (STATUS, True, "ok", "TRACKING: verified"),
+        (None, False, "warn", "none is running"),
+        (None, True, "warn", "says nothing"),
+        (STATUS, False, "warn", "no liveliness token"),
+        (STATUS | {"map_sha256": "cd" * 32}, True, "FAIL", "not abababababab"),
+        (STATUS | {"version": "9.9"}, True, "warn", f"here {__version__}"),
+        (STATUS | {"stamp_ns": ns(-60)}, True, "warn", "60.00 s old"),
+        (STATUS | {"errors": ["bad", "worse"]}, True, "warn", "complains: worse"),
+        ({"state": 7, "errors": "x"}, True, "FAIL", "7: no reason given"),
+    ],
+)
+def test_the_node(status, alive, verdict, part):
+    found = node_finding(heard(status=status, alive=alive), SHA, ns(0))
+    assert found.verdict == verdict
+    assert part in found.found

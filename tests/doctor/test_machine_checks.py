@@ -1,0 +1,137 @@
+"""Findings about machine, libraries and map; probes survive a library that crashes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import coview_kernels as kernels
+from coview_kernels import reference
+from coview_stream.doctor import machine_checks as machine
+from coview_stream.doctor import probes
+from coview_stream.doctor.finding import Finding, failed, from_error
+from coview_stream.doctor.map_checks import node_memory, open_site, site_findings
+from coview_stream.errors import MapError
+
+GOOD = {
+    "kernels": {"backend": "taichi", "seconds": 1.5, "differing": []},
+    "zenoh": {"version": "1.10.2"},
+    "codecs": {"missing": []},
+    "open3d": {"version": "0.20"},
+    "matplotlib": {"version": "3.9"},
+}
+
+
+def test_a_good_machine(monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    found = list(machine.machine_findings(lambda name: GOOD[name]))
+    assert not failed(found)
+    assert [f.what for f in found] == [
+        "python", "processor", "memory", "BLAS threads", "kernels", "zenoh", "message formats", "open3d", "matplotlib",
+    ]  # fmt: skip
+    assert {f.verdict for f in found if f.what not in ("python", "processor", "memory")} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("finding", "verdict", "part"),
+    [
+        (machine.python_finding((3, 14, 1)), "warn", "3.11"),
+        (machine.python_finding((3, 10, 9)), "warn", "3.11"),
+        (machine.python_finding((3, 13, 1)), "ok", ""),
+        (machine.processor_finding("cpu", 8, 1.5), "warn", "2 or more"),
+        (machine.processor_finding("cpu", 1, None), "warn", "2 or more"),
+        (machine.processor_finding("cpu", 4, 3.0), "ok", ""),
+        (machine.memory_finding(int(8e9), int(2e8)), "warn", "0.6 GB"),
+        (machine.memory_finding(None, None), "ok", ""),
+        (machine.blas_finding("16"), "warn", "at 1"),
+        (machine.blas_finding(""), "warn", "at 1"),
+        (machine.kernels_finding({"error": "SIGILL"}, False), "FAIL", "COVIEW_KERNELS=numpy"),
+        (machine.kernels_finding({"error": "no cuda"}, True), "FAIL", "unset"),
+        (machine.kernels_finding(GOOD["kernels"] | {"differing": ["polar_bin"]}, False), "FAIL", "numpy"),
+        (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, False), "warn", "install taichi"),
+        (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, True), "warn", "unset"),
+        (machine.zenoh_finding({"error": "ModuleNotFoundError"}), "FAIL", "eclipse-zenoh"),
+        (machine.zenoh_finding({"version": "1.9.0"}), "warn", "upgrade"),
+        (machine.codecs_finding({"missing": ["rosbags"]}), "FAIL", "reinstall"),
+        (machine.open3d_finding({"error": "DependencyError: no libX11; install it"}), "warn", "install it"),
+        (machine.matplotlib_finding({"error": "ImportError"}), "warn", "install matplotlib"),
+    ],
+)
+def test_what_is_wrong_has_a_remedy(finding, verdict, part):
+    assert finding.verdict == verdict
+    assert part in finding.remedy
+
+
+def test_memory_of_this_machine():
+    total, available = machine.memory()
+    assert total is None or 0 <= available <= total
+
+
+def test_probe_of_the_kernels():
+    found = probes.probe("kernels")
+    assert found["differing"] == []
+    assert found["backend"] in ("taichi", "quadrants", "numpy")
+    assert found["seconds"] >= 0
+
+
+def test_a_wrong_kernel_is_named():
+    def half(*args):
+        grid, dropped = reference.polar_bin(*args)
+        return tuple(np.asarray(part) // 2 for part in grid), dropped
+
+    wrong = SimpleNamespace(
+        **{name: getattr(reference, name) for name in kernels.__all__ if hasattr(reference, name)}
+    )
+    assert probes.differing(wrong, reference) == []
+    wrong.polar_bin = half
+    assert probes.differing(wrong, reference) == ["polar_bin"]
+
+
+@pytest.mark.parametrize(
+    ("code", "out", "err", "part"),
+    [
+        (-4, "", "", "SIGILL"),
+        (3, "", "line\nImportError: no module", "code 3: ImportError: no module"),
+        (0, "banner only\n", "", "it said nothing"),
+    ],
+)
+def test_processes_that_fail(code, out, err, part):
+    assert part in probes._answer(code, out, err)["error"]
+
+
+def test_banners_are_skipped():
+    assert probes._answer(0, 'hello\n{"a": 1}\n', "") == {"a": 1}
+
+
+def test_what_a_probe_raises_is_its_answer(monkeypatch, capsys):
+    monkeypatch.setitem(probes.PROBES, "open3d", lambda: Path("/no/such/file").stat())
+    probes.main("open3d")
+    assert "FileNotFoundError" in probes._answer(0, capsys.readouterr().out, "")["error"]
+
+
+def test_lines():
+    finding = Finding("warn", "clouds", "evil\x1b[2Jtext\n", "do that", "r1")
+    assert finding.line() == "warn  r1 clouds               evil [2Jtext   (do that)"
+    assert from_error("map", MapError("f: damaged; build it again")) == Finding(
+        "FAIL", "map", "f: damaged", "build it again"
+    )
+
+
+def test_a_map(world_file, world_map, tmp_path):
+    base_map, finding = open_site(world_file)
+    assert finding.verdict == "ok"
+    assert f"{len(world_map)} stations" in finding.found
+    verdicts = {
+        available: [f.verdict for f in site_findings(base_map, int(1e8), available)]
+        for available in (None, int(1e6), int(node_memory(base_map) + 1e6), int(64e9))
+    }
+    assert list(verdicts.values()) == [
+        ["ok", "ok", "ok"],
+        ["ok", "ok", "FAIL"],
+        ["ok", "ok", "warn"],
+        ["ok", "ok", "ok"],
+    ]
+    assert open_site(tmp_path / "none.coview")[1].verdict == "FAIL"

@@ -1,0 +1,118 @@
+"""Collecting over a fake network, without time; and what plain TCP says."""
+
+from __future__ import annotations
+
+import json
+import socket
+
+from captured_robot import KEYS, cloud, odometry, steps
+
+from coview_stream.doctor.network_checks import knock, reach_finding, robots_findings
+from coview_stream.messages.types import Sample
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+
+class Time:
+    """A clock that runs while somebody waits, and a robot that sends meanwhile."""
+
+    def __init__(self, net, *messages):
+        self.now, self._net = 50.0, net
+        self._messages = sorted(messages, key=lambda m: m[0])
+
+    def clock(self):
+        return self.now
+
+    def wait(self, seconds):
+        begin, end = self.now, self.now + seconds
+        while self._messages and 50.0 + self._messages[0][0] < end:
+            at, sample = self._messages.pop(0)
+            self.now = max(begin, 50.0 + at)
+            self._net.publish(sample)
+        self.now = end
+
+
+def findings(net, messages, keys=(KEYS,), seconds=3.0, **more):
+    time = Time(net, *messages)
+    return list(robots_findings(net, keys, seconds, wait=time.wait, clock=time.clock, **more))
+
+
+DRIVE = [*((t, odometry(t)) for t in steps(50)), *((t + 0.05, cloud(t)) for t in steps(10))]
+
+
+def test_a_robot_and_its_node():
+    net = FakeTransport()
+    net.announce(KEYS.alive)
+    status = {"state": "SEARCHING", "reason": "too few keyframes", "map_sha256": "ab"}
+    said = [
+        (0.5, Sample(KEYS.status, json.dumps(status).encode())),
+        (0.6, Sample(KEYS.status, b"\xff")),
+    ]
+    found = findings(net, [*DRIVE, *said])
+    assert {f.what: f.verdict for f in found} == {
+        "clouds": "ok",
+        "cloud stamps": "ok",
+        "odometry": "ok",
+        "odometry stamps": "ok",
+        "gravity": "ok",
+        "one clock": "ok",
+        "pairing": "ok",
+        "node": "warn",  # it says no version
+    }
+    assert "SEARCHING: too few keyframes" in found[-1].found
+    assert net.raised == []
+    assert set(net.subscribed) == {KEYS.cloud, KEYS.odometry, KEYS.status}  # nobody else's are asked for
+
+
+def test_what_comes_after_listening_is_not_counted():
+    # clouds alone, so that it goes on to look for others while they still come
+    found = findings(FakeTransport(), [(t / 2, cloud(t / 2)) for t in range(10)], seconds=2.0)
+    assert found[0].found.startswith("2.0 Hz")
+    assert [f.what for f in found] == ["clouds", "cloud stamps", "odometry", "node"]
+    assert "on coview/r1/in/odom" in found[2].found
+
+
+def test_a_silent_robot_is_told_who_speaks():
+    other = robot_keys("native", "coview", "r2")
+    found = findings(FakeTransport(), [(3.5, Sample(KEYS.cloud, b"x"))], keys=[other])
+    assert [(f.verdict, f.what) for f in found] == [
+        ("FAIL", "clouds"),
+        ("FAIL", "odometry"),
+        ("warn", "node"),
+    ]
+    assert found[0].remedy == "clouds come on coview/r1/in/cloud: try --robot r1"
+    assert "does the robot publish" in found[1].remedy
+
+
+def test_without_a_robot_it_names_those_there_are():
+    found = findings(FakeTransport(), [(0.5, cloud(0.0))], keys=[])
+    assert [(f.verdict, f.found) for f in found] == [
+        ("ok", "clouds come on coview/r1/in/cloud: try --robot r1")
+    ]
+    assert [f.verdict for f in findings(FakeTransport(), [], keys=[])] == ["warn"]
+
+
+def test_a_fault_of_one_robot_is_its_own():
+    other = robot_keys("native", "coview", "r2")
+    found = findings(FakeTransport(), DRIVE, keys=[KEYS, other])
+    assert {f.robot for f in found if f.verdict == "FAIL"} == {"r2"}
+
+
+def test_reach():
+    net = FakeTransport()
+    assert reach_finding(net, []).found == "connected: 1 router"
+    net.go_away()
+    with socket.socket() as shut:
+        shut.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{shut.getsockname()[1]}"
+        found = reach_finding(net, [endpoint], lambda seconds: None)
+        assert found.verdict == "FAIL"
+        assert f"{endpoint} refuses" in found.found
+        shut.listen()
+        assert "TLS" in reach_finding(net, [endpoint], lambda seconds: None).remedy
+    assert "nobody has connected" in reach_finding(net, [], lambda seconds: None).found
+
+
+def test_knocking_elsewhere():
+    assert "no host" in knock("tcp/no-such-host.invalid:7447")
+    assert knock("udp/127.0.0.1:7447") == "does not answer"

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from coview_stream.geometry.rotations import (
+    between,
+    exp_so3,
+    log_so3,
+    matrices,
+    nearest_rotation,
+    quaternions,
+)
+
+RNG = np.random.default_rng(3)
+VECTORS = np.concatenate(
+    [
+        RNG.normal(size=(200, 3)),
+        RNG.normal(size=(50, 3)) * 1e-7,
+        RNG.normal(size=(20, 3)) * 1e-12,
+        np.zeros((1, 3)),
+        np.pi * np.eye(3),
+        (np.pi - 1e-9) * np.eye(3),
+        -np.pi * np.eye(3)[::-1],
+        (np.pi / np.sqrt(2)) * np.array([[1.0, 1, 0], [0, -1, 1], [1, 0, -1]]),
+    ]
+)
+
+
+def test_exponential_is_scipys():
+    np.testing.assert_allclose(exp_so3(VECTORS), Rotation.from_rotvec(VECTORS).as_matrix(), atol=1e-15)
+    for vector in VECTORS[-12:]:
+        np.testing.assert_allclose(exp_so3(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
+
+
+def test_quaternions_and_back():
+    R = Rotation.from_rotvec(VECTORS).as_matrix()
+    q = quaternions(R)
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-15)
+    theirs = Rotation.from_matrix(R).as_quat()
+    np.testing.assert_allclose(np.abs((q * theirs).sum(axis=1)), 1.0, atol=1e-14)
+    np.testing.assert_allclose(matrices(q), R, atol=1e-14)
+    np.testing.assert_allclose(matrices(-7.0 * q), R, atol=1e-14)
+    np.testing.assert_array_equal(quaternions(R[0]), q[0])
+    assert quaternions(R[:0]).shape == (0, 4)
+    assert matrices(np.empty((0, 4))).shape == (0, 3, 3)
+
+
+def test_the_logarithm_is_scipys():
+    R = Rotation.random(200, random_state=5)
+    np.testing.assert_allclose(log_so3(R.as_matrix()), R.as_rotvec(), atol=1e-9)
+    np.testing.assert_array_equal(log_so3(np.eye(3)), np.zeros(3))
+
+
+def test_the_way_between_is_slerp():
+    R = Rotation.from_rotvec(VECTORS[:270]).as_matrix()
+    start, end, share = R[:-1], R[1:], RNG.random(len(R) - 1)
+    found = between(start, end, share)
+    for k in range(len(start)):
+        path = Slerp([0.0, 1.0], Rotation.from_matrix(R[k : k + 2]))
+        np.testing.assert_allclose(found[k], path(share[k]).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(between(start, end, np.zeros(len(start))), start, atol=1e-15)
+    np.testing.assert_allclose(between(start, end, np.ones(len(start))), end, atol=1e-13)
+    np.testing.assert_allclose(between(start[3], end[3], 0.25), between(start[3:4], end[3:4], [0.25])[0])
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-3])
+def test_the_nearest_rotation_is_one(noise):
+    R = Rotation.from_rotvec(VECTORS).as_matrix()
+    found = nearest_rotation(R + RNG.normal(size=R.shape) * noise)
+    np.testing.assert_allclose(
+        found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14
+    )
+    np.testing.assert_allclose(found, R, atol=10 * noise + 1e-14)
+    assert (np.linalg.det(found) > 0).all()

@@ -1,0 +1,212 @@
+"""Covariances: odometry's grows as it drives; a registration's is inflated, floored, widened, and the map's alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from courtyard import courtyard, local_map, source_of
+
+from coview_stream.config import RegistrationConfig
+from coview_stream.errors import ConfigError, InputError
+from coview_stream.geometry.se3 import checked_covariance, difference, shifted
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.registration.covariance import (
+    angles_first,
+    carried_along,
+    registration_covariance,
+    without_prior,
+)
+from coview_stream.localization.registration.local_map import LocalMap, Source
+from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.result import Prior
+
+CONFIG = RegistrationConfig()
+TRUTH = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])
+FLOOR = np.array([CONFIG.sigma_floor_angle] * 3 + [CONFIG.sigma_floor] * 3)
+
+
+# ---- orders and motions
+
+
+def test_the_reports_order_is_the_same_covariance():
+    C = np.arange(36.0).reshape(6, 6)
+    np.testing.assert_array_equal(angles_first(angles_first(C)), C)
+    assert angles_first(C)[0, 3] == C[3, 0]
+
+
+def test_an_error_in_heading_becomes_one_in_place_further_on():
+    """Each of many poses drawn from a covariance drives 10 m ahead: their spread is the covariance carried along."""
+    sigma = np.radians([0.1, 0.2, 1.0])
+    C = np.diag([*sigma**2, 0.02**2, 0.03**2, 0.01**2])
+    C[2, 3] = C[3, 2] = 0.5 * sigma[2] * 0.02
+    step = pose_from(rot_z(0.3), [10.0, 2.0, 0.5])
+    shift = (TRUTH @ step)[:3, 3] - TRUTH[:3, 3]
+    drawn = np.random.default_rng(0).multivariate_normal(np.zeros(6), C, 4000)
+    ends = np.array([difference(shifted(TRUTH, d) @ step, TRUTH @ step) for d in drawn])
+    expected = carried_along(C, shift)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        np.cov(ends.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.06
+    )
+    across = np.array([0.0, 0.0, 0.0, -shift[1], shift[0], 0.0]) / np.hypot(*shift[:2])
+    sideways = np.hypot(*shift[:2]) * sigma[2]  # 0.18 m, and what the place was off by before
+    assert np.sqrt(across @ expected @ across) == pytest.approx(sideways, rel=0.1)
+    ahead = np.array([0.0, 0.0, 0.0, *shift[:2], 0.0]) / np.hypot(*shift[:2])
+    assert np.sqrt(ahead @ expected @ ahead) < 0.2 * sideways
+
+
+# ---- a registration's
+
+
+def information_of(sigma):
+    """What a registration would report that is sure to ``sigma`` (6,) after inflation."""
+    return np.diag((np.asarray(sigma) / CONFIG.inflation) ** -2.0)
+
+
+def widened(sigma):
+    """What becomes of a sigma (metres) that the map shows badly."""
+    return sigma * np.hypot(1.0, sigma / CONFIG.weak_from)
+
+
+def test_what_the_map_shows_well_is_inflated_and_floored():
+    sigma = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
+    found = registration_covariance(information_of(sigma), CONFIG)
+    np.testing.assert_allclose(found, np.diag(sigma**2 + FLOOR**2), rtol=5e-3)
+
+
+def test_no_certainty_is_below_the_floor():
+    found = registration_covariance(1e14 * np.eye(6), CONFIG)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), FLOOR, rtol=1e-3)
+
+
+def test_a_weak_direction_is_wide_and_its_neighbours_are_not():
+    """Along a tunnel that runs diagonally: the Hessian claims 0.3 m there, which noise in the normals can feign."""
+    along = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)
+    strong = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
+    weak = (CONFIG.inflation / 0.3) ** 2
+    tunnel = strong + (weak - along @ strong @ along) * np.outer(along, along)
+    found = registration_covariance(tunnel, CONFIG)
+    assert np.sqrt(along @ found @ along) == pytest.approx(widened(0.3), rel=0.02)
+    across = np.array([0.0, 0.0, 0.0, 1.0, -1.0, 0.0]) / np.sqrt(2)
+    assert np.sqrt(across @ found @ across) < 0.025
+    assert np.sqrt(found[2, 2]) < 1.5e-3
+
+
+def test_an_angle_is_weak_by_what_it_moves_at_the_lever():
+    """A degree moves 0.17 m at 10 m, which is weak; a twentieth of that hardly matters."""
+    sigma = np.full(6, 0.001)
+    sigma[2], sigma[0] = np.radians(1.0), np.radians(0.05)
+    found = np.sqrt(np.diag(registration_covariance(information_of(sigma), CONFIG)))
+    lever = CONFIG.weak_lever
+    assert found[2] == pytest.approx(widened(sigma[2] * lever) / lever, rel=0.01)
+    assert found[2] > 1.5 * sigma[2]
+    assert found[0] == pytest.approx(np.hypot(sigma[0], FLOOR[0]), rel=0.05)
+
+
+@pytest.mark.parametrize("weakest", [0.0, -1e-3, 1e-9])
+def test_no_information_is_the_widest_sigma(weakest):
+    """Also where a subtraction has left a little less than nothing."""
+    information = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
+    information[4, 4] = weakest
+    found = registration_covariance(information, CONFIG)
+    checked_covariance("found", found)
+    assert np.sqrt(found[4, 4]) == pytest.approx(CONFIG.weak_sigma, rel=1e-3)
+
+
+def test_the_less_information_the_wider_without_a_jump():
+    sigmas = np.geomspace(0.01, 30.0, 60)
+    found = [
+        np.sqrt(registration_covariance(information_of([1e-3] * 3 + [s, 0.01, 0.01]), CONFIG)[3, 3])
+        for s in sigmas
+    ]
+    steps = np.diff(np.log(found))
+    assert (steps >= -1e-9).all()
+    assert steps.max() < 0.3  # twice the step of the sigmas at most
+    assert (np.array(found) >= np.minimum(sigmas, CONFIG.weak_sigma) * 0.999).all()
+
+
+@pytest.mark.parametrize("bad", [np.eye(5), np.full((6, 6), np.nan)])
+def test_what_is_no_information_is_refused(bad):
+    with pytest.raises(InputError, match="information"):
+        registration_covariance(bad, CONFIG)
+
+
+@pytest.mark.parametrize("name", ["weak_lever", "weak_from", "weak_sigma"])
+def test_settings_are_positive(name):
+    with pytest.raises(ConfigError, match=name):
+        RegistrationConfig(**{name: 0.0})
+
+
+# ---- the measurement without the prior
+
+
+@pytest.fixture(scope="module")
+def target():
+    return local_map(*courtyard())
+
+
+@pytest.fixture(scope="module")
+def scan(target):
+    some = np.random.default_rng(1).permutation(len(target.points))[:3000]
+    exact = source_of(target.points[np.sort(some)], TRUTH)
+    noise = np.random.default_rng(2).normal(0, 0.02, exact.points.shape).astype(np.float32)
+    return Source(exact.points + noise, exact.above, exact.height)
+
+
+@pytest.mark.parametrize("tight", [1.0, 0.1])
+def test_a_registration_without_its_prior_is_the_one_that_had_none(target, scan, tight):
+    """The prior is off by centimetres and, at its tightest, knows more than the pairs do."""
+    config = RegistrationConfig(inflation=8.0)
+    sigma = tight * np.array([0.003, 0.003, 0.005, 0.05, 0.05, 0.05])
+    mean = shifted(TRUTH, np.array([0.002, -0.001, 0.004, 0.04, -0.03, 0.02]))
+    prior = Prior(mean, np.diag(sigma**-2))
+    alone = register(scan, mean, target, config, config.track, centre=np.zeros(3), iterations=40)
+    fused = register(scan, mean, target, config, config.track, prior, np.zeros(3), iterations=40)
+    found = without_prior(fused.T_map_source, fused.information, mean, prior.information, config)
+    pulled = np.linalg.norm(difference(fused.T_map_source, alone.T_map_source)[3:])
+    left = np.linalg.norm(difference(found.T_map_body, alone.T_map_source)[3:])
+    ratio = np.diag(found.information) / np.diag(alone.information)
+    if tight == 1.0:
+        assert left < 0.001
+        np.testing.assert_allclose(ratio, 1.0, atol=0.02)
+    else:
+        assert pulled > 0.03
+        assert left < 0.25 * pulled
+        assert (ratio < 1.0).all()  # residuals are larger at a place that is pulled off: less sure, not surer
+        assert (ratio > 0.1).all()
+
+
+def test_fusing_the_measurement_with_its_prior_gives_the_registration_back():
+    """The subtraction is exact where nothing is weak."""
+    rng = np.random.default_rng(3)
+    A, B = (m @ m.T + 50 * np.eye(6) for m in rng.standard_normal((2, 6, 6)) * 10)
+    a = CONFIG.inflation**2
+    mean, gap = TRUTH, np.array([0.0, 0.0, 1e-5, 0.03, -0.02, 0.05])
+    measured = shifted(mean, gap)
+    total = A + a * B
+    T = shifted(mean, np.linalg.solve(total, A @ gap))
+    found = without_prior(T, total, mean, B, CONFIG)
+    np.testing.assert_allclose(found.information, A, rtol=1e-6, atol=1e-6 * np.abs(A).max())
+    share = np.linalg.eigvals(np.linalg.solve(total, A)).real.min()
+    slack = (0.01 / share) ** 2 * np.linalg.norm(gap) * np.linalg.cond(total)
+    assert np.abs(difference(found.T_map_body, measured)).max() < slack
+
+
+def test_where_the_map_says_nothing_the_measurement_says_nothing():
+    """A bare floor: heading and place come from the prior alone, and must not come back as measured."""
+    side = np.arange(-15, 15, 0.25)
+    floor = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    points = np.column_stack([floor, np.zeros(len(floor))]).astype(np.float32)
+    target = LocalMap(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)))
+    scan = Source(points[::7], np.zeros(len(points[::7]), bool), points[::7, 2])
+    mean = shifted(np.eye(4), np.array([0.0, 0.0, 0.01, 0.1, -0.1, 0.03]))
+    prior = Prior(mean, np.diag(np.array([0.01, 0.01, 0.02, 0.2, 0.3, 0.1]) ** -2))
+    fused = register(scan, mean, target, CONFIG, (0.4,), prior, np.zeros(3))
+    found = without_prior(fused.T_map_source, fused.information, mean, prior.information, CONFIG)
+    sigma = np.sqrt(np.diag(registration_covariance(found.information, CONFIG)))
+    assert (sigma[[0, 1, 5]] < 2 * FLOOR[[0, 1, 5]]).all()
+    assert (sigma[3:5] > 9.0).all()
+    assert sigma[2] > 0.9 * CONFIG.weak_sigma / CONFIG.weak_lever
+    gap = difference(found.T_map_body, mean)
+    assert abs(gap[5] + 0.03) < 0.005  # the floor is where it is
+    assert np.abs(gap[2:5]).max() < 0.01  # the rest stays with the prior

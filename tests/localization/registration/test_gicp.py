@@ -1,0 +1,315 @@
+"""GICP: what is ours with a stand-in for small_gicp, and all of it with the library where it is installed."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+
+import fake_small_gicp
+import numpy as np
+import pytest
+from courtyard import courtyard, local_map, parts, plane, source_of
+from se3 import exp_se3
+from small_world import pose_error
+
+from coview_kernels import Belief
+from coview_stream.config import LocalizerConfig, RegistrationConfig
+from coview_stream.errors import ConfigError, DependencyError
+from coview_stream.geometry.rotations import exp_so3
+from coview_stream.geometry.se3 import difference, shifted
+from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.registration import gicp
+from coview_stream.localization.registration import gicp as pivot
+from coview_stream.localization.registration.covariance import registration_covariance, without_prior
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, Source
+from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.result import Prior
+from coview_stream.localization.result import State
+from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.stream.node.engines import open_engine
+
+TRIMMED = RegistrationConfig()
+CONFIG = RegistrationConfig(method="gicp")
+DISTRUSTING = RegistrationConfig(method="gicp", inflation=8.0)
+"""Pairs count for little, so that a prior comes through."""
+TRUTH = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])
+TILTED = pose_from(exp_so3([0.2, -0.3, 0.7]), [2.0, -1.0, 0.4])
+PIVOT = np.array([3.0, -2.0, 1.0])
+
+
+@pytest.fixture(params=["stand-in", "small_gicp"])
+def library(request, monkeypatch):
+    """Whose residuals are used."""
+    if request.param == "stand-in":
+        monkeypatch.setitem(sys.modules, "small_gicp", fake_small_gicp)
+    elif find_spec("small_gicp") is None:
+        pytest.skip("small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
+    return request.param
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    monkeypatch.setitem(sys.modules, "small_gicp", fake_small_gicp)
+
+
+@pytest.fixture
+def target(library):
+    return local_map(*courtyard())
+
+
+def scan_of(target, T=TRUTH, count=3000, noise=0.02):
+    some = np.sort(np.random.default_rng(1).permutation(len(target.points))[:count])
+    exact = source_of(target.points[some], T)
+    error = np.random.default_rng(2).normal(0, noise, exact.points.shape).astype(np.float32)
+    return Source(exact.points + error, exact.above, exact.height)
+
+
+# ---- our arithmetic
+
+
+def pairs(seed=3, count=40):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-5, 5, (count, 3)), rng.uniform(-5, 5, (count, 3)), rng.standard_normal((count, 3))
+
+
+def test_hessian_and_gradient_are_of_our_tangent():
+    """Against numerical derivatives of the cost, by steps as everyone else here takes them."""
+    p, q, n = pairs()
+
+    def residuals(T):
+        return np.einsum("ij,ij->i", transform(T, p) - q, n)
+
+    def slope(move):
+        h = 1e-6
+        return np.column_stack(
+            [(residuals(move(h * e)) - residuals(move(-h * e))) / (2 * h) for e in np.eye(6)]
+        )
+
+    r = residuals(TILTED)
+    theirs = slope(lambda d: TILTED @ exp_se3(d))
+    ours = slope(lambda d: pivot.moved(TILTED, d, PIVOT))
+    H, b = pivot.about_pivot(theirs.T @ theirs, theirs.T @ r, TILTED, PIVOT)
+    np.testing.assert_allclose(H, ours.T @ ours, rtol=1e-6, atol=1e-5 * np.abs(H).max())
+    np.testing.assert_allclose(b, ours.T @ r, rtol=1e-6, atol=1e-6 * np.abs(b).max())
+
+
+def test_the_pull_of_pairs_is_that_of_their_gaps():
+    p, q, _ = pairs()
+
+    def gaps(T):
+        return (transform(T, p) - q).ravel()
+
+    h = 1e-6
+    moves = [(pivot.moved(TILTED, h * e, PIVOT), pivot.moved(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
+    slope = np.column_stack([(gaps(a) - gaps(b)) / (2 * h) for a, b in moves])
+    there = transform(TILTED, p)
+    H, b = pivot.pulls(there, there - q, transform(TILTED, PIVOT[None])[0])
+    np.testing.assert_allclose(H, slope.T @ slope, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(b, slope.T @ gaps(TILTED), rtol=1e-6, atol=1e-5)
+
+
+def test_a_move_turns_about_the_pivot_and_shifts_it_along_the_maps_axes():
+    step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
+    there = pivot.moved(TILTED, step, PIVOT)
+    gap = transform(there, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
+    np.testing.assert_allclose(gap, step[3:], atol=1e-12)
+    np.testing.assert_allclose(difference(there, TILTED)[:3], step[:3], atol=1e-9)
+
+
+def test_pairs_and_prior_fuse_as_two_gaussians():
+    """From either mean the step leads to the one product of both."""
+    rng = np.random.default_rng(4)
+    A, B = (m @ m.T + 50 * np.eye(6) for m in 10 * rng.standard_normal((2, 6, 6)))
+    gap = np.array([1e-6, -2e-6, 3e-6, 0.003, -0.002, 0.005])  # small: turns add up to first order only
+    measured = pivot.moved(TILTED, gap, PIVOT)
+    prior = Belief(TILTED, B)
+    wanted = np.linalg.solve(A + B, A @ gap)
+    for begin, gradient in ((TILTED, -A @ gap), (measured, np.zeros(6))):
+        step, information = pivot.fused_step(A, gradient, begin, PIVOT, prior)
+        np.testing.assert_array_equal(information, A + B)
+        found = pivot.moved(begin, step, PIVOT)
+        away = transform(found, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
+        np.testing.assert_allclose(away, wanted[3:], atol=1e-7)
+        np.testing.assert_allclose(difference(found, TILTED)[:3], wanted[:3], atol=1e-7)
+
+
+def test_without_a_prior_the_step_is_the_pairs():
+    A = np.diag([4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
+    step, information = pivot.fused_step(A, np.ones(6), TILTED, PIVOT, None)
+    np.testing.assert_allclose(step, -1.0 / np.diag(A), rtol=1e-6)
+    np.testing.assert_array_equal(information, A)
+
+
+# ---- registrations
+
+
+@pytest.mark.parametrize("centre", [None, np.zeros(3), np.array([8.0, -5.0, 1.0])])
+def test_a_metre_and_five_degrees_off_both_methods_find_the_same_pose(target, centre):
+    scan = scan_of(target)
+    start = TRUTH @ exp_se3(np.array([0.01, -0.01, np.radians(5.0), 0.8, -0.6, 0.1]))
+    found, other = (
+        register(scan, start, target, c, c.search, centre=centre, iterations=30) for c in (CONFIG, TRIMMED)
+    )
+    assert pose_error(found.T_map_source, TRUTH)[0] < 0.01
+    metres, degrees = pose_error(found.T_map_source, other.T_map_source)
+    assert metres < 0.02
+    assert degrees < 0.1
+    assert found.converged
+    assert found.pairs > 1000
+    assert 0.005 < found.rmse < 0.04
+    np.testing.assert_allclose(found.information, found.information.T)
+    assert np.linalg.eigvalsh(found.information).min() > 1
+
+
+def test_what_the_map_does_not_have_is_trimmed(target):
+    """A quarter of the scan stands in the air, half of that within reach of the walls."""
+    scan, rng = scan_of(target), np.random.default_rng(5)
+    air = rng.uniform([-12, -12, 0.6], [12, 12, 5], (500, 3)).astype(np.float32)
+    near = scan.points[scan.above][:500] + np.float32([0.25, 0.25, 0.0])
+    stray = np.concatenate([air, near])
+    crowd = Source(
+        np.concatenate([scan.points, stray]),
+        np.concatenate([scan.above, np.ones(len(stray), bool)]),
+        np.concatenate([scan.height, np.full(len(stray), 2.0, np.float32)]),
+    )
+    start = TRUTH @ exp_se3(np.array([0.0, 0.0, 0.03, 0.3, -0.2, 0.1]))
+    found = register(crowd, start, target, CONFIG, CONFIG.search)
+    assert pose_error(found.T_map_source, TRUTH)[0] < 0.03
+
+
+def test_rows_without_numbers_change_nothing(target):
+    scan = scan_of(target)
+    hole = np.full((7, 3), np.nan, np.float32)
+    holed = Source(
+        np.concatenate([hole, scan.points]),
+        np.concatenate([np.ones(7, bool), scan.above]),
+        np.concatenate([hole[:, 0], scan.height]),
+    )
+    a, b = (register(s, TRUTH, target, CONFIG, CONFIG.track, centre=np.zeros(3)) for s in (scan, holed))
+    assert pose_error(a.T_map_source, b.T_map_source)[0] < 1e-4
+
+
+@pytest.mark.parametrize("count", [0, 1, 19, 45])
+def test_too_few_points_are_refused(target, count):
+    scan = scan_of(target)
+    few = Source(scan.points[:count], scan.above[:count], scan.height[:count])
+    assert register(few, TRUTH, target, CONFIG, CONFIG.track, centre=np.zeros(3)) is None
+    assert register(scan, pose_from(np.eye(3), [500, 0, 0]), target, CONFIG, CONFIG.track) is None
+    tiny = LocalMap(target.points[:count], target.normals[:count])
+    assert register(scan, TRUTH, tiny, CONFIG, CONFIG.track) is None
+
+
+def test_a_pose_that_is_none_is_refused(target):
+    with pytest.raises(ValueError, match="finite"):
+        register(scan_of(target), np.full((4, 4), np.nan), target, CONFIG, CONFIG.track)
+
+
+# ---- the prior
+
+
+@pytest.fixture
+def corridor(library):
+    return local_map(
+        *parts(
+            plane([-30, -2, 0], [60, 0, 0], [0, 4, 0]),
+            plane([-30, -2, 0], [60, 0, 0], [0, 0, 3]),
+            plane([-30, 2, 0], [60, 0, 0], [0, 0, 3]),
+        )
+    )
+
+
+def inside(corridor):
+    """The middle of a corridor with ends out of sight, without noise."""
+    middle = corridor.points[np.abs(corridor.points[:, 0]) < 20][::5]
+    return source_of(middle, np.eye(4))
+
+
+def test_along_a_corridor_the_prior_decides(corridor):
+    """It is off to the side, too, and there the walls do."""
+    mean = shifted(np.eye(4), np.array([0.0, 0.0, 0.01, 0.5, 0.1, 0.05]))
+    start = shifted(np.eye(4), np.array([0.0, 0.0, 0.01, 0.2, 0.1, 0.05]))
+    prior = Prior(mean, np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
+    found = register(inside(corridor), start, corridor, DISTRUSTING, DISTRUSTING.track, prior, np.zeros(3))
+    gap = difference(found.T_map_source, np.eye(4))
+    assert gap[3] == pytest.approx(0.5, abs=0.03)
+    assert np.abs(gap[[0, 1, 2, 4, 5]]).max() < 0.01
+
+
+def test_what_a_corridor_does_not_show_is_not_measured(corridor):
+    prior = Prior(np.eye(4), np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
+    fused = register(inside(corridor), np.eye(4), corridor, CONFIG, (0.4,), prior, np.zeros(3))
+    found = without_prior(fused.T_map_source, fused.information, np.eye(4), prior.information, CONFIG)
+    sigma = np.sqrt(np.diag(registration_covariance(found.information, CONFIG)))
+    assert sigma[3] > 10 * sigma[4]
+    assert sigma[4] < 0.02
+
+
+def test_without_its_prior_a_registration_is_the_one_that_had_none(target):
+    """The prior is off by centimetres and knows as much as the pairs."""
+    scan = scan_of(target, TILTED, noise=0.01)
+    mean = shifted(TILTED, np.array([0.001, -0.001, 0.002, 0.03, -0.02, 0.015]))
+    prior = Prior(mean, np.diag(np.array([0.002, 0.002, 0.002, 0.01, 0.01, 0.01]) ** -2))
+    origin = np.zeros(3)
+    alone = register(scan, mean, target, DISTRUSTING, DISTRUSTING.track, centre=origin, iterations=40)
+    fused = register(scan, mean, target, DISTRUSTING, DISTRUSTING.track, prior, origin, iterations=40)
+    found = without_prior(fused.T_map_source, fused.information, mean, prior.information, DISTRUSTING)
+    pulled = np.linalg.norm(difference(fused.T_map_source, alone.T_map_source)[3:])
+    left = np.linalg.norm(difference(found.T_map_body, alone.T_map_source)[3:])
+    assert pulled > 0.003
+    assert left < 0.3 * pulled
+    np.testing.assert_allclose(np.diag(found.information) / np.diag(alone.information), 1.0, atol=0.1)
+
+
+# ---- where it is asked for
+
+
+def test_the_method_is_one_of_two():
+    with pytest.raises(ConfigError, match="trimmed-icp, gicp"):
+        RegistrationConfig(method="icp")
+
+
+def test_a_missing_library_is_named(monkeypatch, world_file):
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    target = local_map(*courtyard())
+    with pytest.raises(DependencyError, match=r"small-gicp .*pip install 'small-gicp>="):
+        register(scan_of(target), TRUTH, target, CONFIG, CONFIG.track)
+    with pytest.raises(DependencyError, match="pip install"):
+        open_engine("track", world_file, "0" * 64, LocalizerConfig(registration=CONFIG))
+
+
+def test_a_crop_is_prepared_for_the_method_that_asks(stand_in):
+    target = local_map(*courtyard())
+    target.prepare()
+    assert "surfaces" not in vars(target)
+    target.prepare("gicp")
+    assert vars(target)["surfaces"] is target.surfaces
+
+
+def test_the_search_keeps_to_trimmed_icp(world_map):
+    config = LocalizerConfig(registration=replace(CONFIG, keep=0.8))
+    search = GlobalSearch(world_map, config, LocalMaps(world_map, 50.0))
+    assert search.config.registration == replace(TRIMMED, keep=0.8)
+    assert replace(search.config, registration=config.registration) == config
+
+
+def test_a_drive_is_tracked(world_map, world_drive, monkeypatch):
+    pytest.importorskip("small_gicp", reason="small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
+    inner, calls = gicp.register_surfaces, []
+    monkeypatch.setattr(gicp, "register_surfaces", lambda *a, **k: calls.append(1) or inner(*a, **k))
+    localizer = Localizer(world_map, replace(LocalizerConfig(), registration=CONFIG))
+    pairs = zip(world_drive.clouds, world_drive.T_odom_body, strict=True)
+    fixes = [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]
+    tracking = [k for k, fix in enumerate(fixes) if fix.state is State.TRACKING]
+    assert len(tracking) >= 4
+    assert len(calls) >= len(tracking)
+    for k in tracking:
+        metres, degrees = pose_error(fixes[k].T_map_body, world_drive.T_map_body[k])
+        assert metres < 0.08
+        assert degrees < 0.4
+    # on a frame that registers nothing the crop is prepared, for the method that will ask for it
+    asked = []
+    monkeypatch.setattr(LocalMap, "prepare", lambda self, *method: asked.append(method))
+    localizer.step(world_drive.clouds[-1], world_drive.T_odom_body[-1], 0.5 * (len(fixes) - 1) + 0.1)
+    assert asked == [("gicp",)]

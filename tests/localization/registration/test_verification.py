@@ -1,0 +1,162 @@
+"""Verification: a right pose scores high, a wrong one low, and little structure proves nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from courtyard import local_map, parts, plane
+
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.localization.registration import verification as rays
+from coview_stream.localization.registration.local_map import LocalMaps, Source
+from coview_stream.localization.registration.prepare_scan import local_source
+from coview_stream.localization.registration.verification import RangeImage, rays_against_map, verify
+
+CONFIG = RegistrationConfig()
+
+
+@pytest.fixture(autouse=True)
+def every_map_point(monkeypatch):
+    """Count every map point, not every third."""
+    monkeypatch.setattr(rays, "_FREE_EVERY", 1)
+
+
+@pytest.fixture(scope="module")
+def seen(world_map, world_drive):
+    """Evidence for the third frame at a pose off by ``dx, dy, dyaw`` (metres, degrees), as a function."""
+    T, cloud = world_drive.T_map_body[2], world_drive.clouds[2]
+    zero = pose_from(np.eye(3), -world_map.origin)
+    maps = LocalMaps(world_map, CONFIG.source_range)
+    source = local_source(small_world.in_map(world_drive, 3), T[:3, 3], CONFIG)
+
+    def evidence(dx=0.0, dy=0.0, degrees=0.0):
+        about = pose_from(np.eye(3), T[:3, 3] + [dx, dy, 0]) @ pose_from(
+            rot_z(np.radians(degrees)), -0 * T[:3, 3]
+        )
+        wrong = zero @ about @ pose_from(np.eye(3), -T[:3, 3])
+        T_body = wrong @ T
+        target = maps.around(T_body[:3, 3])
+        surveyed = world_map.surveyed(transform(wrong, source.points)[:, :2])
+        return verify(source, wrong, RangeImage.of(cloud), T_body, target, surveyed)
+
+    return evidence
+
+
+def test_the_right_pose_scores_high(seen):
+    right = seen()
+    assert right.score > 0.7
+    assert right.near > 0.9
+    assert right.ground > 0.9
+    assert right.free_space > 0.9
+    assert right.inside > 0.9
+
+
+@pytest.mark.parametrize(
+    "offset", [(3, 0, 0), (-2, -2, 0), (0, 5, 0), (0, 0, 15), (0, 0, 180), (0, 0, -90), (9, 7, 40)]
+)
+def test_a_wrong_pose_scores_low(seen, offset):
+    assert seen(*offset).score < 0.6 * seen().score
+
+
+def test_all_evidence_is_a_share(seen):
+    for offset in ((0, 0, 0), (4, 4, 90), (25, 0, 0)):
+        found = seen(*offset)
+        assert all(0.0 <= value <= 1.0 for value in vars(found).values())
+        assert 0.0 <= found.score <= 1.0
+
+
+def test_outside_the_map_is_not_inside(seen):
+    assert seen(45, 0, 0).inside < 0.6 < seen().inside
+
+
+def fan(distance, half_degrees=30.0):
+    """Returns at equal range, ahead, 0.5 degrees apart, and the ground 1.5 m below the sensor."""
+    a, e = (
+        np.radians(v.ravel())
+        for v in np.meshgrid(np.arange(-half_degrees, half_degrees, 0.5), np.arange(-5, 10, 0.5))
+    )
+    rays = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    turn = np.radians(np.arange(0.0, 360.0))
+    ground = np.column_stack([5 * np.cos(turn), 5 * np.sin(turn), np.full_like(turn, -1.5)])
+    return np.concatenate([distance * rays, ground]).astype(np.float32)
+
+
+WALL = parts(plane([10, -2, 1], [0, 4, 0], [0, 0, 1.5]))[0]
+BODY = pose_from(np.eye(3), [0, 0, 1.5])
+
+
+def test_rays_that_end_at_the_wall_met_it():
+    met, passed = rays_against_map(RangeImage.of(fan(10.2)), BODY, WALL)
+    assert passed == 0
+    assert met > 0.9 * len(WALL)
+
+
+def test_rays_that_end_behind_the_wall_passed_through_it():
+    met, passed = rays_against_map(RangeImage.of(fan(25.0)), BODY, WALL)
+    assert met == 0
+    assert passed > 0.5 * len(WALL)
+
+
+def test_a_wall_behind_the_returns_is_hidden():
+    assert rays_against_map(RangeImage.of(fan(4.0)), BODY, WALL) == (0, 0)
+
+
+def test_where_no_ray_went_nothing_is_said():
+    assert rays_against_map(RangeImage.of(fan(25.0)), pose_from(rot_z(np.pi), [0, 0, 1.5]), WALL) == (0, 0)
+    assert rays_against_map(RangeImage.of(fan(25.0)), pose_from(np.eye(3), [-40, 0, 1.5]), WALL) == (0, 0)
+
+
+def test_the_heading_of_the_robot_counts():
+    """Body x ahead: a robot that looks along +y meets a wall that stands at +y."""
+    turned = transform(pose_from(rot_z(np.pi / 2), [0, 0, 0]), WALL)
+    met, passed = rays_against_map(RangeImage.of(fan(10.2)), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
+    assert met > 0
+    assert passed == 0
+    assert rays_against_map(RangeImage.of(fan(10.2)), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (
+        0,
+        0,
+    )
+
+
+def test_little_structure_proves_nothing():
+    field = parts(
+        plane([-20, -20, 0], [40, 0, 0], [0, 40, 0], 0.5), plane([5, 0, 0], [0, 1, 0], [0, 0, 2], 0.5)
+    )
+    target = local_map(*field)
+    height = field[0][:, 2].copy()
+    source = Source(field[0], height > 0.5, height)
+    everywhere = np.ones(len(height), bool)
+    sparse = verify(source, np.eye(4), RangeImage.of(fan(25.0)), BODY, target, everywhere)
+    assert sparse.ground > 0.99
+    assert sparse.near == 0.0
+    assert sparse.score == 0.0
+
+
+def test_points_off_the_survey_do_not_count(seen):
+    target = local_map(
+        *parts(plane([-20, -20, 0], [40, 0, 0], [0, 40, 0]), plane([9, -9, 0], [0, 18, 0], [0, 0, 4]))
+    )
+    elsewhere = target.points + np.array([0, 0, 300], np.float32)
+    points = np.concatenate([target.points, elsewhere])
+    height = np.tile(target.points[:, 2], 2)
+    source = Source(points, height > 0.5, height)
+    surveyed = np.arange(len(points)) < len(target.points)
+    found = verify(source, np.eye(4), RangeImage.of(fan(25.0, 5.0)), BODY, target, surveyed)
+    assert found.near == 1.0
+    assert found.ground > 0.99
+    assert found.inside == 0.5
+
+
+def test_a_dense_frame_is_judged_by_a_part_of_it(monkeypatch):
+    cloud = np.repeat(fan(10.2), 9, axis=0)
+    whole = rays_against_map(RangeImage.of(cloud), BODY, WALL)
+    monkeypatch.setattr(rays, "_MOST_RAYS", len(fan(10.2)) * 3)
+    part = RangeImage.of(cloud)
+    assert 0.2 * len(cloud) < part.hits.sum() < 0.4 * len(cloud)
+    assert rays_against_map(part, BODY, WALL) == whole
+
+
+def test_a_frame_without_points_has_no_rays():
+    assert rays_against_map(RangeImage.of(np.empty((0, 3), np.float32)), BODY, WALL) == (0, 0)

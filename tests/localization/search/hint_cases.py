@@ -1,0 +1,28 @@
+"""Localizers that are told where they may be, and what comes of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.transforms import pose_from, rot_z
+
+RULE = AcceptanceConfig()
+NEAR = pose_from(rot_z(np.radians(2.0)), [0.6, -0.5, 0.1])  # what a parked robot's last pose may be off by
+BESIDE = pose_from(rot_z(2.0), [9.0, -14.0, 0.0])  # another place of the map
+
+
+def follow(localizer, drive, frames, first=0):
+    return [
+        localizer.step(drive.clouds[k], drive.T_odom_body[k], 0.5 * k) for k in range(first, first + frames)
+    ]
+
+
+def first_fix(fixes):
+    return next((k for k, fix in enumerate(fixes) if fix.T_map_body is not None), None)
+
+
+def voteless(localizer, monkeypatch):
+    """The keyframes vote, but nothing comes of it."""
+    monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
+    return localizer

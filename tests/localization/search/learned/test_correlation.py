@@ -1,0 +1,215 @@
+"""Dense correlation equals direct sums, finds planted places, and is honest about what lies off the map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from coview_stream.localization.search.learned.correlation import coarser, correlate, turned
+from coview_stream.localization.search.learned.feature_index import CoarseMap
+
+YAWS = np.arange(12) * (np.pi / 6)
+
+
+def features(rng, *shape, smooth=1.0):
+    """Unit features, correlated over a cell or so like those of a network."""
+    values = ndimage.gaussian_filter(rng.normal(size=shape), (0, smooth, smooth))
+    return (values / np.linalg.norm(values, axis=0)).astype(np.float32)
+
+
+def seen_at(known, row, col, yaw, size):
+    """Query cut out of a map's features (C, H, W), its middle at (row, col), which may lie between cells."""
+    at = np.arange(size) - (size - 1) / 2
+    y, x = np.meshgrid(at, at, indexing="ij")
+    c, s = np.cos(yaw), np.sin(yaw)
+    where = [row + s * x + c * y, col + c * x - s * y]
+    return np.stack([ndimage.map_coordinates(channel, where, order=1) for channel in known]).astype(
+        np.float32
+    )
+
+
+def disk(size):
+    at = np.arange(size) - (size - 1) / 2
+    return (np.hypot(at[:, None], at[None]) <= size / 2).astype(np.float32)
+
+
+def bilinear(image, row, col):
+    """Value of (h, w) between cells, 0 beyond them: loops, to be compared with."""
+    total = 0.0
+    i, j = int(np.floor(row)), int(np.floor(col))
+    for k in (i, i + 1):
+        for m in (j, j + 1):
+            if 0 <= k < image.shape[0] and 0 <= m < image.shape[1]:
+                total += (1 - abs(row - k)) * (1 - abs(col - m)) * image[k, m]
+    return total
+
+
+def by_loops(query, weight, known, surveyed, yaws, covered):
+    """The definition, in float64: the query's grid is turned, laid on every cell, multiplied and summed."""
+    _, height, width = known.shape
+    half = len(weight) // 2
+    out = np.full((len(yaws), height, width), -np.inf)
+    for k, yaw in enumerate(yaws):
+        c, s = np.cos(yaw), np.sin(yaw)
+        grid = []
+        for v in range(-half, half + 1):
+            for u in range(-half, half + 1):
+                if np.hypot(u, v) <= half:
+                    at = (c * v - s * u + half - 0.5, c * u + s * v + half - 0.5)
+                    grid.append((v, u, [bilinear(q, *at) for q in query], bilinear(weight, *at)))
+        total = sum(w for *_, w in grid)
+        for r in range(height):
+            for col in range(width):
+                value = share = 0.0
+                for v, u, q, w in grid:
+                    if 0 <= r + v < height and 0 <= col + u < width:
+                        value += float(np.dot(q, known[:, r + v, col + u]))
+                        share += w * surveyed[r + v, col + u]
+                if covered is None:
+                    out[k, r, col] = value / total
+                elif share / total >= covered:
+                    out[k, r, col] = value / share
+    return out
+
+
+@pytest.mark.parametrize("covered", [None, 0.6, 0.3])
+@pytest.mark.parametrize("most_bytes", [0, 1 << 30])
+@pytest.mark.parametrize(
+    "headings", [(0.0, 0.3, 2.0, -1.2), (0.4, 1.7, 0.4 - np.pi, 1.7 + np.pi)], ids=["any", "opposite"]
+)
+def test_it_equals_direct_sums(covered, most_bytes, headings):
+    rng = np.random.default_rng(1)
+    known = features(rng, 3, 11, 17)
+    known[:, :5, :9] = 0.0
+    surveyed = (known != 0).any(axis=0)
+    local, weights = features(rng, 3, 12, 12), rng.uniform(0.1, 1.0, (12, 12)).astype(np.float32)
+    query, weight = coarser(local, weights)
+    yaws = np.asarray(headings)
+    made = CoarseMap(known, (0.0, 0.0), block=15, margin=4, most_bytes=most_bytes)
+    assert len(made) == 2 * 3
+    assert (made.nbytes > 0) == (most_bytes > 0)
+    ours = correlate(query, weight, made, yaws, covered=covered)
+    expected = by_loops(query, weight, known, surveyed, yaws, covered)
+    assert ours.shape == expected.shape == (4, 11, 17)
+    assert ours.dtype == np.float32
+    scored = np.isfinite(expected)
+    np.testing.assert_array_equal(np.isfinite(ours), scored)
+    assert scored.any()
+    assert scored.all() == (covered is None)
+    np.testing.assert_allclose(ours[scored], expected[scored], atol=1e-4)
+
+
+@pytest.mark.parametrize(("row", "col", "k"), [(30, 41, 0), (52, 20, 5), (9, 9, 8), (70, 118, 3)])
+def test_a_planted_place_is_found_with_its_heading(row, col, k):
+    rng = np.random.default_rng(2)
+    known = features(rng, 8, 80, 130)
+    query = seen_at(known, row, col, YAWS[k], 32)
+    query += rng.normal(0, 0.2, query.shape).astype(np.float32)
+    weight = disk(32)
+    scores = correlate(query * weight, weight, CoarseMap(known, (0, 0)), YAWS)
+    assert np.unravel_index(scores.argmax(), scores.shape) == (k, row, col)
+
+
+def test_it_works_on_single_cells_of_half_precision_on_a_map_smaller_than_a_query():
+    rng = np.random.default_rng(3)
+    known = features(rng, 8, 20, 9).astype(np.float16)
+    query = seen_at(known.astype(np.float32), 11, 4, YAWS[2], 32)
+    weight = disk(32)
+    scores = correlate(query * weight, weight, CoarseMap(known, (0, 0)), YAWS, covered=0.1)
+    assert np.unravel_index(scores.argmax(), scores.shape) == (2, 11, 4)
+
+
+def test_the_maps_edge_neither_favours_nor_punishes():
+    """A true place scores the same inside and where a third of the query hangs over; half over is not scored."""
+    rng = np.random.default_rng(4)
+    known = features(rng, 8, 100, 100)
+    weight = disk(32)
+    coarse = CoarseMap(known, (0, 0))
+    inside, edge = (
+        correlate(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col]
+        for col in (50, 5)
+    )
+    assert edge == pytest.approx(inside, rel=0.05)
+    query = seen_at(known, 50, 5, 0.0, 32) * weight
+    scores = correlate(query, weight, coarse, [0.0])[0]
+    assert np.isneginf(scores[50, 0])  # 54 % lie on the map
+    assert np.isneginf(scores[0, 0])
+    assert np.isfinite(scores[5:95, 16:84]).all()
+    punished = correlate(query, weight, coarse, [0.0], covered=None)[0]
+    assert np.isfinite(punished).all()
+    assert punished[50, 5] < 0.8 * inside
+
+
+def centre_of(coarse, row, col):
+    """x and y (..., 2) of the centres of cells, metres; between cells where the numbers are not whole."""
+    return (np.stack([col, row], axis=-1) + 0.5) * coarse.cell + coarse.corner
+
+
+def test_only_the_blocks_asked_for_are_scored_and_like_in_the_whole():
+    rng = np.random.default_rng(5)
+    known, corner = features(rng, 4, 150, 90), (100.0, -50.0)
+    coarse = CoarseMap(known, corner, block=64)
+    query, weight = features(rng, 4, 32, 32) * disk(32), disk(32)
+    whole = correlate(query, weight, coarse, YAWS[:3])
+    place = centre_of(coarse, 70, 33)
+    near = coarse.blocks_near([place], 20.0)
+    assert 0 < len(near) < len(coarse)
+    part = correlate(query, weight, coarse, YAWS[:3], near)
+    rows, cols = np.indices(known.shape[1:])
+    within = np.hypot(*(centre_of(coarse, rows, cols) - place).transpose(2, 0, 1)) <= 20.0
+    assert np.isfinite(part[:, within]).all()
+    scored = np.isfinite(part)
+    assert scored.sum() < np.isfinite(whole).sum()
+    np.testing.assert_allclose(part[scored], whole[scored], atol=1e-6)
+    assert np.isneginf(correlate(query, weight, coarse, YAWS[:3], coarse.blocks_near([(0, 5000)], 9.0))).all()
+
+
+def test_each_block_answers_for_its_own_cells_only():
+    coarse = CoarseMap(np.ones((1, 70, 130), np.float16), (0, 0), block=64)
+    answered = np.zeros((70, 130), int)
+    for block in range(len(coarse)):
+        answered[coarse.place_of(block)] += 1
+        rows, cols = coarse.place_of(block)
+        middle = centre_of(coarse, (rows.start + rows.stop - 1) / 2, (cols.start + cols.stop - 1) / 2)
+        assert coarse.blocks_near([middle], 0.5).tolist() == [block]
+    assert (answered == 1).all()
+
+
+def test_turning_goes_from_x_to_y():
+    image = np.zeros((1, 32, 32), np.float32)
+    image[0, 15:17, 24:26] = 1.0  # 9 cells along x from the middle
+    for yaw, (row, col) in ((0.0, (16, 25)), (np.pi / 2, (25, 16)), (np.pi, (16, 7))):
+        seen = turned(image, np.array([yaw]))[:, :, 0, 0]
+        assert seen.shape == (33, 33)
+        assert np.unravel_index(seen.argmax(), seen.shape) == (row, col)
+
+
+def test_coarser_cells_are_weighted_means():
+    local = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
+    weight = np.zeros((4, 4), np.float32)
+    weight[0, 0], weight[1, 1] = 2.0, 1.0
+    query, total = coarser(local, weight)
+    assert query[0].tolist() == [[(0 * 2 + 5 * 1) / 4, 0], [0, 0]]
+    assert total.tolist() == [[0.75, 0], [0, 0]]
+    np.testing.assert_allclose(coarser(local)[0][0, 1, 1], np.mean([10, 11, 14, 15]))
+
+
+def test_what_does_not_fit_is_refused():
+    coarse = CoarseMap(np.ones((2, 40, 40), np.float32), (0, 0))
+    query, weight = np.ones((2, 32, 32), np.float32), np.ones((32, 32), np.float32)
+    for wrong in (
+        lambda: correlate(query, weight[1:], coarse, [0.0]),
+        lambda: correlate(query, 0 * weight, coarse, [0.0]),
+        lambda: correlate(query[:1], weight, coarse, [0.0]),
+        lambda: correlate(query, weight, coarse, []),
+        lambda: correlate(np.ones((2, 34, 34), np.float32), np.ones((34, 34), np.float32), coarse, [0.0]),
+        lambda: correlate(query[:, 1:, 1:], weight[1:, 1:], coarse, [0.0]),
+        lambda: CoarseMap(np.ones((2, 0, 4), np.float32), (0, 0)),
+        lambda: CoarseMap(np.ones((2, 4, 4), np.float32), (0, 0), block=32),
+        lambda: CoarseMap(np.ones((2, 4, 4), np.float32), (0, 0), surveyed=np.ones((3, 4), bool)),
+        lambda: coarser(np.ones((1, 5, 4), np.float32)),
+        lambda: coarser(np.ones((1, 4, 4), np.float32), np.ones((2, 2), np.float32)),
+    ):
+        with pytest.raises(ValueError, match=r"."):
+            wrong()

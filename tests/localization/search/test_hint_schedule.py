@@ -1,0 +1,196 @@
+"""Suggested places: how long they are kept, how often they are tried, and when the judge believes one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hint_cases import BESIDE, NEAR, RULE, follow, voteless
+from se3 import exp_se3
+from small_world import pose_error
+from test_global_search import HERE, KEYFRAME, candidate, judged
+
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.result import State
+from coview_stream.localization.search import pose_hints as suggestions
+from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.search.pose_hints import Suggestions, Trials
+from coview_stream.localization.search.request import same_place
+
+# ---- what a localizer keeps
+
+
+def test_kept_until_a_place_is_accepted_or_reset(world_map, world_drive):
+    localizer = Localizer(world_map)
+    localizer.suggest(world_drive.T_map_body[0])
+    queries = [localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)]
+    assert [len(q.suggested) for q in queries] == [1, 1]
+    np.testing.assert_array_equal(queries[0].suggested, queries[1].suggested)
+    localizer.reset()
+    assert localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0).suggested == ()
+    localizer.suggest(world_drive.T_map_body[0] @ BESIDE)
+    assert follow(localizer, world_drive, 4, 1)[-1].state is State.TRACKING
+    assert localizer._suggested(np.eye(4)) == ()
+    localizer.suggest(world_drive.T_map_body[0])  # now it knows better
+    assert localizer._suggested(np.eye(4)) == ()
+
+
+def lost(world_map, world_drive):
+    """A localizer that has just lost its place to a blinded sensor, and the frame after."""
+    localizer = Localizer(world_map)
+    follow(localizer, world_drive, 5)
+    rng = np.random.default_rng(1)
+    k = 5
+    while localizer.state is not State.LOST:
+        garbage = rng.uniform([-20, -20, -1.5], [20, 20, 6], (6000, 3)).astype(np.float32)
+        localizer.step(garbage, world_drive.T_odom_body[k], 0.5 * k)
+        k += 1
+    return localizer, k
+
+
+def test_after_a_loss_the_odometry_that_went_on_suggests_the_place(world_map, world_drive):
+    localizer, k = lost(world_map, world_drive)
+    query = localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    (T_map_odom,) = query.suggested
+    metres, degrees = pose_error(T_map_odom @ query.T_odom_body, world_drive.T_map_body[k])
+    assert metres < 0.3
+    assert degrees < 0.5
+
+
+def test_after_a_loss_an_odometry_that_jumped_suggests_nothing_that_is_believed(world_map, world_drive):
+    localizer, k = lost(world_map, world_drive)
+    jump = pose_from(rot_z(0.7), [12.0, -5.0, 0.0])
+    for fix, truth in zip(
+        [
+            localizer.step(world_drive.clouds[n], jump @ world_drive.T_odom_body[n], 0.5 * n)
+            for n in range(k, 10)
+        ],
+        world_drive.T_map_body[k:],
+        strict=True,
+    ):
+        assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
+
+
+def test_a_loss_keeps_the_odometrys_frame_whatever_the_anchor():
+    rng = np.random.default_rng(3)
+    T_map_odom, T_odom_body = (exp_se3(rng.uniform(-1, 1, 6) * [0, 0, 3, 50, 50, 3]) for _ in range(2))
+    first, second = rng.uniform(-1e3, 1e3, (2, 3))
+    kept = Suggestions()
+    kept.frames_were(T_map_odom, first)
+    (again,) = kept.about(second, np.eye(4))
+    moved = pose_from(np.eye(3), first - second) @ T_odom_body  # the same pose about the second anchor
+    np.testing.assert_allclose(again @ moved, T_map_odom @ T_odom_body, atol=1e-9)
+    np.testing.assert_allclose(kept.about(first, np.eye(4))[0], T_map_odom, atol=1e-9)
+
+
+# ---- what a search tries
+
+
+def test_tried_at_once_then_now_and_then():
+    trials = Trials()
+    tried = []
+    for _ in range(100):
+        due = trials.due((np.eye(4),))
+        tried.append(bool(due))
+        if due:
+            trials.tried(refuted=True)
+    assert tried[: suggestions._TRIES] == [True] * suggestions._TRIES
+    gaps = np.diff(np.flatnonzero(tried))[suggestions._TRIES - 1 :]
+    assert set(gaps) == {suggestions._PAUSE + 1}
+
+
+def test_one_keyframe_that_does_not_speak_against_it_starts_the_count_anew():
+    trials = Trials()
+    for refuted in [*[True] * (suggestions._TRIES - 1), False] * 3:
+        assert trials.due((np.eye(4),))
+        trials.tried(refuted)
+    assert trials.due((np.eye(4),))
+
+
+def test_another_suggestion_is_tried_at_once():
+    trials = Trials()
+    for _ in range(suggestions._TRIES):
+        trials.due((np.eye(4),))
+        trials.tried(refuted=True)
+    assert not trials.due((np.eye(4),))
+    assert trials.due((pose_from(rot_z(0.1), [0, 0, 0]),))
+
+
+def counted(localizer, monkeypatch):
+    """Suggestions that went through registration, keyframe by keyframe."""
+    made = []
+    whole = localizer._search._refinement.refine
+
+    def refine(hypotheses, source, query):
+        made.append(sum(h.station is None for h in hypotheses))
+        return whole(hypotheses, source, query)
+
+    monkeypatch.setattr(localizer._search._refinement, "refine", refine)
+    return made
+
+
+def test_a_refuted_one_is_hardly_tried_again(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    made = counted(localizer, monkeypatch)
+    localizer.suggest(world_drive.T_map_body[0] @ BESIDE)
+    follow(localizer, world_drive, 10)
+    assert made == [1] * suggestions._TRIES + [0] * 4 + [1]
+
+
+def test_where_the_map_knows_nothing_it_is_not_refuted(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    made = counted(localizer, monkeypatch)
+    localizer.suggest(world_drive.T_map_body[0] @ pose_from(np.eye(3), [500.0, 0, 0]))
+    follow(localizer, world_drive, 10)
+    assert made == [1] * 10
+
+
+def test_what_is_remembered_is_not_registered_twice(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    made = counted(localizer, monkeypatch)
+    localizer.suggest(world_drive.T_map_body[0] @ NEAR)
+    follow(localizer, world_drive, 4)
+    assert made == [1] * 4
+
+
+# ---- the judge
+
+
+@pytest.mark.parametrize("votes", [0, 1, RULE.confirmations - 1, RULE.confirmations])
+def test_the_judge_wants_rivals_before_it_believes_a_suggestion(world_map, votes):
+    search = GlobalSearch(world_map, LocalizerConfig(), LocalMaps(world_map, 50.0))
+    for _ in range(votes):
+        search.coview.consensus._ballots.append(None)
+    best = candidate(0.7)
+    alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
+    assert same_place(HERE, HERE, KEYFRAME)
+    verdicts = judged(search, *[[alone, candidate(0.2, BESIDE @ HERE)]] * 5)
+    accepted = [v.accepted is not None for v in verdicts]
+    assert accepted == ([False] * 2 + [True] * 3 if votes == RULE.confirmations else [False] * 5)
+    # a vote for the same place is worth as much as any
+    search.clear()
+    both = [alone, candidate(0.69)]
+    assert [v.accepted is not None for v in judged(search, *[both] * 3)] == [False, False, True]
+
+
+def test_one_scan_alone_never_believes_a_suggestion_that_no_vote_supports(world_map):
+    search = GlobalSearch(world_map, LocalizerConfig(stationary=True), LocalMaps(world_map, 50.0))
+    best = candidate(0.9)
+    alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
+    (unsupported, supported) = judged(search, [alone], [alone, best])
+    assert unsupported.accepted is None
+    assert supported.accepted is not None
+
+
+def test_inverse_of_a_suggestion_is_where_odometry_began():
+    """The robot at the suggested place, whatever odometry says where it is."""
+    kept = Suggestions()
+    T_map_body, T_odom_body = pose_from(rot_z(2.5), [40, -7, 3]), pose_from(rot_z(-1.0), [5, 6, 0.2])
+    kept.robot_at(T_map_body)
+    (T,) = kept.about(np.array([100.0, 200.0, 5.0]), T_odom_body)
+    np.testing.assert_allclose(T @ T_odom_body, T_map_body, atol=1e-9)
+    np.testing.assert_allclose(inverse(T) @ T_map_body, T_odom_body, atol=1e-9)

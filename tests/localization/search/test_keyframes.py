@@ -1,0 +1,120 @@
+"""Keyframes: every so many metres, with all points since, in fixed memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.config import KeyframeConfig
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.registration import prepare_scan
+from coview_stream.localization.search import keyframes
+from coview_stream.localization.search.keyframes import KeyframeBuffer
+
+CONFIG = KeyframeConfig(distance=2.0, capacity=4, voxel=0.25)
+
+
+def at(x, yaw=0.0):
+    return pose_from(rot_z(yaw), [x, 0.0, 1.5])
+
+
+def cloud(seed, count=200):
+    return np.random.default_rng(seed).uniform([2, -9, -1], [9, 9, 3], (count, 3)).astype(np.float32)
+
+
+def test_a_keyframe_every_distance():
+    buffer = KeyframeBuffer(CONFIG)
+    made = [buffer.add(cloud(k), at(0.5 * k), 0.1 * k) is not None for k in range(10)]
+    assert np.flatnonzero(made).tolist() == [0, 4, 8]
+    assert buffer.travelled == pytest.approx(4.0)
+    assert [k.stamp for k in buffer.keyframes] == pytest.approx([0.0, 0.4, 0.8])
+
+
+def test_points_lie_in_the_odometry_frame():
+    buffer = KeyframeBuffer(CONFIG)
+    corner = np.array([[3.0, 1.0, 0.5]] * 3, np.float32)
+    keyframe = buffer.add(corner, at(10.0, np.pi / 2), 0.0)
+    np.testing.assert_allclose(keyframe.points, [[9.0, 3.0, 2.0]], atol=1e-5)
+    np.testing.assert_allclose(keyframe.position, [10.0, 0.0, 1.5])
+
+
+def test_frames_between_keyframes_are_in_the_next_one():
+    buffer = KeyframeBuffer(CONFIG)
+    buffer.add(cloud(0), at(0.0), 0.0)
+    assert buffer.add(np.array([[5.0, 5, 5]], np.float32), at(1.0), 0.1) is None
+    waiting = buffer.recent(1)
+    keyframe = buffer.add(np.array([[-5.0, 5, 5]], np.float32), at(2.5), 0.2)
+    for points in (keyframe.points, waiting):
+        assert np.abs(points - [6.0, 5.0, 6.5]).sum(axis=1).min() < 1e-4
+    assert len(keyframe.points) == 2
+
+
+def test_the_ring_holds_its_capacity():
+    buffer = KeyframeBuffer(CONFIG)
+    for k in range(9):
+        buffer.add(cloud(k), at(2.0 * k), float(k))
+    assert [k.stamp for k in buffer.keyframes] == [5.0, 6.0, 7.0, 8.0]
+    assert len(buffer.recent(2)) == sum(len(k.points) for k in list(buffer.keyframes)[-2:])
+
+
+def test_too_near_returns_are_the_robot_itself():
+    buffer = KeyframeBuffer(KeyframeConfig(range_min=1.0))
+    keyframe = buffer.add(np.array([[0.3, 0, 0], [3, 0, 0]], np.float32), at(0.0), 0.0)
+    np.testing.assert_allclose(keyframe.points, [[3, 0, 1.5]], atol=1e-6)
+
+
+def test_standing_still_needs_no_more_memory(monkeypatch):
+    monkeypatch.setattr(keyframes, "_PENDING_POINTS", 1000)
+    buffer = KeyframeBuffer(CONFIG)
+    for k in range(60):
+        buffer.add(cloud(k % 3), at(0.0), float(k))
+    assert len(buffer.recent(1)) < 1000 + 2 * 200 + 200
+
+
+def test_a_virtual_scan_gathers_what_lies_around():
+    buffer = KeyframeBuffer(CONFIG)
+    for k in range(4):
+        buffer.add(cloud(k), at(5.0 * k), float(k))
+    centre = np.array([15.0, 0.0, 1.5])
+    scan = buffer.virtual_scan(centre, 8.0, 0.5)
+    everything = np.concatenate([k.points for k in buffer.keyframes])
+    near = everything[np.hypot(*(everything[:, :2] - centre[:2]).T) < 8.0]
+    voxels = np.unique(np.floor(near / 0.5), axis=0)
+    assert len(scan) == len(voxels)
+    assert np.hypot(*(scan[:, :2] - centre[:2]).T).max() < 8.0
+
+
+def test_clear_forgets_all():
+    buffer = KeyframeBuffer(CONFIG)
+    buffer.add(cloud(0), at(0.0), 0.0)
+    buffer.add(cloud(1), at(1.0), 0.1)
+    buffer.clear()
+    assert len(buffer.recent(5)) == 0
+    # the next frame is a keyframe wherever it is
+    assert buffer.add(cloud(2), at(1.0), 0.2) is not None
+
+
+def test_the_newest_frame_is_at_hand_as_it_was_thinned():
+    buffer = KeyframeBuffer(CONFIG)
+    for k in range(3):
+        buffer.add(np.repeat(cloud(k), 2, axis=0), at(0.5 * k), float(k))
+        np.testing.assert_array_equal(buffer.newest, prepare_scan.voxelized(cloud(k), at(0.5 * k), CONFIG))
+
+
+def test_what_was_taken_in_stays_as_it_was():
+    """Frames go through buffers that are used again."""
+    buffer = KeyframeBuffer(CONFIG)
+    buffer.add(cloud(0), at(0.0), 0.0)
+    first, before = buffer.newest, buffer.newest.copy()
+    buffer.add(cloud(1), at(0.1), 0.1)
+    np.testing.assert_array_equal(first, before)
+
+
+def test_a_frame_can_be_thinned_without_becoming_part_of_a_keyframe():
+    buffer = KeyframeBuffer(CONFIG)
+    np.testing.assert_array_equal(
+        buffer.thin(cloud(0), at(0.0)), prepare_scan.voxelized(cloud(0), at(0.0), CONFIG)
+    )
+    assert buffer.newest is not None
+    assert len(buffer.recent(1)) == 0
+    assert len(buffer.keyframes) == 0

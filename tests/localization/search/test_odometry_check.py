@@ -1,0 +1,76 @@
+"""Continuity: frames that go on from each other, and a robot that is elsewhere at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_world import ODOM_FAR
+
+from coview_stream.geometry.transforms import pose_from, transform
+from coview_stream.localization.search.keyframes import _PATIENCE, Continuity
+
+T_LOCAL = pose_from(ODOM_FAR[:3, :3], np.zeros(3))
+
+
+def frames_of(drive, T_odom_map=T_LOCAL):
+    """Points and position of every frame in the odometry frame."""
+    for cloud, T in zip(drive.clouds, drive.T_map_body, strict=True):
+        T_odom_body = T_odom_map @ T
+        yield transform(T_odom_body, cloud[::2]).astype(np.float32), T_odom_body[:3, 3]
+
+
+@pytest.fixture
+def frames(slow_drive):
+    return list(frames_of(slow_drive))
+
+
+def test_a_drive_goes_on(frames, world_drive):
+    continuity = Continuity()
+    assert not any(continuity.broken(*frame) for frame in frames)
+    wide = Continuity()
+    assert not any(wide.broken(*frame) for frame in frames_of(world_drive))
+
+
+def test_another_place_is_noticed_after_a_few_frames_and_once(frames, elsewhere):
+    continuity = Continuity()
+    for frame in frames[:10]:
+        continuity.broken(*frame)
+    other, _ = list(frames_of(elsewhere))[2]
+    here = frames[9][1]
+    # it feels no motion: the other place's points lie around where it was
+    moved = (other - other.mean(axis=0) + frames[9][0].mean(axis=0) + [25.0, 9.0, 3.0]).astype(np.float32)
+    told = [continuity.broken(moved, here) for _ in range(6)]
+    assert told == [k == _PATIENCE - 1 for k in range(6)]
+
+
+def test_one_strange_frame_is_dust(frames):
+    continuity = Continuity()
+    rng = np.random.default_rng(0)
+    dust = rng.uniform(-3.0, 3.0, (4000, 3)).astype(np.float32) + np.float32([0.0, 0.0, 20.0])
+    for k, frame in enumerate(frames):
+        assert not continuity.broken(*frame)
+        if k % 3 == 0:
+            assert not continuity.broken(dust, frame[1])
+
+
+def test_a_handful_of_points_says_nothing(frames):
+    continuity = Continuity()
+    assert not continuity.broken(frames[0][0][:5], frames[0][1])
+    for frame in frames[:3]:
+        continuity.broken(*frame)
+    far = frames[0][0][:100] + np.float32(500.0)
+    assert not any(continuity.broken(far, frames[2][1]) for _ in range(9))
+
+
+def test_a_jump_of_odometry_is_noticed_and_can_be_forgotten(frames):
+    jump = np.float32([40.0, 0.0, 0.0])
+    jumped = [(points + jump, place + jump) for points, place in frames]
+    continuity = Continuity()
+    for frame in frames[:10]:
+        continuity.broken(*frame)
+    assert [continuity.broken(*frame) for frame in jumped[10:16]].count(True) == 1
+    cleared = Continuity()
+    for frame in frames[:10]:
+        cleared.broken(*frame)
+    cleared.clear()
+    assert not any(cleared.broken(*frame) for frame in jumped[10:16])

@@ -1,0 +1,179 @@
+"""Suggested places: verified and judged as what the votes find, never trusted, and not in the way when wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from hint_cases import BESIDE, NEAR, RULE, first_fix, follow, voteless
+from se3 import exp_se3
+from small_world import pose_error
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.files import write_cloud
+from coview_stream.errors import RunError
+from coview_stream.geometry.transforms import pose_from, rot_z, tilt_of
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.result import State
+from coview_stream.localization.search.pose_hints import FROM_THERE
+
+UTM = np.array([512_345.6, 5_403_210.9, 287.4])
+
+
+# ---- right ones
+
+
+def test_a_right_one_needs_the_proof_that_any_place_needs(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    localizer.suggest(world_drive.T_map_body[0] @ NEAR)
+    fixes = follow(localizer, world_drive, 4)
+    assert first_fix(fixes) == first_fix(world_fixes) == RULE.confirmations - 1
+    assert [f.evidence.state for f in fixes] == [f.evidence.state for f in world_fixes[:4]]
+
+
+def test_a_right_one_alone_is_found_but_waits_for_rivals(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    localizer.suggest(world_drive.T_map_body[0] @ NEAR)
+    fixes = follow(localizer, world_drive, 6)
+    posed = first_fix(fixes)
+    # the first keyframes had voted too little for a rival to be seen
+    assert posed == 2 * RULE.confirmations - 2
+    assert all(fix.state is State.AMBIGUOUS for fix in fixes[:posed])
+    assert f"rivals rest on 1 keyframes' votes, {RULE.confirmations} needed" in fixes[0].evidence.reason
+    for fix in fixes[:posed]:
+        assert fix.evidence.reason.endswith(FROM_THERE)
+        assert (fix.evidence.station, fix.evidence.shift) == (None, None)
+    metres, degrees = pose_error(fixes[posed].T_map_body, world_drive.T_map_body[posed])
+    assert metres < 0.1
+    assert degrees < 0.3
+
+
+def test_without_it_there_would_be_nothing(world_map, world_drive, monkeypatch):
+    fixes = follow(voteless(Localizer(world_map), monkeypatch), world_drive, 6)
+    assert {fix.state for fix in fixes} == {State.SEARCHING}
+
+
+def test_in_the_frame_of_the_maps_sources(world_map, world_drive, monkeypatch):
+    """A map far from zero, odometry far from zero, and a robot that leans otherwise than when it was saved."""
+    far = BaseMap({**world_map._arrays, "origin": UTM + world_map.origin}, world_map.parameters)
+    localizer = voteless(Localizer(far), monkeypatch)
+    leaning = exp_se3(np.array([0.05, -0.04, 0.0, *UTM])) @ pose_from(np.eye(3), -UTM)
+    there = pose_from(np.eye(3), UTM) @ world_drive.T_map_body[0] @ NEAR
+    localizer.suggest(leaning @ there)
+    fixes = follow(localizer, world_drive, 5)
+    assert fixes[-1].state is State.TRACKING
+    moved = pose_from(np.eye(3), -UTM) @ fixes[-1].T_map_body
+    assert pose_error(moved, world_drive.T_map_body[4])[0] < 0.1
+
+
+def test_it_is_of_the_next_frame_whether_that_is_a_keyframe_or_not(world_map, world_drive, monkeypatch):
+    localizer = Localizer(world_map)
+    follow(localizer, world_drive, 1)
+    voteless(localizer, monkeypatch)
+    localizer._search.clear()
+    T = world_drive.T_odom_body[0] @ pose_from(np.eye(3), [0.1, 0.0, 0.0])
+    localizer.suggest(world_drive.T_map_body[0])
+    assert localizer.take(world_drive.clouds[0], T, 0.1) is None  # no keyframe: it has hardly moved
+    query = localizer.take(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
+    (T_map_odom,) = query.suggested
+    metres, degrees = pose_error(T_map_odom @ query.T_odom_body, world_drive.T_map_body[1])
+    assert metres == pytest.approx(0.1, abs=1e-6)
+    assert degrees < 1e-3
+    assert tilt_of(T_map_odom) < 1e-9
+
+
+# ---- wrong ones
+
+
+@pytest.mark.parametrize(
+    "off", [BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])]
+)
+def test_a_wrong_one_costs_no_fix(world_map, world_drive, world_fixes, off):
+    localizer = Localizer(world_map)
+    localizer.suggest(world_drive.T_map_body[0] @ off)
+    fixes = follow(localizer, world_drive, 4)
+    assert first_fix(fixes) == first_fix(world_fixes)
+    for fix, usual in zip(fixes, world_fixes, strict=False):
+        assert fix.evidence.station == usual.evidence.station
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, usual.T_map_body, atol=1e-6)
+
+
+@pytest.mark.parametrize("share", [(12, -4), (-14, 9)])
+def test_a_wrong_one_is_not_believed_though_nothing_else_is_offered(
+    world_map, world_drive, monkeypatch, share
+):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    localizer.suggest(pose_from(rot_z(0.4), [*share, small_world.SENSOR_HEIGHT]))
+    assert first_fix(follow(localizer, world_drive, 8)) is None
+
+
+def test_never_a_pose_for_a_robot_that_has_left_the_map(world_map, world_drive, elsewhere):
+    localizer = Localizer(world_map)
+    localizer.suggest(world_drive.T_map_body[0])
+    for fix in follow(localizer, elsewhere, 4):
+        assert fix.T_map_body is None
+
+
+@pytest.fixture(scope="module")
+def lookalike_map(map_points, tmp_path_factory):
+    """Beside the robot's place another that is like it but for what stands in its upper right quarter."""
+    path = tmp_path_factory.mktemp("lookalike") / "map.ply"
+    quarter = (map_points[:, 0] > 4) & (map_points[:, 1] > 4) & (map_points[:, 2] > 0.2)
+    other = map_points[~quarter] + np.array([2 * small_world.HALF, 0, 0])
+    write_cloud(path, np.concatenate([map_points, other]).astype(np.float32))
+    return BaseMap.build(path, radius=30.0)
+
+
+def test_the_last_place_looks_like_the_one_that_the_robot_was_moved_to(lookalike_map, world_drive):
+    plain = follow(Localizer(lookalike_map), world_drive, 8)
+    localizer = Localizer(lookalike_map)
+    localizer.suggest(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
+    fixes = follow(localizer, world_drive, 8)
+    assert first_fix(plain) is not None
+    assert first_fix(fixes) == first_fix(plain)
+    for fix, truth in zip(fixes, world_drive.T_map_body, strict=False):
+        assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
+
+
+def test_a_lookalike_is_not_believed_before_the_votes_can_name_the_right_place(
+    lookalike_map, world_drive, monkeypatch
+):
+    """The right place comes up with the fourth keyframe's votes; by itself the wrong one would have won before."""
+    localizer = Localizer(lookalike_map)
+    consensus = localizer._search.coview.consensus
+    found = consensus.hypotheses
+    monkeypatch.setattr(
+        consensus, "hypotheses", lambda: found() if len(consensus) > RULE.confirmations else []
+    )
+    localizer.suggest(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
+    fixes = follow(localizer, world_drive, 8)
+    assert all(f.evidence.score > RULE.score for f in fixes[:3])  # the wrong one, and it was alone
+    posed = first_fix(fixes)
+    assert posed is not None
+    for fix, truth in zip(fixes[posed:], world_drive.T_map_body[posed:], strict=False):
+        assert pose_error(fix.T_map_body, truth)[0] < 0.1
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.eye(3),
+        2 * np.eye(4),
+        np.diag([1.0, -1, 1, 1]),
+        np.full((4, 4), np.nan),
+        pose_from(np.eye(3), [1e8, 0, 0]),
+        "here",
+        None,
+    ],
+    ids=str,
+)
+def test_what_is_no_pose_is_refused(world_map, bad):
+    with pytest.raises(RunError, match="T_map_body"):
+        Localizer(world_map).suggest(bad)
+
+
+def test_the_farthest_that_is_taken_harms_nothing(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    localizer.suggest(pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6]))
+    assert first_fix(follow(localizer, world_drive, 4)) == first_fix(world_fixes)

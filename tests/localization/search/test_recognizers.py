@@ -1,0 +1,176 @@
+"""Sources of hypotheses side by side: which are asked, what each names, and that judging does not care."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_stream.config import LearnedConfig, LocalizerConfig
+from coview_stream.errors import ConfigError, MapError
+from coview_stream.geometry.transforms import inverse, pose_from, transform, yaw_of
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.result import State
+from coview_stream.localization.search.acceptance import BY_FEATURES
+from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.search.learned.matcher import LearnedMap
+from coview_stream.stream.node.engines import SearchEngine
+from coview_stream.stream.node.jobs import SearchJob
+
+
+def search_of(base_map, reloc="auto", **settings):
+    config = LocalizerConfig(reloc=reloc, learned=LearnedConfig(**settings))
+    return GlobalSearch(base_map, config, LocalMaps(base_map, 50.0))
+
+
+@pytest.fixture
+def knowing(monkeypatch, world_drive):
+    """Learned features that know the truth of the drive (see :func:`follow`): their votes, not their networks."""
+    first = world_drive.T_odom_body[0]
+    local = pose_from(np.eye(3), -first[:3, 3]) @ first  # as the localizer has it, about its anchor
+    T_map_local = world_drive.T_map_body[0] @ inverse(local)
+
+    def distances(self, view, suggested):
+        rng = np.random.default_rng(0)
+        found = rng.normal(1.0, 0.1, (len(self.stations), self.config.yaws)).astype(np.float32)
+        there = transform(T_map_local, view.centre[None])[0, :2]
+        station = np.hypot(*(self.stations[:, :2] - there).T).argmin()
+        shift = round(-yaw_of(T_map_local) / (2 * np.pi / self.config.yaws)) % self.config.yaws
+        found[station, shift] = -1.0
+        return found
+
+    monkeypatch.setattr(LearnedMap, "distances", distances)
+    monkeypatch.setattr(LearnedMap, "sharpened", lambda self, hypotheses, view: hypotheses)
+
+
+def follow(localizer, drive):
+    pairs = zip(drive.clouds, drive.T_odom_body, strict=True)
+    return [localizer.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(pairs)]
+
+
+def right(fixes, drive):
+    posed = [(f, T) for f, T in zip(fixes, drive.T_map_body, strict=True) if f.T_map_body is not None]
+    errors = [small_world.pose_error(f.T_map_body, T) for f, T in posed]
+    return bool(posed) and all(metres < 0.3 and degrees < 1.0 for metres, degrees in errors)
+
+
+# ---- which are asked
+
+
+def test_auto_asks_both_where_the_map_has_features(world_map, learned_map):
+    both, coview_only = search_of(learned_map), search_of(world_map)
+    assert both.coview is not None
+    assert both.learned is not None
+    assert (both.needs.descriptor, both.needs.reach) == (learned_map.descriptor_config, 30.0)
+    assert coview_only.learned is None
+    assert coview_only.needs.reach is None
+
+
+def test_each_can_be_asked_alone(learned_map):
+    assert search_of(learned_map, "coview").learned is None
+    alone = search_of(learned_map, "learned")
+    assert alone.coview is None
+    assert alone.needs.descriptor is None
+    assert alone.last_query == {}
+
+
+def test_a_map_without_features_is_refused_where_they_are_asked_for(world_map):
+    with pytest.raises(MapError, match=r"build it again.*--reloc coview"):
+        Localizer(world_map, LocalizerConfig(reloc="learned"))
+    with pytest.raises(ConfigError, match="reloc is 'guesswork'"):
+        LocalizerConfig(reloc="guesswork")
+
+
+def test_together_they_name_no_more_than_their_share(learned_map):
+    assert search_of(learned_map, peaks=2).coview.consensus.config.peaks == 2
+    assert search_of(learned_map, peaks=2).learned.consensus.config.peaks == 2
+    usual = LocalizerConfig().consensus.peaks
+    assert search_of(learned_map, "coview", peaks=2).coview.consensus.config.peaks == usual
+
+
+# ---- what they name
+
+
+def test_features_alone_find_the_way(learned_map, world_drive, knowing):
+    localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
+    fixes = follow(localizer, world_drive)
+    assert right(fixes, world_drive)
+    first = next(f for f in fixes if f.state is State.TRACKING)
+    assert first.evidence.reason.endswith(BY_FEATURES)
+    assert first.evidence.station is not None
+    assert first.evidence.shift is None  # which would be one of the co-view descriptors
+    assert localizer.last_query == {}
+
+
+def test_what_the_descriptors_miss_features_find(learned_map, world_drive, knowing, monkeypatch):
+    localizer = Localizer(learned_map)
+    monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
+    assert right(follow(localizer, world_drive), world_drive)
+
+
+def test_what_features_miss_the_descriptors_find(learned_map, world_drive, world_fixes, monkeypatch):
+    """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
+    named = []
+
+    def distances(self, view, suggested):
+        found = np.random.default_rng(0).normal(1.0, 0.1, (len(self.stations), self.config.yaws))
+        away = np.hypot(*(self.stations[:, :2] - self.stations[:, :2].mean(axis=0)).T)
+        wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
+        found[wrong, np.arange(5) * 7] = -1.0
+        named.append(wrong)
+        return found.astype(np.float32)
+
+    monkeypatch.setattr(LearnedMap, "distances", distances)
+    fixes = follow(Localizer(learned_map), world_drive)
+    assert right(fixes, world_drive)
+    assert named
+    states = [f.state for f in fixes]
+    assert states.index(State.TRACKING) <= [f.state for f in world_fixes].index(State.TRACKING) + 2
+
+
+def test_what_both_name_is_registered_once(learned_map, world_drive, knowing, monkeypatch):
+    localizer = Localizer(learned_map)
+    search = localizer._search
+    query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    search.update(query)
+    rough = search.learned.hypotheses()[0]
+    exact = replace(rough, exact=True)
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [rough])
+    monkeypatch.setattr(search.learned, "hypotheses", lambda: [exact])
+    assert search._voted(query) == [exact]
+    monkeypatch.setattr(search.learned, "hypotheses", lambda: [rough])
+    assert search._voted(query) == [rough, rough]  # neither is better, so neither makes way
+
+
+def test_too_few_points_are_no_vote(learned_map, world_drive):
+    localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
+    fix = localizer.step(world_drive.clouds[0][:40], world_drive.T_odom_body[0], 0.0)
+    assert fix.evidence.reason == "too few points to search with"
+    assert len(localizer._search.learned) == 0
+
+
+def test_without_features_queries_carry_nothing_more(world_map, learned_map, world_drive):
+    first = world_drive.clouds[0], world_drive.T_odom_body[0], 0.0
+    usual = Localizer(world_map).take(*first)
+    assert len(usual.surroundings) == 0
+    both = Localizer(learned_map).take(*first)
+    np.testing.assert_array_equal(usual.scan, both.scan)
+    away = np.hypot(*(both.surroundings[:, :2] - both.position[:2]).T)
+    assert away.max() < 30.0
+    assert len(both.surroundings) > 300
+    assert len(Localizer(learned_map, LocalizerConfig(reloc="learned")).take(*first).scan) == 0
+
+
+def test_robots_of_a_node_share_what_is_known_of_the_map(learned_map, world_drive):
+    engine = SearchEngine(learned_map, LocalizerConfig(reloc="learned"))
+    engine.prepare()
+    localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
+    query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    for robot in ("one", "other"):
+        assert engine.run(SearchJob(robot, 1, query)).evidence.stamp == 0.0
+    searches = [search for _, search in engine._robots.values()]
+    assert searches[0].learned.learned is searches[1].learned.learned
+    assert searches[0].learned.consensus is not searches[1].learned.consensus

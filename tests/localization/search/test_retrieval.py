@@ -1,0 +1,166 @@
+"""Retrieval: exhaustive equals brute force, blocks equal the cache, ring keys score their candidates only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.config import DescriptorConfig, RetrievalConfig
+from coview_stream.descriptors.coview import describe, ring_key
+from coview_stream.localization.search import retrieval
+from coview_stream.localization.search.consensus import yaw_of_shift
+from coview_stream.localization.search.retrieval import Retrieval
+
+M, R, S = 40, 8, 12
+
+
+class Stations:
+    """Random descriptors with empty bins, empty columns and one empty station."""
+
+    descriptor_config = DescriptorConfig(rings=R, sectors=S, channels=("scan_context", "coview"))
+
+    def __init__(self):
+        rng = np.random.default_rng(9)
+        full = rng.uniform(0.5, 10, (2, M, R, S)) * (rng.random((2, M, R, S)) < 0.6)
+        full[:, :, :, 4] *= rng.random((2, M, 1)) < 0.5
+        full[:, 7] = 0.0
+        self.full = dict(zip(("scan_context", "coview"), full.astype(np.float16), strict=True))
+
+    def __len__(self):
+        return M
+
+    def descriptors(self, name):
+        return self.full[name]
+
+
+@pytest.fixture(scope="module")
+def stations():
+    return Stations()
+
+
+@pytest.fixture(scope="module")
+def query():
+    rng = np.random.default_rng(10)
+    q = (rng.uniform(0.5, 10, (2, R, S)) * (rng.random((2, R, S)) < 0.6)).astype(np.float32)
+    q[:, :, 9] = 0.0
+    return dict(zip(("scan_context", "coview"), q, strict=True))
+
+
+def brute(q, c):
+    """Eqs 7-9 to the letter; a column that is empty on either side costs 1."""
+    volume = np.zeros((len(c), S))
+    for m in range(len(c)):
+        for n in range(S):
+            total = 0.0
+            for j in range(S):
+                a, b = q[:, (j + n) % S].astype(float), c[m, :, j].astype(float)
+                size = np.linalg.norm(a) * np.linalg.norm(b)
+                total += 1.0 if size == 0 else 1.0 - a @ b / size
+            volume[m, n] = total / S
+    return volume
+
+
+def test_exhaustive_is_brute_force(stations, query):
+    found = Retrieval(stations, RetrievalConfig()).distances(query)
+    assert list(found) == list(query)
+    for name, volume in found.items():
+        assert volume.shape == (M, S)
+        np.testing.assert_allclose(volume, brute(query[name], stations.full[name]), atol=2e-4)
+        np.testing.assert_allclose(volume[7], 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("block", [1, 7, M, 100])
+def test_blocks_equal_the_cache(stations, query, monkeypatch, block):
+    cached = Retrieval(stations, RetrievalConfig())
+    expected = cached.distances(query)
+    monkeypatch.setattr(retrieval, "_CACHE_BYTES", 0)
+    monkeypatch.setattr(retrieval, "_BLOCK", block)
+    streamed = Retrieval(stations, RetrievalConfig())
+    for name, volume in streamed.distances(query).items():
+        np.testing.assert_allclose(volume, expected[name], atol=1e-5)
+    assert not streamed._spectra
+    assert set(cached._spectra) == set(query)
+
+
+def test_prepared_spectra_are_not_made_again(stations, query, monkeypatch):
+    expected = Retrieval(stations, RetrievalConfig()).distances(query)
+    prepared = Retrieval(stations, RetrievalConfig())
+    prepared.prepare()
+    monkeypatch.delattr(retrieval.kernels, "column_spectra")
+    for name, volume in prepared.distances(query).items():
+        np.testing.assert_array_equal(volume, expected[name])
+
+
+def test_what_does_not_fit_or_is_not_needed_is_not_prepared(stations, monkeypatch):
+    monkeypatch.delattr(retrieval.kernels, "column_spectra")
+    Retrieval(stations, RetrievalConfig(mode="ring_key")).prepare()
+    monkeypatch.setattr(retrieval, "_CACHE_BYTES", 10)
+    Retrieval(stations, RetrievalConfig()).prepare()
+
+
+def test_ring_key_scores_its_candidates_only(stations, query):
+    exhaustive = Retrieval(stations, RetrievalConfig()).distances(query)
+    found = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=6)).distances(query)
+    for name, volume in found.items():
+        keys = ring_key(stations.full[name].astype(np.float32))
+        gap = np.linalg.norm(keys - ring_key(query[name]), axis=1)
+        nearest = np.argsort(gap, kind="stable")[:6]
+        others = np.setdiff1d(np.arange(M), nearest)
+        np.testing.assert_allclose(volume[nearest], exhaustive[name][nearest], atol=1e-5)
+        assert (volume[others] == 1.0).all()
+        assert (volume[nearest] < 0.999).any(axis=1).all()
+
+
+def test_ring_key_with_more_candidates_than_stations_is_exhaustive(stations, query):
+    exhaustive = Retrieval(stations, RetrievalConfig()).distances(query)
+    found = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=10 * M)).distances(query)
+    for name in query:
+        np.testing.assert_allclose(found[name], exhaustive[name], atol=1e-5)
+
+
+@pytest.mark.parametrize("turn", [0, 1, 5, 11])
+def test_a_robot_turned_left_is_found_at_its_heading(turn):
+    """Eq. 9: shift n means that the robot's x axis points at yaw -2 pi n / S in the map."""
+    rng = np.random.default_rng(12)
+    config = DescriptorConfig(radius=20.0, rings=R, sectors=S, channels=("scan_context",))
+    places = [
+        np.column_stack([rng.uniform(-20, 20, (60, 2)), rng.uniform(0.5, 9, 60)]).astype(np.float32)
+        for _ in range(12)
+    ]
+    there = Stations()
+    there.full = {
+        "scan_context": np.stack([describe(p, np.zeros(3), config)["scan_context"] for p in places])
+    }
+    yaw = 2 * np.pi * turn / S
+    c, s = np.cos(yaw), np.sin(yaw)
+    seen = places[8].astype(np.float64) @ np.array(
+        [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    )  # map -> body: inverse turn
+    volume = Retrieval(there, RetrievalConfig()).distances(
+        describe(seen.astype(np.float32), np.zeros(3), config)
+    )
+    station, shift = np.unravel_index(volume["scan_context"].argmin(), volume["scan_context"].shape)
+    assert station == 8
+    assert np.cos(yaw_of_shift(int(shift), S) - yaw) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("mode", ["exhaustive", "ring_key"])
+@pytest.mark.parametrize("k", [1, 5, M + 1])
+def test_the_best_are_those_of_all_distances(stations, query, mode, k):
+    one = Retrieval(stations, RetrievalConfig(mode=mode, candidates=9))
+    found, volumes = one.best(query, k), one.distances(query)
+    for name, volume in volumes.items():
+        nearest = volume.min(axis=1)
+        expected = np.sort(nearest)[: min(k, M)]
+        np.testing.assert_allclose(found[name].distance, expected, atol=1e-6)
+        np.testing.assert_allclose(nearest[found[name].station], expected, atol=1e-6)
+        np.testing.assert_allclose(volume[found[name].station, found[name].shift], expected, atol=1e-6)
+
+
+def test_the_best_without_kernels_are_the_same(stations, query, monkeypatch):
+    expected = Retrieval(stations, RetrievalConfig()).best(query, 4)
+    monkeypatch.setattr(retrieval.kernels, "backend", lambda: "numpy")
+    for name, found in Retrieval(stations, RetrievalConfig()).best(query, 4).items():
+        np.testing.assert_array_equal(found.station, expected[name].station)
+        np.testing.assert_array_equal(found.shift, expected[name].shift)
+        np.testing.assert_allclose(found.distance, expected[name].distance, atol=1e-6)

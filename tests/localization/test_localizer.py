@@ -1,0 +1,341 @@
+"""The engine on a small world: right where it speaks, silent where it cannot know, unharmed by bad frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from small_world import pose_error
+from trackers import garbage
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import RegistrationConfig
+from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.registration import prepare_scan
+from coview_stream.localization.result import State
+from coview_stream.localization.tracking import tracker as tracking
+
+UTM = np.array([512_345.6, 5_403_210.9, 287.4])
+
+
+def follow(localizer, drive, frames=None):
+    some = slice(0, frames)
+    return [
+        localizer.step(cloud, T, 0.5 * k)
+        for k, (cloud, T) in enumerate(zip(drive.clouds[some], drive.T_odom_body[some], strict=True))
+    ]
+
+
+def moved_map(base_map: BaseMap, origin) -> BaseMap:
+    return BaseMap({**base_map._arrays, "origin": np.asarray(origin) + base_map.origin}, base_map.parameters)
+
+
+def test_the_first_fix_and_every_pose_after_it_are_right(world_fixes, world_drive):
+    posed = [k for k, fix in enumerate(world_fixes) if fix.T_map_body is not None]
+    assert posed
+    assert posed[0] <= 5  # 12 m
+    assert posed == list(range(posed[0], len(world_fixes)))
+    for k in posed:
+        metres, degrees = pose_error(world_fixes[k].T_map_body, world_drive.T_map_body[k])
+        assert metres < 0.08, k
+        assert degrees < 0.3, k
+
+
+def test_no_pose_unless_tracking(world_fixes):
+    for fix in world_fixes:
+        known = fix.state is State.TRACKING
+        assert (fix.T_map_body is not None) == known
+        assert (fix.T_map_odom is not None) == known
+        assert (fix.covariance is not None) == known
+        assert known or fix.state in (State.SEARCHING, State.AMBIGUOUS)
+        assert fix.evidence is not None
+
+
+def test_the_first_keyframe_alone_is_not_believed(world_fixes):
+    assert world_fixes[0].T_map_body is None
+    assert world_fixes[0].confidence == 0.0
+
+
+def test_the_correction_explains_the_pose(world_fixes, world_drive):
+    for fix, T_odom_body in zip(world_fixes, world_drive.T_odom_body, strict=True):
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_odom @ T_odom_body, fix.T_map_body, atol=1e-6)
+            R = fix.T_map_body[:3, :3]
+            np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+def test_covariance_is_symmetric_positive_and_ordered(world_fixes):
+    covariance = world_fixes[-1].covariance
+    assert covariance.shape == (6, 6)
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+    sigma = np.sqrt(np.diag(covariance))
+    # metres come first: millimetres to decimetres; then radians: tenths of a degree; map points lie off their surfaces
+    shared = RegistrationConfig()
+    assert (sigma[:2] > shared.shared_position).all()
+    assert sigma[2] > shared.shared_height
+    assert (sigma[:3] < 0.3).all()
+    assert (sigma[3:] < np.radians(1.0)).all()
+    assert (sigma[3:] > shared.shared_yaw).all()
+
+
+def test_confidence_is_a_share(world_fixes):
+    assert all(0.0 <= fix.confidence <= 1.0 for fix in world_fixes)
+    assert world_fixes[-1].confidence > 0.3
+
+
+def test_utm_map_and_utm_odometry_lose_no_millimetre(world_map, world_drive, world_fixes):
+    odometry = small_world.pose_from(small_world.ODOM_FAR[:3, :3], [443_000.4, 5_900_000.8, -60.0])
+    far = world_drive.seen_from(odometry)
+    fixes = follow(Localizer(moved_map(world_map, UTM)), far, 8)
+    posed = 0
+    for here, there, T_odom_body in zip(world_fixes, fixes, far.T_odom_body, strict=False):
+        assert there.state is here.state
+        if here.T_map_body is not None:
+            posed += 1
+            np.testing.assert_allclose(there.T_map_body[:3, 3] - UTM, here.T_map_body[:3, 3], atol=1e-3)
+            np.testing.assert_allclose(there.T_map_body[:3, :3], here.T_map_body[:3, :3], atol=1e-4)
+            np.testing.assert_allclose(there.T_map_odom @ T_odom_body, there.T_map_body, atol=1e-3)
+    assert posed >= 2
+
+
+def test_lost_when_the_world_no_longer_fits(world_map, world_drive):
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, 7)[-1].state is State.TRACKING
+    states = []
+    for k in range(7, 10):
+        fix = localizer.step(garbage(k), world_drive.T_odom_body[k], 0.5 * k)
+        states.append(fix.state)
+        assert (fix.T_map_body is None) == (fix.state is not State.TRACKING)
+    assert states[0] is State.AMBIGUOUS
+    assert states[-1] is State.LOST
+
+
+def test_never_a_pose_outside_the_map(world_map, elsewhere):
+    for fix in follow(Localizer(world_map), elsewhere):
+        assert fix.state in (State.SEARCHING, State.AMBIGUOUS)
+        assert fix.T_map_body is None
+
+
+def test_bad_frames_raise_and_change_nothing(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    cloud, T = world_drive.clouds[0], world_drive.T_odom_body[0]
+    scaled = T.copy()
+    scaled[:3, :3] *= 1.1
+    mirrored = T @ np.diag([1.0, -1.0, 1.0, 1.0])
+    nan_pose = T.copy()
+    nan_pose[0, 3] = np.nan
+    bad = [
+        (cloud[:, :2], T, 0.0, CloudError),
+        (cloud[:9], T, 0.0, CloudError),
+        (np.full((50, 3), np.nan, np.float32), T, 0.0, CloudError),
+        (np.empty((0, 3), np.float32), T, 0.0, CloudError),
+        (cloud, scaled, 0.0, RunError),
+        (cloud, mirrored, 0.0, RunError),
+        (cloud, nan_pose, 0.0, RunError),
+        (cloud, T[:3], 0.0, RunError),
+        (cloud, T, float("nan"), RunError),
+    ]
+    fixes = []
+    for k in range(5):
+        for points, pose, stamp, error in bad:
+            with pytest.raises(error):
+                localizer.step(points, pose, stamp)
+        fixes.append(localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k))
+    for fix, undisturbed in zip(fixes, world_fixes, strict=False):
+        assert fix.state is undisturbed.state
+        if fix.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, undisturbed.T_map_body, atol=1e-9)
+
+
+def test_rows_with_nan_are_dropped(world_map, world_drive):
+    cloud = np.full((len(world_drive.clouds[0]) + 500, 3), np.nan, np.float32)
+    cloud[250:-250] = world_drive.clouds[0]
+    one, other = Localizer(world_map), Localizer(world_map)
+    with_nan = one.step(cloud, world_drive.T_odom_body[0], 0.0)
+    without = other.step(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    assert with_nan.evidence.score == pytest.approx(without.evidence.score)
+
+
+def test_the_callers_arrays_stay_as_they_are(world_map, world_drive):
+    cloud, T = world_drive.clouds[0].copy(), world_drive.T_odom_body[0].copy()
+    Localizer(world_map).step(cloud, T, 0.0)
+    np.testing.assert_array_equal(cloud, world_drive.clouds[0])
+    np.testing.assert_array_equal(T, world_drive.T_odom_body[0])
+
+
+def test_reset_forgets_all_but_the_map(world_map, world_drive, world_fixes):
+    localizer = Localizer(world_map)
+    follow(localizer, world_drive, 2)
+    assert localizer.last_query
+    localizer.reset()
+    assert localizer.state is State.SEARCHING
+    assert not localizer.last_query
+    # another odometry frame after the reset must not matter: the old one is forgotten
+    T_other = pose_from(rot_z(-0.4), [1e5, -2e5, 3.0])
+    again = follow(localizer, world_drive.seen_from(T_other), 6)
+    assert [fix.state for fix in again] == [fix.state for fix in world_fixes[:6]]
+    metres, degrees = pose_error(again[-1].T_map_body, world_drive.T_map_body[5])
+    assert metres < 0.08
+    assert degrees < 0.3
+
+
+@pytest.fixture(scope="module")
+def verdicts(world_map, world_drive):
+    """What the searches of the drive say, up to the one that accepts a place; good for every fresh localizer."""
+    localizer, said = Localizer(world_map), []
+    for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
+        said.append(localizer._search.update(localizer.take(cloud, T, 0.5 * k)))
+        if said[-1].accepted is not None:
+            return said
+        localizer.adopt(said[-1])
+    raise AssertionError("no place was accepted")
+
+
+def searched(world_map, drive, verdicts):
+    """A localizer that has taken every frame up to the decisive one; its verdict is not adopted yet."""
+    localizer = Localizer(world_map)
+    for k, verdict in enumerate(verdicts):
+        localizer.take(drive.clouds[k], drive.T_odom_body[k], 0.5 * k)
+        if verdict.accepted is None:
+            localizer.adopt(verdict)
+    return localizer, verdicts[-1], len(verdicts) - 1
+
+
+def test_take_and_adopt_are_a_step(world_map, world_drive, world_fixes, verdicts):
+    localizer = Localizer(world_map)
+    for k, reference in enumerate(world_fixes[:7]):
+        query = localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        assert (query is not None) == (k < len(verdicts))  # tracking asks for nothing
+        if query is not None:
+            localizer.adopt(verdicts[k])
+        fix = localizer.fix()
+        assert fix.state is reference.state
+        assert fix.evidence == reference.evidence
+        if reference.T_map_body is not None:
+            np.testing.assert_allclose(fix.T_map_body, reference.T_map_body, atol=1e-9)
+            np.testing.assert_allclose(fix.covariance, reference.covariance, atol=1e-12)
+
+
+def test_no_fix_before_the_first_frame(world_map):
+    with pytest.raises(RuntimeError, match="no frame"):
+        Localizer(world_map).fix()
+
+
+def test_a_verdict_of_another_life_is_ignored(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.reset()
+    localizer.adopt(verdict)  # before any frame
+    localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    localizer.adopt(verdict)
+    assert localizer.state is State.SEARCHING
+    assert localizer.fix().T_map_body is None
+    assert localizer.fix().evidence is None
+
+
+def test_a_verdict_from_before_a_loss_is_ignored(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.adopt(verdict)
+    for n in range(1, 4):
+        localizer.take(garbage(n), world_drive.T_odom_body[k + n], 0.5 * (k + n))
+    assert localizer.state is State.LOST
+    localizer.adopt(verdict)
+    assert localizer.state is State.LOST
+    assert localizer.fix().T_map_body is None
+
+
+def test_a_verdict_while_tracking_is_ignored(world_map, world_drive, verdicts):
+    localizer, verdict, _ = searched(world_map, world_drive, verdicts)
+    localizer.adopt(verdict)
+    before = localizer.fix()
+    localizer.adopt(verdict)
+    np.testing.assert_array_equal(localizer.fix().T_map_body, before.T_map_body)
+    np.testing.assert_array_equal(localizer.fix().covariance, before.covariance)
+
+
+def test_a_late_verdict_is_right_where_the_robot_is_now(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    for n in (k + 1, k + 2):
+        localizer.take(world_drive.clouds[n], world_drive.T_odom_body[n], 0.5 * n)
+    assert localizer.fix().T_map_body is None
+    localizer.adopt(verdict)
+    fix = localizer.fix()
+    assert fix.state is State.TRACKING
+    metres, degrees = pose_error(fix.T_map_body, world_drive.T_map_body[k + 2])
+    assert metres < 0.08
+    assert degrees < 0.3
+
+
+def test_a_late_verdict_that_the_newest_frame_does_not_fit_gives_no_pose(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    for n in (k + 1, k + 2):
+        localizer.take(garbage(n), world_drive.T_odom_body[n], 0.5 * n)
+    localizer.adopt(verdict)
+    fix = localizer.fix()
+    assert fix.state is State.AMBIGUOUS
+    assert fix.T_map_body is None
+    # and what follows decides
+    localizer.take(world_drive.clouds[k + 3], world_drive.T_odom_body[k + 3], 0.5 * (k + 3))
+    assert localizer.fix().state is State.TRACKING
+
+
+def test_suspicion_takes_the_pose_until_a_frame_has_verified_it(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.adopt(verdict)
+    assert localizer.fix().state is State.TRACKING
+    localizer.suspect()
+    assert localizer.fix().state is State.AMBIGUOUS
+    assert localizer.fix().T_map_body is None
+    # the robot stands still: nothing is due, and yet it is verified
+    fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
+    assert fix.state is State.TRACKING
+    assert fix.evidence.stamp == 0.5 * k + 0.1
+    assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
+
+
+def test_what_was_found_before_a_suspicion_waits_for_a_frame_after_it(world_map, world_drive, verdicts):
+    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+    localizer.suspect()
+    localizer.adopt(verdict)
+    assert localizer.fix().T_map_body is None
+    fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
+    assert fix.state is State.TRACKING
+
+
+def test_a_frame_is_thinned_once_and_kept_apart_from_the_callers_array(world_map, world_drive, monkeypatch):
+    """A driver may reuse its array for the next frame; adopting a verdict later still looks at the newest one."""
+    monkeypatch.setattr(tracking, "thinned", None)
+    localizer = Localizer(world_map)
+    array = world_drive.clouds[0].copy()
+    localizer.take(array, world_drive.T_odom_body[0], 0.0)
+    array[:] = 0.0
+    np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
+    T = pose_from(world_drive.T_odom_body[0][:3, :3], np.zeros(3))
+    made = prepare_scan.voxelized(world_drive.clouds[0], T, localizer.config.keyframe)
+    np.testing.assert_allclose(localizer._tracker._recent.window(), made, atol=1e-6)
+
+
+def standing(localizer, cloud, T_odom_body, seconds, start):
+    """Fixes at 10 Hz while odometry stands still."""
+    return [localizer.step(cloud, T_odom_body, start + 0.1 * k) for k in range(round(10 * seconds))]
+
+
+def tracking_localizer(world_map, world_drive, frames=6):
+    localizer = Localizer(world_map)
+    for k in range(frames):
+        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    assert fix.state is State.TRACKING
+    return localizer, 0.5 * frames
+
+
+def test_a_robot_that_stands_still_stays_found_and_grows_no_surer(world_map, world_drive):
+    localizer, now = tracking_localizer(world_map, world_drive)
+    fixes = standing(localizer, world_drive.clouds[5], world_drive.T_odom_body[5], 20.0, now)
+    assert all(fix.state is State.TRACKING for fix in fixes)
+    metres, degrees = small_world.pose_error(fixes[-1].T_map_body, world_drive.T_map_body[5])
+    assert metres < 0.05
+    assert degrees < 0.3
+    early, late = (np.sqrt(np.diag(fixes[k].covariance))[:2].max() for k in (20, -1))
+    assert late > 0.8 * early

@@ -1,0 +1,253 @@
+"""Doubt and loss: the pose is gone with the first frame that does not fit, and comes back where it is right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from small_world import pose_error
+from trackers import garbage
+
+from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.result import State
+from coview_stream.localization.tracking.monitor import Cause
+
+RULE = AcceptanceConfig()
+
+
+def follow(localizer, drive, frames, start=0.0):
+    return [localizer.step(drive.clouds[k], drive.T_odom_body[k], start + 0.5 * k) for k in frames]
+
+
+@pytest.fixture
+def found(world_map, world_drive):
+    """A localizer that tracks, after the drive's first five frames."""
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, range(5))[-1].state is State.TRACKING
+    return localizer
+
+
+def right(fix, truth, metres=0.08):
+    return fix.T_map_body is not None and pose_error(fix.T_map_body, truth)[0] < metres
+
+
+def carried(drive, frm, to):
+    """The drive's odometry after the robot was put from one frame's place to another's: it felt nothing."""
+    return drive.seen_from(drive.T_odom_body[frm] @ inverse(drive.T_map_body[to]))
+
+
+# ---- doubt
+
+
+def test_while_the_newest_registration_is_doubtful_there_is_no_pose(found, world_drive):
+    doubtful = found.step(garbage(), world_drive.T_odom_body[5], 2.5)
+    assert doubtful.state is State.AMBIGUOUS
+    assert doubtful.T_map_body is None
+    assert doubtful.T_map_odom is None
+    assert doubtful.covariance is None
+    assert doubtful.drift is None
+    assert doubtful.confidence == 0.0
+    assert doubtful.evidence.score < RULE.keep_score
+    assert doubtful.evidence.cause in (Cause.GROUND, Cause.FITNESS, Cause.FREE_SPACE)
+    known = found.step(world_drive.clouds[6], world_drive.T_odom_body[6], 3.0)
+    assert known.state is State.TRACKING
+    assert right(known, world_drive.T_map_body[6])
+
+
+def test_doubt_is_looked_into_without_driving_on(found, world_drive):
+    """A covered sensor takes the pose away at once; uncovered again it is back at once, and nothing was lost."""
+    covered = [found.step(garbage(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
+    assert [fix.state for fix in covered] == [State.AMBIGUOUS] * 6
+    assert [fix.T_map_body for fix in covered] == [None] * 6
+    assert covered[-1].evidence.stamp == 8.0
+    again = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 9.0)
+    assert again.state is State.TRACKING
+    assert right(again, world_drive.T_map_body[5])
+
+
+def test_what_a_registration_says_is_told(found, world_drive):
+    fix = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 2.5)
+    assert fix.evidence.cause is Cause.VERIFIED
+    assert fix.evidence.reason == "verified"
+    assert 0.0 < fix.evidence.innovation < RULE.keep_innovation
+    assert fix.evidence.stamp == 2.5
+    assert fix.drift is not None
+    doubtful = found.step(garbage(), world_drive.T_odom_body[6], 3.0)
+    assert doubtful.evidence.cause is not Cause.VERIFIED
+    assert doubtful.evidence.reason != "verified"
+
+
+def test_a_search_has_no_cause_and_no_innovation(world_fixes):
+    assert world_fixes[0].evidence.cause is None
+    assert world_fixes[0].evidence.innovation is None
+
+
+# ---- carried to another place
+
+
+def test_after_a_loss_the_search_starts_from_nothing(found, world_drive):
+    """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
+    anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
+    lost = follow(found, anew, range(RULE.patience), 2.5)
+    assert [fix.T_map_body for fix in lost] == [None] * RULE.patience
+    assert lost[-1].state is State.LOST
+    again = follow(found, anew, range(RULE.patience, RULE.patience + RULE.confirmations), 2.5)
+    assert [fix.state for fix in again] == [State.LOST] * (RULE.confirmations - 1) + [State.TRACKING]
+    assert min(fix.evidence.score for fix in again) > 0.9
+    assert right(again[-1], anew.T_map_body[RULE.patience + RULE.confirmations - 1])
+
+
+def found_frame(drive):
+    """odometry <- map of a drive."""
+    return drive.T_odom_body[0] @ inverse(drive.T_map_body[0])
+
+
+def test_odometry_that_starts_anew_far_away_is_lost_and_found(found, world_drive):
+    """There is no map there, which might be the map's edge: patience decides."""
+    anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
+    fixes = [found.step(anew.clouds[0], anew.T_odom_body[0], 3.0 + k) for k in range(12)]
+    assert all(fix.T_map_body is None for fix in fixes)
+    assert fixes[0].evidence.cause is Cause.OFF_MAP
+    states = [fix.state for fix in fixes]
+    assert states.index(State.LOST) == round(RULE.patience_seconds)
+    again = follow(found, anew, range(1, 5), 15.0)
+    assert again[-1].state is State.TRACKING
+    assert right(again[-1], anew.T_map_body[4])
+
+
+@pytest.mark.parametrize("to", [0, 1])
+def test_carried_between_two_frames_there_is_no_wrong_pose_at_all(world_map, world_drive, to):
+    """Odometry says that it stands; the very first frame of the other place takes the pose away."""
+    localizer = Localizer(world_map)
+    assert follow(localizer, world_drive, range(9))[-1].state is State.TRACKING
+    drive = carried(world_drive, 8, to)
+    stood = [localizer.step(drive.clouds[to], drive.T_odom_body[to], 4.1 + 0.1 * k) for k in range(5)]
+    went = follow(localizer, drive, range(to + 1, 10), 5.0)
+    fixes = stood + went
+    truths = [drive.T_map_body[to]] * 5 + drive.T_map_body[to + 1 :]
+    assert all(fix.T_map_body is None for fix in stood)
+    for fix, truth in zip(fixes, truths, strict=True):
+        assert fix.T_map_body is None or right(fix, truth)
+    lost = [fix for fix in fixes if fix.state is State.LOST]
+    assert lost
+    assert f"{RULE.patience} registrations rejected" in lost[0].evidence.reason
+    assert lost[0].evidence.cause in (Cause.FITNESS, Cause.FREE_SPACE, Cause.GROUND)
+    assert went[-1].state is State.TRACKING
+
+
+def test_carried_while_odometry_hangs_it_is_found_out(found, world_drive):
+    elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
+    fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
+    assert all(fix.T_map_body is None for fix in fixes)
+    assert fixes[5].state is State.AMBIGUOUS
+    assert fixes[-1].state is State.LOST
+
+
+# ---- carried with open eyes
+
+
+@pytest.mark.parametrize("begin", [12, 20])
+def test_wheels_stand_while_the_robot_moves_and_no_pose_is_far_off(world_map, slow_drive, begin):
+    """A ferry, a lift truck, ice: 0.2 m at every frame, of which odometry feels nothing."""
+    localizer = Localizer(world_map)
+    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
+    known = [localizer.step(clouds[k], slow_drive.T_odom_body[k], 0.1 * k) for k in range(begin)]
+    while known[-1].state is not State.TRACKING:
+        begin += 1
+        known.append(localizer.step(clouds[begin - 1], slow_drive.T_odom_body[begin - 1], 0.1 * begin))
+    fixes = [
+        localizer.step(clouds[k], slow_drive.T_odom_body[begin - 1], 0.1 * k + 0.1)
+        for k in range(begin, len(clouds))
+    ]
+    assert len(fixes) > 8
+    for fix, T in zip(fixes, truth[begin:], strict=True):
+        assert fix.T_map_body is None or pose_error(fix.T_map_body, T)[0] < 0.3
+    assert any(fix.evidence.cause is Cause.ODOMETRY for fix in fixes)
+    assert fixes[-1].T_map_body is None
+    # it is set down: the lidar has followed it all the way
+    still = localizer.step(clouds[-1], slow_drive.T_odom_body[begin - 1], 0.1 * len(clouds) + 0.1)
+    assert still.state is State.TRACKING
+    assert right(still, truth[-1], 0.05)
+
+
+# ---- covered, and beyond the edge
+
+
+def covered(seed):
+    """A sack over the sensor: a few returns from within it."""
+    return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
+
+
+def test_a_covered_sensor_costs_the_pose_and_in_the_end_the_place_which_is_found_again(found, world_drive):
+    """As soon as any place could be: the first keyframe that sees anything counts already."""
+    seconds = np.arange(2.5, 2.5 + RULE.patience_blind + 2.0, 1.0)
+    fixes = [found.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
+    assert all(fix.T_map_body is None for fix in fixes)
+    assert fixes[0].evidence.cause is Cause.BLIND
+    blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.patience_blind]
+    assert {fix.state for fix in blind} == {State.AMBIGUOUS}
+    assert fixes[-1].state is State.LOST
+    again = follow(found, world_drive, range(6, 10), 100.0)
+    posed = [k for k, fix in enumerate(again) if fix.T_map_body is not None]
+    assert posed[0] == RULE.confirmations - 1
+    for k in posed:
+        assert right(again[k], world_drive.T_map_body[6 + k])
+
+
+def test_after_a_short_cover_the_pose_is_back_at_once_and_after_a_long_one_with_proof(world_map, world_drive):
+    """Meanwhile it may have been carried: one frame could fit by chance."""
+    waits = []
+    for seconds in (0.5 * RULE.patience_seconds, 2.0 * RULE.patience_seconds):
+        localizer = Localizer(world_map)
+        follow(localizer, world_drive, range(5))
+        for t in np.arange(2.5, 2.5 + seconds, 0.5):
+            assert localizer.step(covered(1), world_drive.T_odom_body[5], t).T_map_body is None
+        after = follow(localizer, world_drive, range(5, 10), float(seconds))
+        assert State.LOST not in {fix.state for fix in after}
+        posed = [k for k, fix in enumerate(after) if fix.T_map_body is not None]
+        assert all(right(after[k], world_drive.T_map_body[5 + k]) for k in posed)
+        waits.append(posed[0])
+    assert waits == [0, RULE.confirmations - 1]
+
+
+def test_driving_on_with_a_covered_sensor_is_no_tracking(found, world_drive):
+    """What was seen before is no evidence of where the robot is now."""
+    first = found.step(covered(0), world_drive.T_odom_body[5], 2.5)
+    assert first.state is State.AMBIGUOUS
+    assert first.evidence.cause is Cause.BLIND
+    assert found.step(covered(1), world_drive.T_odom_body[6], 3.0).T_map_body is None
+    known = found.step(world_drive.clouds[7], world_drive.T_odom_body[7], 3.5)
+    assert right(known, world_drive.T_map_body[7])
+
+
+def test_beyond_the_edge_of_the_map_there_is_no_pose_and_back_on_it_there_is(world_map, scene):
+    """Straight over the edge and back again; no pose is wrong, and none is given where there is no map."""
+    way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (-14.0, 90.0)]
+    out = small_world.record_along(scene, way, 2.6)
+    localizer, fixes = Localizer(world_map), []
+    frames = [*range(len(out.clouds)), *reversed(range(len(out.clouds)))]
+    for n, k in enumerate(frames):
+        fixes.append(localizer.step(out.clouds[k], out.T_odom_body[k], 0.5 * n))
+    for fix, k in zip(fixes, frames, strict=True):
+        assert fix.T_map_body is None or right(fix, out.T_map_body[k], 0.15)
+        if out.T_map_body[k][0, 3] > small_world.HALF + 25.0:
+            assert fix.T_map_body is None
+    assert any(fix.evidence.cause is Cause.OFF_MAP for fix in fixes)
+    assert any(fix.state is State.LOST for fix in fixes)
+    assert fixes[-1].state is State.TRACKING
+
+
+def test_after_a_pause_the_first_frame_decides(world_map, world_drive):
+    """What came before the pause is no doubt that has lasted: one good frame is enough, one bad one is not too much."""
+    for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.AMBIGUOUS)):
+        localizer = Localizer(world_map)
+        for k in range(5):
+            fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        assert fix.state is State.TRACKING
+        localizer.suspect()
+        fix = localizer.step(cloud, world_drive.T_odom_body[5], 60.0)
+        assert fix.state is expected
+        assert fix.evidence.state is expected
+        assert fix.evidence.cause is not None

@@ -1,0 +1,143 @@
+"""Offline localization: what is written is what the localizer said, and damaged frames are skipped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import small_world
+from small_world import pose_error
+
+from coview_stream.clouds.files import write_cloud
+from coview_stream.clouds.trajectory import read_tum
+from coview_stream.config import AcceptanceConfig, LocalizerConfig
+from coview_stream.errors import InputError
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.localization.offline import Located, locate, summary, write
+from coview_stream.localization.result import Fix, State
+from coview_stream.recordings.open_run import open_run
+
+
+@pytest.fixture(scope="module")
+def located(world_map, world_run):
+    calls = []
+    found = locate(world_map, open_run(world_run), progress=lambda *call: calls.append(call))
+    assert [(done, total) for done, total, _ in calls] == [(k + 1, 7) for k in range(7)]
+    return found
+
+
+def test_every_frame_is_answered_and_the_answers_are_right(located, world_drive, world_fixes):
+    assert located.frames == len(located.fixes) == len(located.seconds) == 7
+    assert not located.skipped
+    assert [f.state for f in located.fixes] == [f.state for f in world_fixes[:7]]
+    assert located.state is State.TRACKING
+    assert located.posed
+    assert located.first is located.posed[0]
+    for fix in located.posed:
+        k = round((fix.stamp - 100.0) / 0.5)
+        assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
+
+
+def test_the_evidence_of_every_keyframe_is_kept_once(located):
+    stamps = [e.stamp for e in located.keyframes]
+    assert stamps == sorted(set(stamps))
+    assert located.winner.state is State.TRACKING
+    assert located.winner.station is not None
+    assert located.query
+
+
+def test_what_is_written_is_what_was_said(located, world_map, tmp_path):
+    write(located, world_map, tmp_path / "deep" / "out", pictures=False)
+    out = tmp_path / "deep" / "out"
+    assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
+    stamps, poses = read_tum(out / "trajectory.tum")
+    np.testing.assert_allclose(stamps, [f.stamp for f in located.posed])
+    np.testing.assert_allclose(poses, [f.T_map_body for f in located.posed], atol=1e-5)
+    result = json.loads((out / "result.json").read_text())
+    assert result["state"] == "TRACKING"
+    assert result["first_fix_stamp"] == located.first.stamp
+    np.testing.assert_allclose(result["T_map_odom"], located.posed[-1].T_map_odom)
+    assert (result["frames"], result["posed"]) == (7, len(located.posed))
+    timings = result["timings_s"]
+    assert 0 < timings["p50"] <= timings["p95"] <= timings["p99"]
+    assert len(result["keyframes"]) == len(located.keyframes)
+    assert {"stamp", "state", "reason", "score", "rival", "station", "shift"} <= set(result["keyframes"][0])
+    assert all(0 <= k["score"] <= 1 for k in result["keyframes"])
+
+
+def test_the_pictures(located, world_map, tmp_path):
+    write(located, world_map, tmp_path)
+    for name in ("trajectory.png", "descriptors.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_summary_says_state_place_and_time(located):
+    text = summary(located)
+    assert "TRACKING" in text
+    assert f"{len(located.posed)} of 7 frames" in text
+    assert "step time" in text
+    nothing = Located(3, [Fix(0.0, State.SEARCHING)], skipped=["000001.ply: empty"])
+    assert "0 of 3 frames" in summary(nothing)
+    assert "000001.ply: empty" in summary(nothing)
+
+
+def test_damaged_frames_are_skipped_and_named(world_map, world_run, world_drive, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(world_run, run)
+    (run / "frames" / "000000.ply").write_bytes(b"nonsense")
+    write_cloud(run / "frames" / "000002.ply", world_drive.clouds[2][:5])
+    found = locate(world_map, open_run(run))
+    assert len(found.fixes) == 5
+    assert [text for text in found.skipped if "000000.ply" in text]
+    assert len(found.skipped) == 2
+    for fix in found.posed:
+        k = round((fix.stamp - 100.0) / 0.5)
+        assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
+
+
+def test_a_skipped_frame_is_named_by_its_file(world_map, world_drive, tmp_path):
+    run = small_world.write_run(tmp_path / "run", world_drive, 3)
+    write_cloud(run / "frames" / "000001.ply", world_drive.clouds[1][:5])
+    calls = []
+    found = locate(world_map, open_run(run), progress=lambda *call: calls.append(call))
+    assert len(found.skipped) == 1
+    assert "000001.ply" in found.skipped[0]
+    assert [(done, total) for done, total, _ in calls] == [(1, 3), (2, 3), (3, 3)]
+    assert calls[1][2] is None
+
+
+def test_a_run_without_one_usable_frame_is_an_error(world_map, world_drive, tmp_path):
+    run = small_world.write_run(tmp_path / "run", world_drive, 3)
+    for path in (run / "frames").iterdir():
+        path.write_bytes(b"nonsense")
+    with pytest.raises(InputError, match=r"not one of 3 frames.*000000\.ply"):
+        locate(world_map, open_run(run))
+
+
+def test_a_single_scan_takes_the_stationary_path(world_map, world_drive, tmp_path):
+    """One frame may be enough for a fix, but only there; a scan stored far from its zero keeps its own frame."""
+    away = np.array([30_000.0, -20_000.0, 100.0])
+    write_cloud(tmp_path / "scan.ply", world_drive.clouds[3].astype(np.float64), away)
+    easy = LocalizerConfig(acceptance=AcceptanceConfig(single_score=0.3, single_lead=0.05))
+    found = locate(world_map, open_run(tmp_path / "scan.ply"), easy)
+    (fix,) = found.fixes
+    assert fix.state is State.TRACKING
+    truth = world_drive.T_map_body[3] @ pose_from(np.eye(3), -away)
+    seen = np.array([*away, 1.0])
+    # the file's own coordinates of the sensor lead to where the sensor stood
+    np.testing.assert_allclose((fix.T_map_body @ seen)[:3], (truth @ seen)[:3], atol=0.1)
+
+
+def test_results_that_cannot_be_written_are_an_error(located, world_map, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write the results"):
+        write(located, world_map, tmp_path / "file" / "out", pictures=False)
+
+
+def test_pictures_of_an_earlier_run_do_not_stay(located, world_map, tmp_path):
+    write(located, world_map, tmp_path)
+    write(located, world_map, tmp_path, pictures=False)
+    assert not (tmp_path / "trajectory.png").exists()
+    assert not (tmp_path / "descriptors.png").exists()

@@ -1,0 +1,46 @@
+"""What the localizer says, as plain data and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from coview_stream.localization.result import KeyframeEvidence, State
+from coview_stream.localization.tracking.monitor import Cause
+
+
+@pytest.mark.parametrize("cause", [None, *Cause])
+def test_evidence_is_read_back_as_it_was_written(world_fixes, cause):
+    known = world_fixes[-1].evidence
+    rounded = replace(
+        known,
+        score=round(known.score, 4),
+        evidence=replace(known.evidence, **{k: round(v, 4) for k, v in vars(known.evidence).items()}),
+        cause=cause,
+        innovation=None if cause is None else 12.25,
+    )
+    assert KeyframeEvidence.from_json(json.loads(json.dumps(rounded.to_json()))) == rounded
+    blind = KeyframeEvidence(1.5, State.TRACKING, "only 3 points to register", cause=cause)
+    assert KeyframeEvidence.from_json(json.loads(json.dumps(blind.to_json()))) == blind
+
+
+def test_evidence_of_an_earlier_version_can_be_read(world_fixes):
+    """Results were written before there were causes, and without the shares where nothing had been registered."""
+    data = world_fixes[0].evidence.to_json()
+    del data["cause"], data["innovation"]
+    assert KeyframeEvidence.from_json(data).cause is None
+    blind = KeyframeEvidence(1.5, State.TRACKING, "only 3 points to register", cause=Cause.BLIND)
+    short = {key: value for key, value in blind.to_json().items() if value is not None}
+    assert "near" not in short
+    assert KeyframeEvidence.from_json(short | {"station": None, "shift": None}) == blind
+
+
+def test_evidence_has_the_same_keys_whatever_is_known(world_fixes):
+    known = world_fixes[-1].evidence.to_json()
+    blind = KeyframeEvidence(1.5, State.SEARCHING, "too few points").to_json()
+    assert list(blind) == list(known)
+    shares = ("near", "covered", "ground", "free_space", "inside")
+    assert [blind[name] for name in shares] == [None] * 5
+    assert all(0.0 <= known[name] <= 1.0 for name in shares)

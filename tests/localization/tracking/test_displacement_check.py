@@ -1,0 +1,159 @@
+"""The glance: a frame that lies on the map much less than the ones before it asks for a registration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from courtyard import courtyard, local_map
+from small_world import boxes, scan
+
+from coview_stream.geometry.se3 import shifted
+from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
+from coview_stream.localization.tracking import displacement_check as module
+from coview_stream.localization.tracking.displacement_check import Glance, share_on_map
+
+T_MAP_ODOM = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])
+ELSEWHERE = shifted(T_MAP_ODOM, np.array([0.0, 0.0, 1.0, 4.3, -3.7, 0.0]))
+HERE = np.array([0.0, 0.0, 1.7])
+
+
+@pytest.fixture(scope="module")
+def target() -> LocalMap:
+    return local_map(*courtyard())
+
+
+def yard(seed=0, noise=0.02):
+    """A frame of the courtyard in the odometry frame."""
+    points, rng = courtyard()[0], np.random.default_rng(seed)
+    some = points[rng.permutation(len(points))[:4000]] + rng.normal(0.0, noise, (4000, 3))
+    return transform(np.linalg.inv(T_MAP_ODOM), some).astype(np.float32)
+
+
+def shares(target, T, count=5):
+    return [share_on_map(yard(seed), HERE, T, target) for seed in range(count)]
+
+
+def test_what_is_where_the_map_has_it_counts(target):
+    assert min(shares(target, T_MAP_ODOM)) > 0.98
+
+
+def test_the_further_off_the_less_of_it(target):
+    off = [
+        np.mean(shares(target, shifted(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0]))))
+        for x in (0.0, 0.6, 5.3)
+    ]
+    assert off[0] > 1.2 * off[1]
+    assert off[1] > off[2]
+    assert off[2] < 0.5
+
+
+def test_the_ground_and_what_lies_beyond_reach_do_not_count(target):
+    """Both are as one likes; the points between are where the map has them."""
+    frame = yard()
+    height = transform(T_MAP_ODOM, frame)[:, 2]
+    ground = frame[height < 0.1] + np.float32([0.0, 0.0, 0.3])
+    far = frame[height > 1.5] + np.float32([200.0, 0.0, 0.0])
+    mixed = np.concatenate([frame[height > 1.5], ground, far])
+    assert share_on_map(mixed, HERE, T_MAP_ODOM, target) > 0.98
+
+
+def test_a_handful_of_points_says_nothing(target):
+    frame = yard()
+    assert share_on_map(frame[:0], HERE, T_MAP_ODOM, target) is None
+    assert share_on_map(frame[:50], HERE, T_MAP_ODOM, target) is None
+    flat = frame[transform(T_MAP_ODOM, frame)[:, 2] < 0.1]
+    assert len(flat) > 500
+    assert share_on_map(flat, HERE, T_MAP_ODOM, target) is None
+    glance = used_to(target)
+    usual = glance.usual
+    glance.learn(flat, HERE, T_MAP_ODOM, target)
+    assert glance.usual == usual
+    assert not glance.alarming(flat, HERE, ELSEWHERE, target)
+
+
+def used_to(target, frames=5):
+    """A glance that has seen the yard a few times."""
+    glance = Glance()
+    for k in range(frames):
+        glance.learn(yard(100 + k), HERE, T_MAP_ODOM, target)
+    return glance
+
+
+def test_a_frame_that_is_elsewhere_alarms_and_teaches_nothing(target):
+    glance = used_to(target)
+    usual = glance.usual
+    assert not any(glance.alarming(yard(k), HERE, T_MAP_ODOM, target) for k in range(5))
+    assert all(glance.alarming(yard(k), HERE, ELSEWHERE, target) for k in range(5, 30))
+    assert glance.usual == usual
+    assert not glance.alarming(yard(40), HERE, T_MAP_ODOM, target)
+
+
+def test_where_nothing_has_been_learnt_there_is_nothing_to_compare_with(target):
+    glance = Glance()
+    assert not glance.alarming(yard(), HERE, ELSEWHERE, target)
+    assert glance.usual is None
+
+
+def cluttered(share, seed):
+    """A frame a share of which is not on the map: parked cars, people, leaves."""
+    frame, rng = yard(seed), np.random.default_rng(seed)
+    height = transform(T_MAP_ODOM, frame)[:, 2]
+    stray = (rng.random(len(frame)) < share) & (height > 0.5)
+    frame[stray] = rng.uniform([-12.0, -12.0, 8.0], [12.0, 12.0, 20.0], (int(stray.sum()), 3))
+    return frame
+
+
+def test_what_changes_slowly_becomes_usual_and_what_changes_at_once_alarms(target):
+    glance, alarms = Glance(), []
+    for k, share in enumerate(np.linspace(0.0, 0.6, 40)):
+        frame = cluttered(share, k)
+        alarms.append(glance.alarming(frame, HERE, T_MAP_ODOM, target))
+        glance.learn(frame, HERE, T_MAP_ODOM, target)
+    assert not any(alarms)
+    assert glance.usual < 0.6
+    assert used_to(target).alarming(cluttered(0.6, 9), HERE, T_MAP_ODOM, target)
+
+
+def test_one_frame_that_fits_badly_does_not_become_usual(target):
+    """The registration may have been believed by a hair."""
+    glance = used_to(target)
+    before = glance.usual
+    glance.learn(cluttered(0.6, 1), HERE, T_MAP_ODOM, target)
+    assert before - 0.3 < glance.usual < before
+    assert glance.alarming(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
+
+
+def test_what_was_usual_can_be_forgotten(target):
+    glance = used_to(target)
+    glance.clear()
+    assert glance.usual is None
+    assert not glance.alarming(yard(), HERE, ELSEWHERE, target)
+
+
+def test_a_frame_of_another_world_alarms_on_a_real_scan(world_map, world_drive, scene):
+    T, cloud = world_drive.T_map_body[4], world_drive.clouds[4]
+    around = LocalMaps(world_map, 50.0).around(T[:3, 3])
+    glance, other = Glance(), scan(boxes(seed=77), T)
+
+    def arguments(cloud):
+        level = transform(pose_from(T[:3, :3], np.zeros(3)), cloud).astype(np.float32)
+        return level, np.zeros(3), pose_from(np.eye(3), T[:3, 3]), around
+
+    glance.learn(*arguments(cloud))
+    assert glance.usual > 0.9
+    assert glance.alarming(*arguments(other))
+    assert not glance.alarming(*arguments(scan(scene, T, 5)))
+
+
+def test_few_points_are_looked_at(target, monkeypatch):
+    """It has half a millisecond at every frame, whatever the lidar."""
+    asked = []
+    inner = module.kernels.nearest
+    monkeypatch.setattr(
+        module.kernels,
+        "nearest",
+        lambda grid, points, reach: asked.append(len(points)) or inner(grid, points, reach),
+    )
+    share_on_map(np.concatenate([yard(k) for k in range(10)]), HERE, T_MAP_ODOM, target)
+    assert asked == [module._POINTS]

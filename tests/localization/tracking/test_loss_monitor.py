@@ -1,0 +1,139 @@
+"""Doubt: one registration begins it, one clears it; driving on or time makes it too much; a long one wants proof."""
+
+from __future__ import annotations
+
+import pytest
+
+from coview_stream.config import AcceptanceConfig, TrackingConfig
+from coview_stream.localization.tracking.monitor import Cause, Doubt, Judgement
+
+RULE = AcceptanceConfig(patience=3, patience_seconds=10.0, patience_blind=60.0, confirmations=3)
+GOOD = Judgement(Cause.VERIFIED, "verified")
+BAD = Judgement(Cause.FITNESS, "nothing fits")
+AGAINST = [Cause.FITNESS, Cause.GROUND, Cause.FREE_SPACE, Cause.TILT, Cause.OFF_MAP]
+
+
+@pytest.fixture
+def doubt():
+    return Doubt(RULE, TrackingConfig(distance=2.0, seconds=5.0))
+
+
+def test_at_first_there_is_none(doubt):
+    assert not doubt.active
+    assert not doubt.hopeless
+    assert doubt.note(GOOD, 0.0, 0.0) == "verified"
+    assert not doubt.active
+
+
+@pytest.mark.parametrize("cause", [cause for cause in Cause if cause is not Cause.VERIFIED])
+def test_one_registration_begins_it_and_one_clears_it(doubt, cause):
+    assert doubt.note(Judgement(cause, "why"), 1.0, 0.0) == "why"
+    assert doubt.active
+    assert not doubt.hopeless
+    assert doubt.note(GOOD, 2.0, 0.0) == "verified"
+    assert not doubt.active
+
+
+@pytest.mark.parametrize("cause", AGAINST)
+def test_driving_on_with_what_does_not_fit_is_too_much(doubt, cause):
+    against = Judgement(cause, "why")
+    for metres in (0.0, 1.9, 2.0, 3.9):
+        doubt.note(against, 0.1 * metres, metres)
+        assert not doubt.hopeless
+    assert doubt.note(against, 0.5, 4.0) == "3 registrations rejected: why"
+    assert doubt.hopeless
+
+
+@pytest.mark.parametrize("cause", [Cause.BLIND, Cause.ODOMETRY])
+def test_driving_on_adds_nothing_where_nothing_speaks_against_the_place(doubt, cause):
+    for k in range(9):
+        doubt.note(Judgement(cause, "why"), 1.0 * k, 5.0 * k)
+    assert doubt.active
+    assert not doubt.hopeless
+    # and what does speak against it is counted from nothing
+    for k in range(2):
+        assert doubt.note(BAD, 9.0, 50.0 + 5.0 * k) == "nothing fits"
+        assert not doubt.hopeless
+    assert doubt.note(BAD, 9.0, 60.0) == "3 registrations rejected: nothing fits"
+
+
+def test_a_good_one_between_starts_the_count_anew(doubt):
+    for k in range(20):
+        doubt.note(GOOD if k % 3 == 2 else BAD, 0.1 * k, 5.0 * k)
+        assert not doubt.hopeless
+
+
+@pytest.mark.parametrize(
+    ("cause", "longest"), [(Cause.FITNESS, 10.0), (Cause.ODOMETRY, 10.0), (Cause.BLIND, 60.0)]
+)
+def test_standing_still_time_is_too_much(doubt, cause, longest):
+    judgement = Judgement(cause, "why")
+    doubt.note(judgement, 100.0, 7.0)
+    doubt.note(judgement, 100.0 + longest - 0.1, 7.0)
+    assert not doubt.hopeless
+    assert doubt.note(judgement, 100.0 + longest, 7.0) == f"in doubt for {longest:.0f} s: why"
+    assert doubt.hopeless
+
+
+def test_a_suspicion_is_a_doubt_that_lasts_from_the_next_registration_on(doubt):
+    doubt.begin()
+    assert doubt.active
+    doubt.note(BAD, 1000.0, 0.0)
+    doubt.begin()
+    assert not doubt.hopeless
+    doubt.note(BAD, 1010.0, 0.0)
+    assert doubt.hopeless
+    doubt.clear()
+    assert not doubt.active
+    assert not doubt.hopeless
+
+
+def test_a_suspicion_is_cleared_by_the_first_registration(doubt):
+    doubt.begin()
+    assert doubt.note(GOOD, 5000.0, 0.0) == "verified"
+    assert not doubt.active
+
+
+def blinded(doubt, seconds):
+    for k in range(round(seconds) + 1):
+        doubt.note(Judgement(Cause.BLIND, "covered"), float(k), 0.0)
+
+
+def test_after_a_long_one_a_single_registration_is_not_enough(doubt):
+    blinded(doubt, 30.0)
+    told = [doubt.note(GOOD, 31.0 + k, metres) for k, metres in enumerate((0.0, 0.5, 2.0, 3.9))]
+    assert told[0] == "verified 1 of 3 times after 31 s of doubt"
+    assert told[1].startswith("verified 1 of 3")  # the same view again proves nothing more
+    assert told[2].startswith("verified 2 of 3")
+    assert told[3].startswith("verified 2 of 3")
+    assert doubt.active
+    assert doubt.note(GOOD, 36.0, 4.0) == "verified"
+    assert not doubt.active
+    assert not doubt.hopeless
+
+
+def test_a_robot_that_stands_still_is_believed_after_some_seconds(doubt):
+    blinded(doubt, 30.0)
+    told = [doubt.note(GOOD, 31.0 + k, 0.0) for k in range(11)]
+    assert told[0] == told[4] == "verified 1 of 3 times after 31 s of doubt"
+    assert told[5] == told[9] == "verified 2 of 3 times after 31 s of doubt"
+    assert told[10] == "verified"
+    assert not doubt.active
+
+
+def test_one_against_it_undoes_the_proof(doubt):
+    blinded(doubt, 30.0)
+    doubt.note(GOOD, 31.0, 0.0)
+    doubt.note(GOOD, 32.0, 2.0)
+    doubt.note(Judgement(Cause.BLIND, "covered"), 33.0, 4.0)
+    assert doubt.note(GOOD, 34.0, 6.0).startswith("verified 1 of 3")
+    assert doubt.active
+
+
+def test_after_a_short_one_a_single_registration_is(doubt):
+    blinded(doubt, 8.0)
+    doubt.note(GOOD, 9.9, 0.0)
+    assert not doubt.active
+    # and the proof of an earlier doubt is not counted for a later one
+    blinded(doubt, 30.0)
+    assert doubt.note(GOOD, 31.0, 0.0).startswith("verified 1 of 3")

@@ -1,0 +1,108 @@
+"""Drift: what odometry is believed to gather, and what registrations show that it does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.config import TrackingConfig
+from coview_stream.geometry.se3 import checked_covariance
+from coview_stream.localization.tracking.odometry_noise import Drift, DriftEstimator
+
+CONFIG = TrackingConfig(
+    position_drift=0.015,
+    height_drift=0.01,
+    tilt_drift=np.radians(0.05),
+    yaw_drift=np.radians(0.15),
+    turn_drift=0.02,
+    drift_trust=10.0,
+    drift_memory=40.0,
+)
+NOISE = np.square([3e-4, 3e-4, 2e-4, 0.004, 0.004, 0.002])
+RATES = Drift(position=0.1, height=0.05, tilt=0.01, yaw=0.02, turn=0.05)
+
+
+def test_a_random_walk_with_metres_and_radians():
+    sigma = np.sqrt(np.diag(RATES.covariance(4.0, 0.6)))
+    np.testing.assert_allclose(sigma, [0.02, 0.02, np.hypot(0.04, 0.03), 0.2, 0.2, 0.1])
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(RATES.reported(4.0, 0.6))), [0.2, 0.2, 0.1, 0.02, 0.02, np.hypot(0.04, 0.03)]
+    )
+
+
+def test_standing_still_is_a_covariance_too():
+    checked_covariance("still", Drift.of(CONFIG).covariance(0.0, 0.0))
+
+
+def driven(true: Drift, metres=100.0, step=1.0, turned=0.0, seed=0, config=CONFIG, noise=NOISE):
+    """An estimator that was shown a drive with odometry of these rates."""
+    estimator, rng = DriftEstimator(config), np.random.default_rng(seed)
+    for _ in range(round(metres / step)):
+        gap = rng.normal(0.0, np.sqrt(true.variances(step, turned) + noise))
+        estimator.add(gap, noise, step, turned)
+    return estimator
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0, 5.0])
+def test_rates_are_found(factor):
+    """Registrations must be able to show them: where odometry is good, they have to be."""
+    nominal = Drift.of(CONFIG)
+    true = Drift(*(factor * rate for rate in vars(nominal).values()))
+    noise = NOISE * min(1.0, factor**2)
+    found = [list(vars(driven(true, seed=seed, noise=noise).drift).values()) for seed in range(10)]
+    np.testing.assert_allclose(np.mean(found, axis=0), list(vars(true).values()), rtol=0.2)
+
+
+def test_the_noise_of_registrations_is_hardly_taken_for_drift():
+    """Clipped at zero, what is left of it adds up a little."""
+    perfect, nominal = Drift(0.0, 0.0, 0.0, 0.0, 0.0), Drift.of(CONFIG)
+    for scale in (0.1, 1.0, 10.0):
+        sigma = np.sqrt(scale * NOISE)
+        found = driven(perfect, 200.0, noise=scale * NOISE).drift
+        assert found.tilt < max(0.9 * sigma[0], 0.35 * nominal.tilt)
+        assert found.yaw < max(0.9 * sigma[2], 0.35 * nominal.yaw)
+        assert found.position < max(0.9 * sigma[3], 0.35 * nominal.position)
+
+
+def test_each_kind_is_found_by_itself():
+    true = Drift(position=0.1, height=0.001, tilt=1e-4, yaw=0.01, turn=0.0)
+    found = driven(true, 200.0).drift
+    assert found.position == pytest.approx(0.1, rel=0.3)
+    assert found.yaw == pytest.approx(0.01, rel=0.3)
+    assert found.height < 0.35 * CONFIG.height_drift
+    assert found.tilt < 0.5 * CONFIG.tilt_drift
+
+
+def test_at_first_the_configuration_is_believed():
+    assert DriftEstimator(CONFIG).drift == Drift.of(CONFIG)
+    bad = Drift(*(10 * rate for rate in vars(Drift.of(CONFIG)).values()))
+    after = [driven(bad, metres).drift.yaw / CONFIG.yaw_drift for metres in (1.0, 10.0, 100.0)]
+    assert after[0] < 5.0
+    assert after[0] < after[2]
+    assert after[2] == pytest.approx(10.0, rel=0.4)
+
+
+def test_what_was_long_ago_is_forgotten():
+    estimator = driven(Drift(*(5 * rate for rate in vars(Drift.of(CONFIG)).values())))
+    assert estimator.drift.position > 3 * CONFIG.position_drift
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        estimator.add(rng.normal(0.0, np.sqrt(NOISE)), NOISE, 1.0, 0.0)
+    assert estimator.drift.position < 0.7 * CONFIG.position_drift
+
+
+def test_one_slip_does_not_make_odometry_useless():
+    estimator = driven(Drift.of(CONFIG))
+    before = estimator.drift.position
+    estimator.add(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0]), NOISE, 1.0, 0.0)  # 200 sigma
+    assert before < estimator.drift.position < 1.5 * before
+
+
+def test_turning_on_the_spot_teaches_about_headings_alone():
+    estimator, rng = DriftEstimator(CONFIG), np.random.default_rng(2)
+    for _ in range(60):
+        gap = rng.normal(0.0, np.sqrt(NOISE))
+        gap[2] += rng.normal(0.0, 0.06 * 0.5)
+        estimator.add(gap, NOISE, 0.0, 0.5)
+    assert estimator.drift.turn == pytest.approx(0.06, rel=0.3)
+    assert estimator.drift.position == pytest.approx(CONFIG.position_drift, rel=0.2)

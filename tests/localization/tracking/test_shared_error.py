@@ -1,0 +1,115 @@
+"""What pairs say of a registration's error by disagreeing place by place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from courtyard import courtyard, local_map, source_of
+
+from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.se3 import difference
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.register import register
+from coview_stream.localization.tracking.shared_error import Shared, clustered_covariance
+
+CONFIG = RegistrationConfig()
+PIVOT = np.array([0.0, 0.0, 1.5])
+
+
+def street(rng, off):
+    """Fronts of 25 houses and the ground before them; the map has each of them ``off`` (sigma, metres) elsewhere."""
+    seen, mapped, normals = [], [], []
+    for x in np.arange(-32.0, 33.0, 16.0):
+        for y in np.arange(-32.0, 33.0, 16.0):
+            axis = int(rng.integers(2))
+            front = np.zeros((160, 3))
+            front[:, 1 - axis] = rng.uniform(-3, 3, 160)
+            front[:, 2] = rng.uniform(1.5, 6, 160)
+            ground = np.column_stack([rng.uniform(-6, 6, (160, 2)), np.zeros(160)])
+            n = np.eye(3)[axis]
+            place = np.array([x + 8.0, y + 8.0, 0.0])
+            seen += [front + place, ground + place]
+            mapped += [
+                front + place + n * rng.normal(0.0, off),
+                ground + place + [0, 0, rng.normal(0.0, off)],
+            ]
+            normals += [np.tile(n, (160, 1)), np.tile([0.0, 0.0, 1.0], (160, 1))]
+    seen, mapped, normals = (np.concatenate(part).astype(np.float32) for part in (seen, mapped, normals))
+    noise = rng.normal(0.0, 0.01, seen.shape).astype(np.float32)
+    return source_of(seen + noise, np.eye(4)), LocalMap(mapped, normals)
+
+
+def registered(seed, off):
+    """Error (6,) of a registration, its clustered covariance, and the inverse Hessian's."""
+    source, target = street(np.random.default_rng(seed), off)
+    found = register(source, np.eye(4), target, CONFIG, CONFIG.track, centre=PIVOT)
+    T_body = found.T_map_source @ pose_from(np.eye(3), PIVOT)
+    spread = clustered_covariance(source, found.T_map_source, target, PIVOT, CONFIG)
+    return difference(T_body, pose_from(np.eye(3), PIVOT)), spread, np.linalg.inv(found.information)
+
+
+def nees(errors, covariances):
+    """Mean squared Mahalanobis distance per degree of freedom."""
+    return np.mean([e @ np.linalg.solve(C, e) for e, C in zip(errors, covariances, strict=True)]) / 6
+
+
+def test_it_is_about_the_true_error_where_the_hessian_is_far_below():
+    errors, spreads, hessians = zip(*(registered(seed, 0.03) for seed in range(40)), strict=True)
+    assert 0.5 < nees(errors, spreads) < 2.5
+    assert nees(errors, hessians) > 10
+
+
+def test_it_grows_with_what_the_map_is_off_by():
+    sigma = [np.sqrt(np.diag(registered(1, off)[1])) for off in (0.01, 0.02, 0.04)]
+    assert (sigma[1] > 1.3 * sigma[0]).all()
+    assert (sigma[2] > 1.3 * sigma[1]).all()
+
+
+def test_too_few_places_say_nothing():
+    points, normals = courtyard()
+    target = local_map(points, normals)
+    few = np.abs(points[:, 0] - 3) + np.abs(points[:, 1] - 3) < 2
+    source = source_of(points[few], np.eye(4))
+    assert clustered_covariance(source, np.eye(4), target, PIVOT, CONFIG) is None
+
+
+def test_where_nothing_has_a_partner_nothing_is_said():
+    source, target = street(np.random.default_rng(0), 0.0)
+    assert clustered_covariance(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT, CONFIG) is None
+
+
+def test_what_is_shared_is_so_many_times_what_was_seen_of_late_and_the_rest():
+    config = RegistrationConfig(
+        shared=2.0, shared_position=0.03, shared_height=0.02, shared_tilt=0.002, shared_yaw=0.001
+    )
+    rest = np.square([0.002, 0.002, 0.001, 0.03, 0.03, 0.02])
+    shared = Shared(config)
+    np.testing.assert_allclose(shared.covariance, np.diag(rest))
+    source, target = street(np.random.default_rng(0), 0.03)
+    now = clustered_covariance(source, np.eye(4), target, PIVOT, config)
+    shared.learn(source, np.eye(4), target, PIVOT)
+    np.testing.assert_allclose(shared.covariance, 4 * now + np.diag(rest))
+    better, same = street(np.random.default_rng(0), 0.0)
+    for _ in range(20):
+        shared.learn(better, np.eye(4), same, PIVOT)
+    assert (np.diag(shared.covariance) - rest < 0.2 * 4 * np.diag(now)).all()
+    shared.clear()
+    np.testing.assert_allclose(shared.covariance, np.diag(rest))
+
+
+def test_a_scan_of_nothing_new_teaches_nothing():
+    source, target = street(np.random.default_rng(0), 0.03)
+    shared = Shared(CONFIG)
+    shared.learn(source, np.eye(4), target, PIVOT)
+    before = shared.covariance
+    shared.learn(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT)
+    np.testing.assert_array_equal(shared.covariance, before)
+
+
+@pytest.mark.parametrize("name", ["shared", "shared_position", "shared_height", "shared_tilt", "shared_yaw"])
+def test_settings_are_positive(name):
+    from coview_stream.errors import ConfigError
+
+    with pytest.raises(ConfigError, match=name):
+        RegistrationConfig(**{name: 0.0})

@@ -1,0 +1,221 @@
+"""Updates: which registrations are believed, what they do to the belief, and what is said of the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from se3 import exp_se3
+from small_world import pose_error, scan
+from trackers import OFF, Ride, garbage, on_the_way, refused, registration, ride_of
+
+from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
+from coview_stream.geometry.transforms import inverse, pose_from
+from coview_stream.localization.registration.covariance import registration_covariance
+from coview_stream.localization.tracking.monitor import Cause
+
+RULE = AcceptanceConfig()
+
+
+def ruled(**acceptance):
+    return LocalizerConfig(acceptance=AcceptanceConfig(**acceptance))
+
+
+# ---- one that is believed
+
+
+def test_a_good_registration_is_believed(world_map, world_drive):
+    cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
+    ride = ride_of(world_map, world_drive)
+    before = ride.tracker.predicted_covariance()
+    assert ride.error(truth)[0] == pytest.approx(0.25)
+    judgement = ride.update(cloud, truth)
+    assert judgement.cause is Cause.VERIFIED
+    assert judgement.verified
+    assert judgement.reason == "verified"
+    assert judgement.score == judgement.evidence.score > 0.8
+    assert 0.0 < judgement.innovation < RULE.keep_innovation
+    metres, degrees = ride.error(truth)
+    assert metres < 0.05
+    assert degrees < 0.2
+    after = ride.tracker.predicted_covariance()
+    assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
+
+
+def test_a_drive_is_followed_longer_than_the_graph_is(world_map, slow_drive):
+    config = LocalizerConfig(graph=GraphConfig(window=2, restart=6))
+    ride = ride_of(world_map, slow_drive, config, 0)
+    for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):
+        assert ride.update(cloud, truth).verified
+        metres, degrees = ride.error(truth)
+        assert metres < 0.03
+        assert degrees < 0.2
+
+
+def test_the_error_is_within_what_is_reported(world_map, slow_drive):
+    """Odometry lies by 5 %, in both ways, and is corrected once a metre."""
+    for scale in (0.95, 1.05):
+        ride = ride_of(world_map, slow_drive, frame=0)
+        T, off = ride.odometry(slow_drive.T_map_body[0]), []
+        for k in range(1, len(slow_drive.clouds)):
+            step = inverse(slow_drive.T_map_body[k - 1]) @ slow_drive.T_map_body[k]
+            step[:3, 3] *= scale
+            T = T @ step
+            ride.tracker.observe(slow_drive.clouds[k], T)
+            if ride.tracker.due():
+                assert ride.tracker.update(slow_drive.clouds[k], T).verified
+                gap = (ride.tracker.T_map_odom @ T)[:2, 3] - slow_drive.T_map_body[k][:2, 3]
+                C = ride.tracker.reported_covariance()[:2, :2]
+                off.append(gap @ np.linalg.solve(C, gap))
+        assert len(off) > 6
+        assert np.sqrt(max(off)) < 3.5
+        assert pose_error(ride.tracker.T_map_odom @ T, slow_drive.T_map_body[-1])[0] < 0.1
+
+
+def test_the_map_is_cropped_before_it_is_needed(world_map, world_drive, monkeypatch):
+    """On a frame that registers nothing: both together would take too long."""
+    cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
+    ride = ride_of(world_map, world_drive)
+    ride.tracker.look_around(ride.odometry(truth))
+    monkeypatch.setattr(type(world_map), "crop", None)
+    monkeypatch.setattr("coview_stream.localization.registration.register.edge_raster", None)
+    assert ride.update(cloud, truth).verified
+
+
+# ---- those that are not
+
+
+@pytest.mark.parametrize(
+    ("rule", "cause"),
+    [("keep_score", None), ("inside", Cause.OFF_MAP), ("keep_ground", Cause.GROUND)],
+)
+def test_the_same_registration_held_to_a_higher_standard(world_map, world_drive, rule, cause):
+    cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
+    judgement = refused(ride_of(world_map, world_drive, ruled(**{rule: 1.0})), cloud, truth)
+    evidence = judgement.evidence
+    assert 0.8 < min(evidence.score, evidence.inside, evidence.ground) < 1.0
+    assert judgement.cause is cause or cause is None
+
+
+def test_garbage_is_not_believed(world_map, world_drive):
+    ride = ride_of(world_map, world_drive)
+    judgement = refused(ride, garbage(), world_drive.T_map_body[4], alone=True)
+    assert judgement.cause in (Cause.GROUND, Cause.FITNESS, Cause.FREE_SPACE)
+    assert judgement.score < RULE.keep_score
+
+
+def test_another_world_does_not_fit_by_what_stands_there(world_map, world_drive, elsewhere):
+    ride = ride_of(world_map, world_drive)
+    assert ride.update(world_drive.clouds[4], world_drive.T_map_body[4]).verified
+    judgement = refused(ride, elsewhere.clouds[2], world_drive.T_map_body[4], alone=True)
+    assert judgement.cause in (Cause.FITNESS, Cause.FREE_SPACE)
+    assert "usual here" in judgement.reason or "rays pass" in judgement.reason
+
+
+def test_rays_that_pass_through_what_the_map_shows_are_named(world_map, world_drive, scene):
+    """The nearest buildings have been torn down; what is left stands where it stood."""
+    truth = world_drive.T_map_body[4]
+    near = sorted(scene, key=lambda box: np.hypot(*(box.centre - truth[:2, 3])))
+    ride = ride_of(world_map, world_drive, ruled(keep_share=0.95))
+    assert ride.update(world_drive.clouds[4], truth).verified
+    judgement = refused(ride, scan(near[4:], truth), truth, alone=True)
+    assert judgement.cause is Cause.FREE_SPACE
+    assert judgement.evidence.near > 0.9
+
+
+@pytest.mark.parametrize("seen", [0, 20, 90])
+def test_a_frame_that_sees_nothing_is_blind_whatever_the_ones_before_saw(world_map, world_drive, seen):
+    """Older frames make a scan denser; they do not say where the robot is now."""
+    ride = ride_of(world_map, world_drive)
+    truth = world_drive.T_map_body
+    assert ride.update(world_drive.clouds[4], truth[4]).verified
+    judgement = refused(ride, world_drive.clouds[5][:seen], truth[5])
+    assert judgement.cause is Cause.BLIND
+    assert judgement.evidence is None
+    assert judgement.innovation is None
+    assert judgement.score == 0.0
+    assert ride.update(world_drive.clouds[5], truth[5]).verified
+
+
+def test_off_the_map_nothing_is_compared(world_map, world_drive):
+    far = pose_from(np.eye(3), [5000.0, 0.0, 1.7])
+    ride = Ride.begin(world_map, None, world_drive.clouds[4], far)
+    judgement = refused(ride, world_drive.clouds[4], far)
+    assert judgement.cause is Cause.OFF_MAP
+    assert "empty" in judgement.reason
+
+
+@pytest.mark.parametrize("limit", [2.0, 0.5])
+def test_a_pose_that_leans_more_than_the_limit_is_not_believed(world_map, world_drive, limit):
+    """The odometry leans against gravity by 3 degrees: the registration is good, but cannot be true."""
+    tilt, truth = np.radians(3.0), world_drive.T_map_body[4]
+    leaning = exp_se3(np.array([0.0, tilt, 0.0, 0.0, 0.0, 0.0]))
+    robot = pose_from(np.eye(3), truth[:3, 3])
+    config = ruled(most_tilt=limit * tilt, keep_score=0.01, inside=0.01, keep_ground=0.01)
+    ride = Ride.begin(
+        world_map,
+        config,
+        world_drive.clouds[4],
+        truth,
+        off=robot @ OFF @ inverse(robot),
+        T_map_odom=robot @ leaning,
+    )
+    if limit > 1:
+        assert ride.update(world_drive.clouds[4], truth).verified
+        assert ride.error(truth)[0] < 0.1
+    else:
+        judgement = refused(ride, world_drive.clouds[4], truth)
+        assert judgement.cause is Cause.TILT
+        assert "leans 3 degrees" in judgement.reason
+
+
+def test_what_was_refused_does_not_spoil_the_next(world_map, slow_drive):
+    """Though the window would reach back over all of it."""
+    wide = TrackingConfig(window=20.0, min_points=30_000)
+    ride = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
+    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
+    for k in range(1, 4):
+        assert ride.update(clouds[k], truth[k]).verified
+    ride.see(garbage(2), truth[4])
+    refused(ride, garbage(3), truth[5])
+    ride.see(clouds[6], truth[6])
+    judgement = ride.update(clouds[7], truth[7])
+    assert judgement.verified
+    assert judgement.score > 0.9
+    assert ride.error(truth[7])[0] < 0.05
+
+
+def test_alone_means_the_newest_frame_alone(world_map, slow_drive):
+    wide = TrackingConfig(window=20.0, min_points=30_000)
+    ride = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
+    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
+    for seed in range(3):
+        ride.see(garbage(seed), truth[1])
+    assert ride.update(clouds[1], truth[1], alone=True).score > 0.9
+    again = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
+    for seed in range(3):
+        again.see(garbage(seed), truth[1])
+    assert again.update(clouds[1], truth[1]).score < 0.8
+
+
+# ---- a new start
+
+
+def test_a_new_start_carries_nothing_of_the_old_belief_over(world_map, slow_drive, world_drive):
+    ride = on_the_way(world_map, slow_drive)
+    usual = ride.tracker.predicted_covariance()
+    T = ride.odometry(world_drive.T_map_body[8])
+    ride.tracker.start(registration(world_drive.T_map_body[8] @ OFF @ inverse(T)), T, ride.tracker.travelled)
+    assert (np.diag(ride.tracker.predicted_covariance()) > 10 * np.diag(usual)).all()
+    judgement = ride.update(world_drive.clouds[8], world_drive.T_map_body[8])
+    assert judgement.verified
+    assert ride.error(world_drive.T_map_body[8])[0] < 0.03
+
+
+def test_the_first_look_is_surer_than_its_start_but_not_than_its_registration(world_map, world_drive):
+    ride = ride_of(world_map, world_drive)
+    started = np.diag(ride.tracker.predicted_covariance())
+    ride.update(world_drive.clouds[4], world_drive.T_map_body[4])
+    looked = np.diag(ride.tracker.predicted_covariance())
+    assert (looked < started).all()
+    floor = np.diag(registration_covariance(1e14 * np.eye(6), ride.tracker.config.registration))
+    assert (looked > 0.9 * floor).all()

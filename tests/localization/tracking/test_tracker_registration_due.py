@@ -1,0 +1,251 @@
+"""Between registrations: when the next is due, what it will use, and how unsure the pose grows meanwhile."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from trackers import Ride, registration, tracker_of
+
+from coview_stream.config import LocalizerConfig, TrackingConfig
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.registration.covariance import angles_first
+from coview_stream.localization.tracking.shared_error import Shared
+
+SETTINGS = TrackingConfig()
+NOTHING = np.zeros((20, 3), np.float32)
+GOOD = {"position_drift": 1e-3, "yaw_drift": 1e-4, "turn_drift": 1e-3}
+"""Odometry that is never unsure before a metre is over."""
+
+
+def steps_until_due(world_map, poses, patience=1.0, **settings):
+    """How many of the poses it takes after the first; a registration is never due at the first."""
+    tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(**{**GOOD, **settings})))
+    for k, T in enumerate(poses):
+        tracker.observe(NOTHING, T, NOTHING)
+        if tracker.due(patience):
+            return k
+    return None
+
+
+def straight(step, count=200):
+    return [pose_from(np.eye(3), [step * k, 0.0, 0.0]) for k in range(count)]
+
+
+def turning(angles):
+    return [pose_from(rot_z(angle), np.zeros(3)) for angle in angles]
+
+
+# ---- when it is due
+
+
+def test_standing_still_nothing_is_due(world_map):
+    assert steps_until_due(world_map, [np.eye(4)] * 20, position_drift=5.0, yaw_drift=1.0) is None
+
+
+@pytest.mark.parametrize(("patience", "metres"), [(1.0, 1.5), (3.0, 4.5)])
+def test_driving_makes_it_due_and_in_a_hurry_three_times_as_late(world_map, patience, metres):
+    found = steps_until_due(world_map, straight(0.02, 300), patience, distance=1.5)
+    assert 0.02 * found == pytest.approx(metres, abs=0.021)
+
+
+def test_driving_to_and_fro_adds_up(world_map):
+    shuttle = [pose_from(np.eye(3), [0.4 * (k % 2), 0.0, 0.0]) for k in range(9)]
+    assert steps_until_due(world_map, shuttle, distance=1.5) == 4
+
+
+def test_turning_makes_it_due_and_to_and_fro_adds_up(world_map):
+    turn = SETTINGS.turn
+    assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.4, 0.8, 1.2]))) == 3
+    assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.4, 0.0, 0.4]))) == 3
+    assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.9, 0.9, 0.9]))) is None
+
+
+@pytest.mark.parametrize(
+    ("bad", "metres"),
+    [
+        ({"position_drift": 0.04, "unsure_position": 0.03}, 0.75**2),
+        ({"yaw_drift": 0.004, "unsure_yaw": 0.003}, 0.75**2),
+        ({"position_drift": 0.4, "unsure_position": 0.03, "least_distance": 0.25}, 0.25),
+        ({"yaw_drift": 0.4, "unsure_yaw": 0.003, "least_distance": 0.25}, 0.25),
+        ({"position_drift": 0.01, "unsure_position": 0.03}, 1.0),
+    ],
+)
+def test_where_odometry_is_bad_it_is_due_earlier_but_not_at_once(world_map, bad, metres):
+    settings = {"distance": 1.0, "least_distance": 0.2, **bad}
+    found = steps_until_due(world_map, straight(0.01), **settings)
+    assert 0.01 * found == pytest.approx(metres, abs=0.0101)
+    late = steps_until_due(world_map, straight(0.05), 3.0, **settings)
+    if metres == 0.75**2:
+        assert 0.05 * late == pytest.approx(3.0, abs=0.0501)  # 9 x 0.56 m would be later than the thrice 1 m
+    else:
+        assert 0.05 * late == pytest.approx(3 * metres, abs=0.0501)
+
+
+def test_after_an_update_it_is_not_due_at_once(world_map, world_drive):
+    clouds, truth = world_drive.clouds, world_drive.T_map_body
+    ride = Ride.begin(world_map, None, clouds[0], truth[0])
+    ride.see(clouds[1], truth[1])
+    assert ride.tracker.due()
+    ride.tracker.update(clouds[1], ride.odometry(truth[1]))
+    assert not ride.tracker.due()
+    ride.see(clouds[1], truth[1])
+    assert not ride.tracker.due()
+    ride.see(clouds[2], truth[2])
+    assert ride.tracker.due()
+
+
+def test_one_that_is_rejected_does_not_come_again_at_once_either(world_map, world_drive):
+    ride = Ride.begin(world_map, None, world_drive.clouds[0], world_drive.T_map_body[0])
+    assert not ride.update(NOTHING, world_drive.T_map_body[1]).verified
+    assert not ride.tracker.due()
+
+
+# ---- from what
+
+
+def test_the_window_is_the_last_metres_more_for_few_points_less_for_many(world_map):
+    def window(points, **settings):
+        config = LocalizerConfig(tracking=TrackingConfig(min_points=2500, max_points=50_000, **settings))
+        tracker = tracker_of(world_map, config)
+        for k in range(8):
+            T = pose_from(np.eye(3), [0.5 * k, 0, 0])
+            tracker.observe(NOTHING, T, np.full((points, 3), k, np.float32))
+        return sorted({int(k) for k in tracker._recent.window()[:, 0]})
+
+    assert window(1000, window=2.0) == [3, 4, 5, 6, 7]
+    assert window(300, window=2.0) == list(range(8))  # 2,500 points need more
+    assert window(20_000, window=2.0) == [5, 6, 7]  # 50,000 are plenty
+    assert window(3000, window=0.01) == [7]
+    assert window(1000, window=0.01) == [5, 6, 7]
+
+
+def test_frames_that_lie_far_back_are_not_kept(world_map):
+    """A robot that never gets its points together, on a robot that runs for weeks."""
+    tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(min_points=10**6)))
+    for k in range(300):
+        tracker.observe(NOTHING, pose_from(np.eye(3), [0.01 * k, 0, 0]), np.zeros((10, 3), np.float32))
+    assert len(tracker._recent.window()) <= 400
+
+
+# ---- how unsure
+
+
+def test_before_a_fix_there_is_nothing_to_update(world_map, world_drive):
+    tracker = tracker_of(world_map)
+    tracker.observe(world_drive.clouds[0], np.eye(4))
+    with pytest.raises(RuntimeError, match="call start first"):
+        tracker.update(world_drive.clouds[0], np.eye(4))
+
+
+@pytest.fixture
+def started(world_map):
+    """A tracker at the odometry's origin, and how unsure it is after driving to a pose."""
+    tracker = tracker_of(world_map)
+
+    def covariance(*poses):
+        for T in poses:
+            tracker.observe(NOTHING, T, NOTHING)
+        return tracker.predicted_covariance()
+
+    covariance(np.eye(4))
+    tracker.start(registration(np.eye(4)), np.eye(4), 0.0)
+    return tracker, covariance
+
+
+def test_metres_and_radians_make_it_less_sure(started):
+    tracker, covariance = started
+    before = np.diag(covariance())
+    turned = np.diag(covariance(pose_from(rot_z(0.5), np.zeros(3))))
+    drift = tracker.drift
+    np.testing.assert_allclose(turned - before, drift.variances(0.0, 0.5), rtol=1e-3, atol=1e-6)
+    assert turned[2] > before[2]
+    driven = np.diag(covariance(pose_from(rot_z(0.5), [5.0, 0.0, 0.0])))
+    grown = (driven - before)[[0, 1, 2, 3]]
+    np.testing.assert_allclose(grown, drift.variances(5.0, 0.5)[:4], rtol=1e-3)
+
+
+def test_a_doubt_in_heading_becomes_one_across_the_way(started):
+    tracker, covariance = started
+    before = covariance()
+    there = covariance(pose_from(np.eye(3), [8.0, 0.0, 0.0]))
+    gathered = tracker.drift.variances(8.0, 0.0)[4]
+    assert there[4, 4] - before[4, 4] == pytest.approx(64.0 * before[2, 2] + gathered, rel=1e-3)
+    assert there[2, 4] == pytest.approx(8.0 * before[2, 2], rel=1e-3)
+
+
+def test_a_fix_that_comes_late_is_less_sure(world_map):
+    sigmas = []
+    for found_at in (3.0, 0.0):
+        tracker = tracker_of(world_map)
+        for x in (0.0, 3.0):
+            tracker.observe(NOTHING, pose_from(np.eye(3), [x, 0.0, 0.0]), NOTHING)
+        tracker.start(registration(np.eye(4)), pose_from(np.eye(3), [3.0, 0.0, 0.0]), found_at)
+        sigmas.append(np.diag(tracker.predicted_covariance()))
+    expected = tracker.drift.variances(3.0, 0.0)
+    np.testing.assert_allclose(sigmas[1] - sigmas[0], expected, rtol=0.01)
+
+
+def test_what_is_reported_has_metres_first_and_what_registrations_share(started, world_map):
+    tracker, covariance = started
+    predicted = covariance(pose_from(rot_z(0.3), [2.0, 1.0, 0.0]))
+    reported = tracker.reported_covariance()
+    shared = Shared(tracker.config.registration).covariance  # nothing has been registered yet
+    np.testing.assert_allclose(reported, angles_first(predicted + shared))
+    assert reported[0, 0] == pytest.approx(predicted[3, 3] + shared[3, 3])
+    assert reported[0, 5] == pytest.approx(predicted[3, 2])
+
+
+def test_however_many_registrations_the_report_keeps_what_they_share(world_map, slow_drive):
+    ride = Ride.begin(world_map, None, slow_drive.clouds[0], slow_drive.T_map_body[0])
+    for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):
+        assert ride.update(cloud, truth).verified
+    shared = np.diag(angles_first(Shared(ride.tracker.config.registration).covariance))
+    variances = np.diag(ride.tracker.reported_covariance())
+    assert (variances > shared).all()
+    assert np.sqrt(variances[:3]).max() < 0.05
+
+
+# ---- what it learns of odometry
+
+
+def ridden(world_map, drive, scale):
+    """A tracker that has driven with odometry that tells ``scale`` times the way."""
+    ride = Ride.begin(world_map, None, drive.clouds[0], drive.T_map_body[0], off=np.eye(4))
+    T = ride.odometry(drive.T_map_body[0])
+    steps = zip(drive.T_map_body, drive.T_map_body[1:], drive.clouds[1:], strict=False)
+    for before, now, cloud in steps:
+        step = np.linalg.inv(before) @ now
+        step[:3, 3] *= scale
+        T = T @ step
+        ride.tracker.observe(cloud, T)
+        if ride.tracker.due():
+            assert ride.tracker.update(cloud, T).verified
+    return ride.tracker, T
+
+
+def metres_until_due(tracker, T):
+    for k in range(1, 200):
+        tracker.observe(NOTHING, T @ pose_from(np.eye(3), [0.01 * k, 0.0, 0.0]), NOTHING)
+        if tracker.due():
+            return 0.01 * k
+    raise AssertionError("nothing is due after two metres")
+
+
+def test_bad_odometry_is_found_out_and_watched_more_closely(world_map, slow_drive):
+    good, bad = (ridden(world_map, slow_drive, scale) for scale in (1.0, 1.08))
+    known = SETTINGS.position_drift
+    assert good[0].drift.position < known
+    assert bad[0].drift.position > 1.5 * known
+    ahead = pose_from(np.eye(3), [0.9, 0.0, 0.0])
+    for tracker, T in (good, bad):
+        tracker.update(slow_drive.clouds[-1], T)
+    grown = []
+    for tracker, T in (good, bad):
+        before = tracker.predicted_covariance()[3:5, 3:5].trace()
+        tracker.observe(NOTHING, T @ ahead, NOTHING)
+        grown.append(tracker.predicted_covariance()[3:5, 3:5].trace() - before)
+    assert grown[1] > 2.0 * grown[0]
+    for tracker, T in (good, bad):
+        tracker.observe(NOTHING, T, NOTHING)
+        tracker.update(slow_drive.clouds[-1], T)
+    assert metres_until_due(*bad) < 0.8 * metres_until_due(*good)

@@ -1,0 +1,124 @@
+"""Odometry that contradicts the lidar: slips, steps of another place, wheels that stand while the robot is carried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_world import pose_error
+from trackers import garbage, on_the_way, refused, ride_of
+
+from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.tracking.monitor import Cause
+
+RULE = AcceptanceConfig()
+SIDEWAYS = pose_from(np.eye(3), [0.0, 0.5, 0.0])
+
+
+# ---- odometry that slips
+
+
+@pytest.mark.parametrize(
+    "slip",
+    [
+        SIDEWAYS,
+        pose_from(np.eye(3), [-0.5, 0.0, 0.0]),
+        pose_from(np.eye(3), [0.9, -0.6, 0.1]),
+        pose_from(rot_z(np.radians(6.0)), [0.1, 0.0, 0.0]),
+    ],
+)
+def test_a_slip_is_found_and_the_next_frame_is_right(world_map, slow_drive, slip):
+    ride, k = on_the_way(world_map, slow_drive), 8
+    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
+    drift = ride.tracker.drift
+    metres, degrees = pose_error(slip, np.eye(4))
+    ride.slips(slip, truth[k - 1])
+    judgement = ride.update(clouds[k], truth[k])
+    assert judgement.cause is Cause.ODOMETRY
+    assert not judgement.verified
+    assert judgement.innovation > RULE.keep_innovation
+    told = [float(word) for word in judgement.reason.split() if word[0].isdigit()]
+    # by the new way's end a wrong heading is a wrong place, too
+    assert told[0] == pytest.approx(metres, abs=0.03 + 0.2 * np.radians(degrees))
+    assert told[1] == pytest.approx(degrees, abs=0.2)
+    assert judgement.score > 0.8
+    assert ride.error(truth[k])[0] < 0.03
+    assert ride.tracker.drift == drift  # it was no drift
+    assert ride.update(clouds[k + 1], truth[k + 1]).cause is Cause.VERIFIED
+    assert ride.tracker.drift == drift  # nor is it told from the step across it
+    metres, degrees = ride.error(truth[k + 1])
+    assert metres < 0.03
+    assert degrees < 0.2
+
+
+def test_a_slip_that_is_not_real_is_not_believed(world_map, slow_drive, elsewhere):
+    """Garbage and another world may register anywhere within reach: that is no slip."""
+    ride = on_the_way(world_map, slow_drive)
+    for cloud in (garbage(), *elsewhere.clouds):
+        assert refused(ride, cloud, slow_drive.T_map_body[8], alone=True).cause is not Cause.ODOMETRY
+
+
+def test_what_may_be_odometrys_drift_is_no_slip(world_map, slow_drive):
+    """How far odometry may be off depends on how far it has driven, and on how it has been so far."""
+    small = pose_from(np.eye(3), [0.0, 0.06, 0.0])
+    causes = []
+    for trusted in (0.002, 0.1):
+        config = LocalizerConfig(
+            tracking=replace(TrackingConfig(), position_drift=trusted, drift_trust=1000.0)
+        )
+        ride = on_the_way(world_map, slow_drive, config)
+        ride.slips(small, slow_drive.T_map_body[7])
+        causes.append(ride.update(slow_drive.clouds[8], slow_drive.T_map_body[8]).cause)
+    assert causes == [Cause.ODOMETRY, Cause.VERIFIED]
+
+
+def test_a_frame_off_its_place_alarms_after_a_good_one_and_not_before(world_map, slow_drive):
+    clouds, truth = slow_drive.clouds, slow_drive.T_map_body
+    away = pose_from(np.eye(3), [6.0, 3.0, 0.0])
+    ride = ride_of(world_map, slow_drive, frame=0)
+    ride.see(clouds[1], truth[1])
+    assert not ride.tracker.alarmed(ride.odometry(truth[1] @ away))  # nothing to compare with
+    ride = on_the_way(world_map, slow_drive)
+    ride.see(clouds[8], truth[8])
+    assert not ride.tracker.alarmed(ride.odometry(truth[8]))
+    ride.slips(away, truth[8])
+    ride.see(clouds[9], truth[9])
+    assert ride.tracker.alarmed(ride.odometry(truth[9]))
+    ride.tracker.forget_points()
+    assert not ride.tracker.alarmed(ride.odometry(truth[9]))  # no frame to look at
+
+
+# ---- standing still
+
+
+def stood(world_map, slow_drive, looks, idle):
+    """Variances of the belief after looking again and again at the same thing."""
+    ride = on_the_way(world_map, slow_drive, frames=3)
+    for _ in range(looks):
+        assert ride.update(slow_drive.clouds[3], slow_drive.T_map_body[3], idle=idle).verified
+    return np.diag(ride.tracker.predicted_covariance())
+
+
+def test_looking_again_does_not_add_up_to_certainty(world_map, slow_drive):
+    some, many = (stood(world_map, slow_drive, looks, idle=True) for looks in (5, 40))
+    np.testing.assert_allclose(many, some, rtol=0.15)
+    assert (
+        stood(world_map, slow_drive, 40, idle=False) < 0.5 * some
+    ).sum() >= 2  # or it could not be seen here
+
+
+def test_standing_still_only_what_was_seen_since_counts(world_map, slow_drive):
+    """It may have been carried meanwhile: the frames before the last look are of another place."""
+    wide = LocalizerConfig(tracking=TrackingConfig(window=20.0, min_points=30_000))
+    ride = on_the_way(world_map, slow_drive, wide, 4)
+    for k in (1, 2):
+        ride.see(garbage(k), slow_drive.T_map_body[4])
+    judgement = ride.update(garbage(3), slow_drive.T_map_body[4], idle=True)
+    assert not judgement.verified
+    assert judgement.score < RULE.keep_score
+    moving = on_the_way(world_map, slow_drive, wide, 4)
+    for k in (1, 2):
+        moving.see(garbage(k), slow_drive.T_map_body[4])
+    assert moving.update(garbage(3), slow_drive.T_map_body[4]).score > judgement.score

@@ -1,0 +1,176 @@
+"""Which codec reads a sample: option > Encoding > key > hint > magic."""
+
+from __future__ import annotations
+
+import pytest
+from codec_bytes import POINTS, STAMP, TURN, XYZ, cdr_cloud, cdr_odometry, envelope, pb_cloud, pb_transform
+
+from coview_stream import messages as codecs
+from coview_stream.errors import ConfigError, EncodingError, MessageError
+from coview_stream.messages import OversizedError
+from coview_stream.messages import validation as checks
+from coview_stream.messages.choose import codec_for
+from coview_stream.messages.types import Sample
+
+NATIVE = "coview/r1/in/cloud"
+RMW = "0/points/sensor_msgs::msg::dds_::PointCloud2_/RIHS01_9198cabf"
+RMW_ODOM = "0/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported"
+KEELSON = "rise/@v0/boat/pubsub/point_cloud/lidar/0"
+
+
+def cloud_codec(payload=b"?", encoding="", key=NATIVE, option=None, hint=None):
+    return codec_for("cloud", codecs.CLOUD_CODECS, Sample(key, payload, encoding), option, hint)
+
+
+def odometry_codec(payload=b"?", encoding="", key="coview/r1/in/odom", option=None, hint=None):
+    return codec_for("odometry", codecs.ODOMETRY_CODECS, Sample(key, payload, encoding), option, hint)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "name"),
+    [
+        ("application/octet-stream;layout=xyz", "xyz"),
+        ('Application/Octet-Stream ; Layout = "XYZI"', "xyzi"),
+        ("zenoh/bytes;layout=xyz", "xyz"),
+        ("application/cdr", "cdr"),
+        ("application/cdr;sensor_msgs/msg/PointCloud2", "cdr"),
+        ("application/cdr; sensor_msgs::msg::dds_::PointCloud2_", "cdr"),
+        ("application/cdr;schema='sensor_msgs/PointCloud2'", "cdr"),
+        ("application/protobuf;foxglove.PointCloud", "foxglove"),
+        ("application/protobuf; schema=foxglove.PointCloud", "foxglove"),
+        ('application/x-protobuf;schema="foxglove.PointCloud"; v=1', "foxglove"),
+        ("application/protobuf", "foxglove"),
+        ("application/protobuf;core.Envelope", "keelson"),
+    ],
+)
+def test_encodings_of_clouds_as_the_wild_writes_them(encoding, name):
+    assert cloud_codec(encoding=encoding) == name
+
+
+@pytest.mark.parametrize(
+    ("encoding", "name"),
+    [
+        ("application/json", "json"),
+        ("text/json; charset=utf-8", "json"),
+        ("application/cdr;nav_msgs/msg/Odometry", "cdr"),
+        ("application/protobuf;foxglove.PoseInFrame", "foxglove"),
+        ("application/protobuf;foxglove.FrameTransform", "foxglove"),
+    ],
+)
+def test_encodings_of_odometry(encoding, name):
+    assert odometry_codec(encoding=encoding) == name
+
+
+@pytest.mark.parametrize(
+    ("encoding", "named"),
+    [
+        ("application/cbor", "application/cbor"),
+        ("application/octet-stream;layout=xyzrgb", "xyzrgb"),
+        ("application/protobuf;foxglove.LaserScan", "foxglove.laserscan"),
+        ("application/cdr;nav_msgs/msg/Odometry", "nav_msgs/msg/Odometry"),
+        ("application/cdr;foxglove_msgs/msg/PointCloud", "foxglove_msgs/msg/PointCloud"),
+        ("application/cdr;foxglove.PointCloud", "contradicts itself"),
+        ("application/json", "application/json"),
+        ("application/cdr;" + 300 * "x", "application/cdr;xxx"),
+    ],
+)
+def test_an_encoding_of_no_use_for_clouds_is_named(encoding, named):
+    with pytest.raises(EncodingError) as caught:
+        cloud_codec(encoding=encoding)
+    assert named in str(caught.value)
+    assert NATIVE in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_option_beats_encoding_beats_key_beats_hint_beats_magic():
+    cdr = b"\0\1\0\0"
+    said = "application/octet-stream;layout=xyz"
+    assert cloud_codec(cdr, said, KEELSON, option="xyzi", hint="foxglove") == "xyzi"
+    assert cloud_codec(cdr, said, KEELSON, hint="foxglove") == "xyz"
+    assert cloud_codec(cdr, "", KEELSON, hint="foxglove") == "keelson"
+    assert cloud_codec(cdr, "", NATIVE, hint="foxglove") == "foxglove"
+    assert cloud_codec(cdr, "", NATIVE) == "cdr"
+
+
+@pytest.mark.parametrize(
+    "mute", ["", "zenoh/bytes", "zenoh/string", "application/octet-stream", " Zenoh/Bytes "]
+)
+def test_encodings_that_say_nothing_go_on_to_key_hint_and_magic(mute):
+    assert cloud_codec(b"?", mute, RMW) == "cdr"
+    assert cloud_codec(b"?", mute, NATIVE, hint="xyz") == "xyz"
+    assert cloud_codec(b"\0\0\0\0", mute) == "cdr"
+    assert odometry_codec(b'{"stamp_ns":1}', mute) == "json"
+    with pytest.raises(EncodingError, match="no encoding is set"):
+        cloud_codec(b"\1\2\3\4", mute)
+
+
+def test_bare_protobuf_is_whatever_key_or_hint_make_of_it():
+    assert cloud_codec(encoding="application/protobuf", key=KEELSON, hint="foxglove") == "keelson"
+    assert cloud_codec(encoding="application/protobuf", hint="keelson") == "keelson"
+    assert cloud_codec(encoding="application/protobuf", hint="cdr") == "foxglove"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        RMW_ODOM,
+        "0/x/tf2_msgs::msg::dds_::TFMessage_/RIHS01_ab",
+        KEELSON.replace("point_cloud", "frame_transform"),
+    ],
+)
+def test_a_key_whose_type_is_no_cloud_is_an_error_that_names_it(key):
+    with pytest.raises(EncodingError, match=r"cannot carry|no codec knows") as caught:
+        cloud_codec(b"\0\1\0\0", "", key)
+    assert key in str(caught.value)
+
+
+def test_odometry_by_key():
+    assert odometry_codec(b"?", "", RMW_ODOM) == "cdr"
+    assert odometry_codec(b"?", "", KEELSON.replace("point_cloud", "frame_transform")) == "keelson"
+
+
+def test_json_magic_does_not_make_a_cloud():
+    with pytest.raises(EncodingError):
+        cloud_codec(b"{}")
+
+
+@pytest.mark.parametrize("where", ["option", "hint"])
+@pytest.mark.parametrize("name", ["pcd", "json", ""])
+def test_an_option_or_hint_that_is_no_codec_of_the_channel(where, name):
+    with pytest.raises(ConfigError, match=r"xyz, xyzi, foxglove, cdr, keelson"):
+        cloud_codec(**{where: name})
+    with pytest.raises(ConfigError):
+        codecs.encode_pose(None, "xyz")
+
+
+def test_whole_samples_pass_through_dispatch():
+    rows = POINTS.tobytes()
+    stamp = STAMP.to_bytes(8, "little")
+    assert len(codecs.decode_cloud(Sample(RMW, cdr_cloud(rows, XYZ, 12, 2))).points) == 2
+    assert len(codecs.decode_cloud(Sample(KEELSON, envelope(pb_cloud(rows, XYZ, 12)))).points) == 2
+    assert len(codecs.decode_cloud(Sample(NATIVE, rows, "", stamp), option="xyz").points) == 2
+    assert codecs.decode_odometry(Sample("tf", pb_transform()), hint="foxglove").stamp_ns == STAMP
+    assert codecs.decode_odometry(Sample("odom", cdr_odometry(quaternion=TURN))).stamp_ns == STAMP
+
+
+def test_an_rmw_attachment_gives_stamp_and_sequence():
+    attachment = (41).to_bytes(8, "little") + STAMP.to_bytes(8, "little") + b"\x10" + bytes(16)
+    raw = Sample(NATIVE, POINTS.tobytes(), "application/octet-stream;layout=xyz", attachment)
+    assert codecs.decode_cloud(raw).stamp_ns == STAMP
+    assert codecs.decode_cloud(raw).sequence == 41
+    cdr = Sample(RMW, cdr_cloud(POINTS.tobytes(), XYZ, 12, 2), "", attachment[:16] + b"\x11" + bytes(16))
+    assert codecs.decode_cloud(cdr).sequence is None
+
+
+def test_oversized_is_told_apart_and_names_the_key(monkeypatch):
+    monkeypatch.setattr(checks, "MAX_POINTS", 1)
+    with pytest.raises(OversizedError, match=f"{NATIVE}: a cloud of 2 points"):
+        codecs.decode_cloud(Sample(NATIVE, cdr_cloud(POINTS.tobytes(), XYZ, 12, 2)))
+    with pytest.raises(OversizedError, match="67108865 bytes"):
+        codecs.decode_cloud(Sample(NATIVE, bytes(codecs.MAX_PAYLOAD + 1)))
+    assert issubclass(OversizedError, MessageError)
+    assert not issubclass(OversizedError, EncodingError)
+
+
+def test_prepare_takes_any_codec_names():
+    codecs.prepare(*codecs.CLOUD_CODECS, *codecs.POSE_CODECS)

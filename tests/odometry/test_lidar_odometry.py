@@ -1,0 +1,225 @@
+"""Lidar odometry around any registration: gravity, prediction, deskewing, refusal, and what a refusal leaves."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+import small_world
+from fake_lidar_odometry import Told, Truth, frame, swept
+
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.errors import CloudError, DependencyError, RunError
+from coview_stream.geometry.transforms import inverse, is_pose, pose_from, rot_z, tilt_of
+from coview_stream.odometry.lidar_odometry import LidarOdometry
+
+LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
+
+
+@pytest.fixture(scope="module")
+def cloud(scene):
+    return frame(scene)[0]
+
+
+def moved(x, yaw=0.0):
+    return pose_from(rot_z(yaw), [x, 0.0, 0.0])
+
+
+def test_the_odometry_frame_is_level_though_the_sensor_leans(scene):
+    cloud, up = frame(scene, (0.15, -0.1))
+    odometry = LidarOdometry(registration=Told())
+    T = odometry.step(cloud, None, 5.0)
+    assert np.degrees(np.arccos((T[:3, :3].T @ [0, 0, 1]) @ up)) < 0.2
+    assert (T[:3, 3] == 0).all()
+    assert odometry.ground is not None
+
+
+def test_gravity_that_is_given_is_taken(cloud):
+    g = np.array([0.1, -0.2, -0.97])
+    odometry = LidarOdometry(LidarOdometryConfig(gravity=tuple(g)), Told())
+    T = odometry.step(cloud, None, 5.0)
+    assert np.allclose(T[:3, :3] @ (g / np.linalg.norm(g)), [0, 0, -1])
+    assert odometry.ground is None
+
+
+def test_without_ground_nothing_begins_and_later_frames_may(cloud):
+    odometry = LidarOdometry(registration=Told())
+    wall = np.random.default_rng(0).uniform([8, -15, -1], [8.1, 15, 9], (5000, 3)).astype(np.float32)
+    with pytest.raises(CloudError, match="--gravity level"):
+        odometry.step(wall, None, 5.0)
+    assert tilt_of(odometry.step(cloud, None, 5.1)) < 0.01
+
+
+def test_the_last_motion_predicts_the_next_over_the_time_between(cloud):
+    told = Told(np.eye(4), moved(1.0, 0.1), moved(2.0, 0.2))
+    odometry = LidarOdometry(LEVEL, told)
+    for stamp in (0.0, 0.1, 0.2):
+        odometry.step(cloud, None, stamp)
+    odometry.step(cloud, None, 0.5)
+    step = inverse(moved(1.0, 0.1)) @ moved(2.0, 0.2)
+    guess = inverse(moved(2.0, 0.2)) @ told.guesses[3]
+    assert np.allclose(guess[:3, 3], 3 * step[:3, 3])
+    assert np.arctan2(guess[1, 0], guess[0, 0]) == pytest.approx(0.3)
+
+
+def test_a_sweep_is_deskewed_by_the_motion_before_it(cloud):
+    step = moved(1.0, 0.05)
+    told = Told(np.eye(4), step)
+    odometry = LidarOdometry(LEVEL, told)
+    odometry.step(cloud, None, 0.0)
+    odometry.step(cloud, None, 0.1)
+    skewed, times = swept(cloud, step)
+    odometry.step(skewed, times, 0.2)
+    assert np.abs(skewed - cloud).max() > 0.5
+    assert np.abs(told.frames[2] - cloud).max() < 0.1
+    assert np.abs(odometry.points - cloud).max() < 0.1
+
+
+@pytest.mark.parametrize("times", [0.0, 7.0, np.nan, np.inf, 1.6e9])
+def test_times_that_say_nothing_deskew_nothing(cloud, times):
+    told = Told(np.eye(4), moved(1.0))
+    odometry = LidarOdometry(LEVEL, told)
+    for k in range(3):
+        odometry.step(cloud, np.full(len(cloud), times), 0.1 * k)
+    assert (told.frames[2] == cloud).all()
+
+
+def test_one_bad_time_leaves_its_point_where_it_is(cloud):
+    told = Told(np.eye(4), moved(1.0))
+    odometry = LidarOdometry(LEVEL, told)
+    times = np.linspace(-0.1, 0.0, len(cloud))
+    times[7] = np.nan
+    for k in range(3):
+        odometry.step(cloud, times, 0.1 * k)
+    assert np.allclose(told.frames[2][7], cloud[7], atol=0.01)
+    assert np.isfinite(told.frames[2]).all()
+    assert np.abs(told.frames[2][0] - cloud[0]).max() > 0.5
+
+
+def covered(cloud):
+    return (0.3 * cloud / np.linalg.norm(cloud, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        lambda c: np.empty((0, 3), np.float32),
+        lambda c: c[:50],
+        lambda c: np.full_like(c, np.nan),
+        lambda c: np.full_like(c, np.inf),
+        lambda c: c + np.float32(1e7),
+        lambda c: c.astype(np.float64) + 1e300,
+        lambda c: c[:, :2],
+        lambda c: "cloud",
+        covered,
+    ],
+    ids=["empty", "few", "nan", "inf", "far", "absurd", "flat", "text", "covered"],
+)
+def test_a_bad_frame_is_refused_and_changes_nothing(cloud, bad):
+    told = Told(np.eye(4), moved(0.1))
+    odometry = LidarOdometry(LEVEL, told)
+    odometry.step(cloud, None, 0.0)
+    odometry.step(cloud, None, 0.1)
+    with pytest.raises(CloudError):
+        odometry.step(bad(cloud), None, 0.2)
+    assert len(told.frames) == 2
+    assert np.allclose(odometry.step(cloud, None, 0.3), moved(0.3))  # as predicted from the motion before
+    assert odometry.restarts == 0
+
+
+def test_rows_with_nan_go_and_their_times_too(cloud):
+    told = Told()
+    odometry = LidarOdometry(LEVEL, told)
+    holes = cloud.copy()
+    holes[::10] = np.nan
+    odometry.step(holes, np.linspace(0, 0.1, len(cloud)), 0.0)
+    assert len(told.frames[0]) == len(odometry.points) == np.isfinite(holes).all(axis=1).sum()
+    with pytest.raises(CloudError, match="one time per point"):
+        odometry.step(cloud, np.zeros(3), 0.1)
+
+
+@pytest.mark.parametrize("stamp", [0.0, -1.0, np.nan, np.inf])
+def test_stamps_must_go_on(cloud, stamp):
+    odometry = LidarOdometry(LEVEL, Told())
+    odometry.step(cloud, None, 0.0)
+    with pytest.raises(RunError, match="stamp"):
+        odometry.step(cloud, None, stamp)
+    assert is_pose(odometry.step(cloud, None, 0.1))
+
+
+def test_after_a_gap_the_local_map_begins_anew_where_the_robot_was(cloud):
+    told = Told(np.eye(4), moved(1.0), moved(2.0))
+    odometry = LidarOdometry(LEVEL, told)
+    for k in range(3):
+        odometry.step(cloud, None, 0.1 * k)
+    clears = told.clears
+    assert np.allclose(odometry.step(cloud, None, 30.0), moved(2.0))
+    assert told.clears == clears + 1
+    assert odometry.restarts == 1
+
+
+@pytest.mark.parametrize("wild", [moved(40.0), moved(0.0, 2.5), np.full((4, 4), np.nan)])
+def test_an_impossible_motion_is_refused(cloud, wild):
+    told = Told(np.eye(4), moved(1.0), wild)
+    odometry = LidarOdometry(LEVEL, told)
+    odometry.step(cloud, None, 0.0)
+    odometry.step(cloud, None, 0.1)
+    with pytest.raises(CloudError, match="lost its way"):
+        odometry.step(cloud, None, 0.2)
+    assert odometry.restarts == 1
+    assert np.allclose(odometry.step(cloud, None, 0.3), moved(1.0))
+
+
+def test_a_frame_may_be_reused_by_the_caller(cloud):
+    told = Told()
+    odometry = LidarOdometry(LEVEL, told)
+    buffer = cloud.copy()
+    T = odometry.step(buffer, None, 0.0)
+    buffer[:], T[:] = 0.0, 0.0
+    assert (odometry.points == cloud).all()
+    assert is_pose(odometry.step(cloud, None, 0.1))
+
+
+def test_reset_begins_another_odometry_frame(cloud):
+    odometry = LidarOdometry(LEVEL, Told(np.eye(4), moved(1.0)))
+    odometry.step(cloud, None, 10.0)
+    odometry.step(cloud, None, 10.1)
+    odometry.reset()
+    assert np.allclose(odometry.step(cloud, None, 3.0), np.eye(4))
+
+
+def test_walls_undo_a_tilt_that_drifts(cloud):
+    tilt = np.eye(4)
+    tilt[:3, :3] = [[np.cos(0.002), 0, np.sin(0.002)], [0, 1, 0], [-np.sin(0.002), 0, np.cos(0.002)]]
+    lean = [np.linalg.matrix_power(tilt, k) for k in range(25)]  # the robot stands, and registration tilts it
+    ends = {}
+    for plumb in (True, False):
+        odometry = LidarOdometry(LidarOdometryConfig(gravity="level", plumb=plumb), Told(*lean))
+        for k in range(25):
+            T = odometry.step(cloud, None, 0.1 * k)
+        ends[plumb] = np.degrees(tilt_of(T))
+        assert is_pose(T)
+    assert ends[False] > 2.5
+    assert ends[True] < 0.3
+
+
+def test_a_localizer_goes_by_it(world_map, world_drive):
+    from coview_stream.localization.localizer import Localizer
+    from coview_stream.localization.result import State
+
+    odometry = LidarOdometry(registration=Truth(world_drive.T_map_body))
+    localizer = Localizer(world_map)
+    for k, cloud in enumerate(world_drive.clouds):
+        T = odometry.step(cloud, None, 0.5 * k)
+        fix = localizer.step(odometry.points, T, 0.5 * k)
+    assert fix.state is State.TRACKING
+    assert small_world.pose_error(fix.T_map_body, world_drive.T_map_body[-1])[0] < 0.1
+
+
+def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "kiss_icp", None)
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    with pytest.raises(DependencyError, match="pip install 'kiss-icp>=") as caught:
+        LidarOdometry()
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,300 @@
+"""The odometry buffer: poses between samples, and which samples continue it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_robot import message, ns, pose
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.errors import ConfigError
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.messages.types import OdometryMessage
+from coview_stream.odometry.buffer import Intake, OdometryBuffer
+
+STRAYS = (Intake.OUT_OF_ORDER, Intake.DUPLICATE)
+
+
+def buffer(*samples, **limits):
+    """A buffer that took in samples (sensor seconds, x, y, yaw) without delay."""
+    taken = OdometryBuffer(NodeConfig(**limits))
+    for seconds, *place in samples:
+        taken.add(message(seconds, *place), seconds)
+    return taken
+
+
+def steady(odometry, begin, end, rate=20.0, **place):
+    """Verdicts on samples of a steady drive without delay."""
+    times = begin + np.arange(round((end - begin) * rate) + 1) / rate
+    return [odometry.add(message(t, **place), t) for t in times]
+
+
+def test_a_pose_between_samples_is_interpolated():
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.3])
+    before = pose_from(Rotation.from_rotvec([0.0, 0.4, 0.0]).as_matrix(), [1.0, 2.0, 3.0])
+    after = pose_from(before[:3, :3] @ turn.as_matrix(), [1.4, 1.8, 3.1])
+    odometry = OdometryBuffer(NodeConfig())
+    odometry.add(OdometryMessage(ns(0.0), before), 0.0)
+    odometry.add(OdometryMessage(ns(0.1), after), 0.1)
+    T = odometry.at(ns(0.025))
+    np.testing.assert_allclose(T[:3, 3], [1.1, 1.95, 3.025], atol=1e-9)
+    quarter = before[:3, :3] @ Rotation.from_rotvec(0.25 * turn.as_rotvec()).as_matrix()
+    np.testing.assert_allclose(T[:3, :3], quarter, atol=1e-9)
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_a_turn_across_half_a_circle_goes_the_short_way():
+    odometry = buffer((0.0, 0.0, 0.0, np.pi - 0.1), (0.1, 0.0, 0.0, -np.pi + 0.1))
+    np.testing.assert_allclose(odometry.at(ns(0.05)), pose(yaw=np.pi), atol=1e-9)
+
+
+def test_a_sample_is_its_own_pose():
+    odometry = buffer((0.0, 1.0), (0.1, 1.1), (0.2, 1.2))
+    for seconds, x in ((0.0, 1.0), (0.1, 1.1), (0.2, 1.2)):
+        np.testing.assert_array_equal(odometry.at(ns(seconds)), pose(x))
+
+
+def test_what_the_buffer_covers():
+    empty = buffer()
+    assert empty.covers(ns(0.0)) == 1
+    assert empty.at(ns(0.0)) is None
+    odometry = buffer((1.0,), (1.1,))
+    assert [odometry.covers(ns(t)) for t in (0.9, 1.0, 1.05, 1.1, 1.2)] == [-1, 0, 0, 0, 1]
+    assert odometry.at(ns(0.9)) is None
+    assert odometry.at(ns(1.2)) is None
+
+
+def test_nothing_is_interpolated_across_a_gap():
+    odometry = buffer((0.0, 0.0), (0.3, 0.1), max_gap=0.2)
+    assert odometry.at(ns(0.15)) is None
+    np.testing.assert_array_equal(odometry.at(ns(0.3)), pose(0.1))
+    assert buffer((0.0, 0.0), (0.2, 0.1), max_gap=0.2).at(ns(0.15)) is not None
+
+
+def test_steady_samples_continue():
+    odometry = buffer()
+    assert set(steady(odometry, 0.0, 2.0)) == {Intake.CONTINUES}
+    assert odometry.newest.stamp_ns == ns(2.0)
+    assert odometry.arrived == 2.0
+    assert odometry.travelled == pytest.approx(4.0)
+    assert odometry.turned == pytest.approx(0.0)
+
+
+def test_turns_add_up_whatever_their_sense():
+    odometry = buffer((0.0, 0, 0, 0.0), (0.1, 0, 0, 0.2), (0.2, 0, 0, -0.1))
+    assert odometry.turned == pytest.approx(0.5)
+    assert odometry.travelled == 0.0
+
+
+@pytest.mark.parametrize(
+    ("pause", "intake"),
+    [
+        (0.5, Intake.CONTINUES),
+        (0.51, Intake.GAP),
+        (1.9, Intake.GAP),
+        (2.1, Intake.OUTAGE),
+        (4.9, Intake.OUTAGE),
+    ],
+)
+def test_a_pause_of_the_stamps_is_a_gap(pause, intake):
+    odometry = buffer((1.0, 0.0))
+    assert odometry.add(message(1.0 + pause, 0.0), 1.0 + pause) is intake
+    assert odometry.newest.stamp_ns == ns(1.0 + pause)
+
+
+def test_a_long_pause_in_both_clocks_is_an_outage():
+    odometry = buffer((1.0, 0.0))
+    assert odometry.add(message(601.0, 0.0), 601.0) is Intake.OUTAGE
+    assert odometry.covers(ns(1.0)) == -1
+
+
+def test_a_duplicate_leaves_no_trace():
+    odometry = buffer((0.0, 0.0), (0.1, 0.1))
+    assert odometry.add(message(0.1, 0.7), 0.4) is Intake.DUPLICATE
+    assert odometry.arrived == 0.1
+    np.testing.assert_array_equal(odometry.at(ns(0.1)), pose(0.1))
+
+
+def test_an_older_sample_leaves_no_trace():
+    odometry = buffer((0.0, 0.0), (0.2, 0.2))
+    assert odometry.add(message(0.1, 0.7), 0.25) is Intake.OUT_OF_ORDER
+    assert odometry.arrived == 0.2
+    assert odometry.travelled == pytest.approx(0.2)
+    np.testing.assert_allclose(odometry.at(ns(0.1)), pose(0.1), atol=1e-12)
+    assert odometry.add(message(0.3, 0.3), 0.3) is Intake.CONTINUES
+
+
+@pytest.mark.parametrize(
+    ("x", "yaw", "intake"),
+    [
+        (0.95, 0.0, Intake.CONTINUES),
+        (1.05, 0.0, Intake.JUMP),
+        (-1.05, 0.0, Intake.JUMP),
+        (0.0, np.radians(23), Intake.JUMP),  # 20 rad/s for 10 ms are 11 degrees, and 20 are always allowed
+        (0.0, np.radians(19), Intake.CONTINUES),
+    ],
+)
+def test_farther_than_the_robot_can_have_come_is_a_jump(x, yaw, intake):
+    odometry = buffer((0.0, 0.0), (0.01, 0.0))
+    assert odometry.add(message(0.02, x, 0.0, yaw), 0.02) is intake
+
+
+def test_what_is_possible_grows_with_time():
+    assert buffer((0.0, 0.0)).add(message(0.1, 5.4), 0.1) is Intake.CONTINUES
+    assert buffer((0.0, 0.0)).add(message(0.1, 5.6), 0.1) is Intake.JUMP
+    assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 1.9), 0.1) is Intake.CONTINUES
+    assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 2.1), 0.1) is Intake.JUMP
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0])
+def test_what_is_possible_depends_on_what_the_robot_does(speed):
+    """Half a metre, and three times its speed of the last seconds and three metres per second more."""
+    most = 0.5 + 0.1 * (3.0 * speed + 3.0)
+    for off, intake in ((-0.05, Intake.CONTINUES), (0.05, Intake.JUMP)):
+        odometry = buffer(*((0.1 * k, 0.1 * k * speed) for k in range(11)))
+        fast = min(most, 0.5 + 0.1 * 50.0)
+        assert odometry.add(message(1.1, speed + fast + off), 1.1) is intake
+
+
+def test_a_jump_forgets_what_was_before():
+    odometry = buffer((0.0, 0.0), (0.1, 0.5))
+    assert odometry.add(message(0.2, 500.0), 0.2) is Intake.JUMP
+    assert odometry.covers(ns(0.1)) == -1
+    assert odometry.travelled == 0.0
+    np.testing.assert_array_equal(odometry.at(ns(0.2)), pose(500.0))
+    assert odometry.add(message(0.3, 500.1), 0.3) is Intake.CONTINUES
+
+
+@pytest.mark.parametrize("stray", [3600.0, 1e9, -3600.0, -1e9, 8.0])
+def test_one_stray_stamp_does_not_shut_out_what_follows(stray):
+    odometry = buffer()
+    steady(odometry, 0.0, 1.0)
+    assert odometry.add(message(stray, 2.0), 1.01) in STRAYS
+    assert set(steady(odometry, 1.05, 3.0)) == {Intake.CONTINUES}
+
+
+def test_strays_that_come_again_and_again_are_no_clock_of_their_own():
+    """Another sender, an hour behind, on the same key: between them come ours."""
+    odometry = buffer()
+    for k in range(100):
+        t = 0.05 * k
+        assert odometry.add(message(t), t) is Intake.CONTINUES
+        assert odometry.add(message(t - 3600.0, 7.0), t + 0.01) is not Intake.RESTART
+
+
+def test_a_clock_that_started_anew_is_believed_once_it_has_run_on():
+    odometry = buffer()
+    steady(odometry, 100.0, 101.0)
+    verdicts = []
+    for k in range(25):
+        verdicts.append(odometry.add(message(1.0 + 0.05 * k, 0.1 * k), 101.05 + 0.05 * k))
+    at = verdicts.index(Intake.RESTART)
+    assert set(verdicts[:at]) == {Intake.OUT_OF_ORDER}
+    assert 20 <= at <= 21  # after a second, not before
+    assert set(verdicts[at + 1 :]) == {Intake.CONTINUES}
+    assert odometry.covers(ns(100.5)) == 1  # the old clock's samples are gone
+    assert odometry.newest.stamp_ns == ns(2.2)
+
+
+def test_a_slow_clock_needs_five_samples():
+    odometry = buffer((100.0, 0.0))
+    verdicts = [odometry.add(message(float(k), 0.0), 101.0 + k) for k in range(6)]
+    assert verdicts == [Intake.OUT_OF_ORDER] * 4 + [Intake.RESTART, Intake.GAP]
+
+
+def test_a_clock_set_forward_is_an_outage_once_it_has_run_on():
+    odometry = buffer()
+    steady(odometry, 0.0, 1.0)
+    verdicts = [odometry.add(message(3600.0 + 0.05 * k, 2.0), 1.05 + 0.05 * k) for k in range(23)]
+    at = verdicts.index(Intake.OUTAGE)
+    assert set(verdicts[:at]) == {Intake.OUT_OF_ORDER}
+    assert 20 <= at <= 21
+    assert set(verdicts[at + 1 :]) == {Intake.CONTINUES}
+
+
+def test_stamps_that_run_backwards_for_ever_are_no_restart():
+    odometry = buffer()
+    steady(odometry, 100.0, 101.0)
+    for k in range(200):
+        assert odometry.add(message(100.9 - 0.05 * k), 101.05 + 0.05 * k) in STRAYS
+    assert odometry.newest.stamp_ns == ns(101.0)
+    assert odometry.arrived == 101.0
+
+
+def test_only_the_horizon_is_remembered():
+    odometry = buffer(horizon=2.0)
+    steady(odometry, 0.0, 10.0)
+    assert odometry.covers(ns(7.99)) == -1
+    assert odometry.covers(ns(8.0)) == 0
+
+
+def test_the_samples_around_a_sweep():
+    odometry = buffer((0.0, 0.0), (0.1, 0.1), (0.2, 0.2), (0.3, 0.3), (0.4, 0.4))
+
+    def stamps(begin, end):
+        segment = odometry.around(ns(begin), ns(end))
+        assert segment.poses.shape == (len(segment.stamps), 4, 4)
+        np.testing.assert_allclose(segment.poses[:, 0, 3], (segment.stamps - ns(0.0)) * 1e-9, atol=1e-9)
+        return [round((s - ns(0.0)) * 1e-9, 3) for s in segment.stamps.tolist()]
+
+    assert stamps(0.12, 0.22) == [0.1, 0.2, 0.3]
+    assert stamps(0.1, 0.3) == [0.1, 0.2, 0.3]
+    assert stamps(0.25, 0.25) == [0.2, 0.3]
+    assert stamps(-1.0, 0.05) == [0.0, 0.1]
+    assert stamps(0.35, 9.0) == [0.3, 0.4]
+    assert stamps(-1.0, 9.0) == [0.0, 0.1, 0.2, 0.3, 0.4]
+
+
+def test_an_empty_buffer_has_nothing_around():
+    segment = buffer().around(ns(0.0), ns(1.0))
+    assert segment.stamps.shape == (0,)
+    assert segment.poses.shape == (0, 4, 4)
+
+
+stamps = st.one_of(
+    st.integers(0, 60).map(lambda k: 0.05 * k),
+    st.floats(-10.0, 10.0),
+    st.floats(-9e8, 9e8),
+)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.lists(st.tuples(stamps, st.floats(0.0, 0.7), st.floats(-3.0, 3.0)), max_size=60))
+def test_whatever_stamps_come_the_buffer_stays_in_order(samples):
+    odometry, now, travelled = OdometryBuffer(NodeConfig()), 0.0, 0.0
+    for seconds, later, x in samples:
+        now += later
+        newest = odometry.newest
+        intake = odometry.add(message(seconds, x), now)
+        held = odometry.around(-(1 << 62), 1 << 62).stamps
+        assert (np.diff(held) > 0).all()
+        assert held[-1] == odometry.newest.stamp_ns
+        assert held[-1] - held[0] <= 5e9
+        if intake in STRAYS:
+            assert odometry.newest is newest
+        else:
+            assert odometry.newest.stamp_ns == ns(seconds)
+        if intake in (Intake.CONTINUES, Intake.GAP) and newest is not None:
+            assert odometry.newest.stamp_ns > newest.stamp_ns
+            assert odometry.travelled >= travelled
+        travelled = odometry.travelled
+        for stamp in held.tolist():
+            assert odometry.at(stamp) is not None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"pose_rate": 0.0},
+        {"coast": -1.0},
+        {"horizon": float("nan")},
+        {"max_gap": float("inf")},
+        {"pose_rate": 201.0},
+    ],
+)
+def test_limits_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        NodeConfig(**wrong)

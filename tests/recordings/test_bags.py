@@ -1,0 +1,321 @@
+"""Recordings as runs: every storage, stamps of headers, deskewing, topics, and what cannot be read."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_files import LATE, cloud, odometry, write_bag
+
+from coview_stream.cli import main
+from coview_stream.clouds import write_tum
+from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.recordings.bag_reader import BagReader
+from coview_stream.recordings.odometry_track import Track
+from coview_stream.recordings.open_run import open_run
+
+START = 1_700_000_000_000_000_000
+SPEED, TURN = 6.0, 0.5
+COUNT = 8
+CLOUD_NS = [START + 40_000_000 + k * 100_000_000 for k in range(COUNT)]
+ODOMETRY_NS = [START + k * 20_000_000 for k in range(50)]
+POINTS = np.random.default_rng(5).uniform(-30, 30, (40, 3)).astype(np.float32)
+
+
+def T_at(stamp_ns):
+    """(4, 4) odometry <- body of a robot on a circle, far from odometry's zero."""
+    t = 1e-9 * (np.asarray(stamp_ns) - START)
+    yaw = TURN * t
+    place = (SPEED / TURN * np.sin(yaw) + 3000.0, SPEED / TURN * (1 - np.cos(yaw)) - 2000.0, 1.5)
+    return pose_from(rot_z(yaw), place)
+
+
+def driven(stamps=ODOMETRY_NS):
+    return [odometry(ns, T_at(ns)) for ns in stamps]
+
+
+def clouds(stamps=CLOUD_NS):
+    return [cloud(ns, POINTS + np.float32(k)) for k, ns in enumerate(stamps)]
+
+
+def only_file(folder: Path) -> Path:
+    return next(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
+
+
+@pytest.mark.parametrize(
+    ("name", "storage", "compression", "single"),
+    [
+        ("mcap", "mcap", "", False),
+        ("db3", "sqlite3", "", False),
+        ("mcap_file", "mcap", "", True),
+        ("db3_file", "sqlite3", "", True),
+        ("zstd_chunks", "mcap", "STORAGE", True),
+        ("zstd_messages", "sqlite3", "MESSAGE", False),
+        ("zstd_file", "sqlite3", "FILE", False),
+        ("ros1.bag", "", "", False),
+    ],
+)
+def test_every_storage(tmp_path, name, storage, compression, single):
+    bag = write_bag(tmp_path / name, {"/points": clouds(), "/odom": driven()}, storage, compression)
+    if single:
+        (bag / "metadata.yaml").unlink()
+    run = open_run(only_file(bag) if single else bag)
+    assert (len(run), run.notes) == (COUNT, ())
+    np.testing.assert_allclose(run.stamps, 1e-9 * np.array(CLOUD_NS), rtol=0, atol=1e-6)
+    for k, frame in enumerate(run):
+        np.testing.assert_array_equal(frame.points, POINTS + np.float32(k))
+        np.testing.assert_allclose(frame.T_odom_body, T_at(CLOUD_NS[k]), atol=1e-4)
+        assert not frame.origin.any()
+    for k in (5, 2, 3, 0, 7):
+        np.testing.assert_array_equal(run.read(k).points, POINTS + np.float32(k))
+    with pytest.raises(IndexError):
+        run.read(COUNT)
+
+
+def test_poses_between_samples_are_interpolated(tmp_path):
+    between = [ns + 7_000_000 for ns in CLOUD_NS]
+    bag = write_bag(tmp_path / "bag", {"/points": clouds(between), "/odom": driven()})
+    for T, ns in zip(open_run(bag).poses, between, strict=True):
+        np.testing.assert_allclose(T, T_at(ns), atol=5e-4)
+        assert abs(T[0, 3] - T_at(ns - 2_000_000)[0, 3]) > 5e-3
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("begin", "end"), [(0.0, 0.1), (-0.1, 0.0)])
+def test_a_sweep_is_as_if_measured_at_once(tmp_path, order, begin, end):
+    rng = np.random.default_rng(2)
+    stamp = START + 400_000_000
+    world = transform(T_at(stamp), rng.uniform(-25, 25, (300, 3)))
+    times = rng.uniform(begin, end, len(world))
+    swept = [
+        transform(inverse(T_at(stamp + round(1e9 * t))), p[None])[0]
+        for p, t in zip(world, times, strict=True)
+    ]
+    at_once = transform(inverse(T_at(stamp)), world)
+    swept[7][1] = np.nan
+    messages = [cloud(stamp, np.array(swept, np.float32), times, order)]
+    frame = open_run(write_bag(tmp_path / "bag", {"/points": messages, "/odom": driven()})).read(0)
+    assert frame.dropped == 1
+    kept = np.arange(len(world)) != 7
+    assert np.linalg.norm(np.array(swept)[kept] - at_once[kept], axis=1).max() > 0.4
+    assert np.linalg.norm(frame.points - at_once[kept], axis=1).max() < 0.01
+
+
+def test_a_recording_is_read_once_in_order_and_not_held(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()})
+    begun, ask = [], BagReader.messages
+    monkeypatch.setattr(BagReader, "messages", lambda self, *a: begun.append(a) or ask(self, *a))
+    run = open_run(bag)
+    assert len(begun) == 1
+    assert len(list(run)) == COUNT
+    assert len(begun) == 2
+    run.read(6)
+    run.read(7)
+    assert len(begun) == 3
+    assert begun[2][1] > LATE
+
+
+def test_another_thread_may_read(tmp_path):
+    run = open_run(write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()}, "sqlite3"))
+    seen = []
+    reader = threading.Thread(target=lambda: seen.extend(frame.points[0, 0] for frame in run))
+    reader.start()
+    reader.join()
+    assert seen == [POINTS[0, 0] + np.float32(k) for k in range(COUNT)]
+
+
+def test_several_topics_need_a_choice(tmp_path):
+    topics = {
+        "/rear": clouds(CLOUD_NS[:3]),
+        "/front": clouds(),
+        "/odom": driven(),
+        "/wheel": driven(),
+        "/idle": [],
+    }
+    bag = write_bag(tmp_path / "bag", topics)
+    listed = (
+        r"2 topics with sensor_msgs/msg/PointCloud2; choose by --cloud-topic: .*/front \(8 mess.*/rear \(3 "
+    )
+    with pytest.raises(RunError, match=listed):
+        open_run(bag)
+    with pytest.raises(RunError, match=r"--odometry-topic: /odom \(50 messages\), /wheel"):
+        open_run(bag, cloud_topic="/rear")
+    with pytest.raises(RunError, match=r"no topic '/odom' with sensor_msgs.*--cloud-topic may be /front"):
+        open_run(bag, cloud_topic="/odom")
+    assert len(open_run(bag, cloud_topic="/rear", odometry_topic="/wheel")) == 3
+
+
+def test_frames_without_odometry_are_left_out_and_counted(tmp_path):
+    far = pose_from(np.eye(3), (500.0, 0.0, 0.0))
+    gap = [ns for ns in ODOMETRY_NS if ns < START + 300_000_000]
+    track = driven(gap) + [odometry(ns, T_at(ns)) for ns in (START + 900_000_000, START + 920_000_000)]
+    track += [odometry(ns, far @ T_at(ns)) for ns in (START + 940_000_000, START + 960_000_000)]
+    stamps = [START - 5, START + 100_000_000, START + 100_000_000, START + 600_000_000, START + 910_000_000]
+    stamps += [START + 930_000_000, START + 940_000_000, START + 960_000_900, START + 970_000_000]
+    run = open_run(write_bag(tmp_path / "bag", {"/points": clouds(stamps), "/odom": track}))
+    # the first differs from the first sample by less than stamps are good for
+    assert [run.read(k).points[0, 0] - POINTS[0, 0] for k in range(len(run))] == pytest.approx(
+        [0, 1, 4, 6, 7], abs=1e-4
+    )
+    assert len(run.notes) == 1
+    assert "4 of 9 clouds left out: 3 without odometry around their stamps, 1 with a stamp" in run.notes[0]
+
+
+def test_a_sweep_is_not_moved_across_a_jump():
+    stamps = np.array([0, 20, 40, 60, 80], np.int64) * 1_000_000
+    poses = np.stack([pose_from(np.eye(3), (0.1 * k + 90.0 * (k > 2), 0.0, 0.0)) for k in range(5)])
+    track = Track(stamps, poses)
+    for stamp, expected in ((30, [20, 40]), (40, [20, 40]), (60, [60, 80]), (70, [60, 80])):
+        segment = track.around(25_000_000, 75_000_000, stamp * 1_000_000)
+        np.testing.assert_array_equal(segment.stamps, np.array(expected) * 1_000_000)
+    np.testing.assert_array_equal(track.at(stamps + 10_000_000)[1], [True, True, False, True, False])
+
+
+def test_late_and_damaged_messages(tmp_path):
+    messages = clouds()
+    messages[2], messages[3] = messages[3], messages[2]
+    messages[5] = messages[5].__class__(**{**vars(messages[5]), "width": 5000})
+    samples = driven()
+    samples[9].pose.pose.position.x = np.nan
+    run = open_run(write_bag(tmp_path / "bag", {"/points": messages, "/odom": samples}))
+    assert np.diff(run.stamps).min() > 0.09
+    assert run.notes == (f"{tmp_path / 'bag'}: 1 damaged messages left out",)
+    assert run.read(2).points[0, 0] == POINTS[0, 0] + 2
+    with pytest.raises(CloudError, match=r"bag: cloud of /points at 1700000000\.54.*truncated; skip it"):
+        run.read(5)
+    assert run.read(6).points[0, 0] == POINTS[0, 0] + 6
+
+
+def test_odometry_from_a_file_and_a_lone_scan(tmp_path):
+    bag = write_bag(tmp_path / "bag", {"/points": clouds()})
+    write_tum(tmp_path / "a.tum", [1e-9 * ns for ns in CLOUD_NS[2:]], [T_at(ns) for ns in CLOUD_NS[2:]])
+    run = open_run(bag, tmp_path / "a.tum")
+    assert (len(run), len(run.notes)) == (COUNT - 2, 1)
+    np.testing.assert_allclose(run.poses[0], T_at(CLOUD_NS[2]), atol=1e-5)
+    with pytest.raises(RunError, match="give one of them"):
+        open_run(bag, tmp_path / "a.tum", odometry_topic="/odom")
+    lone = open_run(write_bag(tmp_path / "scan", {"/points": clouds([START])}))
+    assert (len(lone), lone.stamps[0]) == (1, 1.7e9)
+    np.testing.assert_array_equal(lone.read(0).T_odom_body, np.eye(4))
+
+
+def test_a_lidar_away_from_the_odometrys_body_is_said(tmp_path):
+    messages = [cloud(ns, POINTS, frame="velodyne") for ns in CLOUD_NS]
+    run = open_run(write_bag(tmp_path / "bag", {"/points": messages, "/odom": driven()}))
+    assert len(run.notes) == 1
+    assert "clouds are in frame 'velodyne', odometry moves 'body': taken for one" in run.notes[0]
+
+
+def _cut(bag):
+    file = only_file(bag)
+    file.write_bytes(file.read_bytes()[:-4000])
+    return bag
+
+
+def _unknown_codec(bag):
+    file = only_file(bag)
+    file.write_bytes(file.read_bytes().replace(b"\4\0\0\0zstd", b"\4\0\0\0snap"))
+    return file
+
+
+def _metadata(bag, old, new):
+    text = (bag / "metadata.yaml").read_text()
+    assert old in text
+    (bag / "metadata.yaml").write_text(text.replace(old, new))
+    return bag
+
+
+def _without(bag):
+    only_file(bag).unlink()
+    return bag
+
+
+@pytest.mark.parametrize(
+    ("storage", "compression", "harm", "reason"),
+    [
+        ("mcap", "", _cut, "end magic.*mcap recover"),
+        ("sqlite3", "", _cut, "malformed.*repair it"),
+        (
+            "mcap",
+            "STORAGE",
+            _unknown_codec,
+            r"Unsupported chunk compression 'snap'\); write it again with zstd",
+        ),
+        (
+            "sqlite3",
+            "MESSAGE",
+            lambda b: _metadata(b, "zstd", "brotli"),
+            "'brotli' is not supported.*ros2 bag convert",
+        ),
+        (
+            "mcap",
+            "",
+            lambda b: _metadata(b, "storage_identifier: mcap", "storage_identifier: other"),
+            "'other'",
+        ),
+        ("mcap", "", lambda b: _metadata(b, "version: 9", "{"), "YAML.*ros2 bag reindex"),
+        ("mcap", "", _without, "missing.*repair it"),
+    ],
+)
+def test_recordings_that_cannot_be_read(tmp_path, storage, compression, harm, reason):
+    bag = write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()}, storage, compression)
+    with pytest.raises(RunError, match=reason) as caught:
+        open_run(harm(bag))
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "bag") in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("topics", "reason"),
+    [
+        ({}, r"no topic with sensor_msgs/msg/PointCloud2; record one: it has no topics at all"),
+        ({"/odom": driven()}, r"no topic with sensor_msgs.*it has /odom \(nav_msgs/msg/Odometry\)"),
+        ({"/points": [], "/odom": driven()}, "not one cloud"),
+        ({"/points": clouds()}, r"no topic with nav_msgs/msg/Odometry; give --odometry FILE"),
+        ({"/points": [b"\0\1\0\0"] * 3, "/odom": driven()}, "not one cloud"),
+        (
+            {"/points": clouds([0, 0, 0]), "/odom": driven()},
+            r"0\.000 to 0\.000 s, odometry 17.*clocks the same",
+        ),
+        (
+            {"/points": clouds(), "/odom": driven([*ODOMETRY_NS, START - 10**10, START])},
+            "odometry go back by 1",
+        ),
+    ],
+)
+def test_recordings_without_a_run(tmp_path, topics, reason):
+    with pytest.raises(RunError, match=reason):
+        open_run(write_bag(tmp_path / "bag", topics))
+
+
+def test_directories_of_recordings(tmp_path):
+    bag = write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()})
+    (bag / "metadata.yaml").unlink()
+    assert len(open_run(bag)) == COUNT
+    (bag / "other.mcap").touch()
+    with pytest.raises(RunError, match=r"several recordings \(bag\.mcap, other\.mcap\) without metadata"):
+        open_run(bag)
+
+
+def test_locate_finds_its_way_in_a_recording(world_file, world_drive, tmp_path, capsys):
+    stamps = [START + k * 500_000_000 for k in range(7)]
+    messages = [cloud(ns, c, frame="lidar") for ns, c in zip(stamps, world_drive.clouds, strict=False)]
+    samples = [odometry(ns, T) for ns, T in zip(stamps, world_drive.T_odom_body, strict=False)]
+    bag = write_bag(tmp_path / "bag", {"/points": messages, "/odom": samples})
+    command = ["locate", str(world_file), str(bag), "-o", str(tmp_path / "out"), "--no-pictures"]
+    assert main([*command, "--cloud-topic", "/points", "--odometry-topic", "/odom"]) == 0
+    assert capsys.readouterr().err.count("taken for one") == 1
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["frames"] == 7
+    assert main([*command, "--cloud-topic", "/none"]) == 2
+    assert "--cloud-topic may be /points (7 messages)" in capsys.readouterr().err
+
+
+def test_files_have_no_topics(tmp_path):
+    write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()})
+    (tmp_path / "frames").mkdir()
+    with pytest.raises(RunError, match="has no topics"):
+        open_run(tmp_path, cloud_topic="/points")

@@ -1,0 +1,163 @@
+"""Runs without odometry, in files and in recordings, around a registration that knows the truth."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import small_world
+from fake_lidar_odometry import Truth
+
+from coview_stream.cli import build_parser, main
+from coview_stream.clouds.trajectory import read_tum
+from coview_stream.errors import RunError
+from coview_stream.geometry.transforms import inverse
+from coview_stream.odometry import lidar_odometry as module
+from coview_stream.odometry.lidar_odometry import LidarOdometry
+from coview_stream.recordings.open_run import open_run
+
+
+@pytest.fixture
+def bare(world_run, tmp_path):
+    """The small world's run without its odometry."""
+    run = tmp_path / "run"
+    shutil.copytree(world_run, run)
+    (run / "odometry.tum").unlink()
+    return run
+
+
+def truthful(world_drive):
+    return LidarOdometry(registration=Truth(world_drive.T_map_body))
+
+
+def times(run, stamps):
+    (run / "times.txt").write_text("\n".join(map(str, stamps)) + "\n")
+
+
+def test_a_run_gets_poses_and_notes(bare, world_drive):
+    done = []
+    times(bare, 100.0 + 0.5 * np.arange(7))
+    run = open_run(bare, "kiss-icp", lidar=truthful(world_drive), progress=lambda *at: done.append(at))
+    assert len(run) == 7
+    assert run.stamps[3] == 101.5
+    motion, truth = (inverse(T[0]) @ T[6] for T in (run.poses, world_drive.T_map_body))
+    assert small_world.pose_error(motion, truth)[0] < 0.02
+    assert abs(run.poses[0, 2, 2] - 1.0) < 1e-4
+    assert done[-1] == (7, 7)
+    assert "down is taken from the ground" in run.notes[0]
+
+
+def test_frames_without_stamps_are_taken_for_ten_a_second(bare, world_drive):
+    run = open_run(bare, "kiss-icp", lidar=truthful(world_drive))
+    assert np.allclose(run.stamps, 0.1 * np.arange(7))
+    assert "no times.txt" in run.notes[0]
+
+
+def test_stamps_of_odometry_that_is_not_wanted(world_run, world_drive):
+    run = open_run(world_run, "kiss-icp", lidar=truthful(world_drive))
+    assert np.allclose(run.stamps, 100.0 + 0.5 * np.arange(7))
+    assert np.abs(run.poses[:, :3, 3]).max() < 30  # not those of the file, kilometres away
+
+
+def test_frames_that_cannot_be_placed_are_left_out(bare, world_drive):
+    (bare / "frames" / "000006.ply").write_bytes(b"")
+    run = open_run(bare, "kiss-icp", lidar=truthful(world_drive))
+    assert len(run) == 6
+    assert "could not place 1 of 7 frames" in run.notes[-1]
+    assert "000006.ply" in run.notes[-1]
+
+
+def test_nothing_that_can_be_placed(bare, world_drive):
+    for path in (bare / "frames").iterdir():
+        path.write_bytes(b"")
+    with pytest.raises(RunError, match="not one of 7 frames"):
+        open_run(bare, "kiss-icp", lidar=truthful(world_drive))
+
+
+def test_times_that_do_not_fit(bare, world_drive):
+    times(bare, [1.0, 2.0])
+    with pytest.raises(RunError, match="too short"):
+        open_run(bare, "kiss-icp", lidar=truthful(world_drive))
+    with pytest.raises(RunError, match="odometry-topic"):
+        open_run(bare, "kiss-icp", odometry_topic="/odom")
+    with pytest.raises(RunError, match="cloud-topic"):
+        open_run(bare, "kiss-icp", cloud_topic="/points")
+
+
+def test_one_frame_needs_none(bare):
+    only = bare / "frames" / "000000.ply"
+    assert len(open_run(only, "kiss-icp")) == 1
+
+
+def test_locate_by_it(world_file, bare, world_drive, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(module, "KissRegistration", lambda config: Truth(world_drive.T_map_body))
+    times(bare, 100.0 + 0.5 * np.arange(7))
+    out = tmp_path / "out"
+    command = [
+        "locate",
+        str(world_file),
+        str(bare),
+        "-o",
+        str(out),
+        "--no-pictures",
+        "--odometry",
+        "kiss-icp",
+    ]
+    assert main(command) == 0
+    assert "down is taken from the ground" in capsys.readouterr().err
+    stamps, poses = read_tum(out / "trajectory.tum")
+    truth = np.array(world_drive.T_map_body)[np.round((stamps - 100.0) / 0.5).astype(int)]
+    assert len(stamps) >= 2
+    assert np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.08
+    assert main([*command, "--gravity", "level"]) == 0
+    assert "down is taken" not in capsys.readouterr().err
+    assert main([*command, "--gravity=-1e-3,0,-9.81"]) == 0
+
+
+@pytest.mark.parametrize("gravity", [["--gravity", "level"], ["--gravity=-1e-3,0,-9.81"]])
+def test_gravity_takes_one_value_and_leaves_the_rest(gravity):
+    for command in ("locate", "serve"):
+        end = ["site.coview", "run", "-o", "out"] if command == "locate" else ["site.coview", "--robot", "a"]
+        args = build_parser().parse_args([command, "--odometry", "kiss-icp", *gravity, *end])
+        assert args.gravity == gravity[-1].removeprefix("--gravity=")
+
+
+def complaint(capsys):
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("coview-stream: error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_a_missing_package_is_one_line(world_file, world_run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "kiss_icp", None)
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
+    command = [
+        "locate",
+        str(world_file),
+        str(world_run),
+        "-o",
+        str(tmp_path / "out"),
+        "--odometry",
+        "kiss-icp",
+    ]
+    assert main(command) == 2
+    assert "pip install 'kiss-icp>=1.2'" in complaint(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--gravity", "level"], "--gravity goes with --odometry kiss-icp"),
+        (["--odometry", "kiss-icp", "--gravity", "up"], "ground, level, or three numbers"),
+        (["--odometry", "kiss-icp", "--gravity", "0,0,9.8"], "accelerometer"),
+        (["--odometry", "kiss-icp", "--gravity="], "ground, level, or three numbers"),
+    ],
+)
+def test_wrong_options(world_file, world_run, tmp_path, capsys, options, text):
+    assert main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), *options]) == 2
+    assert text in complaint(capsys)

@@ -1,0 +1,211 @@
+"""Runs and trajectories: layouts, lazy reading, and everything that does not fit together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coview_stream.clouds import read_tum, write_cloud, write_tum
+from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.recordings.open_run import open_run
+
+POINTS = np.random.default_rng(3).normal(0, 20, (30, 3)).astype(np.float32)
+COUNT = 4
+POSES = np.stack([pose_from(rot_z(0.3 * i), (2.0 * i, -1.0, 0.1)) for i in range(COUNT)])
+STAMPS = 1_700_000_000.125 + 0.1 * np.arange(COUNT)
+LINES = [f"{i}.5 {i} 0 0 0 0 0 1" for i in range(COUNT)]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    (tmp_path / "frames").mkdir()
+    for i in range(COUNT):
+        write_cloud(tmp_path / "frames" / f"{i:06d}.pcd", POINTS + i)
+    write_tum(tmp_path / "odometry.tum", STAMPS, POSES)
+    return tmp_path
+
+
+def _kitti(root: Path, poses: np.ndarray) -> Path:
+    (root / "velodyne").mkdir()
+    for i in range(len(poses)):
+        write_cloud(root / "velodyne" / f"{i:06d}.bin", POINTS + i)
+    np.savetxt(root / "times.txt", np.arange(len(poses)) * 0.1)
+    np.savetxt(root / "poses.txt", poses[:, :3].reshape(-1, 12))
+    return root
+
+
+def test_run_yields_frames_in_order(run: Path) -> None:
+    opened = open_run(run)
+    frames = list(opened)
+    assert len(opened) == len(frames) == COUNT
+    for i, frame in enumerate(frames):
+        assert frame.index == i
+        assert frame.stamp == pytest.approx(STAMPS[i], abs=1e-6)
+        np.testing.assert_array_equal(frame.points, POINTS + np.float32(i))
+        np.testing.assert_allclose(frame.T_odom_body, POSES[i], atol=1e-6)
+        assert not frame.origin.any()
+
+
+def test_frames_are_sorted_by_number(run: Path) -> None:
+    for i in range(COUNT):
+        (run / "frames" / f"{i:06d}.pcd").rename(run / "frames" / f"{i + 8}.pcd")
+    assert [path.name for path in open_run(run).frames_paths] == ["8.pcd", "9.pcd", "10.pcd", "11.pcd"]
+
+
+def test_one_damaged_frame_fails_alone(run: Path) -> None:
+    (run / "frames" / "000002.pcd").write_bytes(b"")
+    opened = open_run(run)
+    assert len(opened.read(3).points) == 30
+    with pytest.raises(CloudError, match=r"000002\.pcd"):
+        opened.read(2)
+    with pytest.raises(IndexError):
+        opened.read(COUNT)
+
+
+def test_frames_of_a_run_must_be_in_the_body_frame(run: Path) -> None:
+    write_cloud(run / "frames" / "000001.pcd", POINTS, origin=(500_000.0, 4e6, 0.0))
+    with pytest.raises(CloudError, match="body frame"):
+        open_run(run).read(1)
+
+
+def test_single_cloud_keeps_its_origin(tmp_path: Path) -> None:
+    origin = np.array([500_000.25, 4_000_000.5, 30.0])
+    write_cloud(tmp_path / "scan.laz", POINTS, origin=origin)
+    opened = open_run(tmp_path / "scan.laz")
+    frame = opened.read(0)
+    assert len(opened) == 1
+    assert frame.stamp == 0.0
+    np.testing.assert_array_equal(frame.T_odom_body, np.eye(4))
+    np.testing.assert_allclose(frame.points + frame.origin, POINTS + origin, atol=1e-3)
+
+
+def test_one_frame_needs_no_odometry(run: Path) -> None:
+    (run / "odometry.tum").unlink()
+    with pytest.raises(RunError, match="4 frames but no odometry"):
+        open_run(run)
+    for i in range(1, COUNT):
+        (run / "frames" / f"{i:06d}.pcd").unlink()
+    assert len(open_run(run)) == 1
+
+
+def test_odometry_from_another_file(run: Path) -> None:
+    write_tum(run / "other.tum", STAMPS + 5, POSES)
+    assert open_run(run, run / "other.tum").stamps[0] == pytest.approx(STAMPS[0] + 5)
+    with pytest.raises(RunError, match=r"missing\.tum: no such file"):
+        open_run(run, run / "missing.tum")
+
+
+def test_kitti_layout(tmp_path: Path) -> None:
+    opened = open_run(_kitti(tmp_path, POSES))
+    np.testing.assert_allclose(opened.poses, POSES, atol=1e-9)
+    np.testing.assert_allclose(opened.stamps, np.arange(COUNT) * 0.1)
+    np.testing.assert_array_equal(opened.read(1).points, POINTS + np.float32(1))
+
+
+def test_kitti_camera_poses_need_their_calibration(tmp_path: Path) -> None:
+    T_camera_body = pose_from([[0, -1, 0], [0, 0, -1], [1, 0, 0]], (0.1, -0.2, -0.3))
+    body = np.stack([pose_from(np.eye(3), (4.0 * i, 0.0, 0.0)) for i in range(COUNT)])
+    _kitti(tmp_path, T_camera_body @ body @ inverse(T_camera_body))
+    with pytest.raises(RunError, match=r"calib\.txt"):
+        open_run(tmp_path)
+    numbers = " ".join(map(str, T_camera_body[:3].ravel()))
+    (tmp_path / "calib.txt").write_text(f"P0: 1 2 3\nTr: {numbers}\n")
+    np.testing.assert_allclose(open_run(tmp_path).poses, body, atol=1e-9)
+    (tmp_path / "calib.txt").write_text("Tr: 1 2 3\n")
+    with pytest.raises(RunError, match="calibration"):
+        open_run(tmp_path)
+
+
+def test_kitti_times_must_fit(tmp_path: Path) -> None:
+    _kitti(tmp_path, POSES)
+    (tmp_path / "times.txt").write_text("0\n1\n2\n")
+    with pytest.raises(RunError, match=r"times\.txt: too short, 3 stamps for 4 frames"):
+        open_run(tmp_path)
+    (tmp_path / "times.txt").unlink()
+    with pytest.raises(RunError, match=r"times\.txt: no such file"):
+        open_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "reason"),
+    [
+        (LINES[:3], "too short, 3 poses for 4 frames"),
+        ([*LINES, "9 0 0 0 0 0 0 1"], "too long, 5 poses for 4 frames"),
+        ([], "too short, 0 poses"),
+        ([LINES[1], LINES[0], *LINES[2:]], r"tum:2: stamp 0\.500000 comes before"),
+        ([LINES[0], LINES[0], *LINES[2:]], r"tum:2: stamp 0\.500000 repeats"),
+        ([LINES[0], "1.5 nan 0 0 0 0 0 1", *LINES[2:]], "tum:2: NaN"),
+        ([LINES[0], "1.5 0 0 1e30 0 0 0 1", *LINES[2:]], "tum:2: NaN, infinite or absurd"),
+        ([LINES[0], "1.5 0 0 0 0 0 0 0", *LINES[2:]], "tum:2: quaternion is zero"),
+        ([LINES[0], "1.5 0 0 0 0 0 1", *LINES[2:]], "tum:2: 7 columns instead of 8"),
+        (["# t x y z qx qy qz qw", "", LINES[0], "1.5 a 0 0 0 0 0 1", *LINES[2:]], "tum:4: not a number"),
+        (["<html>"], "tum:1: 1 columns"),
+        (["1 0 0 0 1 0 0 0 1 0 0 0"] * 4, "times"),
+    ],
+)
+def test_odometry_that_does_not_fit(run: Path, lines: list[str], reason: str) -> None:
+    (run / "odometry.tum").write_text("\n".join(lines))
+    with pytest.raises(RunError, match=reason) as caught:
+        open_run(run)
+    assert "\n" not in str(caught.value)
+
+
+def test_odometry_that_is_no_text(run: Path) -> None:
+    (run / "odometry.tum").write_bytes(bytes(range(256)))
+    with pytest.raises(RunError, match="is no text"):
+        open_run(run)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda d: d / "nothing", "no such run"),
+        (lambda d: d, "no frames/ directory"),
+        (lambda d: (d / "frames").mkdir() or d, "no frames"),
+        (lambda d: write_cloud(d / "a.pcd", POINTS) or d, "in the directory itself"),
+        (lambda d: (d / "a.mcap").touch() or d / "a.mcap", "seems to be empty.*copy or record"),
+        (lambda d: (d / "metadata.yaml").touch() or d, r"cannot be read \(Invalid bag metadata.*reindex"),
+        (lambda d: (d / "a.txt").touch() or d / "a.txt", "neither a run nor a cloud"),
+    ],
+)
+def test_no_run_at_all(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
+    with pytest.raises(RunError, match=reason):
+        open_run(make(tmp_path))
+
+
+def test_frames_must_be_files_and_differ(run: Path) -> None:
+    write_cloud(run / "frames" / "000001.ply", POINTS)
+    with pytest.raises(RunError, match="same frame"):
+        open_run(run)
+    (run / "frames" / "000001.ply").unlink()
+    (run / "frames" / "000004.pcd").symlink_to(run / "gone")
+    with pytest.raises(RunError, match="broken link"):
+        open_run(run)
+
+
+def test_trajectory_round_trip_and_quaternions_of_any_length(tmp_path: Path) -> None:
+    write_tum(tmp_path / "a.tum", STAMPS, POSES)
+    stamps, poses = read_tum(tmp_path / "a.tum")
+    np.testing.assert_allclose(stamps, STAMPS, atol=1e-6)
+    np.testing.assert_allclose(poses, POSES, atol=1e-6)
+    (tmp_path / "b.tum").write_text("1 0 0 0 0 0 3 3\n")
+    np.testing.assert_allclose(read_tum(tmp_path / "b.tum")[1][0, :3, :3], rot_z(np.pi / 2), atol=1e-12)
+
+
+def test_empty_trajectory(tmp_path: Path) -> None:
+    write_tum(tmp_path / "a.tum", [], [])
+    stamps, poses = read_tum(tmp_path / "a.tum")
+    assert stamps.shape == (0,)
+    assert poses.shape == (0, 4, 4)
+    assert (tmp_path / "a.tum").read_bytes() == b""
+
+
+def test_trajectory_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"):
+        write_tum(tmp_path / "nowhere" / "a.tum", STAMPS, POSES)
+    with pytest.raises(InputError, match="3 stamps for 4 poses"):
+        write_tum(tmp_path / "a.tum", STAMPS[:3], POSES)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,121 @@
+"""The table of robots: what it shows, and what it no longer shows. Time is handed in."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from coview_stream.errors import MessageError
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.messages import decode_pose, encode_pose
+from coview_stream.messages.json_messages import pose_record, read_status
+from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.stream.client.fleet import SILENT, STALE, Fleet, printable
+
+T = pose_from(rot_z(math.radians(30)), [412_000.123, 5_318_000.456, 7.891])
+POSE = PoseMessage(5, "r1", "TRACKING", T, np.eye(6), 0.93, "ab", 0.12)
+STATUS = {
+    "state": "TRACKING",
+    "reason": "all well",
+    "counters": {"dropped": 4},
+    "latency_ms": {"p50": 31.4, "p95": 50, "p99": 88.6},
+}
+
+
+def test_a_robot_that_tracks():
+    fleet = Fleet()
+    fleet.add_status("r1", STATUS, 9.0)
+    for k in range(60):
+        fleet.add_pose(POSE, 10.0 + 0.1 * k)
+    header, line = fleet.table(15.9)
+    assert header.split()[:6] == ["robot", "state", "x", "y", "z", "yaw"]
+    assert line.split() == [
+        *("r1", "TRACKING", "412000.12", "5318000.46", "7.89", "30.0"),
+        *("0.12", "10.0", "0.93", "31/89", "4", "all", "well"),
+    ]
+
+
+def test_a_stale_pose_is_no_longer_shown():
+    fleet = Fleet()
+    fleet.add_pose(POSE, 10.0)
+    assert "412000.12" in fleet.table(10.0 + STALE - 0.1)[1]
+    fleet.add_status("r1", {"state": "LOST"}, 10.0 + STALE)
+    line = fleet.table(10.0 + STALE + 0.1)[1]
+    assert "412000.12" not in line
+    assert line.split()[:3] == ["r1", "LOST", "-"]
+
+
+def test_a_robot_that_got_lost_shows_no_pose():
+    fleet = Fleet()
+    fleet.add_pose(POSE, 10.0)
+    fleet.add_status("r1", {"state": "LOST"}, 10.1)
+    assert "412000.12" not in fleet.table(10.2)[1]
+    fleet.add_pose(POSE, 10.3)  # found again; the status that says so comes later
+    assert "412000.12" in fleet.table(10.4)[1]
+
+
+def test_a_robot_that_went_silent_says_so():
+    fleet = Fleet()
+    fleet.add_status("r1", STATUS, 10.0)
+    assert "TRACKING" in fleet.table(10.0 + SILENT)[1]
+    assert "silent 7 s" in fleet.table(17.2)[1]
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        {},
+        {"state": None, "counters": 3, "latency_ms": []},
+        {"state": 5, "counters": {"dropped": "x"}, "latency_ms": {"p50": None, "p99": 10**400}},
+        {"reason": {"deep": [1]}},
+    ],
+)
+def test_any_status_can_be_shown(status):
+    fleet = Fleet()
+    fleet.add_status("r1", status, 1.0)
+    assert fleet.table(1.5)[1].startswith("r1 ")
+
+
+def test_robots_are_sorted_and_text_from_the_network_is_harmless():
+    fleet = Fleet()
+    fleet.add_status("zoe", {"state": "\x1b[2JSEARCHING\n", "reason": "a\tb"}, 1.0)
+    fleet.add_status("ada", {}, 1.0)
+    lines = fleet.table(1.0, header=False)
+    assert [line.split()[0] for line in lines] == ["ada", "zoe"]
+    assert printable("a\x1b[2J\nb") == "a [2J b"
+    assert all(line.isprintable() for line in lines)
+
+
+def test_a_pose_without_confidence_shows_none():
+    fleet = Fleet()
+    message = decode_pose(Sample("k", encode_pose(POSE, "foxglove").payload), hint="foxglove")
+    fleet.add_pose(PoseMessage(**{**vars(message), "robot": "r1"}), 1.0)
+    assert fleet.table(1.1)[1].split()[-4:] == ["0.0", "-", "-/-", "-"]
+
+
+@pytest.mark.parametrize("name", ["json", "cdr", "foxglove", "keelson"])
+def test_records_have_the_same_fields_whatever_the_format(name):
+    encoded = encode_pose(POSE, name)
+    sample = Sample("k", encoded.payload, encoded.encoding)
+    record = pose_record(decode_pose(sample), sample)
+    native = json.loads(encode_pose(POSE, "json").payload)
+    assert set(record) == set(native)
+    assert record["position"] == pytest.approx(native["position"])
+    assert record["stamp_ns"] == 5
+    json.dumps(record, allow_nan=False)
+    assert record["confidence"] == (0.93 if name == "json" else None)
+    assert (record["covariance"] is None) is (name in ("foxglove", "keelson"))
+
+
+def test_json_is_passed_on_with_fields_that_are_not_known_here():
+    payload = json.dumps({**json.loads(encode_pose(POSE, "json").payload), "new": 1}).encode()
+    assert pose_record(POSE, Sample("k", payload))["new"] == 1
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b"3", b"{", b"\xff", b'{"a": NaN}', b"[" * 100_000])
+def test_what_is_no_status(payload):
+    with pytest.raises(MessageError, match="the status is no JSON"):
+        read_status(Sample("coview/r1/out/status", payload))

@@ -1,0 +1,246 @@
+"""Replays: what is sent, when and in which order, on a clock of the test's own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coview_stream.clouds.files import write_cloud
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.errors import CloudError, ConfigError
+from coview_stream.geometry.transforms import pose_from, rot_z, yaw_of
+from coview_stream.messages import decode_cloud, decode_odometry
+from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings.run import Run
+from coview_stream.stream.client.replay import replay
+from coview_stream.stream.client.replay_schedule import ReplayConfig, beats, frame_times, odometry_spacing
+from coview_stream.stream.client.sender import Sender, nanoseconds
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+STAMPS = np.array([1000.0, 1000.1, 1000.2, 1000.35])
+KEYS = robot_keys("native", "coview", "r1")
+
+
+class TestClock:
+    """Time passes only while somebody waits; the end comes at ``end`` seconds, or after ``waits`` waits."""
+
+    __test__ = False
+
+    def __init__(self, end=np.inf, waits=None):
+        self.time, self.end, self.waits = 50.0, 50.0 + end, waits
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += max(0.0, seconds)
+        if self.waits is not None:
+            self.waits -= 1
+        return self.time >= self.end or (self.waits is not None and self.waits < 0)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("replay") / "run"
+    (folder / "frames").mkdir(parents=True)
+    for k in range(4):
+        write_cloud(folder / "frames" / f"{k:06d}.ply", np.full((5, 3), 1.0 + k, np.float32))
+    poses = [pose_from(rot_z(0.2 * k), [k, 0, 0]) for k in range(4)]
+    write_tum(folder / "odometry.tum", STAMPS, poses)
+    return folder
+
+
+@pytest.fixture
+def run(run_folder):
+    return open_run(run_folder)
+
+
+def recorded(run, config, clock=None, **options):
+    """(report, [(seconds after the first, key, decoded message)])."""
+    net, clock = FakeTransport(), clock or TestClock()
+    sent = []
+    net.subscribe(KEYS.cloud, lambda s: sent.append((clock.now() - 50.0, "cloud", decode_cloud(s))), "newest")
+    net.subscribe(
+        KEYS.odometry, lambda s: sent.append((clock.now() - 50.0, "odom", decode_odometry(s))), "all"
+    )
+    report = replay(run, Sender(net, KEYS, **options), config, clock)
+    assert net.raised == []
+    return report, sent
+
+
+def test_frames_come_as_recorded_each_after_its_odometry(run):
+    report, sent = recorded(run, ReplayConfig())
+    assert [kind for _, kind, _ in sent] == ["odom", "cloud"] * 4
+    for k, ((when, _, odom), (then, _, cloud)) in enumerate(zip(sent[::2], sent[1::2], strict=True)):
+        assert when == then == pytest.approx(STAMPS[k] - STAMPS[0])
+        assert odom.stamp_ns == cloud.stamp_ns == nanoseconds(STAMPS[k])
+        assert odom.T_odom_body == pytest.approx(run.poses[k])
+        assert cloud.points[0, 0] == 1.0 + k
+    assert (report.frames, report.odometry, report.points, report.finished) == (4, 4, 20, True)
+    assert report.seconds == pytest.approx(0.35)
+    assert "4 frames (8.57 Hz) and 4 odometry samples sent in 0.4 s" in report.text()
+    assert "put p50 0.0 ms" in report.text()
+
+
+@pytest.mark.parametrize(
+    ("options", "times"),
+    [
+        ({"speed": 2.0}, [0.0, 0.05, 0.1, 0.175]),
+        ({"rate": 20.0}, [0.0, 0.05, 0.1, 0.15]),
+        ({"rate": 2.0}, [0.0, 0.5, 1.0, 1.5]),
+    ],
+)
+def test_speed_and_rate_change_the_deadlines_but_not_the_stamps(run, options, times):
+    _, sent = recorded(run, ReplayConfig(**options))
+    clouds = [(when, message) for when, kind, message in sent if kind == "cloud"]
+    assert [when for when, _ in clouds] == pytest.approx(times)
+    assert [m.stamp_ns for _, m in clouds] == [nanoseconds(s) for s in STAMPS]
+
+
+def test_odometry_between_frames_is_interpolated(run):
+    _, sent = recorded(run, ReplayConfig(odometry_rate=40.0))
+    odometry = [(when, message) for when, kind, message in sent if kind == "odom"]
+    assert len(odometry) == 4 + 3 + 3 + 5
+    when, between = odometry[1]
+    assert when == pytest.approx(0.025)
+    assert between.stamp_ns == pytest.approx(nanoseconds(1000.025), abs=1000)
+    assert between.T_odom_body[:3, 3] == pytest.approx([0.25, 0, 0])
+    assert yaw_of(between.T_odom_body) == pytest.approx(0.05)
+    stamps = [m.stamp_ns for _, m in odometry]
+    assert stamps == sorted(set(stamps))
+    assert len([1 for _, kind, _ in sent if kind == "cloud"]) == 4
+
+
+def test_a_loop_goes_on_with_increasing_stamps_and_back_at_the_start(run):
+    report, sent = recorded(run, ReplayConfig(loop=True, odometry_rate=40.0), TestClock(end=0.72))
+    assert not report.finished
+    assert "ended early" in report.text()
+    clouds = [(when, m) for when, kind, m in sent if kind == "cloud"]
+    # a lap is 0.35 s and one usual period
+    assert [when for when, _ in clouds] == pytest.approx([0, 0.1, 0.2, 0.35, 0.45, 0.55, 0.65])
+    assert clouds[4][1].stamp_ns == pytest.approx(nanoseconds(1000.45), abs=1000)
+    assert clouds[4][1].points[0, 0] == 1.0
+    stamps = [m.stamp_ns for _, _, m in sent]
+    assert stamps == sorted(stamps)
+    # the way back from the end to the start was never driven, so nothing is sent for it
+    assert not [when for when, kind, _ in sent if kind == "odom" and 0.36 < when < 0.44]
+
+
+def test_deadlines_are_absolute(run):
+    """A send that takes long delays what comes next, but not what comes after that."""
+    clock, net = TestClock(), FakeTransport()
+    times = []
+
+    def slow(sample):
+        times.append(clock.now() - 50.0)
+        clock.time += 0.17 if len(times) == 1 else 0.0
+
+    net.subscribe(KEYS.cloud, slow, "newest")
+    report = replay(run, Sender(net, KEYS), ReplayConfig(), clock)
+    assert times == pytest.approx([0.0, 0.17, 0.2, 0.35])
+    assert list(report.late_ms) == pytest.approx([0, 70, 0, 0], abs=1e-6)
+    assert report.put_ms[0] == pytest.approx(170)
+    assert "1 frames were sent more than 20 ms late" in report.text()
+
+
+def test_it_ends_when_told(run):
+    report, sent = recorded(run, ReplayConfig(), TestClock(waits=2))
+    assert len(sent) == 4
+    assert (report.frames, report.finished) == (2, False)
+
+
+def test_damaged_frames_are_left_out_and_counted(run_folder, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    (folder / "frames" / "000001.ply").write_bytes(b"no cloud")
+    report, sent = recorded(open_run(folder), ReplayConfig())
+    assert [kind for _, kind, _ in sent] == ["odom", "cloud", "odom", "odom", "cloud", "odom", "cloud"]
+    assert (report.frames, report.damaged) == (3, 1)
+    assert "1 damaged frames left out, the first:" in report.text()
+    assert "000001.ply" in report.text()
+    for k in range(4):
+        (folder / "frames" / f"{k:06d}.ply").write_bytes(b"no cloud")
+    with pytest.raises(CloudError, match=r"000000\.ply"):
+        recorded(open_run(folder), ReplayConfig())
+
+
+def test_a_frame_without_a_finite_point_ends_nothing(run, monkeypatch):
+    inner = Run.read
+
+    def read(self, index):
+        frame = inner(self, index)
+        return replace(frame, points=frame.points * np.float32(np.nan)) if index == 1 else frame
+
+    monkeypatch.setattr(Run, "read", read)
+    report, _ = recorded(run, ReplayConfig())
+    assert (report.frames, report.damaged, report.finished) == (3, 1, True)
+    assert "none of them finite" in report.text()
+
+
+def test_one_cloud_is_a_run_too(run_folder):
+    single = open_run(run_folder / "frames" / "000002.ply")
+    report, sent = recorded(single, ReplayConfig())
+    assert [kind for _, kind, _ in sent] == ["odom", "cloud"]
+    assert report.text().startswith("1 frames and 1 odometry")
+    _, sent = recorded(single, ReplayConfig(loop=True), TestClock(end=0.35))
+    clouds = [m.stamp_ns for _, kind, m in sent if kind == "cloud"]
+    assert clouds == [0, 100_000_000, 200_000_000, 300_000_000]
+
+
+@pytest.mark.parametrize("cloud", ["xyz", "xyzi", "foxglove", "cdr", "keelson"])
+@pytest.mark.parametrize("odometry", ["json", "cdr"])
+def test_encodings(run, cloud, odometry):
+    report, sent = recorded(run, ReplayConfig(), cloud_encoding=cloud, odometry_encoding=odometry)
+    assert report.frames == 4
+    assert sent[3][2].points[:, 0] == pytest.approx(np.full(5, 2.0))
+    assert sent[2][2].T_odom_body == pytest.approx(run.poses[1])
+
+
+def test_what_goes_wrong_while_reading_ahead_reaches_the_caller(run):
+    crooked = replace(run, poses=np.zeros((4, 4, 4)))  # finite, but no rotations
+    with pytest.raises(ValueError, match="rigid"):
+        recorded(crooked, ReplayConfig())
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"rate": 0.0}, "--rate"),
+        ({"rate": float("nan")}, "--rate"),
+        ({"speed": -1.0}, "--speed"),
+        ({"odometry_rate": float("inf")}, "--odometry-rate"),
+        ({"rate": 5.0, "speed": 2.0}, "one of them"),
+        ({"read_ahead": 0}, "read_ahead"),
+    ],
+)
+def test_bad_options(options, text):
+    with pytest.raises(ConfigError, match=text):
+        ReplayConfig(**options)
+
+
+def test_a_schedule_without_loop_ends(run):
+    assert [beat.frame for beat in beats(run, ReplayConfig())] == [0, 1, 2, 3]
+    assert frame_times(run, ReplayConfig(rate=10.0)) == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+def test_how_far_apart_odometry_comes(run, run_folder):
+    assert odometry_spacing(run, ReplayConfig()) == pytest.approx(0.1)
+    assert odometry_spacing(run, ReplayConfig(odometry_rate=50.0)) == pytest.approx(0.02)
+    assert odometry_spacing(run, ReplayConfig(speed=0.1)) == pytest.approx(1.0)
+    assert odometry_spacing(run, ReplayConfig(rate=100.0)) == pytest.approx(
+        0.1
+    )  # the stamps stay what they are
+    assert odometry_spacing(open_run(run_folder / "frames" / "000000.ply"), ReplayConfig()) == 0.0
+
+
+def test_json_odometry_is_small_enough_for_a_microcontroller(run):
+    net = FakeTransport()
+    sender = Sender(net, KEYS)
+    message = sender.odometry(run.poses[3], nanoseconds(1.7e9))
+    assert set(json.loads(message.payload)) == {"stamp_ns", "position", "orientation"}
+    assert len(message.payload) < 400

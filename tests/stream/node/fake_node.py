@@ -1,0 +1,119 @@
+"""A node without threads, its robots, and the network between them."""
+
+from __future__ import annotations
+
+import json
+import time
+
+from fake_robot import SHA, cloud, odometry, tracking, verdict
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.messages import decode_pose
+from coview_stream.stream.node.engine_process import DiedError, attempt, unwrap
+from coview_stream.stream.node.jobs import FrameJob
+from coview_stream.stream.node.node import Node
+from coview_stream.stream.node.session import Session
+from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+STEP = 0.05
+PATIENT = NodeConfig(odometry_timeout=30.0, pairing_wait=30.0, coast=30.0)  # however slow the machine is
+THREADS = ("coview-track", "coview-search", "coview-poses", "coview-status")
+
+
+class Engine:
+    """Knows every robot's place at once; searches without success."""
+
+    def __init__(self):
+        self.answer = tracking
+        self.failing = {}
+        self.served = []
+
+    def run(self, job):
+        self.served.append(job.robot)
+        if job.robot in self.failing:
+            raise self.failing[job.robot]
+        return self.answer(job) if isinstance(job, FrameJob) else verdict()
+
+    def forget(self, robot):
+        pass
+
+
+class InlineLane:
+    """Runs jobs on the caller's thread."""
+
+    def __init__(self, engine):
+        self.engine = engine
+
+    def run(self, job):
+        return unwrap(*attempt(self.engine, job))
+
+    def close(self):
+        pass
+
+
+def publish_statuses(node, now, everyone=True):
+    """Publish the status of every robot, or of those whose state has changed."""
+    node._reporter.publish(now, everyone)
+
+
+class Lane(InlineLane):
+    """An engine that dies when it is told to."""
+
+    def __init__(self, engine):
+        super().__init__(engine)
+        self.dead = False
+        self.closed = 0
+
+    def run(self, job):
+        if self.dead:
+            self.dead = False
+            raise DiedError("the track engine died")
+        return super().run(job)
+
+    def close(self):
+        self.closed += 1
+
+
+class Site:
+    """A node without threads, its robots, and the network between them."""
+
+    def __init__(self, *names, preset="native", engines=None, config=PATIENT, **more):
+        self.net = FakeTransport()
+        self.engine = Engine()
+        track, search = engines or (self.engine, self.engine)
+        self.track, self.search = Lane(track), Lane(search)
+        self.keys = {name: robot_keys(preset, "coview", name) for name in names}
+        sessions = [Session(keys, SHA, config) for keys in self.keys.values()]
+        self.sessions = dict(zip(names, sessions, strict=True))
+        self.node = Node(sessions, self.net, self.track, self.search, config, **more)
+
+    def moves(self, name, seconds, **place):
+        self.net.publish(odometry(seconds, keys=self.keys[name], **place))
+
+    def sees(self, name, seconds, **fields):
+        """A cloud with the odometry of its stamp."""
+        self.moves(name, seconds)
+        self.net.publish(cloud(seconds, keys=self.keys[name], **fields))
+
+    def work(self, name):
+        """Let the engines do what there is to do for a robot."""
+        session = self.sessions[name]
+        for lane, take in (("track", session.take_frame), ("search", session.take_search)):
+            if (job := take()) is not None:
+                self.node.work(lane, session, job)
+
+    def frame(self, name, seconds, **fields):
+        self.sees(name, seconds, **fields)
+        self.work(name)
+
+    def poses(self, name):
+        self.node.publish_poses(time.monotonic())
+        return [decode_pose(s) for s in self.net.samples(self.keys[name].pose)]
+
+    def statuses(self, name):
+        return [json.loads(s.payload) for s in self.net.samples(self.keys[name].status)]
+
+    def status(self, name):
+        publish_statuses(self.node, time.monotonic())
+        return self.statuses(name)[-1]

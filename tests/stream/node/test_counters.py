@@ -1,0 +1,90 @@
+"""Counters, percentiles, and the estimate of what never arrived."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from coview_stream.stream.node.counters import Counters, Latency, Missing
+
+FRAME = 100_000_000  # ns
+
+
+def missing(*messages):
+    """Estimates after messages (frame number, sequence), 10 Hz."""
+    estimate = Missing()
+    return [estimate.after(round(k * FRAME), sequence) for k, sequence in messages]
+
+
+def unnumbered(*frames):
+    return missing(*((k, None) for k in frames))
+
+
+def test_each_counter_counts_alone():
+    counters = Counters()
+    counters.count("late")
+    counters.count("missing", 3)
+    document = counters.to_json()
+    assert (document.pop("late"), document.pop("missing")) == (1, 3)
+    assert set(document.values()) == {0}
+    assert json.loads(json.dumps(document)) == document
+
+
+def test_there_is_no_counter_of_that_name():
+    with pytest.raises(AttributeError):
+        Counters().count("lates")
+
+
+def test_latencies_in_milliseconds():
+    latency = Latency()
+    assert latency.to_json() == {"p50": None, "p95": None, "p99": None}
+    for k in range(101):
+        latency.add(0.001 * k)
+    assert latency.to_json() == {"p50": 50.0, "p95": 95.0, "p99": 99.0}
+
+
+def test_old_latencies_are_forgotten():
+    latency = Latency()
+    for seconds in [9.0] * 300 + [0.01] * 600:
+        latency.add(seconds)
+    assert latency.to_json() == {"p50": 10.0, "p95": 10.0, "p99": 10.0}
+
+
+def test_a_steady_sender_misses_nothing():
+    assert set(unnumbered(*range(50))) == {0}
+    jittered = [k + 0.2 * (-1) ** k for k in range(50)]
+    assert set(unnumbered(*jittered)) == {0}
+
+
+def test_gaps_in_a_steady_sequence_of_stamps():
+    assert unnumbered(*range(10), 11, 12)[-2:] == [1, 0]
+    assert unnumbered(*range(10), 14, 15)[-2:] == [4, 0]
+
+
+def test_no_estimate_before_the_rate_is_known():
+    assert unnumbered(0, 1, 5, 6) == [0, 0, 0, 0]
+
+
+def test_a_pause_is_no_loss():
+    """A robot that was switched off for an hour has lost no frames."""
+    assert unnumbered(*range(10), 36_000, 36_001)[-2:] == [0, 0]
+
+
+def test_a_changed_rate_is_learnt():
+    slow = [20 + 2 * k for k in range(30)]
+    assert unnumbered(*range(20), *slow)[-1] == 0
+
+
+def test_numbered_frames_are_counted_exactly():
+    assert missing((0, 7), (1, 8), (2, 11), (3, 12)) == [0, 0, 2, 0]
+    assert missing((0, 7), (5, 8)) == [0, 0]  # a pause, but no number is missing
+
+
+def test_numbers_that_start_anew_are_no_loss():
+    assert missing((0, 900), (1, 1), (2, 2)) == [0, 0, 0]
+    assert missing((0, 1), (1, 5_000_000)) == [0, 0]
+
+
+def test_stamps_that_go_back_are_no_loss():
+    assert unnumbered(*range(10), 3, 4)[-2:] == [0, 0]

@@ -1,0 +1,235 @@
+"""Lanes: what a job may come to, and an engine in a process of its own that dies and comes back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from multiprocessing.connection import Connection
+
+import numpy as np
+import pytest
+from fake_node import InlineLane
+from fake_robot import tracking
+from sockets import until
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.errors import CloudError, CoViewError, InputError
+from coview_stream.localization.result import State
+from coview_stream.stream.node import worker
+from coview_stream.stream.node.engine_process import (
+    CancelledError,
+    DiedError,
+    FailedError,
+    ProcessLane,
+    RejectedError,
+)
+from coview_stream.stream.node.jobs import FrameJob
+
+
+def job(points=None, robot="r1"):
+    return FrameJob(
+        robot, 1, 1_000_000_000, np.zeros((20, 3), np.float32) if points is None else points, np.eye(4)
+    )
+
+
+class Engine:
+    """Does what it is told."""
+
+    def __init__(self, error=None):
+        self.error = error
+        self.forgotten = []
+
+    def run(self, job):
+        if self.error is not None:
+            raise self.error
+        return tracking(job)
+
+    def forget(self, robot):
+        self.forgotten.append(robot)
+
+
+def test_a_job_done():
+    engine = Engine()
+    assert InlineLane(engine).run(job()).fix.state is State.TRACKING
+    assert engine.forgotten == []
+
+
+def test_a_job_rejected_costs_the_job_only():
+    engine = Engine(CloudError("cloud has 3 finite points"))
+    with pytest.raises(RejectedError, match="3 finite points"):
+        InlineLane(engine).run(job())
+    assert engine.forgotten == []
+
+
+def test_an_engine_that_failed_forgets_the_robot_and_says_where():
+    engine = Engine(ZeroDivisionError("by nothing"))
+    with pytest.raises(FailedError) as caught:
+        InlineLane(engine).run(job(robot="r7"))
+    assert engine.forgotten == ["r7"]
+    assert str(caught.value).strip().splitlines()[-1] == "ZeroDivisionError: by nothing"
+    assert "Traceback" in str(caught.value)
+    engine.error = None
+    assert InlineLane(engine).run(job()).fix.state is State.TRACKING
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
+    lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256)
+    good = job(world_drive.clouds[0])
+    try:
+        lane.start()
+        lane.wait_ready()
+        first = lane.pid
+        result = lane.run(good)
+        assert result.fix.state is State.SEARCHING
+        assert result.query is not None
+        np.testing.assert_array_equal(result.query.cloud, world_drive.clouds[0])
+        with pytest.raises(RejectedError, match="finite points"):
+            lane.run(job(np.zeros((3, 3), np.float32)))
+        assert (
+            lane.run(good).query is None
+        )  # the same child, and it remembers: no keyframe without driving on
+        assert lane.pid == first
+
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(DiedError, match="track engine died"):
+            lane.run(good)
+        result = lane.run(good)
+        assert lane.pid != first
+        assert result.query is not None  # and this one remembers nothing
+    finally:
+        second = lane.pid
+        lane.close()
+    assert lane.pid is None
+    until(lambda: not alive(second), 5.0)
+    with pytest.raises(DiedError, match="closed"):
+        lane.run(good)
+    lane.close()
+
+
+def test_a_map_that_cannot_be_opened(tmp_path):
+    broken = tmp_path / "broken.coview"
+    broken.write_bytes(b"no map at all")
+    lane = ProcessLane("search", str(broken), "0" * 64)
+    try:
+        lane.start()
+        with pytest.raises(CoViewError, match=r"broken\.coview"):
+            lane.wait_ready()
+    finally:
+        lane.close()
+    assert lane.pid is None
+
+
+def test_an_engine_that_cannot_prepare_says_why_each_time(monkeypatch):
+    """And the child ends: the next job starts another, which may do better."""
+
+    class Unprepared(Engine):
+        kernels = ()
+
+        def prepare(self):
+            raise InputError("ground.onnx: no weights of the ground network; train them")
+
+    monkeypatch.setattr("coview_stream.stream.node.engines.open_engine", lambda *given: Unprepared())
+    ended = []
+
+    def start(lane):
+        ours, theirs = socket.socketpair()
+        given = [str(theirs.detach()), "search", "unused", "0" * 64, "0", "trimmed-icp", "auto"]
+        threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
+        lane._pipe, lane._awaited = Connection(ours.detach()), ["ready", "prepared"]
+
+    monkeypatch.setattr(ProcessLane, "start", start)
+    lane = ProcessLane("search", "unused", "0" * 64)
+    for times in (1, 2):
+        with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):
+            lane.run(job())
+        until(lambda times=times: ended == [1] * times, 5.0)
+    lane.close()
+
+
+def test_a_map_that_was_replaced_is_named_each_time(world_file):
+    lane = ProcessLane("track", str(world_file), "0" * 64)
+    try:
+        for _ in range(2):
+            with pytest.raises(
+                DiedError, match=r"has been replaced by another map; start the node \(serve\) again"
+            ):
+                lane.run(job())
+    finally:
+        lane.close()
+
+
+def test_a_worker_that_stands_still_is_ended_even_with_a_frame_half_sent(world_file, world_drive):
+    lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
+    good = job(world_drive.clouds[0])
+    try:
+        lane.start()
+        lane.run(good)
+        first = lane.pid
+        os.kill(first, signal.SIGSTOP)
+        lane.patience = 0.3
+        with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
+            lane.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
+        until(lambda: not alive(first), 5.0)
+        lane.patience = 30.0
+        assert lane.run(good).query is not None
+    finally:
+        lane.close()
+
+
+def with_child(lane, program):
+    """Give a lane a child that runs ``program``, which finds its end of the pipe as ``fd``."""
+    ours, theirs = socket.socketpair()
+    with theirs:
+        code = f"import os, time; fd = {theirs.fileno()}\n{program}"
+        lane._child = subprocess.Popen([sys.executable, "-c", code], pass_fds=[theirs.fileno()])
+    lane._pipe = Connection(ours.detach())
+
+
+def test_an_answer_that_breaks_off_ends_the_worker():
+    lane = ProcessLane("search", "unused", "0" * 64, patience=0.3)
+    with_child(lane, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
+    child = lane.pid
+    with pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
+        lane.run(job())
+    until(lambda: not alive(child), 5.0)
+    lane.close()
+
+
+def test_opening_has_a_limit_of_its_own_and_can_be_cancelled():
+    lane = ProcessLane("track", "unused", "0" * 64, patience=0.01, opening=0.3)
+    with_child(lane, "time.sleep(60)")
+    lane._awaited = ["ready", "prepared"]
+    asked = []
+
+    def cancelled():
+        asked.append(1)
+        return len(asked) == 2
+
+    with pytest.raises(CancelledError, match="track"):
+        lane.wait_ready(cancelled)
+    with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
+        lane.wait_ready()
+    lane.close()
+
+
+def test_closing_ends_a_job_under_way():
+    lane = ProcessLane("track", "unused", "0" * 64)
+    with_child(lane, "time.sleep(60)")
+    timer = threading.Timer(0.2, lane.close)
+    timer.start()
+    with pytest.raises(DiedError, match="died"):
+        lane.run(job())
+    timer.join()
+    until(lambda: "coview-watch-track" not in [thread.name for thread in threading.enumerate()])

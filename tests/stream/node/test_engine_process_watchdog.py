@@ -1,0 +1,43 @@
+"""The watchdog: acts on what takes too long, and on nothing else."""
+
+from __future__ import annotations
+
+import threading
+
+from sockets import until
+
+from coview_stream.stream.node.engine_process import Watchdog
+
+
+def names():
+    return [thread.name for thread in threading.enumerate()]
+
+
+def test_it_frees_who_is_stuck():
+    freed = threading.Event()
+    dog = Watchdog("coview-test-dog", freed.set)
+    with dog.limit(60.0):
+        pass
+    assert not dog.acted
+    with dog.limit(0.05):  # while its thread sleeps until the deadline before
+        assert freed.wait(10.0)
+    assert dog.acted
+    dog.close()
+    until(lambda: "coview-test-dog" not in names())
+
+
+def test_what_ends_in_time_is_left_alone_and_a_new_limit_starts_anew():
+    calls = []
+    dog = Watchdog("coview-test-dog", lambda: calls.append(1))
+    for _ in range(3):
+        with dog.limit(0.02):
+            pass
+    with dog.limit(60.0):  # longer than all the limits before
+        threading.Event().wait(0.1)
+    assert calls == []
+    with dog.limit(0.01):
+        until(lambda: calls)
+    with dog.limit(60.0):
+        assert not dog.acted
+    assert calls == [1]
+    dog.close()

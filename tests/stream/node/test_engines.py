@@ -1,0 +1,229 @@
+"""The engine's two halves on the small world: together what a localizer is, and one robot is nothing to another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_world import pose_error
+
+import coview_kernels
+from coview_kernels import runtime
+from coview_kernels.launch import Launch
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.errors import CloudError, MapError, RunError
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.localization.result import State
+from coview_stream.odometry.buffer import Segment
+from coview_stream.stream.node.engines import SearchEngine, TrackEngine, open_engine
+from coview_stream.stream.node.jobs import FrameJob, SearchJob
+
+FRAMES = 7
+OTHER_ODOMETRY = pose_from(rot_z(-1.2), [-300.0, 40.0, 7.0])
+
+
+class Follower:
+    """Feeds a robot's frames to two engines in turn: what a frame asks is searched before the next one."""
+
+    def __init__(self, track, search, robot="r1", epoch=1):
+        self.track, self.search, self.robot, self.epoch = track, search, robot, epoch
+        self.verdict = None
+        self.fixes = []
+        self.verdicts = []
+
+    def job(self, drive, k):
+        stamp, cloud, T = round(5e8 * k), drive.clouds[k], drive.T_odom_body[k]
+        return FrameJob(self.robot, self.epoch, stamp, cloud, T, verdict=self.verdict)
+
+    def follow(self, drive, frames, known=()):
+        """Track frames; ``known`` verdicts spare the search."""
+        for k in frames:
+            result = self.track.run(self.job(drive, k))
+            self.verdict = None
+            if result.query is not None and k < len(known):
+                self.verdict = known[k]
+            elif result.query is not None:
+                self.verdict = self.search.run(SearchJob(self.robot, self.epoch, result.query))
+                self.verdicts.append(self.verdict)
+            self.fixes.append(result.fix)
+        return self.fixes
+
+
+@pytest.fixture(scope="module")
+def engines(world_map):
+    return TrackEngine(world_map), SearchEngine(world_map)
+
+
+@pytest.fixture(scope="module")
+def reference(engines, world_drive):
+    """A robot that has had the engines for itself."""
+    follower = Follower(*engines, "alone")
+    follower.follow(world_drive, range(FRAMES))
+    return follower
+
+
+@pytest.fixture(scope="module")
+def alone(reference):
+    """Its fixes."""
+    return reference.fixes
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Names of the kernel modules that were launched since it was last cleared."""
+    coview_kernels.warm_up()  # modules that import one another do so now
+    names = set()
+    kernels, launch = runtime.kernels, Launch.__call__
+    monkeypatch.setattr(runtime, "kernels", lambda name: names.add(name) or kernels(name))
+    monkeypatch.setattr(Launch, "__call__", lambda self: names.add(self._name[0]) or launch(self))
+    return names
+
+
+@pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
+def test_engines_name_the_kernels_that_they_launch(world_map, world_drive, launched, monkeypatch):
+    """What is not named is compiled when the first job needs it, which takes a second."""
+    track, search = TrackEngine(world_map), SearchEngine(world_map)
+    asked = {}
+    for engine in (track, search):
+
+        def run(job, engine=engine, run=engine.run):
+            launched.clear()
+            result = run(job)
+            asked.setdefault(engine, set()).update(launched)
+            return result
+
+        monkeypatch.setattr(engine, "run", run)
+    follower = Follower(track, search, "fresh")
+    follower.follow(world_drive, range(FRAMES))
+    assert follower.fixes[-1].state is State.TRACKING
+    for engine in (track, search):
+        launched.clear()
+        coview_kernels.warm_up(*engine.kernels)
+        assert asked[engine] == launched
+
+
+def same(fix, other):
+    assert fix.state is other.state
+    assert (fix.T_map_body is None) == (other.T_map_body is None)
+    if fix.T_map_body is not None:
+        np.testing.assert_allclose(fix.T_map_body, other.T_map_body, atol=1e-6)
+        np.testing.assert_allclose(fix.covariance, other.covariance, rtol=1e-3, atol=1e-9)
+
+
+def test_two_halves_are_a_localizer_one_frame_late(alone, world_fixes):
+    first = next(k for k, fix in enumerate(world_fixes) if fix.state is State.TRACKING)
+    assert first + 1 < FRAMES
+    assert alone[0].state is State.SEARCHING
+    for k in range(1, first + 1):
+        assert alone[k].state is world_fixes[k - 1].state
+        assert alone[k].T_map_body is None
+    for k in range(first + 1, FRAMES):
+        same(alone[k], world_fixes[k])
+
+
+def test_the_poses_are_right(alone, world_drive):
+    assert alone[-1].T_map_body is not None
+    for fix, truth in zip(alone, world_drive.T_map_body, strict=False):
+        if fix.T_map_body is not None:
+            assert pose_error(fix.T_map_body, truth)[0] < 0.08
+
+
+def test_two_robots_are_as_each_alone(engines, alone, world_drive):
+    other_drive = world_drive.seen_from(OTHER_ODOMETRY)
+    one, two = Follower(*engines, "one"), Follower(*engines, "two", epoch=9)
+    for k in range(FRAMES):
+        one.follow(world_drive, [k])
+        two.follow(other_drive, [k])
+    for here, there, undisturbed in zip(one.fixes, two.fixes, alone, strict=True):
+        same(here, undisturbed)
+        assert there.state is undisturbed.state
+        if there.T_map_body is not None:
+            np.testing.assert_allclose(there.T_map_body, undisturbed.T_map_body, atol=0.02)
+
+
+def test_a_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_drive):
+    follower = Follower(*engines, "careless")
+    bad = (
+        (np.full((50, 3), np.nan, np.float32), world_drive.T_odom_body[0], CloudError),
+        (world_drive.clouds[0][:3], world_drive.T_odom_body[0], CloudError),
+        (world_drive.clouds[0], np.diag([1.0, 1.0, 2.0, 1.0]), RunError),
+    )
+    for k in range(FRAMES):
+        for points, T, error in bad:
+            with pytest.raises(error):
+                engines[0].run(FrameJob("careless", 1, round(5e8 * k), points, T, verdict=follower.verdict))
+        follower.follow(world_drive, [k], reference.verdicts)
+    for fix, undisturbed in zip(follower.fixes, reference.fixes, strict=True):
+        same(fix, undisturbed)
+
+
+def test_a_new_epoch_starts_anew_in_both_halves(engines, alone, world_drive):
+    follower = Follower(*engines, "restarted")
+    follower.follow(world_drive, range(2))
+    follower.epoch, follower.verdict, follower.fixes = 2, None, []
+    # another odometry frame: votes of the old one would speak for places that are not
+    follower.follow(world_drive.seen_from(OTHER_ODOMETRY), range(FRAMES))
+    assert [fix.state for fix in follower.fixes] == [fix.state for fix in alone]
+    np.testing.assert_allclose(follower.fixes[-1].T_map_body, alone[-1].T_map_body, atol=0.02)
+
+
+def test_a_robot_forgotten_begins_anew(engines, alone, world_drive):
+    follower = Follower(*engines, "forgotten")
+    follower.follow(world_drive, range(3))
+    for engine in engines:
+        engine.forget("forgotten")
+        engine.forget("never seen")
+    follower.verdict, follower.fixes = None, []
+    follower.follow(world_drive, range(3))
+    for fix, first in zip(follower.fixes, alone, strict=False):
+        assert fix.state is first.state
+        assert (fix.evidence and fix.evidence.reason) == (first.evidence and first.evidence.reason)
+
+
+def test_a_suspect_frame_is_verified(engines, reference, world_drive):
+    follower = Follower(*engines, "suspect")
+    fix = follower.follow(world_drive, range(FRAMES), reference.verdicts)[-1]
+    assert fix.state is State.TRACKING
+    last = follower.job(world_drive, FRAMES - 1)  # at the same place: without suspicion nothing is looked at
+    for later, suspect in ((10**8, False), (2 * 10**8, True)):
+        again = replace(last, stamp_ns=last.stamp_ns + later, suspect=suspect)
+        fix = engines[0].run(again).fix
+        assert fix.state is State.TRACKING
+        assert (fix.evidence.stamp == pytest.approx(again.stamp_ns * 1e-9)) == suspect
+
+
+def test_points_with_times_are_deskewed(engines, world_drive):
+    """A sweep on the move is, deskewed, the frame that was measured at once."""
+    speed, T = 8.0, world_drive.T_odom_body[0]
+    points = world_drive.clouds[0]
+    times = np.random.default_rng(2).choice([-0.1, -0.05, 0.0], len(points))
+    swept = points.copy()
+    for t in (-0.1, -0.05):
+        swept[times == t] = transform(inverse(pose_from(np.eye(3), [speed * t, 0, 0])), points[times == t])
+    along = [T @ pose_from(np.eye(3), [speed * t, 0, 0]) for t in (-0.1, 0.0)]
+    segment = Segment(np.array([900_000_000, 1_000_000_000], np.int64), np.array(along))
+    engine = engines[0]
+    engine.run(FrameJob("moving", 1, 1_000_000_000, swept, T, times, segment))
+    cloud = engine._robots["moving"][1]._newest.cloud
+    np.testing.assert_allclose(cloud, points, atol=0.01)
+
+
+def test_work_of_the_other_half_is_refused(engines, world_drive):
+    track, search = engines
+    frame = FrameJob("r1", 1, 0, world_drive.clouds[0], world_drive.T_odom_body[0])
+    with pytest.raises(TypeError, match="FrameJob"):
+        search.run(frame)
+    asked = track.run(FrameJob("asking", 1, 0, world_drive.clouds[0], world_drive.T_odom_body[0])).query
+    with pytest.raises(TypeError, match="SearchJob"):
+        track.run(SearchJob("asking", 1, asked))
+
+
+def test_engines_from_a_file(world_file, tmp_path):
+    sha256 = BaseMap.load(world_file).sha256
+    assert isinstance(open_engine("track", world_file, sha256), TrackEngine)
+    assert isinstance(open_engine("search", world_file, sha256), SearchEngine)
+    with pytest.raises(MapError, match="replaced"):
+        open_engine("track", world_file, "0" * 64)
+    with pytest.raises(MapError, match="none"):
+        open_engine("track", tmp_path / "none.coview", sha256)

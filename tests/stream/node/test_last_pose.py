@@ -1,0 +1,183 @@
+"""The last pose on disk: comes back as it was, or not at all, and never as an exception."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from se3 import exp_se3
+
+from coview_stream.errors import ConfigError
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.stream.node import last_pose
+from coview_stream.stream.node.last_pose import LastPose, default_folder, file_of, forget, load, save
+
+SHA = "0123456789abcdef" * 4
+UTM = [512_345.678_901, 5_403_210.123_456, 287.4]
+LAST = LastPose("r1", SHA, 1_700_000_000_123_456_789, exp_se3(np.array([0.02, -0.01, 2.1, *UTM])))
+
+
+def same(a, b):
+    assert (a.robot, a.map_sha256, a.stamp_ns) == (b.robot, b.map_sha256, b.stamp_ns)
+    np.testing.assert_array_equal(a.T_map_body, b.T_map_body)  # every bit
+
+
+def test_comes_back_as_it_was(tmp_path):
+    path = save(tmp_path / "made" / "now", LAST)
+    assert path.name == "r1-0123456789abcdef.json"
+    found = load(tmp_path / "made" / "now", "r1", SHA)
+    same(found, LAST)
+    assert found.T_map_body.dtype == np.float64
+
+
+def test_the_newest_replaces_the_one_before_and_leaves_nothing_else(tmp_path):
+    save(tmp_path, LAST)
+    newer = replace(LAST, stamp_ns=LAST.stamp_ns + 5, T_map_body=np.eye(4))
+    save(tmp_path, newer)
+    same(load(tmp_path, "r1", SHA), newer)
+    assert [p.name for p in tmp_path.iterdir()] == ["r1-0123456789abcdef.json"]
+
+
+def test_nothing_saved_is_no_warning(tmp_path, caplog):
+    assert load(tmp_path / "not there", "r1", SHA) is None
+    assert not caplog.records
+
+
+def test_every_robot_and_map_has_its_own(tmp_path):
+    save(tmp_path, LAST)
+    save(tmp_path, replace(LAST, robot="r2"))
+    save(tmp_path, replace(LAST, map_sha256="f" * 64))
+    assert len(list(tmp_path.iterdir())) == 3
+    assert load(tmp_path, "r3", SHA) is None
+    assert load(tmp_path, "r1", "e" * 64) is None
+
+
+NAMES = (
+    "site/hall 3/r1",
+    "..",
+    "a\\b",
+    "C:r1",
+    "Roboter Ä",
+    "R1",
+    "rué" * 90,
+    "con",
+    "a%2Fb",
+    "r1.json",
+    "-",
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_name_gives_a_file_in_the_folder(tmp_path, name):
+    save(tmp_path / "state", replace(LAST, robot=name))
+    assert load(tmp_path / "state", name, SHA).robot == name
+    (file,) = (tmp_path / "state").iterdir()
+    assert file.name.isascii()
+    assert len(file.name) < 120
+    assert not set(file.name) & set('\\/:*?"<>|')
+
+
+def test_no_two_names_share_a_file_even_where_case_does_not_count(tmp_path):
+    names = [*NAMES, "r1", "con/", "a/b", "rué" * 91, "CON"]
+    assert len({file_of(tmp_path, n, SHA).name.lower() for n in names}) == len(names)
+
+
+def document(**changes):
+    fields = {
+        "format": "coview_stream last pose", "version": 1, "robot": "r1", "map_sha256": SHA, "stamp_ns": 5,
+        "T_map_body": np.eye(4).tolist(),
+    } | changes  # fmt: skip
+    return json.dumps({name: value for name, value in fields.items() if value is not None})
+
+
+USELESS = {
+    "empty": "",
+    "cut off": document()[:-20],
+    "no text": b"\xff\xfe\x00\x80",
+    "a list": "[1, 2]",
+    "something else": document(format="result"),
+    "a later version": document(version=2),
+    "no version": document(version=None),
+    "another robot": document(robot="r2"),
+    "another map with the same 16 digits": document(map_sha256=SHA[:16] + "0" * 48),
+    "no pose": document(T_map_body=None),
+    "3 x 3": document(T_map_body=np.eye(3).tolist()),
+    "ragged": document(T_map_body=[[1, 0], [0]]),
+    "words": document(T_map_body=[["a"] * 4] * 4),
+    "not finite": document(T_map_body=pose_from(np.eye(3), [np.nan, 0, 0]).tolist()),
+    "scaled": document(T_map_body=(2.0 * np.eye(4)).tolist()),
+    "mirrored": document(T_map_body=np.diag([1.0, -1.0, 1.0, 1.0]).tolist()),
+    "no stamp": document(stamp_ns=None),
+    "endless stamp": document(stamp_ns=float("inf")),
+    "deep": "[" * 60_000,
+    "long": document() + " " * 70_000,
+    "huge number": '{"format": "coview_stream last pose", "version": ' + "9" * 5000 + "}",
+}
+
+
+@pytest.mark.parametrize("what", USELESS)
+def test_what_cannot_be_used_is_a_warning_that_names_the_file(tmp_path, caplog, what):
+    content = USELESS[what]
+    path = file_of(tmp_path, "r1", SHA)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert load(tmp_path, "r1", SHA) is None
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert str(path) in record.getMessage()
+    assert len(record.getMessage()) < len(str(path)) + 250
+    save(tmp_path, LAST)  # and the next pose takes its place
+    assert load(tmp_path, "r1", SHA) is not None
+
+
+def test_what_cannot_be_opened_is_a_warning(tmp_path, caplog):
+    file_of(tmp_path, "r1", SHA).mkdir()
+    assert load(tmp_path, "r1", SHA) is None
+    assert str(file_of(tmp_path, "r1", SHA)) in caplog.text
+
+
+def test_a_failing_disk_is_the_callers_business_and_spoils_nothing(tmp_path, monkeypatch):
+    save(tmp_path, LAST)
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(last_pose.os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save(tmp_path, replace(LAST, stamp_ns=9))
+    same(load(tmp_path, "r1", SHA), LAST)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="file"):
+        save(tmp_path / "file", LAST)
+
+
+def test_forgotten(tmp_path):
+    save(tmp_path, LAST)
+    save(tmp_path, replace(LAST, robot="r2"))
+    for _ in range(2):
+        forget(tmp_path, "r1", SHA)
+    assert load(tmp_path, "r1", SHA) is None
+    assert load(tmp_path, "r2", SHA) is not None
+
+
+def test_the_default_folder(monkeypatch, tmp_path):
+    monkeypatch.setattr(last_pose.sys, "platform", "linux")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert default_folder() == tmp_path / "coview-stream"
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for nowhere in ("", "relative"):
+        monkeypatch.setenv("XDG_STATE_HOME", nowhere)
+        assert default_folder() == tmp_path / "home/.local/state/coview-stream"
+    monkeypatch.setattr(last_pose.sys, "platform", "win32")
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "AppData"))
+    assert default_folder() == tmp_path / "AppData/coview-stream"
+
+    def homeless():
+        raise RuntimeError("no home")
+
+    monkeypatch.delenv("LOCALAPPDATA")
+    monkeypatch.setattr(last_pose.Path, "home", homeless)
+    with pytest.raises(ConfigError, match="--no-state"):
+        default_folder()

@@ -1,0 +1,346 @@
+"""What a node knows from one start to the next: saved, handed over, forgotten, and no trouble if the disk is."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+import numpy as np
+import pytest
+from fake_node import STEP, Site
+from fake_robot import SHA, T_MAP_ODOM, Robot, ns, pose, tracking, unknown
+from sockets import until
+
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.stream.node import last_pose
+from coview_stream.stream.node import last_pose_keeper as memory
+from coview_stream.stream.node.engines import TrackEngine
+from coview_stream.stream.node.jobs import FrameJob
+from coview_stream.stream.node.last_pose import LastPose, file_of, load, save
+from coview_stream.stream.node.last_pose_keeper import Memory
+
+BEFORE = pose_from(rot_z(1.0), [30.0, 40.0, 1.5])
+
+
+@pytest.fixture
+def robot():
+    made = Robot()
+    made.moved(0.0)
+    return made
+
+
+def jobs_of(robot, count=3, answer=unknown, begin=0.1):
+    """What the next frames take to the engine as a suggestion."""
+    return [robot.frame(begin + 0.1 * k, answer).suggested for k in range(count)]
+
+
+# ---- a session
+
+
+def test_a_suggestion_goes_with_one_frame(robot):
+    robot.session.suggest(BEFORE)
+    first, *others = jobs_of(robot)
+    assert first is BEFORE
+    assert others == [None, None]
+
+
+def test_it_waits_for_the_next_frame_if_one_is_under_way(robot):
+    robot.saw(0.0)
+    robot.moved(0.05)
+    job = robot.session.take_frame()
+    robot.session.suggest(BEFORE)
+    robot.session.frame_done(job, unknown(job), robot.now)
+    assert jobs_of(robot) == [BEFORE, None, None]
+
+
+def test_a_frame_of_no_use_takes_it_nowhere(robot):
+    robot.session.suggest(BEFORE)
+    robot.saw(0.0)
+    robot.moved(0.05)
+    robot.session.frame_failed(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
+    assert jobs_of(robot) == [BEFORE, None, None]
+
+
+def test_a_suggestion_at_which_the_engine_fails_is_not_made_again(robot):
+    robot.session.suggest(BEFORE)
+    robot.saw(0.0)
+    robot.moved(0.05)
+    robot.session.frame_failed(robot.session.take_frame(), "boom", rejected=False)
+    assert jobs_of(robot) == [None, None, None]
+
+
+def test_an_engine_that_is_started_again_hears_of_it_again(robot):
+    robot.session.suggest(BEFORE)
+    jobs_of(robot, 1)
+    robot.session.engine_restarted("search")
+    assert jobs_of(robot, 1, begin=0.2) == [None]
+    robot.session.engine_restarted("track")
+    assert jobs_of(robot, 1, begin=0.3) == [BEFORE]
+
+
+def test_a_suggestion_comes_too_late_for_a_robot_that_is_tracked(robot):
+    robot.localized(0.1)
+    robot.session.suggest(BEFORE)
+    assert jobs_of(robot, 2, tracking, 0.2) == [None, None]
+    robot.session.engine_restarted()
+    np.testing.assert_allclose(jobs_of(robot, 1, begin=0.4)[0], T_MAP_ODOM @ pose(0.6), atol=1e-9)
+
+
+def test_when_odometry_jumps_the_robot_is_where_it_was(robot):
+    robot.localized(0.1)
+    place = T_MAP_ODOM @ pose(0.2)
+    robot.moved(0.3, x=500.0)
+    assert robot.counters.odometry_jumps == 1
+    robot.moved(0.35, x=500.1)
+    robot.saw(0.4, now=robot.now)
+    robot.moved(0.45, x=500.2)
+    np.testing.assert_allclose(robot.session.take_frame().suggested, place, atol=1e-9)
+
+
+@pytest.mark.parametrize("ask", ["relocalize", "reset"])
+def test_whoever_asks_to_forget_is_not_brought_back(robot, ask):
+    robot.session.suggest(BEFORE)
+    robot.localized(0.1)
+    getattr(robot.session, ask)()
+    assert robot.session.recall().T_map_body is None
+    robot.moved(0.2)
+    robot.session.engine_restarted()
+    robot.session.suggest(BEFORE)  # by a disk that has been slow
+    robot.moved(0.25)
+    assert jobs_of(robot, 3, begin=0.3) == [None] * 3
+    # but what has been found since then is known
+    robot.frame(0.8)
+    assert robot.session.recall().stamp_ns == ns(0.81)
+    robot.session.engine_restarted()
+    assert jobs_of(robot, 1, begin=0.9)[0] is not None
+
+
+def test_what_is_recalled_is_the_newest_pose(robot):
+    assert robot.session.recall().T_map_body is None
+    robot.frame(0.1, unknown)
+    assert robot.session.recall().T_map_body is None
+    robot.localized(0.2)
+    robot.moved(0.4)
+    poses = robot.counters.poses
+    now = robot.session.recall()
+    assert now.stamp_ns == ns(0.4)
+    np.testing.assert_allclose(now.T_map_body, T_MAP_ODOM @ pose(0.8), atol=1e-9)
+    assert robot.counters.poses == poses  # nothing has been published
+    robot.session.tick(robot.now + 60.0)
+    assert robot.session.recall().T_map_body is None
+
+
+# ---- the engine
+
+
+def test_the_localizer_hears_of_it(world_map, world_drive):
+    engine = TrackEngine(world_map)
+    there = world_drive.T_map_body[0]
+
+    def job(k, suggested=None):
+        return FrameJob(
+            "r1", 1, ns(0.5 * k), world_drive.clouds[k], world_drive.T_odom_body[k], suggested=suggested
+        )
+
+    (T_map_odom,) = engine.run(job(0, there)).query.suggested
+    assert [len(engine.run(job(k)).query.suggested) for k in (1, 2)] == [1, 1]
+    engine.forget("r1")
+    query = engine.run(job(0, pose_from(np.eye(3), [1e9, 0.0, 0.0]))).query  # of no use, but the frame is
+    assert query.suggested == ()
+    assert query is not None
+    assert T_map_odom.shape == (4, 4)
+
+
+# ---- the node
+
+
+def remembering(folder, *names, **more):
+    site = Site(*names)
+    site.node.declare()
+    return site, Memory(folder, list(site.sessions.values()), **more)
+
+
+def test_saved_and_handed_over_at_the_next_start(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    site, kept = remembering(tmp_path, "r1", "r2")
+    kept.suggest()
+    kept.keep()
+    assert not list(tmp_path.iterdir())  # nobody knows anything yet
+    site.frame("r1", 0.0)
+    kept.keep()
+    saved = load(tmp_path, "r1", SHA)
+    assert saved.stamp_ns == ns(0.0)
+    assert load(tmp_path, "r2", SHA) is None
+
+    again, other = remembering(tmp_path, "r1", "r2")
+    other.suggest()
+    assert "r1: was last at 100.0, -20.0" in caplog.text
+    for name, place in (("r1", saved.T_map_body), ("r2", None)):
+        again.sees(name, 5.0)
+        suggested = again.sessions[name].take_frame().suggested
+        assert suggested is None if place is None else np.array_equal(suggested, place)
+    assert again.status("r1")["state"] == "SEARCHING"  # it is never trusted
+
+
+def test_another_map_is_another_place(tmp_path):
+    save(tmp_path, LastPose("r1", "cd" * 32, 5, BEFORE))
+    site, kept = remembering(tmp_path, "r1")
+    kept.suggest()
+    site.sees("r1", 0.0)
+    assert site.sessions["r1"].take_frame().suggested is None
+
+
+def test_a_damaged_file_is_a_warning_and_is_replaced(tmp_path, caplog):
+    file_of(tmp_path, "r1", SHA).write_text("{")
+    save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
+    site, kept = remembering(tmp_path, "r1", "r2")
+    kept.suggest()
+    (line,) = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+    assert str(file_of(tmp_path, "r1", SHA)) in line
+    site.sees("r2", 0.0)
+    assert site.sessions["r2"].take_frame().suggested is not None
+    site.frame("r1", 0.0)
+    kept.keep()
+    assert load(tmp_path, "r1", SHA) is not None
+
+
+def writes(monkeypatch):
+    made = []
+    monkeypatch.setattr(memory, "save", lambda folder, last: (made.append(last), save(folder, last)))
+    return made
+
+
+def test_a_robot_that_stands_is_written_once(tmp_path, monkeypatch):
+    made = writes(monkeypatch)
+    site, kept = remembering(tmp_path, "r1")
+    site.frame("r1", 0.0)
+    for k in range(1, 4):
+        site.moves("r1", STEP * k, x=0.01 * k)
+        kept.keep()
+    assert len(made) == 1
+    site.moves("r1", 0.3, x=0.5)
+    kept.keep()
+    site.moves("r1", 0.4, x=0.5, yaw=0.1)
+    kept.keep()
+    assert len(made) == 3
+    np.testing.assert_allclose(made[-1].T_map_body, T_MAP_ODOM @ pose(0.5, yaw=0.1), atol=1e-9)
+
+
+@pytest.mark.parametrize("ask", ["relocalize", "reset"])
+def test_what_is_to_be_forgotten_is_deleted(tmp_path, ask):
+    save(tmp_path, LastPose("r1", SHA, 5, BEFORE))
+    save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
+    site, kept = remembering(tmp_path, "r1", "r2")
+    kept.suggest()
+    site.net.query(f"coview/r1/rpc/{ask}")
+    kept.keep()
+    assert load(tmp_path, "r1", SHA) is None
+    assert load(tmp_path, "r2", SHA) is not None
+    site.frame("r1", 0.0)
+    kept.keep()
+    assert load(tmp_path, "r1", SHA) is not None
+    kept.keep()
+    assert load(tmp_path, "r1", SHA) is not None  # it was asked for once
+
+
+def test_a_failing_disk_is_one_warning(tmp_path, caplog, monkeypatch):
+    site, kept = remembering(tmp_path / "state", "r1")
+    (tmp_path / "state").write_text("a file where the directory should be")
+    site.frame("r1", 0.0)
+    for k in range(1, 5):
+        site.moves("r1", 0.2 * k)
+        kept.keep()
+    (line,) = [r.getMessage() for r in caplog.records]
+    assert str(tmp_path / "state") in line
+    (tmp_path / "state").unlink()
+    kept.keep()
+    assert load(tmp_path / "state", "r1", SHA) is not None
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(last_pose.os, "fsync", full)
+    for k in range(5, 9):
+        site.moves("r1", 0.2 * k)
+        kept.keep()
+    assert len(caplog.records) == 2  # once more, for it had worked meanwhile
+
+
+def test_whatever_goes_wrong_with_one_robot_the_others_are_kept(tmp_path, monkeypatch, caplog):
+    def recall():
+        raise RuntimeError("nobody thought of this")
+
+    site, kept = remembering(tmp_path, "r1", "r2")
+    for name in ("r1", "r2"):
+        site.frame(name, 0.0)
+    monkeypatch.setattr(site.sessions["r1"], "recall", recall)
+    kept.keep()
+    assert load(tmp_path, "r2", SHA) is not None
+    assert "nobody thought of this" in caplog.text
+
+
+def running(site, kept):
+    site.node._aside = {"memory": kept.run}
+    site.node.start()
+    return site
+
+
+def test_a_running_node_keeps_it_now_and_then_and_at_its_end(tmp_path):
+    site = Site("r1")
+    kept = Memory(tmp_path, list(site.sessions.values()), interval=0.05)
+    running(site, kept)
+    try:
+        site.sees("r1", 0.0)
+        until(lambda: load(tmp_path, "r1", SHA) is not None)
+        kept._interval = 60.0
+        time.sleep(0.1)
+        site.moves("r1", 1.0)
+    finally:
+        assert site.node.close(5.0)
+    np.testing.assert_allclose(load(tmp_path, "r1", SHA).T_map_body, T_MAP_ODOM @ pose(2.0), atol=1e-9)
+
+
+def test_a_disk_that_hangs_holds_up_nobody(tmp_path, monkeypatch):
+    hanging, released = threading.Event(), threading.Event()
+
+    def hang(folder, last):
+        hanging.set()
+        released.wait(30.0)
+
+    monkeypatch.setattr(memory, "save", hang)
+    site = Site("r1")
+    running(site, Memory(tmp_path, list(site.sessions.values()), interval=0.02))
+    try:
+        site.sees("r1", 0.0)
+        until(hanging.is_set)
+        before = len(site.net.samples("coview/r1/out/pose"))
+        until(lambda: len(site.net.samples("coview/r1/out/pose")) >= before + 3)
+        site.moves("r1", 0.1)
+        begin = time.monotonic()
+        assert site.node.close(5.0)
+        assert time.monotonic() - begin < 4.0
+    finally:
+        released.set()
+
+
+def test_a_disk_that_hangs_at_the_start_holds_up_nobody(tmp_path, monkeypatch):
+    released = threading.Event()
+    monkeypatch.setattr(memory, "load", lambda *args: released.wait(30.0))
+    site = Site("r1")
+    running(site, Memory(tmp_path, list(site.sessions.values()), interval=0.02))
+    try:
+        site.sees("r1", 0.0)
+        until(lambda: site.net.samples("coview/r1/out/pose"))
+        assert site.node.close(5.0)
+    finally:
+        released.set()
+
+
+def test_an_engine_that_died_is_told_where_the_robot_was(tmp_path):
+    site, _ = remembering(tmp_path, "r1")
+    site.frame("r1", 0.0)
+    site.track.dead = True
+    site.frame("r1", STEP)
+    site.sees("r1", 2 * STEP)
+    np.testing.assert_allclose(site.sessions["r1"].take_frame().suggested, T_MAP_ODOM @ pose(0.0), atol=1e-9)

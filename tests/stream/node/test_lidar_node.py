@@ -1,0 +1,223 @@
+"""A node that makes odometry itself, and its engine in a process that dies and comes back."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+from fake_node import publish_statuses
+from fake_robot import KEYS, SHA, cloud, message, ns, odometry, tracking
+from sockets import until
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.errors import CoViewError
+from coview_stream.geometry.transforms import inverse
+from coview_stream.stream.node.engine_process import DiedError, ProcessLane, RejectedError
+from coview_stream.stream.node.jobs import SweepJob, SweepResult
+from coview_stream.stream.node.lidar_session import LidarSession
+from coview_stream.stream.node.node import Node
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
+CLOUD = np.random.default_rng(0).uniform(-30, 30, (500, 3)).astype(np.float32)
+FATAL = np.concatenate([CLOUD, CLOUD])
+
+STAND_IN = """
+import os
+import types
+import numpy as np
+
+class KISSConfig:
+    def __init__(self):
+        self.data, self.mapping, self.registration = (types.SimpleNamespace() for _ in range(3))
+
+class KissICP:
+    def __init__(self, config):
+        self.last_pose = self.last_delta = np.eye(4)
+
+    def register_frame(self, points, times):
+        if len(points) == 1000:
+            os.abort()
+        self.last_pose = self.last_pose @ self.last_delta
+"""
+
+
+@pytest.fixture
+def stand_in(tmp_path, monkeypatch):
+    """A kiss-icp for child processes: the robot goes on as it went, and a frame of 1000 points is the end."""
+    package = tmp_path / "kiss_icp"
+    package.mkdir()
+    for name in ("__init__", "config", "kiss_icp"):
+        (package / f"{name}.py").write_text(STAND_IN if name != "__init__" else "")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def sweep(points, seconds, times=None, config=LEVEL):
+    return SweepJob("r1", 1, ns(seconds), points, times, config)
+
+
+class Lane:
+    """Plays an engine; dies when it is told to."""
+
+    def __init__(self, answer):
+        self.answer, self.dead = answer, False
+
+    def run(self, job):
+        if self.dead:
+            self.dead = False
+            raise DiedError("the odometry engine died")
+        return self.answer(job)
+
+    def close(self):
+        pass
+
+
+def placing(job):
+    assert isinstance(job, SweepJob)
+    return SweepResult(message((job.stamp_ns - ns(0)) * 1e-9).T_odom_body, None, False, 0.01)
+
+
+@pytest.fixture
+def quiet():
+    net = FakeTransport()
+    session = LidarSession(KEYS, SHA, NodeConfig(odometry_timeout=30.0, coast=30.0))
+    track, lane = Lane(tracking), Lane(placing)
+    made = Node([session], net, track, track, session.config, odometry=lane)
+    made.declare()
+    return made, net, lane
+
+
+def worked(node, *lanes):
+    for name in lanes:
+        found = node.next_job(name)
+        if found is not None:
+            node.work(name, *found)
+
+
+def status(node, net):
+    publish_statuses(node, 0.0)
+    return json.loads(net.samples(KEYS.status)[-1].payload)
+
+
+def test_the_node_listens_to_clouds_only(quiet):
+    node, net, _ = quiet
+    assert net.subscribed == {KEYS.cloud: "newest"}
+    net.publish(odometry(0.0))
+    assert status(node, net)["odometry"] == "kiss-icp"
+    assert status(node, net)["counters"]["odometry_received"] == 0
+    net.publish(cloud(0.0))
+    worked(node, "odometry", "track")
+    assert status(node, net)["state"] == "TRACKING"
+    node.publish_poses(0.0)
+    assert len(net.samples(KEYS.pose)) == 1
+
+
+def test_an_odometry_engine_that_died_costs_the_place_not_the_node(quiet):
+    node, net, lane = quiet
+    node._stopping.wait = lambda seconds: None  # the pause after a death
+    net.publish(cloud(0.0))
+    worked(node, "odometry", "track")
+    lane.dead = True
+    net.publish(cloud(0.1))
+    worked(node, "odometry", "track")
+    said = status(node, net)
+    why = "lidar odometry was started again: the odometry engine died"
+    assert (said["state"], said["reason"]) == ("LOST", why)
+    assert said["counters"]["engine_restarts"] == 1
+    assert said["errors"] == [
+        "the odometry engine is started again: the odometry engine died",
+        "r1: frames that lidar odometry failed at; the first: the odometry engine died",
+    ]
+    net.publish(cloud(0.2))
+    worked(node, "odometry", "track")
+    assert status(node, net)["state"] == "TRACKING"
+
+
+def test_rpc_reset(quiet):
+    node, net, _ = quiet
+    net.publish(cloud(0.0))
+    worked(node, "odometry", "track")
+    assert net.query(KEYS.reset)["state"] == "SEARCHING"
+    net.publish(cloud(0.0))
+    _, job = node.next_job("odometry")
+    assert job.generation == 2
+
+
+def test_an_engine_that_aborts_is_started_again(stand_in):
+    lane = ProcessLane("odometry", "unused", "")
+    try:
+        assert lane.run(sweep(CLOUD, 0.0)).begun
+        assert not lane.run(sweep(CLOUD, 0.1)).begun
+        first = lane.pid
+        with pytest.raises(RejectedError, match="does not come after"):
+            lane.run(sweep(CLOUD, 0.1))
+        with pytest.raises(DiedError, match="odometry engine died"):
+            lane.run(sweep(FATAL, 0.2))
+        assert lane.run(sweep(CLOUD, 0.3)).begun
+        assert lane.pid not in (None, first)
+    finally:
+        lane.close()
+
+
+def test_a_node_survives_its_odometry_engine(stand_in):
+    net = FakeTransport()
+    config = NodeConfig(odometry_timeout=30.0, coast=30.0, max_outage=30.0, pose_rate=50.0)
+    session = LidarSession(KEYS, SHA, config, lidar=LEVEL)
+    track, lane = Lane(tracking), ProcessLane("odometry", "unused", "")
+    node = Node([session], net, track, track, config, odometry=lane)
+    node.start()
+    stamps = iter(0.1 * k for k in range(100_000))
+
+    def tracked(points=CLOUD):
+        net.publish(cloud(next(stamps), points))
+        return session.state()[0].value == "TRACKING"
+
+    try:
+        until(tracked, 20.0)
+        first = lane.pid
+        os.kill(first, signal.SIGKILL)
+        until(lambda: tracked() and session.counters.engine_restarts == 1, 20.0)
+        assert lane.pid not in (None, first)
+        until(lambda: tracked(FATAL) or session.counters.engine_restarts == 2, 20.0)
+        until(lambda: session.counters.engine_restarts >= 2, 20.0)
+        until(tracked, 20.0)
+    finally:
+        node.close()
+    said = [json.loads(s.payload)["reason"] for s in net.samples(KEYS.status)]
+    assert "lidar odometry was started again: the odometry engine died" in said
+    assert net.raised == []
+    assert not [t for t in threading.enumerate() if t.name == "coview-odometry"]
+
+
+def test_without_kiss_icp_it_says_so_in_a_line(tmp_path, monkeypatch):
+    (tmp_path / "kiss_icp").mkdir()
+    (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
+    monkeypatch.syspath_prepend(tmp_path)
+    lane = ProcessLane("odometry", "unused", "")
+    try:
+        lane.start()
+        with pytest.raises(CoViewError, match="pip install 'kiss-icp>=") as caught:
+            lane.wait_ready()
+    finally:
+        lane.close()
+    assert "\n" not in str(caught.value)
+
+
+def test_kiss_icp_itself(world_drive):
+    pytest.importorskip("kiss_icp.kiss_icp", reason="kiss-icp is not installed")
+    lane = ProcessLane("odometry", "unused", "")
+    try:
+        poses = []
+        for k in range(3):
+            times = np.zeros(len(world_drive.clouds[k]))  # what ends the interpreter if kiss-icp sees it
+            job = sweep(world_drive.clouds[k], 0.5 * k, times, LidarOdometryConfig(gravity="level"))
+            poses.append(lane.run(job).T_odom_body)
+    finally:
+        lane.close()
+    assert all(np.isfinite(pose).all() for pose in poses)
+    assert np.linalg.norm((inverse(poses[0]) @ poses[2])[:3, 3]) > 0.5

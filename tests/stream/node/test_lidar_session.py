@@ -1,0 +1,235 @@
+"""A robot that sends clouds only: what its session makes of them, with an odometry lane that the test plays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_robot import KEYS, POINTS, SHA, cloud, counted, ends, message, ns, state, tracking
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.localization.result import State
+from coview_stream.messages.types import Sample
+from coview_stream.stream.node.jobs import SweepResult
+from coview_stream.stream.node.lidar_session import LidarSession
+
+TIMES = np.linspace(0.0, 0.1, len(POINTS))
+
+
+class Robot:
+    """A session and the two lanes that work for it, at 10 Hz."""
+
+    def __init__(self, config=None):
+        self.session = LidarSession(KEYS, SHA, config)
+        self.now = 1000.0
+        self.first = True
+
+    @property
+    def counters(self):
+        return self.session.counters
+
+    def saw(self, seconds, **fields):
+        self.now = 1000.0 + seconds
+        self.session.on_cloud(cloud(seconds, codec="foxglove", **fields), self.now)
+
+    def placed(self, begun=None, **place):
+        """Play the odometry lane for one frame; it drives 2 m/s."""
+        job = self.session.take_sweep()
+        if job is None:
+            return None
+        begun, self.first = (self.first if begun is None else begun), False
+        pose = message((job.stamp_ns - ns(0)) * 1e-9, **place).T_odom_body
+        deskewed = None if job.times is None else job.points + np.float32(1.0)
+        self.session.sweep_done(job, SweepResult(pose, deskewed, begun, 0.01), self.now + 0.04)
+        return job
+
+    def tracked(self):
+        """Play the tracking lane for one frame."""
+        job = self.session.take_frame()
+        if job is not None:
+            self.session.frame_done(job, tracking(job), self.now + 0.06)
+        return job
+
+    def frame(self, seconds, **more):
+        self.saw(seconds)
+        self.placed(**more)
+        return self.tracked()
+
+    def drive(self, begin, end):
+        for k in range(round(10 * begin), round(10 * end) + 1):
+            self.frame(0.1 * k)
+        return self
+
+
+def test_a_frame_is_paired_with_the_odometry_that_was_made_of_it():
+    robot = Robot()
+    job = robot.frame(0.5)
+    assert (job.stamp_ns, job.T_odom_body[0, 3]) == (ns(0.5), 1.0)
+    assert job.times is None
+    pose = robot.session.pose()
+    assert pose.stamp_ns == ns(0.5)
+    assert counted(robot) == {"received": 1, "processed": 1, "odometry_received": 1, "fixes": 1, "poses": 1}
+
+
+def test_a_sweep_goes_on_deskewed():
+    robot = Robot()
+    robot.saw(0.0, times=TIMES)
+    assert robot.placed().times is not None
+    job = robot.tracked()
+    assert (job.times, job.segment) == (None, None)
+    assert np.allclose(job.points, POINTS + 1.0)
+    plain = Robot(NodeConfig(deskew=False))
+    plain.saw(0.0, times=TIMES)
+    assert plain.placed().times is None
+    assert np.allclose(plain.tracked().points, POINTS)
+
+
+def test_poses_go_on_at_the_steady_clock_between_clouds():
+    robot = Robot().drive(0.0, 1.0)
+    stamps = []
+    for k in range(4):
+        robot.session.tick(robot.now + 0.1 * k)
+        stamps.append(robot.session.pose().stamp_ns)
+    assert stamps == [ns(1.0)] * 4
+
+
+def test_frames_that_odometry_has_no_time_for_make_room():
+    robot = Robot()
+    robot.frame(0.0)
+    for k in range(1, 8):
+        robot.saw(0.1 * k)
+    stamps = []
+    while (job := robot.placed()) is not None:
+        stamps.append(job.stamp_ns)
+        robot.tracked()
+    assert stamps == [ns(0.6), ns(0.7)]
+    assert robot.counters.dropped == 5
+    assert ends(robot.counters) == robot.counters.received
+    assert state(robot) is State.TRACKING
+
+
+def test_one_frame_is_under_way_at_a_time():
+    robot = Robot()
+    robot.saw(0.0)
+    robot.saw(0.1)
+    assert robot.session.take_sweep() is not None
+    assert robot.session.take_sweep() is None
+
+
+def test_clouds_that_stop_are_told_from_clouds_of_no_use():
+    robot = Robot().drive(0.0, 1.0)
+    robot.session.tick(robot.now + 0.6)
+    assert robot.session.state() == (State.LOST, "no clouds for 0.5 s")
+    robot.frame(1.7)
+    assert state(robot) is State.TRACKING  # verified by a frame after the pause
+    for k in range(6):
+        robot.saw(1.8 + 0.1 * k)
+        job = robot.session.take_sweep()
+        robot.session.sweep_failed(job, "frame has 3 of 9 points between 1 and 100 m", rejected=True)
+    robot.session.tick(robot.now)
+    state_now, reason = robot.session.state()
+    assert state_now is State.LOST
+    assert reason.startswith("lidar odometry has placed no frame for 0.5 s")
+    assert robot.counters.rejected == 6
+    assert robot.session.complaints.texts[-1].endswith("3 of 9 points between 1 and 100 m")
+
+
+def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
+    robot = Robot()
+    assert robot.session.state()[1] == "waiting for clouds on coview/r1/in/cloud"
+    robot.saw(0.0)
+    assert robot.session.state()[1] == "no frame has been processed yet"
+    robot.session.sweep_failed(robot.session.take_sweep(), "no ground to take gravity from", rejected=True)
+    assert robot.session.state()[1] == "1 frames were of no use; see errors"
+
+
+def test_odometry_that_began_anew_is_a_robot_that_begins_anew():
+    robot = Robot().drive(0.0, 1.0)
+    robot.saw(1.1)
+    robot.placed(begun=True, x=0.0)
+    assert robot.session.state() == (State.LOST, "lidar odometry began anew")
+    assert robot.session.pose() is None
+    assert robot.tracked().epoch > 1
+    assert state(robot) is State.TRACKING
+    assert robot.counters.odometry_jumps == 0  # it is no surprise
+
+
+@pytest.mark.parametrize("kind", ["failed", "restarted"])
+def test_an_engine_that_forgot(kind):
+    robot = Robot().drive(0.0, 1.0)
+    robot.saw(1.1)
+    job = robot.session.take_sweep()
+    if kind == "restarted":
+        robot.session.engine_restarted("odometry")
+    robot.session.sweep_failed(job, "Traceback\nBoom", rejected=False)
+    said = {
+        "failed": "lidar odometry failed on a frame",
+        "restarted": "lidar odometry was started again: it died",
+    }
+    assert robot.session.state() == (State.LOST, said[kind])
+    assert robot.counters.engine_errors == 1
+    assert robot.session.odometry.newest is None
+    robot.saw(1.2)
+    again = robot.session.take_sweep()
+    assert again.generation == job.generation + 1
+    assert ends(robot.counters) == robot.counters.received - 1
+
+
+def test_a_result_of_a_generation_that_is_over_is_dropped():
+    robot = Robot().drive(0.0, 1.0)
+    robot.saw(1.1)
+    job = robot.session.take_sweep()
+    robot.session.engine_restarted("odometry")
+    robot.session.sweep_done(job, SweepResult(np.eye(4), None, True, 0.0), robot.now)
+    assert robot.session.odometry.newest is None
+    assert robot.counters.dropped == 1
+    assert robot.frame(1.2, begun=True) is not None
+
+
+def test_reset_forgets_odometry_and_what_is_under_way():
+    robot = Robot().drive(0.0, 1.0)
+    robot.saw(1.1)
+    job = robot.session.take_sweep()
+    robot.session.reset()
+    robot.session.sweep_done(job, SweepResult(np.eye(4), None, False, 0.0), robot.now)
+    assert counted(robot) == {}
+    robot.saw(0.3)  # whatever the stamp
+    assert robot.session.take_sweep().generation > job.generation
+
+
+def test_searching_again_leaves_odometry_alone():
+    robot = Robot().drive(0.0, 1.0)
+    robot.session.begin_anew("asked to search again")
+    robot.saw(1.1)
+    assert robot.session.take_sweep().generation == 1
+    assert robot.session.odometry.newest.stamp_ns == ns(1.0)
+
+
+def test_strays_are_counted_and_a_clock_that_starts_anew_is_followed():
+    robot = Robot().drive(5.0, 6.0)
+    robot.saw(6.0)
+    robot.now += 0.1
+    robot.session.on_cloud(cloud(2.0), robot.now)
+    assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
+    before = robot.session.take_sweep()
+    assert before is None
+    for k in range(1, 16):
+        robot.session.on_cloud(cloud(0.1 * k), 1006.0 + 0.1 * k)
+    assert robot.counters.clock_restarts == 1
+    assert robot.session.state() == (State.LOST, "the sender's clock started anew")
+    job = robot.session.take_sweep()
+    assert job.generation == 2
+    assert job.stamp_ns < ns(2.0)
+
+
+def test_a_long_pause_is_a_new_beginning():
+    robot = Robot().drive(0.0, 1.0)
+    robot.frame(9.0, begun=True)  # as lidar odometry says after a gap
+    assert counted(robot)["losses"] == 1
+    assert state(robot) is State.TRACKING
+
+
+def test_rubbish_costs_nothing():
+    robot = Robot()
+    robot.session.on_cloud(Sample(KEYS.cloud, b"rubbish", "video/raw"), 1000.0)
+    assert robot.session.take_sweep() is None
+    assert counted(robot) == {"received": 1, "unknown_encoding": 1}

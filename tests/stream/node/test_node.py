@@ -1,0 +1,229 @@
+"""The node on a network in memory: declared keys, statuses, queries, and its end."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import pytest
+from fake_node import STEP, THREADS, Site, publish_statuses
+from fake_robot import SHA, ns
+from sockets import until
+
+from coview_stream import __version__
+from coview_stream.config.node import NodeConfig
+from coview_stream.messages import decode_pose
+from coview_stream.messages.types import Sample
+from coview_stream.stream.node.counters import Counters
+
+
+@pytest.fixture
+def site():
+    made = Site("r1")
+    made.node.declare()
+    return made
+
+
+@pytest.fixture
+def pair():
+    made = Site("r1", "r2")
+    made.node.declare()
+    return made
+
+
+def test_keys_and_urgencies(pair):
+    assert pair.net.subscribed == {
+        "coview/r1/in/cloud": "newest",
+        "coview/r1/in/odom": "all",
+        "coview/r2/in/cloud": "newest",
+        "coview/r2/in/odom": "all",
+    }
+    urgencies = {p.key: p.urgency for p in pair.net.publishers}
+    assert urgencies["coview/r1/out/pose"] == "realtime"
+    assert urgencies["coview/r2/out/status"] == "report"
+    assert set(pair.net.announced) == {"coview/r1/alive", "coview/r2/alive"}
+
+
+def test_the_status_says_all_of_the_contract(site):
+    status = site.status("r1")
+    assert (status["state"], status["reason"]) == ("SEARCHING", "waiting for clouds on coview/r1/in/cloud")
+    assert status["pose"]["age_s"] is None
+    assert status["latency_ms"] == {"p50": None, "p95": None, "p99": None}
+    site.frame("r1", 0.0)
+    site.poses("r1")
+    site.net.publish(Sample("coview/r1/in/cloud", b"", "video/raw"))
+    before = time.time_ns()
+    status = site.status("r1")
+    assert before <= status["stamp_ns"] <= time.time_ns()
+    assert (status["robot"], status["version"], status["map_sha256"]) == ("r1", __version__, SHA)
+    assert (status["state"], status["reason"]) == ("TRACKING", "verified")
+    assert status["last_frame_ns"] == ns(0.0)
+    assert status["evidence"]["score"] == 0.8
+    assert status["pose"]["age_s"] == 0.0
+    assert status["uptime_s"] >= 0.0
+    assert set(status["latency_ms"]) == set(status["engine_ms"]) == {"p50", "p95", "p99"}
+    assert status["engine_ms"]["p50"] == 10.0
+    assert set(status["counters"]) == set(Counters().to_json())
+    assert status["counters"]["unknown_encoding"] == 1
+    assert any("video/raw" in text for text in status["errors"])
+    assert status["connection"] == {"routers": ["fake"], "peers": [], "reconnects": 0}
+
+
+def test_statuses_are_plain_json(site):
+    site.status("r1")
+    (sample,) = site.net.samples("coview/r1/out/status")
+    assert sample.encoding == "application/json"
+    json.loads(sample.payload, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
+
+
+def test_the_rate_of_poses(site):
+    site.frame("r1", 0.0)
+    begin = time.monotonic()
+    for k in range(1, 6):
+        site.moves("r1", STEP * k)
+        site.node.publish_poses(begin + 0.1 * k)
+    publish_statuses(site.node, begin + 0.6)
+    assert site.statuses("r1")[-1]["pose"]["rate_hz"] == pytest.approx(10.0)
+    publish_statuses(site.node, begin + 10.0)
+    assert site.statuses("r1")[-1]["pose"]["rate_hz"] == 0.0
+
+
+def test_only_changes_are_told_between_regular_statuses(pair):
+    now = time.monotonic()
+    publish_statuses(pair.node, now)
+    publish_statuses(pair.node, now, everyone=False)
+    assert (len(pair.statuses("r1")), len(pair.statuses("r2"))) == (1, 1)
+    pair.frame("r1", 0.0)
+    publish_statuses(pair.node, now, everyone=False)
+    publish_statuses(pair.node, now, everyone=False)
+    assert [s["state"] for s in pair.statuses("r1")] == ["SEARCHING", "TRACKING"]
+    assert len(pair.statuses("r2")) == 1
+
+
+def test_a_router_that_comes_back_is_counted(site):
+    assert site.status("r1")["connection"]["reconnects"] == 0
+    site.frame("r1", 0.0)
+    for times in (1, 2):
+        site.net.go_away()
+        publish_statuses(site.node, time.monotonic())
+        publish_statuses(site.node, time.monotonic())
+        site.net.come_back()
+        status = site.status("r1")
+        assert status["connection"] == {"routers": ["fake"], "peers": [], "reconnects": times}
+    assert status["state"] == "TRACKING"  # what was known is still known
+
+
+def test_a_router_that_comes_late_is_no_reconnection():
+    site = Site("r1")
+    site.net.go_away()
+    site.node.declare()
+    publish_statuses(site.node, time.monotonic())
+    site.net.come_back()
+    assert site.status("r1")["connection"]["reconnects"] == 0
+
+
+def test_relocalize(pair):
+    for name in ("r1", "r2"):
+        pair.frame(name, 0.0)
+    reply = pair.net.query("coview/r1/rpc/relocalize")
+    assert (reply["ok"], reply["robot"], reply["state"]) == (True, "r1", "LOST")
+    assert pair.status("r1")["counters"]["received"] == 1
+    assert pair.status("r2")["state"] == "TRACKING"
+    pair.frame("r1", STEP)
+    assert pair.status("r1")["state"] == "TRACKING"
+
+
+def test_reset(pair):
+    for name in ("r1", "r2"):
+        pair.frame(name, 0.0)
+    reply = pair.net.query("coview/r1/rpc/reset", {"why": "test"})
+    assert (reply["ok"], reply["robot"], reply["state"]) == (True, "r1", "SEARCHING")
+    assert sum(pair.status("r1")["counters"].values()) == 0
+    assert pair.status("r2")["counters"]["processed"] == 1
+    json.dumps(reply)
+
+
+def test_close_says_goodbye_once(site):
+    site.frame("r1", 0.0)
+    site.status("r1")
+    site.node.close()
+    last = site.statuses("r1")[-1]
+    assert (last["state"], last["reason"]) == ("LOST", "the node is shutting down")
+    assert site.net.closed
+    assert site.net.announced == ()
+    assert (site.track.closed, site.search.closed) == (1, 1)
+    count = len(site.net.published)
+    site.node.close()
+    assert (len(site.net.published), site.track.closed) == (count, 1)
+
+
+def test_with_threads():
+    site = Site("r1", "r2", config=NodeConfig(pose_rate=50.0, status_rate=0.05, odometry_timeout=0.2))
+    site.node.start()
+    try:
+        until(lambda: site.statuses("r1"))
+        clock = iter(range(100_000))
+
+        def localized():
+            k = next(clock)
+            site.sees("r1", 0.02 * k)
+            site.moves("r2", 0.02 * k)
+            return len(site.net.samples("coview/r1/out/pose")) >= 5
+
+        until(localized)
+        # the regular status comes every 20 s only: these are told because they change
+        until(lambda: site.statuses("r1")[-1]["state"] == "LOST")
+        states = [s["state"] for s in site.statuses("r1")]
+        assert states[0] == "SEARCHING"
+        assert "TRACKING" in states
+        assert "no odometry" in site.statuses("r1")[-1]["reason"]
+        assert site.net.samples("coview/r2/out/pose") == []
+        assert len(site.statuses("r2")) <= 2
+        stamps = [decode_pose(s).stamp_ns for s in site.net.samples("coview/r1/out/pose")]
+        assert stamps == sorted(stamps)
+    finally:
+        site.node.close()
+    assert site.net.raised == []
+    assert site.net.closed
+    assert not [t for t in threading.enumerate() if t.name in THREADS]
+    assert "shutting down" in site.statuses("r1")[-1]["reason"]
+
+
+def test_the_end_waits_for_no_network():
+    site = Site("r1")
+    site.node.start()
+    stuck = threading.Event()
+    site.net.close = stuck.wait
+    begin = time.monotonic()
+    assert site.node.close(patience=0.6) is False
+    assert time.monotonic() - begin < 5.0
+    assert (site.track.closed, site.search.closed) == (1, 1)
+    assert "shutting down" in site.statuses("r1")[-1]["reason"]
+    stuck.set()
+    until(lambda: site.node.close(patience=0.0))
+
+
+def test_the_end_waits_for_no_reader_of_a_last_status():
+    site = Site("r1")
+    site.node.declare()
+    stuck = threading.Event()
+    for publisher in site.net.publishers:
+        publisher.put = lambda message: stuck.wait()
+    assert site.node.close(patience=0.3) is False
+    stuck.set()
+    until(lambda: site.node.close(patience=0.0))
+    assert site.net.closed
+
+
+@pytest.mark.parametrize(("away", "losses"), [(True, 0), (False, 1)])
+def test_a_pause_that_the_network_explains_keeps_the_place(away, losses):
+    site = Site("r1")
+    site.node.declare()
+    site.frame("r1", 0.0)
+    if away:
+        site.net.go_away()
+        publish_statuses(site.node, time.monotonic())
+        site.net.come_back()
+    site.frame("r1", 4.0)
+    assert site.status("r1")["counters"]["losses"] == losses

@@ -1,0 +1,237 @@
+"""Failures of one robot and of the engines, and whose turn it is."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from fake_node import STEP, Site, publish_statuses
+from fake_robot import ns, query, unknown
+from sockets import until
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.errors import CloudError
+from coview_stream.messages.types import Sample
+from coview_stream.stream.node.engine_process import DiedError
+
+
+@pytest.fixture
+def site():
+    made = Site("r1")
+    made.node.declare()
+    return made
+
+
+@pytest.fixture
+def pair():
+    made = Site("r1", "r2")
+    made.node.declare()
+    return made
+
+
+def test_one_robots_garbage_and_failures_are_its_own(pair):
+    rng = np.random.default_rng(5)
+    pair.engine.failing["r1"] = ZeroDivisionError("boom")
+    for k in range(10):
+        for key in ("coview/r1/in/cloud", "coview/r1/in/odom"):
+            for encoding in ("", "application/json", "application/cdr", "video/raw", "application/protobuf"):
+                pair.net.publish(Sample(key, rng.bytes(50), encoding))
+        pair.frame("r1", STEP * k)
+        pair.frame("r2", STEP * k)
+        pair.node.publish_poses(time.monotonic())
+    assert pair.net.raised == []
+    assert len(pair.net.samples("coview/r2/out/pose")) == 10
+    assert pair.net.samples("coview/r1/out/pose") == []
+    bad, good = pair.status("r1"), pair.status("r2")
+    assert bad["counters"]["engine_errors"] == 10
+    assert bad["counters"]["malformed"] + bad["counters"]["unknown_encoding"] == 50
+    assert any("ZeroDivisionError: boom" in error for error in bad["errors"])
+    assert good["state"] == "TRACKING"
+    assert good["errors"] == []
+    assert {n: c for n, c in good["counters"].items() if c} == {
+        "received": 10,
+        "processed": 10,
+        "odometry_received": 10,
+        "fixes": 1,
+        "poses": 10,
+    }
+
+
+def test_a_rejected_frame_leaves_the_pose(site):
+    site.frame("r1", 0.0)
+    site.engine.failing["r1"] = CloudError("cloud has 3 finite points")
+    site.frame("r1", STEP)
+    assert site.poses("r1")[-1].stamp_ns == ns(STEP)
+    status = site.status("r1")
+    assert (status["state"], status["counters"]["rejected"]) == ("TRACKING", 1)
+    assert status["errors"] == ["r1: frames of no use; the first: cloud has 3 finite points"]
+
+
+def test_an_engine_that_died_has_forgotten_all_robots(pair):
+    for name in ("r1", "r2"):
+        pair.frame(name, 0.0)
+    pair.track.dead = True
+    pair.frame("r1", STEP)
+    for name in ("r1", "r2"):
+        status = pair.status(name)
+        assert (status["state"], status["reason"]) == (
+            "LOST",
+            "the engine was started again: the track engine died",
+        )
+        assert status["counters"]["engine_restarts"] == 1
+        assert pair.poses(name) == []
+    for name in ("r1", "r2"):
+        pair.frame(name, 2 * STEP)
+        assert pair.status(name)["state"] == "TRACKING"
+
+
+REPLACED = "site.coview: has been replaced by another map; start the node (serve) again"
+
+
+@pytest.mark.parametrize("lane", ["track", "search"])
+def test_why_an_engine_does_not_come_back_is_said(pair, lane, caplog):
+    def die(text):
+        def run(job):
+            raise DiedError(text)
+
+        return run
+
+    for name in ("r1", "r2"):
+        pair.frame(name, 0.0)
+    pair.engine.answer = lambda job: unknown(job, ask=query())
+    pair.node._stopping.wait = lambda seconds: True  # no pauses
+    for k, text in enumerate(["it died", REPLACED, REPLACED, REPLACED], 1):
+        getattr(pair, lane).run = die(text)
+        pair.frame("r1", STEP * k)
+    for name in ("r1", "r2"):
+        status = pair.status(name)
+        assert f"the {lane} engine is started again: {REPLACED}" in status["errors"]
+        assert (REPLACED in status["reason"]) == (lane == "track")
+        assert status["counters"]["losses"] == (lane == "track")
+    lines = [r.getMessage() for r in caplog.records if "is started again" in r.getMessage()]
+    assert len(lines) == 2  # each text once, for all robots
+    assert "it died" in lines[0]
+    assert REPLACED in lines[1]
+
+
+def test_a_robot_that_never_had_a_frame_hears_of_the_engine_too(site):
+    site.track.dead = True
+    site.frame("r1", 0.0)
+    assert site.status("r1")["reason"] == "frames at which the engine failed: 1; see errors"
+
+
+def test_a_search_engine_that_died_loses_no_place(pair):
+    def ask(job):
+        return unknown(job, ask=query())
+
+    pair.frame("r1", 0.0)
+    pair.engine.answer = ask
+    pair.sees("r2", 0.0)
+    pair.search.dead = True
+    pair.work("r2")
+    assert pair.status("r1")["state"] == "TRACKING"
+    status = pair.status("r2")
+    counters = status["counters"]
+    assert (counters["searches"], counters["search_errors"], counters["engine_restarts"]) == (0, 1, 1)
+    assert any("engine died" in text for text in status["errors"])
+    pair.frame("r2", STEP)
+    assert pair.status("r2")["counters"]["searches"] == 1
+
+
+def test_robots_take_turns():
+    names = ("r1", "r2", "r3", "r4")
+    site = Site(*names)
+    site.node.declare()
+    served = []
+    for k in range(40):
+        for name in names:
+            for flood in range(10 if name == "r2" else 1):  # one sends ten times as much
+                site.sees(name, STEP * k + 0.001 * flood)
+        session, job = site.node.next_job("track")
+        served.append(job.robot)
+        site.node.work("track", session, job)
+    assert served == list(names) * 10
+
+
+def test_a_search_engine_that_fails_is_named(site):
+    class Broken:
+        def run(self, job):
+            raise ValueError("the spectra are gone")
+
+        def forget(self, robot):
+            pass
+
+    site.engine.answer = lambda job: unknown(job, ask=query())
+    site.search.engine = Broken()
+    for k in range(5):
+        site.frame("r1", STEP * k)
+    status = site.status("r1")
+    assert (status["counters"]["searches"], status["counters"]["search_errors"]) == (0, 5)
+    assert any("the spectra are gone" in text for text in status["errors"])
+    site.search.engine = site.engine
+    site.frame("r1", 1.0)
+    assert site.status("r1")["counters"]["searches"] == 1
+
+
+def test_failures_on_every_frame_do_not_flood_the_log(site, caplog):
+    site.engine.failing["r1"] = ValueError("bad frame")
+    for k in range(50):
+        site.frame("r1", STEP * k)
+    assert site.status("r1")["counters"]["engine_errors"] == 50
+    lines = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
+    assert len(lines) == 1
+    assert "r1: the track engine" in lines[0]
+    assert "bad frame" in lines[0]
+    site.track.run = lambda job: 1 / 0
+    site.node._stopping.set()  # no pauses
+    for k in range(50, 60):
+        site.frame("r1", STEP * k)
+    assert len([r for r in caplog.records if "unexpected" in r.getMessage()]) == 1
+
+
+class Unsayable:
+    """Evidence that cannot be written."""
+
+    reason = "none"
+
+    def to_json(self):
+        raise RuntimeError("cannot be said")
+
+
+def test_one_robots_status_that_raises_silences_nobody(pair):
+    pair.sessions["r1"].whereabouts.evidence = Unsayable()
+    for _ in range(3):
+        publish_statuses(pair.node, time.monotonic())
+    assert len(pair.statuses("r2")) == 3
+    assert pair.statuses("r1") == []
+    pair.sessions["r1"].whereabouts.evidence = None
+    assert pair.status("r1")["robot"] == "r1"
+
+
+def test_an_unknown_connection_silences_nobody(pair):
+    def fail():
+        raise RuntimeError("cannot ask")
+
+    pair.net.connection = fail
+    assert pair.status("r1")["connection"] == {"routers": [], "peers": [], "reconnects": 0}
+    assert len(pair.statuses("r2")) == 1
+
+
+def test_a_status_that_raises_is_not_tried_over_and_over():
+    config = NodeConfig(pose_rate=200.0, status_rate=2.0)
+    site = Site("r1", config=config)
+    asked = []
+
+    class Counting(Unsayable):
+        def to_json(self):
+            asked.append(time.monotonic())
+            return super().to_json()
+
+    site.sessions["r1"].whereabouts.evidence = Counting()
+    site.node.start()
+    try:
+        until(lambda: len(asked) >= 3)
+    finally:
+        site.node.close()
+    assert asked[2] - asked[0] > 0.5

@@ -1,0 +1,128 @@
+"""The node's poses: a drive through the small world, formats, silence."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+from fake_node import STEP, Site
+from fake_robot import SHA, T_MAP_ODOM, message, ns
+from small_world import pose_error
+
+from coview_stream.geometry.transforms import inverse, pose_from
+from coview_stream.messages import decode_pose, encode_cloud, encode_odometry
+from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
+from coview_stream.stream.node.engines import SearchEngine, TrackEngine
+from coview_stream.stream.transport.rmw import NO_HASH, gid_of, read_attachment
+
+
+@pytest.fixture
+def site():
+    made = Site("r1")
+    made.node.declare()
+    return made
+
+
+def test_a_drive_through_the_small_world(world_map, world_drive):
+    site = Site("r1", engines=(TrackEngine(world_map), SearchEngine(world_map)))
+    site.node.declare()
+    right = []
+    for k in range(8):
+        moved = encode_odometry(OdometryMessage(ns(0.5 * k), world_drive.T_odom_body[k]), "json")
+        seen = encode_cloud(CloudMessage(ns(0.5 * k), world_drive.clouds[k]), "xyz")
+        for key, each in ((site.keys["r1"].odometry, moved), (site.keys["r1"].cloud, seen)):
+            site.net.publish(Sample(key, each.payload, each.encoding, each.attachment))
+        site.work("r1")
+        before = len(right)
+        for sent in site.poses("r1")[before:]:
+            assert sent.stamp_ns == ns(0.5 * k)
+            right.append(pose_error(sent.T_map_body, world_drive.T_map_body[k])[0])
+    assert len(right) >= 3
+    assert max(right) < 0.1
+    assert site.net.raised == []
+    (raw, *_) = site.net.samples("coview/r1/out/pose")
+    assert raw.encoding == "application/json"
+    fields = json.loads(raw.payload)
+    assert {
+        "stamp_ns",
+        "robot",
+        "state",
+        "position",
+        "orientation",
+        "covariance",
+        "confidence",
+        "map_sha256",
+    } <= set(fields)
+    assert (fields["robot"], fields["state"], fields["map_sha256"]) == ("r1", "TRACKING", SHA)
+    assert len(fields["covariance"]) == 36
+    status = site.status("r1")
+    assert status["state"] == "TRACKING"
+    assert status["counters"]["processed"] == 8
+    assert status["counters"]["searches"] >= 3
+    assert status["counters"]["fixes"] == 1
+    assert 0.2 < status["evidence"]["score"] <= 1.0
+
+
+def test_poses_in_the_way_of_rmw_zenoh():
+    site = Site("r1", preset="rmw_zenoh")
+    site.node.declare()
+    keys = site.keys["r1"]
+    for seconds in (0.0, STEP):
+        moved = encode_odometry(message(seconds), "cdr")
+        seen = encode_cloud(CloudMessage(ns(seconds), np.ones((20, 3), np.float32)), "cdr")
+        # rmw_zenoh sets no Encoding
+        site.net.publish(Sample(keys.odometry.replace("*", NO_HASH), moved.payload))
+        site.net.publish(Sample(keys.cloud.replace("*", NO_HASH), seen.payload))
+        site.work("r1")
+        site.node.publish_poses(time.monotonic())
+    sent = site.net.samples(keys.pose)
+    assert [s.encoding for s in sent] == ["", ""]
+    assert [read_attachment(s.attachment)[0] for s in sent] == [1, 2]
+    nodes = [t for t in site.net.announced if "/NN/" in t]
+    publishers = [t for t in site.net.announced if "/MP/" in t]
+    assert (len(nodes), len(publishers)) == (1, 1)
+    assert "%r1%coview%pose" in publishers[0]
+    assert read_attachment(sent[0].attachment)[2] == gid_of(publishers[0])
+    np.testing.assert_allclose(
+        decode_pose(sent[1]).T_map_body, T_MAP_ODOM @ pose_from(np.eye(3), [2 * STEP, 0, 0]), atol=1e-6
+    )
+
+
+def test_robots_of_one_ros_node_have_publishers_of_their_own():
+    site = Site("r1", "r2", preset="rmw_zenoh")
+    site.node.declare()
+    publishers = sorted(t for t in site.net.announced if "/MP/" in t)
+    assert len(publishers) == 2
+    assert len({t.split("/")[4] for t in publishers}) == 2  # entity ids
+    assert len([t for t in site.net.announced if "/NN/" in t]) == 1
+
+
+def test_another_format_when_asked_for():
+    site = Site("r1", pose_format="cdr")
+    site.node.declare()
+    site.frame("r1", 0.0)
+    site.poses("r1")
+    (sent,) = site.net.samples("coview/r1/out/pose")
+    assert sent.encoding.startswith("application/cdr;")
+
+
+def test_poses_go_on_with_odometry_between_frames(site):
+    site.frame("r1", 0.0)
+    for k in range(1, 5):
+        site.moves("r1", STEP * k)
+        sent = site.poses("r1")[-1]
+        assert sent.stamp_ns == ns(STEP * k)
+        T_odom_body = inverse(T_MAP_ODOM) @ sent.T_map_body
+        np.testing.assert_allclose(T_odom_body[:3, 3], [2 * STEP * k, 0, 0], atol=1e-6)
+    assert len(site.poses("r1")) == 5
+
+
+def test_silence_of_odometry_ends_the_poses(site):
+    site.frame("r1", 0.0)
+    count = len(site.poses("r1"))
+    assert count == 1
+    site.node.publish_poses(time.monotonic() + 31.0)
+    assert len(site.net.samples("coview/r1/out/pose")) == count
+    assert site.status("r1")["state"] == "LOST"

@@ -1,0 +1,106 @@
+"""The engine behind ``serve --odometry kiss-icp``: robots apart, and honest about every new beginning."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import small_world
+from fake_lidar_odometry import Told, swept
+
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.errors import CloudError, DependencyError, RunError
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.odometry import kiss_icp as kiss
+from coview_stream.stream.node.engines import open_engine
+from coview_stream.stream.node.jobs import FrameJob, SweepJob
+from coview_stream.stream.node.odometry_engine import OdometryEngine
+
+LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
+
+
+@pytest.fixture(scope="module")
+def cloud(scene):
+    return small_world.scan(scene, small_world.drive()[0])
+
+
+def moved(x, yaw=0.0):
+    return pose_from(rot_z(yaw), [x, 0.0, 0.0])
+
+
+def job(cloud, seconds, robot="r1", generation=1, times=None, config=LEVEL):
+    return SweepJob(robot, generation, round(1e9 * seconds), cloud, times, config)
+
+
+def engine_of(*poses):
+    """An engine whose every robot moves like this."""
+    return OdometryEngine(lambda config: Told(*poses))
+
+
+def test_robots_have_odometry_of_their_own(cloud):
+    engine = engine_of(np.eye(4), moved(1.0), moved(2.0))
+    one = [engine.run(job(cloud, 0.1 * k)) for k in range(3)]
+    other = engine.run(job(cloud, 7.0, "r2"))
+    assert [r.T_odom_body[0, 3] for r in one] == pytest.approx([0.0, 1.0, 2.0])
+    assert other.T_odom_body[0, 3] == 0.0
+    assert [r.begun for r in (*one, other)] == [True, False, False, True]
+    assert all(r.points is None for r in one)
+
+
+@pytest.mark.parametrize("bring_about", ["generation", "gap", "forget"])
+def test_a_new_beginning_is_said(cloud, bring_about):
+    engine = engine_of(np.eye(4), moved(1.0), moved(2.0))
+    for k in range(2):
+        engine.run(job(cloud, 0.1 * k))
+    if bring_about == "forget":
+        engine.forget("r1")
+    again = {"generation": job(cloud, 0.05, generation=2), "gap": job(cloud, 9.0), "forget": job(cloud, 0.0)}
+    result = engine.run(again[bring_about])
+    assert result.begun
+    stamp = again[bring_about].stamp_ns * 1e-9
+    assert not engine.run(job(cloud, stamp + 0.1, generation=again[bring_about].generation)).begun
+
+
+def test_an_impossible_motion_makes_the_next_pose_a_beginning(cloud):
+    engine = engine_of(np.eye(4), moved(40.0), moved(0.1), moved(0.2))
+    engine.run(job(cloud, 0.0))
+    with pytest.raises(CloudError, match="lost its way"):
+        engine.run(job(cloud, 0.1))
+    assert [engine.run(job(cloud, 0.1 * k)).begun for k in (2, 3)] == [True, False]
+
+
+def test_frames_come_back_deskewed(cloud):
+    step = moved(1.0, 0.05)
+    engine = engine_of(np.eye(4), step, step @ step)
+    for k in range(2):
+        engine.run(job(cloud, 0.1 * k))
+    skewed, times = swept(cloud, step)
+    result = engine.run(job(skewed, 0.2, times=times))
+    assert np.abs(skewed - cloud).max() > 0.5
+    assert np.abs(result.points - cloud).max() < 0.1
+    assert np.allclose(inverse(step @ step) @ result.T_odom_body, np.eye(4))
+
+
+def test_what_cannot_be_placed(cloud):
+    engine = engine_of()
+    with pytest.raises(CloudError, match="is the sensor covered"):
+        engine.run(job(cloud[:9], 0.0))
+    engine.run(job(cloud, 0.1))
+    with pytest.raises(RunError, match="does not come after"):
+        engine.run(job(cloud, 0.1))
+    with pytest.raises(TypeError, match="FrameJob is no sweep"):
+        engine.run(FrameJob("r1", 1, 0, cloud, np.eye(4)))
+
+
+def test_it_needs_no_map_but_kiss_icp(monkeypatch):
+    class Kiss:
+        pass
+
+    monkeypatch.setattr(kiss, "_settings", lambda config: (lambda settings: Kiss(), None))
+    assert open_engine("odometry", "no/such.coview", "").kernels == ()
+
+    def missing(config):
+        raise DependencyError("pip install it")
+
+    monkeypatch.setattr(kiss, "_settings", missing)
+    with pytest.raises(DependencyError, match="pip install"):
+        open_engine("odometry", "no/such.coview", "")

@@ -1,0 +1,218 @@
+"""Every counter of a session, by the message that causes it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_robot import (
+    KEYS,
+    POINTS,
+    Robot,
+    cloud,
+    counted,
+    ns,
+    numbered,
+    odometry,
+    query,
+    state,
+    tracking,
+    unknown,
+    verdict,
+)
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.localization.result import State
+from coview_stream.messages.types import Sample
+
+
+@pytest.fixture
+def robot():
+    return Robot()
+
+
+def test_processed(robot):
+    robot.frame(0.0, unknown)
+    assert counted(robot) == {"received": 1, "processed": 1, "odometry_received": 2}
+
+
+def test_rejected(robot):
+    robot.drive(-0.1, 0.1)
+    robot.saw(0.0)
+    robot.session.frame_failed(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
+    assert counted(robot) == {"received": 1, "rejected": 1, "odometry_received": 5}
+    assert list(robot.session.complaints.texts) == [
+        "r1: frames of no use; the first: cloud has 3 finite points"
+    ]
+
+
+def test_engine_errors_are_told_by_their_last_line(robot):
+    robot.drive(-0.1, 0.1)
+    robot.saw(0.0)
+    trace = "Traceback:\n  somewhere\nValueError: boom\n"
+    robot.session.frame_failed(robot.session.take_frame(), trace, rejected=False)
+    assert counted(robot) == {"received": 1, "engine_errors": 1, "odometry_received": 5}
+    assert list(robot.session.complaints.texts) == [
+        "r1: frames that the engine failed at; the first: ValueError: boom"
+    ]
+
+
+def test_dropped_because_a_newer_frame_came(robot):
+    robot.drive(0.0, 1.0)
+    for t in (0.2, 0.3, 0.4):
+        robot.saw(t, now=1001.0)
+    assert robot.counters.dropped == 2
+    job = robot.session.take_frame()
+    assert job.stamp_ns == ns(0.4)
+    assert robot.session.take_frame() is None
+
+
+def test_a_frame_under_way_is_not_dropped(robot):
+    robot.drive(0.0, 1.0)
+    robot.saw(0.2, now=1001.0)
+    busy = robot.session.take_frame()
+    robot.saw(0.3, now=1001.0)
+    robot.saw(0.4, now=1001.0)
+    assert robot.session.take_frame() is None  # one at a time
+    assert robot.counters.dropped == 1
+    robot.session.frame_done(busy, tracking(busy), 1001.1)
+    assert robot.session.take_frame().stamp_ns == ns(0.4)
+
+
+def test_late(robot):
+    robot.drive(0.0, 7.0)
+    robot.saw(1.9, now=1007.0)
+    assert robot.counters.late == 1
+    assert robot.session.take_frame() is None
+    robot.saw(2.1, now=1007.0)
+    assert robot.session.take_frame() is not None
+
+
+def test_out_of_order_and_duplicate(robot):
+    robot.drive(0.0, 1.0)
+    robot.saw(0.5, now=1001.0)
+    robot.saw(0.5, now=1001.0)
+    assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 0)
+    robot.saw(0.4, now=1001.0)
+    assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
+    assert robot.session.take_frame().stamp_ns == ns(0.5)
+
+
+def test_duplicate_of_a_frame_that_waits(robot):
+    robot.saw(0.5)
+    robot.saw(0.5)
+    assert robot.counters.duplicate == 1
+
+
+def test_frames_that_wait_are_put_in_order(robot):
+    """The network may change their order; that alone loses nothing."""
+    robot.drive(0.0, 0.1)
+    for t in (0.3, 0.2):
+        robot.saw(t, now=1000.3)
+    robot.moved(0.25, now=1000.3)
+    assert robot.session.take_frame().stamp_ns == ns(0.2)
+    robot.moved(0.35, now=1000.35)
+    assert counted(robot) == {"received": 2, "odometry_received": 5}
+
+
+def test_no_odometry(robot):
+    robot.drive(0.0, 1.0)
+    robot.saw(1.2)
+    robot.session.tick(robot.now + 0.29)
+    assert robot.counters.no_odometry == 0
+    robot.session.tick(robot.now + 0.31)
+    assert robot.counters.no_odometry == 1
+
+
+def test_no_odometry_in_a_gap(robot):
+    robot.moved(0.0, x=0.0)
+    robot.moved(0.8, x=0.0)
+    robot.saw(0.4, now=1000.8)
+    assert robot.counters.no_odometry == 1
+
+
+def test_malformed_oversized_and_unknown(robot):
+    good = cloud(0.0)
+    robot.session.on_cloud(Sample(KEYS.cloud, b"12345", good.encoding, good.attachment), 0.0)
+    robot.session.on_cloud(Sample(KEYS.cloud, good.payload, good.encoding, None), 0.0)
+    assert (robot.counters.received, robot.counters.malformed) == (2, 2)
+    robot.session.on_cloud(Sample(KEYS.cloud, good.payload, "video/raw", good.attachment), 0.0)
+    assert robot.counters.unknown_encoding == 1
+    assert any("video/raw" in text for text in robot.session.complaints.texts)
+    small = Robot(NodeConfig(max_payload=len(good.payload)))
+    small.saw(0.0)
+    assert small.counters.oversized == 0
+    small.saw(0.1, points=np.zeros((len(POINTS) + 1, 3), np.float32))
+    assert (small.counters.oversized, small.counters.received) == (1, 2)
+
+
+def test_odometry_malformed_oversized_and_unknown():
+    robot = Robot(NodeConfig(max_payload=1000))
+    good = odometry(0.0)
+    robot.session.on_odometry(Sample(good.key, b'{"stamp_ns": 1', good.encoding), 0.0)
+    robot.session.on_odometry(Sample(good.key, good.payload, "video/raw"), 0.0)
+    robot.session.on_odometry(Sample(good.key, b"{" + bytes(1000), good.encoding), 0.0)
+    assert counted(robot) == {
+        "odometry_received": 3,
+        "odometry_malformed": 1,
+        "odometry_unknown_encoding": 1,
+        "odometry_oversized": 1,
+    }
+
+
+def test_odometry_that_does_not_continue(robot):
+    robot.drive(0.0, 1.0)
+    robot.moved(1.0)
+    robot.moved(0.9)
+    assert (robot.counters.odometry_duplicate, robot.counters.odometry_out_of_order) == (1, 1)
+    robot.moved(2.0)
+    assert robot.counters.odometry_gaps == 1
+    robot.moved(2.05, x=400.0)
+    assert robot.counters.odometry_jumps == 1
+    for k in range(25):
+        robot.moved(-50.0 + 0.05 * k, now=1002.1 + 0.05 * k)
+    assert robot.counters.clock_restarts == 1
+
+
+def test_missing_by_number(robot):
+    robot.drive(0.0, 1.0)
+    for sequence, t in ((1, 0.1), (2, 0.2), (5, 0.3)):
+        robot.saw(t, now=1001.0, attachment=numbered(sequence, t))
+    assert robot.counters.missing == 2
+
+
+def test_searches_and_those_skipped(robot):
+    robot.frame(0.0, unknown, ask=query(0.0))
+    job = robot.session.take_search()
+    assert job.query.stamp == 0.0
+    robot.frame(0.1, unknown, ask=query(0.1))
+    assert robot.session.take_search() is None  # one at a time
+    assert robot.counters.searches_skipped == 0
+    robot.frame(0.2, unknown, ask=query(0.2))
+    assert (robot.counters.searches_skipped, robot.counters.searches) == (1, 0)
+    robot.session.search_done(job, verdict())
+    assert robot.counters.searches == 1
+    assert robot.session.take_search().query.stamp == 0.2
+    assert robot.session.take_search() is None
+
+
+def test_fixes_poses_and_losses(robot):
+    robot.localized()
+    assert (robot.counters.fixes, robot.counters.poses, robot.counters.losses) == (1, 1, 0)
+    robot.frame(0.1)
+    robot.session.pose()
+    assert (robot.counters.fixes, robot.counters.poses) == (1, 2)
+    robot.frame(0.2, unknown, state=State.LOST)
+    assert robot.session.pose() is None
+    assert (robot.counters.fixes, robot.counters.poses, robot.counters.losses) == (1, 2, 1)
+    robot.frame(0.3, unknown, state=State.LOST)
+    assert robot.counters.losses == 1
+    robot.frame(0.4)
+    assert robot.counters.fixes == 2
+
+
+def test_engine_restarts(robot):
+    robot.localized()
+    robot.session.engine_restarted()
+    assert (robot.counters.engine_restarts, robot.counters.losses) == (1, 1)
+    assert robot.session.pose() is None
+    assert state(robot) is State.LOST

@@ -1,0 +1,143 @@
+"""A doubt of a place that has been found is not a search: what befalls the robot meanwhile has its consequences."""
+
+from __future__ import annotations
+
+import pytest
+from fake_robot import Robot, counted, doubted, ns, reason, state, tracking, unknown
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.stream.node.status import status
+from coview_stream.stream.transport.transport import Connection
+
+
+@pytest.fixture
+def covered():
+    """A robot whose sensor has been covered after it was found."""
+    robot = Robot().localized(0.0)
+    robot.frame(0.1, doubted)
+    assert robot.session.state() == (State.AMBIGUOUS, "only 0 points to register")
+    return robot
+
+
+def changes(robot):
+    told = status(robot.session, Connection((), ()), 0, 0.0, 1.0)["transitions"]
+    return [(c["from"], c["to"], c["reason"]) for c in told]
+
+
+def test_a_doubt_is_told_from_a_search():
+    def fix(state, cause):
+        return Fix(0.0, state, evidence=KeyframeEvidence(0.0, state, "so", cause=cause))
+
+    assert fix(State.AMBIGUOUS, Cause.BLIND).doubted
+    assert fix(State.AMBIGUOUS, Cause.VERIFIED).doubted  # a long doubt takes more than one
+    assert not fix(State.AMBIGUOUS, None).doubted
+    assert not fix(State.TRACKING, Cause.VERIFIED).doubted
+    assert not fix(State.LOST, Cause.FITNESS).doubted
+    assert not Fix(0.0, State.AMBIGUOUS).doubted
+
+
+def test_a_pause_of_odometry_during_a_doubt_keeps_the_place(covered):
+    epoch = covered.frame(0.2, doubted).epoch
+    covered.moved(0.9, x=0.4)
+    assert covered.counters.odometry_gaps == 1
+    assert state(covered) is State.AMBIGUOUS
+    assert covered.counters.losses == 0
+    covered.moved(1.0, x=0.5)
+    covered.saw(0.95)
+    job = covered.session.take_frame()
+    assert (job.epoch, job.suspect) == (epoch, True)
+    covered.session.frame_done(job, tracking(job), covered.now)
+    assert covered.session.pose() is not None
+
+
+def test_so_does_one_that_has_been_noticed_before_it_ended(covered):
+    epoch = covered.frame(0.2, doubted).epoch
+    covered.session.tick(covered.now + 0.6)
+    assert covered.session.state() == (State.LOST, "no odometry for 0.5 s")
+    covered.moved(0.9, x=0.4)
+    covered.moved(1.0, x=0.5)
+    covered.saw(0.95)
+    job = covered.session.take_frame()
+    assert (job.epoch, job.suspect) == (epoch, True)
+    covered.session.frame_done(job, tracking(job), covered.now)
+    assert state(covered) is State.TRACKING
+    assert covered.counters.losses == 1
+
+
+def test_a_search_begins_anew_after_a_pause_all_the_same():
+    robot = Robot()
+    epoch = robot.frame(0.0, unknown, state=State.AMBIGUOUS).epoch
+    robot.moved(0.7, x=0.4)
+    assert robot.frame(0.8, unknown).epoch != epoch
+    assert robot.counters.losses == 0
+
+
+def test_what_begins_anew_during_a_doubt_is_a_loss(covered):
+    covered.moved(0.15, x=900.0)
+    assert covered.session.state() == (State.LOST, "odometry jumped")
+    assert covered.counters.losses == 1
+    covered.moved(0.2, x=900.0)
+    covered.moved(0.8, x=900.1)  # nothing is known there that could be verified
+    assert reason(covered) == "odometry jumped"
+    assert not covered.session.whereabouts.found
+    assert covered.counters.losses == 1
+
+
+def test_silence_during_a_doubt_loses_the_place(covered):
+    covered.session.tick(covered.now + 0.4)
+    assert state(covered) is State.AMBIGUOUS
+    covered.session.tick(covered.now + 3600.0)
+    assert covered.session.state() == (State.LOST, "no odometry for 0.5 s")
+    assert covered.counters.losses == 1
+    assert changes(covered)[-1] == ("AMBIGUOUS", "LOST", "no odometry for 0.5 s")
+
+
+@pytest.mark.parametrize("answer", [tracking, doubted])
+def test_without_frames_a_place_that_waits_to_be_verified_is_lost_but_the_first_frame_may_do_it(answer):
+    robot = Robot(NodeConfig(coast=2.0)).localized(0.0)
+    robot.frame(0.1, answer)
+    robot.moved(0.8, x=0.3)  # after a pause
+    for k in range(17, 80):
+        robot.moved(0.05 * k, x=0.3)
+        robot.session.tick(robot.now)
+    assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
+    assert robot.counters.losses == 1
+    robot.saw(3.9, now=robot.now)
+    job = robot.session.take_frame()
+    assert job.stamp_ns == ns(3.9)
+    for k in range(80, 84):  # while the frame is under way
+        robot.moved(0.05 * k, x=0.3)
+        robot.session.tick(robot.now)
+    robot.session.frame_done(job, tracking(job), robot.now)
+    assert state(robot) is State.TRACKING
+
+
+def test_a_doubt_is_in_no_hurry_for_a_search(covered):
+    assert not covered.session.hopeful()
+    searching = Robot()
+    searching.frame(0.0, unknown, state=State.AMBIGUOUS)
+    assert searching.session.hopeful()
+
+
+def test_a_loss_has_the_reason_of_the_newest_and_is_counted_once():
+    robot = Robot().localized(0.0)
+    silent = robot.now + 0.6
+    robot.session.tick(silent)
+    for answer, stamp in ((doubted, 0.1), (unknown, 0.2)):
+        robot.moved(stamp, now=silent + stamp)
+        robot.saw(stamp - 0.01, now=silent + stamp)
+        job = robot.session.take_frame()
+        more = {"state": State.LOST, "reason": "in doubt for 60 s"} if answer is unknown else {}
+        robot.session.frame_done(job, answer(job, **more), silent + stamp)
+        if answer is doubted:
+            assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
+    assert robot.session.state() == (State.LOST, "in doubt for 60 s")
+    assert counted(robot)["losses"] == 1
+    assert changes(robot)[1:] == [
+        ("TRACKING", "LOST", "no odometry for 0.5 s"),
+        ("LOST", "LOST", "in doubt for 60 s"),
+    ]
+    robot.session.tick(silent + 0.3)
+    assert len(changes(robot)) == 3

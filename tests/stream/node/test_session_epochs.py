@@ -1,0 +1,126 @@
+"""Beginning anew: what is asked for, and what comes too late."""
+
+from __future__ import annotations
+
+import pytest
+from fake_robot import KEYS, Robot, counted, query, state, tracking, unknown, verdict
+
+from coview_stream.localization.result import State
+from coview_stream.messages.types import Sample
+
+
+@pytest.fixture
+def robot():
+    return Robot()
+
+
+def test_begin_anew_searches_from_nothing(robot):
+    robot.localized(0.0)
+    before = robot.frame(0.1)
+    robot.session.begin_anew("asked to search again")
+    assert robot.session.state() == (State.LOST, "asked to search again")
+    assert robot.session.pose() is None
+    assert robot.counters.received == 2  # nothing is forgotten but the place
+    after = robot.frame(0.2, unknown)
+    assert after.epoch != before.epoch
+    assert robot.session.pose() is None
+
+
+def test_begin_anew_before_a_fix_is_no_loss(robot):
+    robot.frame(0.0, unknown)
+    robot.session.begin_anew("asked to search again")
+    assert state(robot) is State.SEARCHING
+    assert robot.counters.losses == 0
+
+
+def test_reset_forgets_everything(robot):
+    epoch = robot.localized(0.0).frame(0.1).epoch
+    robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
+    robot.session.reset()
+    assert counted(robot) == {}
+    assert not robot.session.complaints.texts
+    assert robot.session.pose() is None
+    assert robot.session.whereabouts.evidence is None
+    assert robot.session.whereabouts.last_frame_ns is None
+    assert robot.session.work.latency.to_json()["p50"] is None
+    assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
+    assert robot.frame(0.2, unknown).epoch != epoch
+
+
+@pytest.mark.parametrize("how", ["begin_anew", "reset", "jump"])
+def test_what_was_under_way_before_is_ignored(robot, how):
+    robot.frame(0.0, unknown, ask=query(0.0))
+    searching = robot.session.take_search()
+    robot.drive(0.05, 0.2)
+    robot.saw(0.15)
+    busy = robot.session.take_frame()
+    if how == "begin_anew":
+        robot.session.begin_anew("asked to")
+    elif how == "reset":
+        robot.session.reset()
+    else:
+        robot.moved(0.25, x=500.0)
+    robot.session.frame_done(busy, tracking(busy), robot.now)
+    assert robot.session.pose() is None
+    robot.session.search_done(searching, verdict(accepted="a place"))
+    far = 500.0 if how == "jump" else 0.6
+    robot.moved(0.3, x=far)
+    robot.moved(0.35, x=far)
+    robot.saw(0.33)
+    job = robot.session.take_frame()
+    assert job.verdict is None
+    assert job.epoch > busy.epoch
+    # the old frame's end does not end the new one
+    robot.session.frame_done(job, unknown(job, ask=query(1.0)), robot.now)
+    assert robot.session.take_search().epoch == job.epoch
+
+
+def test_an_old_failure_does_not_end_the_frame_under_way(robot):
+    robot.drive(0.0, 0.2)
+    robot.saw(0.15)
+    old = robot.session.take_frame()
+    robot.session.begin_anew("asked to")
+    robot.saw(0.18)
+    busy = robot.session.take_frame()
+    assert busy is not None
+    robot.session.frame_failed(old, "boom", rejected=False)
+    robot.saw(0.19)
+    assert robot.session.take_frame() is None
+    robot.session.frame_done(busy, tracking(busy), robot.now)
+    assert robot.session.pose() is not None
+
+
+def test_a_verdict_goes_with_the_next_frame_once(robot):
+    robot.frame(0.0, unknown, ask=query(0.0))
+    said = verdict()
+    robot.session.search_done(robot.session.take_search(), said)
+    assert robot.frame(0.1, unknown).verdict is said
+    assert robot.frame(0.2, unknown).verdict is None
+
+
+def test_a_verdict_is_not_lost_with_a_rejected_frame(robot):
+    robot.frame(0.0, unknown, ask=query(0.0))
+    said = verdict()
+    robot.session.search_done(robot.session.take_search(), said)
+    robot.drive(0.05, 0.2)
+    robot.saw(0.1)
+    robot.session.frame_failed(robot.session.take_frame(), "too few points", rejected=True)
+    robot.saw(0.15)
+    assert robot.session.take_frame().verdict is said
+
+
+def test_a_search_that_failed_costs_its_keyframe_only(robot):
+    robot.frame(0.0, unknown, ask=query(0.0))
+    robot.session.search_done(robot.session.take_search(), None)
+    assert robot.frame(0.1, unknown, ask=query(0.1)).verdict is None
+    assert robot.session.take_search() is not None
+
+
+def test_an_engine_that_failed_begins_anew(robot):
+    epoch = robot.localized(0.0).frame(0.1).epoch
+    robot.drive(0.15, 0.3)
+    robot.saw(0.25)
+    robot.session.frame_failed(robot.session.take_frame(), "boom", rejected=False)
+    assert robot.session.pose() is None
+    assert state(robot) is State.LOST
+    assert robot.frame(0.4, unknown).epoch != epoch

@@ -1,0 +1,169 @@
+"""Frames and their odometry: who waits for what, and what people are told when nothing comes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_robot import KEYS, POINTS, SHA, Robot, cloud, ends, ns, odometry, pose, reason, tracking, unknown
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.localization.result import State
+from coview_stream.messages.types import Sample
+from coview_stream.stream.node.session import Session
+
+
+@pytest.fixture
+def robot():
+    return Robot()
+
+
+def test_a_frame_has_the_odometry_of_its_own_stamp(robot):
+    robot.drive(0.0, 0.5, rate=10.0)
+    robot.saw(0.325, now=1000.5)
+    np.testing.assert_allclose(robot.session.take_frame().T_odom_body, pose(0.65), atol=1e-9)
+
+
+def test_a_frame_waits_for_the_odometry_after_it(robot):
+    robot.drive(0.0, 0.1)
+    robot.saw(0.12)
+    assert robot.session.take_frame() is None
+    robot.moved(0.15)
+    job = robot.session.take_frame()
+    assert job.stamp_ns == ns(0.12)
+    np.testing.assert_allclose(job.T_odom_body, pose(0.24), atol=1e-9)
+
+
+def test_a_frame_without_odometry_holds_up_no_other(robot):
+    """One cloud from the far future must not shut out those of the present."""
+    robot.drive(0.0, 0.1)
+    robot.saw(3600.0, now=1000.1)
+    robot.saw(0.05, now=1000.1)
+    assert robot.session.take_frame().stamp_ns == ns(0.05)
+    robot.session.tick(1000.5)
+    assert robot.counters.no_odometry == 1
+    robot.drive(0.15, 0.6)
+    robot.saw(0.55)
+    assert robot.counters.out_of_order == 0
+
+
+def test_a_flood_of_clouds_without_odometry_is_bounded(robot):
+    robot.drive(0.0, 0.1)
+    for k in range(100):
+        robot.saw(0.2 + 0.001 * k, now=1000.2)
+    assert 92 - 1 <= robot.counters.dropped <= 92 + 1
+    robot.moved(0.35)
+    assert robot.session.take_frame().stamp_ns == ns(0.299)
+
+
+def test_a_sweep_waits_for_the_odometry_of_its_end(robot):
+    robot.drive(0.0, 0.2)
+    times = np.linspace(0.0, 0.1, len(POINTS))
+    robot.saw(0.15, now=1000.26, codec="foxglove", times=times)
+    assert robot.session.take_frame() is None
+    robot.moved(0.26)
+    job = robot.session.take_frame()
+    np.testing.assert_allclose(job.times, times, atol=1e-6)
+    assert job.segment.stamps.tolist()[0] <= ns(0.15)
+    assert job.segment.stamps.tolist()[-1] >= ns(0.25)
+
+
+def test_a_sweep_does_not_wait_for_ever(robot):
+    robot.drive(0.0, 0.2)
+    robot.saw(0.15, now=1000.26, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
+    robot.session.tick(1000.40)
+    assert robot.session.take_frame() is None
+    robot.session.tick(1000.42)
+    assert robot.session.take_frame() is not None
+
+
+def test_times_before_the_stamp(robot):
+    robot.drive(0.0, 0.2)
+    robot.saw(0.18, codec="foxglove", times=np.linspace(-0.1, 0.0, len(POINTS)))
+    job = robot.session.take_frame()
+    assert job.segment.stamps.tolist()[0] <= ns(0.08)
+    assert job.segment.stamps.tolist()[-1] >= ns(0.18)
+
+
+def test_no_deskew_when_asked_not_to():
+    robot = Robot(NodeConfig(deskew=False))
+    robot.drive(0.0, 0.2)
+    robot.saw(0.18, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
+    assert robot.session.take_frame().segment is None
+
+
+def test_reasons_when_nothing_comes(robot):
+    assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
+    robot.saw(0.0)
+    assert reason(robot) == f"waiting for odometry on {KEYS.odometry}"
+    robot.moved(0.0)
+    assert "no frame has been processed yet" in reason(robot)
+
+
+@pytest.mark.parametrize("difference", [-3600.0, 3600.0])
+def test_reason_when_the_clocks_differ(robot, difference):
+    for k in range(20):
+        robot.moved(0.1 * k)
+        robot.saw(0.1 * k + difference, now=robot.now)
+        robot.session.tick(robot.now)
+    assert "clock" in reason(robot)
+    assert ends(robot.counters) >= 15
+
+
+def test_the_reason_is_the_evidences(robot):
+    robot.frame(0.0, unknown, reason="two places fit")
+    assert robot.session.state() == (State.SEARCHING, "two places fit")
+    robot.frame(0.1)
+    assert robot.session.state() == (State.TRACKING, "verified")
+    robot.frame(0.2, unknown, state=State.LOST, reason="evidence gone, 2 times in a row")
+    assert robot.session.state() == (State.LOST, "evidence gone, 2 times in a row")
+
+
+def test_the_same_complaint_is_kept_once_and_only_the_newest(robot):
+    for _ in range(50):
+        robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
+    assert len(robot.session.complaints.texts) == 1
+    for k in range(50):
+        robot.session.on_cloud(Sample(KEYS.cloud, b"x", f"video/{k}"), 0.0)
+    assert len(robot.session.complaints.texts) <= 10
+    assert any("video/49" in text for text in robot.session.complaints.texts)
+
+
+def test_latency_is_from_the_cloud_to_its_result(robot):
+    robot.drive(0.0, 0.2)
+    robot.saw(0.15, now=1000.2)
+    job = robot.session.take_frame()
+    robot.session.frame_done(job, tracking(job), 1000.26)
+    assert robot.session.work.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
+    assert robot.session.work.engine_latency.to_json()["p50"] == 10.0
+
+
+def test_the_longest_wait_is_for_the_engine_not_for_the_sender(robot):
+    robot.frame(0.0)
+    robot.frame(60.0)  # a minute without clouds
+    assert robot.session.work.longest_wait < 0.1
+    robot.drive(60.1, 60.4)
+    robot.saw(60.2)
+    robot.saw(60.3)  # takes the place of the other, which has waited since 60.2
+    job = robot.session.take_frame()
+    robot.session.frame_done(job, tracking(job), 1061.0)
+    assert robot.session.work.longest_wait == pytest.approx(0.8, abs=0.01)
+
+
+def test_options_force_the_codecs():
+    session = Session(KEYS, SHA, options=("xyz", "json"))
+    sample, moved = cloud(0.0), odometry(0.0)
+    session.on_cloud(Sample(sample.key, sample.payload, "video/raw", sample.attachment), 0.0)
+    session.on_odometry(Sample(moved.key, moved.payload, "video/raw"), 0.0)
+    assert session.take_frame() is not None
+
+
+def test_a_frame_that_took_anothers_place_is_in_a_hurry():
+    robot = Robot()
+    robot.drive(-0.1, 0.5)
+    robot.saw(0.0)
+    robot.saw(0.1)
+    job = robot.session.take_frame()
+    assert (job.stamp_ns, job.hurry) == (ns(0.1), True)
+    robot.session.frame_done(job, tracking(job), robot.now)
+    robot.saw(0.2)
+    assert not robot.session.take_frame().hurry

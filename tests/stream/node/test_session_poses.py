@@ -1,0 +1,232 @@
+"""Poses that may be believed, and silence that ends them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, ns, pose, reason, state, tracking, unknown
+
+from coview_stream.config.node import NodeConfig
+from coview_stream.localization.result import State
+
+
+@pytest.fixture
+def robot():
+    return Robot()
+
+
+def test_no_pose_before_the_first_fix(robot):
+    robot.drive(0.0, 1.0)
+    assert robot.session.pose() is None
+    robot.frame(1.1, unknown)
+    assert robot.session.pose() is None
+    assert robot.session.age() is None
+    robot.frame(1.2, unknown, state=State.AMBIGUOUS)
+    assert robot.session.pose() is None
+    assert robot.counters.poses == 0
+
+
+def test_a_pose_is_the_newest_odometry_corrected(robot):
+    robot.localized(0.0)
+    robot.drive(0.05, 0.4)
+    sent = robot.session.pose()
+    assert sent.stamp_ns == ns(0.4)
+    np.testing.assert_allclose(sent.T_map_body, T_MAP_ODOM @ pose(0.8), atol=1e-9)
+    assert (sent.robot, sent.state, sent.map_sha256, sent.confidence) == ("r1", "TRACKING", SHA, 0.8)
+    assert sent.age == pytest.approx(0.4)
+    assert robot.session.age() == pytest.approx(0.4)
+
+
+def test_covariance_grows_with_what_was_driven_and_turned():
+    drift = replace(DRIFT, position=0.2, height=0.2, turn=0.3)
+    known = np.diag([0.01, 0.01, 0.01, 0.0, 0.0, 0.0])
+    robot = Robot()
+    robot.localized(0.0, drift=drift, covariance=known)
+    begin = robot.session.pose().covariance
+    robot.moved(1.0)
+    robot.moved(2.0)
+    robot.frame(2.1, drift=drift, covariance=known)
+    np.testing.assert_allclose(np.diag(robot.session.pose().covariance), np.diag(begin), atol=2e-3)
+    robot.drive(2.2, 4.1)
+    later = robot.session.pose().covariance
+    np.testing.assert_allclose(later, known + drift.reported(4.0, 0.0), rtol=0.03)
+    for k in range(20):
+        robot.moved(4.15 + 0.05 * k, x=8.2, yaw=0.05 * k)
+    turned = robot.session.pose().covariance
+    assert turned[5, 5] == pytest.approx(later[5, 5] + (0.3 * 0.95) ** 2, rel=0.05)
+    assert turned[0, 0] == pytest.approx(later[0, 0], rel=0.05)
+
+
+def test_an_error_of_the_heading_is_one_of_the_place_further_on():
+    robot = Robot()
+    heading = np.zeros((6, 6))
+    heading[5, 5] = np.radians(1.0) ** 2
+    robot.localized(0.0, covariance=heading)
+    robot.drive(0.05, 2.0)
+    later = robot.session.pose()
+    gathered = DRIFT.reported(4.0, 0.0)
+    along = later.T_map_body[:3, 0]
+    across = later.T_map_body[:3, 1]
+    lever = later.covariance[:3, :3] - gathered[:3, :3]
+    assert np.sqrt(across @ lever @ across) == pytest.approx(4.0 * np.radians(1.0), rel=0.02)
+    assert abs(along @ lever @ along) < 1e-4
+    # who is off to the left (a positive yaw) lies to the left: both errors are one
+    assert across @ later.covariance[:3, 5] == pytest.approx(4.0 * np.radians(1.0) ** 2, rel=0.02)
+    np.testing.assert_allclose(later.covariance, later.covariance.T)
+
+
+def test_corrections_do_not_move_the_past(robot):
+    robot.localized(0.0)
+    stamps = []
+    for k in range(1, 40):
+        robot.moved(0.05 * k)
+        if k % 2 == 0:
+            robot.saw(0.05 * k - 0.02)
+            job = robot.session.take_frame()
+            robot.session.frame_done(job, tracking(job, T_MAP_ODOM @ pose(0.01 * k)), robot.now)
+        sent = robot.session.pose()
+        stamps.append(sent.stamp_ns)
+        newest = k if k % 2 == 0 else k - 1
+        np.testing.assert_allclose(
+            sent.T_map_body, T_MAP_ODOM @ pose(0.01 * newest) @ pose(0.1 * k), atol=1e-9
+        )
+    assert stamps == sorted(stamps)
+    assert stamps[-1] == ns(1.95)
+
+
+def test_a_correction_replaced_leaves_nothing_of_the_old(robot):
+    robot.localized(0.0)
+    robot.frame(0.1, tracking, T_map_odom=T_MAP_ODOM @ pose(1.0), sigma=0.5)
+    sent = robot.session.pose()
+    np.testing.assert_allclose(sent.T_map_body, T_MAP_ODOM @ pose(1.0) @ pose(0.22), atol=1e-9)
+    assert sent.covariance[0, 0] == pytest.approx(0.25, rel=0.01)
+
+
+def test_doubt_takes_the_pose_away_at_once(robot):
+    robot.localized(0.0)
+    robot.frame(0.1, unknown, state=State.AMBIGUOUS, reason="evidence gone, 1 times in a row")
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.AMBIGUOUS, "evidence gone, 1 times in a row")
+    robot.frame(0.2)
+    assert state(robot) is State.TRACKING
+
+
+def test_without_odometry_there_is_no_pose(robot):
+    robot.localized(0.0)
+    robot.session.tick(robot.now + 0.49)
+    assert robot.session.pose() is not None
+    robot.session.tick(robot.now + 0.51)
+    assert robot.session.pose() is None
+    assert robot.session.age() is None
+    assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
+    assert robot.counters.losses == 1
+
+
+def test_after_silence_only_a_verified_frame_brings_the_pose_back(robot):
+    robot.localized(0.0)
+    silent = robot.now + 0.6
+    robot.session.tick(silent)
+    robot.moved(0.2, now=silent + 0.01)
+    assert robot.session.pose() is None
+    assert state(robot) is State.LOST
+    robot.saw(0.19, now=silent + 0.02)
+    job = robot.session.take_frame()
+    assert job.suspect
+    robot.session.frame_done(job, unknown(job, State.AMBIGUOUS), silent + 0.05)
+    assert robot.session.pose() is None
+    robot.moved(0.3, now=silent + 0.1)
+    robot.saw(0.29, now=silent + 0.1)
+    job = robot.session.take_frame()
+    robot.session.frame_done(job, tracking(job), silent + 0.15)
+    assert state(robot) is State.TRACKING
+    assert robot.session.pose() is not None
+    robot.moved(0.4, now=silent + 0.2)
+    robot.saw(0.39, now=silent + 0.2)
+    assert not robot.session.take_frame().suspect
+
+
+def test_a_frame_from_before_the_silence_brings_nothing_back(robot):
+    robot.localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.25)
+    job = robot.session.take_frame()
+    robot.session.tick(robot.now + 0.6)
+    robot.session.frame_done(job, tracking(job), robot.now + 0.7)
+    assert robot.session.pose() is None
+    assert state(robot) is State.LOST
+
+
+def test_duplicates_keep_nobody_alive(robot):
+    robot.localized(0.0)
+    for k in range(20):
+        robot.moved(0.01, now=1000.0 + 0.05 * k)
+        robot.session.tick(robot.now)
+    assert state(robot) is State.LOST
+
+
+def test_without_frames_odometry_carries_on_for_a_while_only():
+    robot = Robot(NodeConfig(coast=2.0)).localized(0.0)
+    for k in range(1, 39):
+        robot.moved(0.05 * k)
+        robot.session.tick(robot.now)
+        assert robot.session.pose() is not None
+    for k in range(39, 45):
+        robot.moved(0.05 * k)
+        robot.session.tick(robot.now)
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
+    robot.saw(2.19)
+    assert robot.session.take_frame().suspect
+
+
+def test_frames_that_are_rejected_do_not_count_as_seen():
+    robot = Robot(NodeConfig(coast=1.0)).localized(0.0)
+    for k in range(1, 30):
+        robot.moved(0.05 * k)
+        robot.saw(0.05 * k - 0.01)
+        job = robot.session.take_frame()
+        robot.session.frame_failed(job, "too few points", rejected=True)
+        robot.session.tick(robot.now)
+    assert state(robot) is State.LOST
+
+
+def test_a_pause_of_the_stamps_takes_the_pose_until_a_frame_has_verified(robot):
+    robot.localized(0.0)
+    robot.moved(0.8, x=0.0, now=1000.1)
+    assert robot.counters.odometry_gaps == 1
+    assert robot.session.pose() is None
+    assert state(robot) is not State.TRACKING
+    assert "pause" in reason(robot)
+    robot.moved(0.9, x=0.0, now=1000.2)
+    robot.saw(0.85, now=1000.2)
+    job = robot.session.take_frame()
+    assert job.suspect
+    robot.session.frame_done(job, tracking(job), 1000.3)
+    assert robot.session.pose() is not None
+
+
+def test_a_jump_of_odometry_begins_anew(robot):
+    first = robot.localized(0.0).frame(0.1)
+    robot.moved(0.15, x=900.0)
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.LOST, "odometry jumped")
+    robot.moved(0.2, x=900.1)
+    robot.saw(0.18)
+    job = robot.session.take_frame()
+    assert job.epoch != first.epoch
+    assert not job.suspect  # the engine begins anew as well
+    assert job.verdict is None
+
+
+def test_a_clock_that_starts_anew_may_publish_older_stamps():
+    robot = Robot().localized(100.0)
+    for k in range(30):
+        robot.moved(0.05 * k, now=1100.1 + 0.05 * k)
+        robot.session.tick(robot.now)
+    assert robot.session.state() == (State.LOST, "the sender's clock started anew")
+    robot.saw(1.42, now=1102.0)
+    job = robot.session.take_frame()
+    robot.session.frame_done(job, tracking(job), 1102.0)
+    assert robot.session.pose().stamp_ns == ns(1.45)

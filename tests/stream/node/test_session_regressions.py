@@ -1,0 +1,226 @@
+"""Hazards that were found once: each let a wrong pose out, lost a right one, or miscounted."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_node import Site
+from fake_robot import DRIFT, Robot, ns, numbered, pose, query, tracking, unknown, verdict
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_world import pose_error
+from sockets import until
+from test_session_random_events import live, quiet, usual
+
+from coview_stream.geometry.transforms import pose_from
+from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.result import State
+from coview_stream.odometry.buffer import Segment
+from coview_stream.odometry.deskew import deskew
+from coview_stream.stream.node.status import PoseRate
+
+
+def test_what_was_under_way_at_a_reset_is_nobodys():
+    robot = Robot()
+    robot.drive(-0.1, 0.1)
+    robot.saw(0.0)
+    job = robot.session.take_frame()
+    robot.session.reset()
+    robot.session.frame_done(job, tracking(job), robot.now)
+    assert robot.counters.received == robot.counters.processed == 0
+
+
+def test_a_search_under_way_at_a_reset_is_nobodys():
+    robot = Robot()
+    robot.frame(0.0, unknown, ask=query(0.0))
+    job = robot.session.take_search()
+    robot.session.reset()
+    robot.session.search_done(job, verdict())
+    assert robot.counters.searches == 0
+
+
+reset = st.tuples(st.just("reset"), st.none())
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.lists(st.one_of(usual, usual, st.lists(st.one_of(*quiet, reset), max_size=4)), max_size=12))
+def test_random_lives_with_resets(chapters):
+    live([event for chapter in chapters for event in chapter])
+
+
+def test_a_frame_from_before_a_gap_does_not_clear_its_suspicion():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.2)
+    robot.session.tick(robot.now + 0.6)  # silence: LOST, the next frame is suspect
+    busy = robot.session.take_frame()
+    assert busy.suspect
+    robot.moved(2.0, x=0.6, now=robot.now + 1.7)  # the robot was carried away meanwhile
+    assert robot.counters.odometry_gaps == 1
+    robot.session.frame_done(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
+    robot.moved(2.1, x=0.6, now=robot.now + 0.1)
+    robot.saw(2.05)
+    job = robot.session.take_frame()
+    assert job.suspect
+
+
+def test_a_gap_while_the_first_fix_is_under_way():
+    robot = Robot()
+    robot.frame(0.0, unknown, state=State.AMBIGUOUS)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.2)
+    busy = robot.session.take_frame()  # carries the verdict that will be accepted
+    robot.moved(2.0, x=0.6, now=robot.now + 0.02)
+    assert robot.counters.odometry_gaps == 1
+    robot.session.frame_done(busy, tracking(busy), robot.now + 0.01)
+    assert robot.session.pose() is None
+    robot.moved(2.1, x=0.6, now=robot.now + 0.1)
+    robot.saw(2.05)
+    assert robot.session.take_frame().epoch > busy.epoch  # the search begins anew
+
+
+def test_a_long_outage_of_odometry_is_a_new_beginning():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    assert robot.session.pose() is not None
+    robot.moved(2.7, x=0.6, now=robot.now + 2.4)
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.LOST, "odometry was away for too long")
+
+
+@pytest.mark.parametrize(("seconds", "state"), [(6.0, State.AMBIGUOUS), (12.0, State.LOST)])
+def test_an_outage_of_the_network_keeps_the_place_for_a_while(seconds, state):
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.session.unreachable(robot.now + 1.0)
+    robot.moved(0.3 + seconds, x=0.6, now=robot.now + seconds)
+    assert robot.session.pose() is None
+    assert robot.session.state()[0] is state
+    robot.moved(0.4 + seconds, x=0.6, now=robot.now + 0.1)
+    robot.saw(0.35 + seconds)
+    job = robot.session.take_frame()
+    assert job.suspect or state is State.LOST
+    robot.session.frame_done(job, tracking(job), robot.now + 0.01)
+    assert robot.session.pose() is not None
+
+
+def test_a_stamp_is_not_given_two_poses():
+    robot = Robot().localized(0.0)
+    first = robot.session.pose()
+    robot.saw(0.0)
+    robot.drive(0.05, 0.1)
+    robot.saw(0.1)
+    job = robot.session.take_frame()
+    before = robot.session.pose()
+    robot.session.frame_done(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
+    assert robot.session.pose() is before
+    robot.drive(0.15, 0.2)
+    after = robot.session.pose()
+    assert after.stamp_ns > before.stamp_ns >= first.stamp_ns
+    assert abs(after.T_map_body[0, 3] - before.T_map_body[0, 3]) > 1.0
+
+
+def test_covariance_of_a_cloud_that_comes_late():
+    drift = replace(DRIFT, position=0.2, height=0.2)
+    known = np.diag([0.01, 0.01, 0.01, 0.0, 0.0, 0.0])
+    robot = Robot()
+    robot.drive(0.0, 3.0)  # 2 m/s
+    robot.saw(1.0, now=1003.0)  # two seconds in the network
+    job = robot.session.take_frame()
+    robot.session.frame_done(job, tracking(job, drift=drift, covariance=known), 1003.0)
+    grown = robot.session.pose().covariance - known
+    np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)
+
+
+@pytest.mark.parametrize("second", [None, verdict(1.0)])
+def test_an_accepted_verdict_is_not_replaced(second):
+    robot = Robot()
+    robot.frame(0.0, unknown, ask=query(0.0))
+    first = robot.session.take_search()
+    robot.frame(0.1, unknown, ask=query(0.1))
+    accepted = verdict(0.0, accepted="a place")
+    robot.session.search_done(first, accepted)
+    robot.session.search_done(robot.session.take_search(), second)
+    assert robot.frame(0.2, unknown).verdict is accepted
+
+
+def test_a_frame_that_came_is_not_missing():
+    robot = Robot()
+    robot.moved(0.0, x=0.0)
+    robot.saw(0.0, attachment=numbered(1, 0.0))
+    robot.session.take_frame()
+    robot.saw(0.3, attachment=numbered(2, 0.3))
+    robot.session.tick(robot.now + 1.0)  # the second found none
+    robot.moved(0.45, x=0.0)
+    robot.saw(0.45, attachment=numbered(3, 0.45))
+    assert (robot.counters.no_odometry, robot.counters.missing) == (1, 0)
+
+
+def _segment(*times):
+    return Segment(np.array([ns(t) for t in times], np.int64), np.array([pose(10.0 * t) for t in times]))
+
+
+@pytest.mark.parametrize("times", [[0.05, 0.05], [0.3, 0.4]])
+def test_points_all_of_another_time_than_the_stamp(times):
+    points = np.array([[5.0, 1.0, 0.5], [6.0, 1.0, 0.5]], np.float32)
+    moved = deskew(points, np.array(times), _segment(0.0, 0.1), ns(0.0), pose(0.0))
+    expected = points + np.array([10.0 * min(times[0], 0.1), 0.0, 0.0])
+    np.testing.assert_allclose(moved, expected, atol=0.02)
+
+
+def test_the_rate_of_poses_at_one_time():
+    rate = PoseRate()
+    rate.add(1.0)
+    rate.add(1.0)
+    assert rate.rate(1.0) >= 0.0
+
+
+def test_a_robot_that_was_carried_away_is_found_out(world_map, world_drive):
+    """Odometry paused, the robot was moved by hand 10 m back, and odometry goes on where it was."""
+    localizer = Localizer(world_map)
+    for k in range(6):
+        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    assert fix.state is State.TRACKING
+    localizer.suspect()
+    fixes = [localizer.step(world_drive.clouds[0], world_drive.T_odom_body[5], 2.6)]
+    ahead = world_drive.T_odom_body[5]
+    for k in range(1, 4):
+        ahead = ahead @ pose_from(np.eye(3), [2.1, 0.0, 0.0])
+        fixes.append(localizer.step(world_drive.clouds[k], ahead, 2.6 + 0.5 * k))
+    wrong = [
+        round(pose_error(fix.T_map_body, world_drive.T_map_body[k])[0], 1)
+        for k, fix in enumerate(fixes)
+        if fix.T_map_body is not None
+    ]
+    assert not wrong, f"poses wrong by {wrong} m"
+
+
+def test_a_pose_that_cannot_be_written_is_its_robots_own():
+    site = Site("r1", "r2")
+    site.node.declare()
+    site.engine.answer = lambda job: tracking(job, sigma=float("nan") if job.robot == "r1" else 0.1)
+    for name in ("r1", "r2"):
+        site.frame(name, 0.0)
+    site.node.publish_poses(time.monotonic())
+    assert len(site.net.samples("coview/r2/out/pose")) == 1
+
+
+def test_an_unexpected_error_of_a_lane_does_not_end_the_work():
+    site = Site("r1")
+    run = site.track.run
+    errors = [RuntimeError("nobody thought of this")]
+    site.track.run = lambda job: run(job) if not errors else (_ for _ in ()).throw(errors.pop())
+    site.node.start()
+    try:
+        clock = iter(range(100_000))
+
+        def localized():
+            site.sees("r1", 0.02 * next(clock))
+            return site.net.samples("coview/r1/out/pose")
+
+        until(localized, 3.0)
+    finally:
+        site.node.close()

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import pytest
+import zenoh
+
+from coview_stream.errors import ConfigError
+from coview_stream.stream.transport.key_expressions import (
+    check_chunk,
+    check_expression,
+    check_prefix,
+    matches,
+)
+from coview_stream.stream.transport.keys import PRESETS, robot_keys
+
+POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
+
+
+def test_native_keys_are_the_contract() -> None:
+    keys = robot_keys("native", "coview", "rover1")
+    assert keys.cloud == "coview/rover1/in/cloud"
+    assert keys.odometry == "coview/rover1/in/odom"
+    assert keys.pose == "coview/rover1/out/pose"
+    assert keys.status == "coview/rover1/out/status"
+    assert keys.alive == "coview/rover1/alive"
+    assert (keys.relocalize, keys.reset) == ("coview/rover1/rpc/relocalize", "coview/rover1/rpc/reset")
+    assert (keys.cloud_hint, keys.pose_format, keys.rmw, keys.bare) == (None, "json", False, False)
+
+
+def test_ros2dds_uses_topic_names_and_keeps_our_own_keys() -> None:
+    keys = robot_keys("ros2dds", "site/hall3", "bot1")
+    assert (keys.cloud, keys.odometry, keys.pose) == ("bot1/points", "bot1/odom", "bot1/coview/pose")
+    assert keys.status == "site/hall3/bot1/out/status"
+    assert (keys.cloud_hint, keys.odometry_hint, keys.pose_format) == ("cdr", "cdr", "cdr")
+    assert keys.bare
+    assert not keys.rmw
+
+
+def test_rmw_zenoh_reads_any_release_and_writes_the_published_hash() -> None:
+    keys = robot_keys("rmw_zenoh", "coview", "bot1", domain=7)
+    golden = "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+    for ending in (golden, "TypeHashNotSupported"):
+        assert matches(keys.cloud, f"7/bot1/points/sensor_msgs::msg::dds_::PointCloud2_/{ending}")
+        assert matches(keys.odometry, f"7/bot1/odom/nav_msgs::msg::dds_::Odometry_/{ending}")
+    assert not matches(keys.cloud, f"0/bot1/points/sensor_msgs::msg::dds_::PointCloud2_/{golden}")
+    typed = "7/bot1/coview/pose/geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
+    assert keys.pose == f"{typed}/{POSE_HASH}"
+    assert keys.rmw
+    humble = robot_keys("rmw_zenoh", "coview", "bot1", domain=7, humble=True)
+    assert humble.pose == f"{typed}/TypeHashNotSupported"
+
+
+def test_keelson_never_reads_its_own_pose_as_odometry() -> None:
+    keys = robot_keys("keelson", "rise", "masslab")
+    assert matches(keys.cloud, "rise/@v0/masslab/pubsub/point_cloud/lidar/bow")
+    assert matches(keys.odometry, "rise/@v0/masslab/pubsub/frame_transform/odometry")
+    assert keys.pose == "rise/@v0/masslab/pubsub/frame_transform/coview"
+    assert not matches(keys.odometry, keys.pose)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_makes_keys_that_zenoh_accepts(preset: str) -> None:
+    keys = robot_keys(preset, "a/b", "rover 1")
+    for key in (keys.cloud, keys.odometry, keys.pose, keys.status, keys.alive, keys.relocalize, keys.reset):
+        assert str(zenoh.KeyExpr(key)) == key
+
+
+def test_overrides_fill_placeholders_once() -> None:
+    keys = robot_keys(
+        "native", "fleet", "r1", cloud="{domain}/{robot}/**", odometry="/x"[1:], pose="{base}/p", domain=3
+    )
+    assert (keys.cloud, keys.odometry, keys.pose) == ("3/r1/**", "x", "fleet/p")
+    assert robot_keys("native", "fleet", "{domain}").cloud == "fleet/{domain}/in/cloud"
+
+
+def test_a_ros_pose_key_keeps_the_convention() -> None:
+    keys = robot_keys(
+        "rmw_zenoh", "coview", "r1", pose="{domain}/{robot}/located/my_msgs::msg::dds_::Pose_/{pose_hash}"
+    )
+    assert keys.pose == f"0/r1/located/my_msgs::msg::dds_::Pose_/{POSE_HASH}"
+    for wrong in ("{base}/pose", "7/pose/type", "x/topic/type/hash"):
+        with pytest.raises(ConfigError, match=r"--pose-key.*rmw_zenoh"):
+            robot_keys("rmw_zenoh", "coview", "r1", pose=wrong)
+
+
+@pytest.mark.parametrize("robot", ["", "a/b", "a*", "a$", "a?", "#1", "@home", "tab\t"])
+def test_bad_robot_names_name_the_option(robot: str) -> None:
+    with pytest.raises(ConfigError, match="--robot"):
+        robot_keys("native", "coview", robot)
+
+
+@pytest.mark.parametrize("base", ["", "/a", "a/", "a//b", "a/*", "@v0/x", "a/$*"])
+def test_bad_bases_name_the_option(base: str) -> None:
+    with pytest.raises(ConfigError, match="--base"):
+        robot_keys("native", base, "rover1")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cloud": "a//b"}, "--cloud-key"),
+        ({"odometry": "a/{what}"}, "--odometry-key.*{what}.*robot"),
+        ({"pose": "{base}/*/pose"}, "--pose-key.*wildcard"),
+        ({"domain": 233}, "--domain"),
+    ],
+)
+def test_bad_overrides_name_the_option(options: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        robot_keys("native", "coview", "rover1", **options)
+
+
+def test_an_unknown_preset_lists_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="native, ros2dds, rmw_zenoh, keelson"):
+        robot_keys("ros1", "coview", "rover1")
+
+
+EXPRESSIONS = [
+    "a", "a/b", "*", "**", "a/*", "a/**", "*/**", "**/b", "a/**/b", "a/$*x", "a/x$*y$*", "a/@v0/b", "a/@v0/**",
+    "@v0", "a b/c",
+]  # fmt: skip
+WRONG = [
+    "",
+    "/a",
+    "a/",
+    "a//b",
+    "a*",
+    "*a",
+    "a/***",
+    "a/$*",
+    "a/$b",
+    "a$*$*",
+    "a/**/**",
+    "a/**/*",
+    "a?",
+    "#",
+    "$",
+]
+
+
+@pytest.mark.parametrize("text", EXPRESSIONS + WRONG)
+def test_expressions_are_judged_as_zenoh_does(text: str) -> None:
+    try:
+        zenoh.KeyExpr(text)
+        valid = True
+    except zenoh.ZError:
+        valid = False
+    assert valid == (text in EXPRESSIONS)
+    if valid:
+        assert check_expression(text, "key") == text
+    else:
+        with pytest.raises(ConfigError, match="key"):
+            check_expression(text, "key")
+
+
+def test_names_pass_through() -> None:
+    assert check_chunk("rover-1", "--robot") == "rover-1"
+    assert check_prefix("a/b", "--base") == "a/b"

@@ -1,0 +1,52 @@
+"""Robots of one node that cannot be told apart by their keys are refused."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from coview_stream.errors import ConfigError
+from coview_stream.stream.transport.keys import PRESETS, check_apart, robot_keys
+
+
+def fleet(preset="native", names=("r1", "r2"), **given):
+    return [robot_keys(preset, "coview", name, **given) for name in names]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_keeps_robots_apart(preset):
+    check_apart(fleet(preset, ("r1", "r2", "r10")))
+
+
+def test_wide_keys_of_one_robot_or_with_its_name_are_fine():
+    check_apart(fleet(names=["r1"], cloud="**/cloud", odometry="*/odom"))
+    check_apart(fleet(cloud="site/*/{robot}/**", odometry="{robot}$*/odom", pose="poses/{robot}"))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cloud": "lidar/points"}, "--cloud-key.*r1.*r2.*use {robot} in --cloud-key"),
+        ({"cloud": "**/cloud"}, "--cloud-key.*r1.*r2.*use {robot} in --cloud-key"),
+        ({"odometry": "*/odom"}, "--odometry-key.*r1.*r2.*use {robot} in --odometry-key"),
+        ({"cloud": "a/{robot}/*", "odometry": "a/*/odom"}, "--cloud-key and --odometry-key"),
+        ({"pose": "pose"}, "--pose-key.*r1 and r2.*use {robot} in --pose-key"),
+        ({"pose": "coview/{robot}/in/odom"}, "--pose-key.*robot r1.*input of r1.*--odometry-key"),
+        ({"cloud": "{robot}/**", "pose": "{robot}/pose"}, "--pose-key.*robot r1.*input of r1.*--cloud-key"),
+    ],
+)
+def test_refused(given, message):
+    with pytest.raises(ConfigError, match=re.sub(r"([{}])", r"\\\1", message)):
+        check_apart(fleet(**given))
+
+
+def test_a_pose_that_another_robot_would_read():
+    first = robot_keys("native", "coview", "r1", pose="coview/r2/in/odom")
+    with pytest.raises(ConfigError, match=r"poses of robot r1 .* input of r2"):
+        check_apart([first, robot_keys("native", "coview", "r2")])
+
+
+def test_a_name_given_twice():
+    with pytest.raises(ConfigError, match="each name once"):
+        check_apart(fleet(names=("r1", "r1")))

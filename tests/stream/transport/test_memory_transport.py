@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from coview_stream.errors import ConfigError, TransportError
+from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.transport import Transport
+
+
+def test_samples_reach_matching_handlers_before_publish_returns() -> None:
+    net = FakeTransport()
+    wild: list[Sample] = []
+    exact: list[Sample] = []
+    net.subscribe("coview/*/in/cloud", wild.append, "newest")
+    net.subscribe("coview/r1/in/cloud", exact.append, "all")
+    first, second = Sample("coview/r1/in/cloud", b"1"), Sample("coview/r2/in/cloud", b"2", "x", b"y")
+    net.publish(first)
+    net.publish(second)
+    assert wild == [first, second]
+    assert exact == [first]
+    assert net.subscribed == {"coview/*/in/cloud": "newest", "coview/r1/in/cloud": "all"}
+
+
+def test_publishers_are_recorded_and_heard() -> None:
+    net = FakeTransport()
+    heard: list[Sample] = []
+    net.subscribe("**", heard.append, "all")
+    publisher = net.publisher("a/b", "realtime")
+    publisher.put(Encoded(b"x", "application/json", b"t"))
+    publisher.close()
+    publisher.put(Encoded(b"late"))
+    assert net.published == heard == net.samples("a/*") == [Sample("a/b", b"x", "application/json", b"t")]
+    assert net.publishers[0].urgency == "realtime"
+
+
+def test_a_handler_that_raises_is_recorded_and_called_again(caplog: pytest.LogCaptureFixture) -> None:
+    net = FakeTransport()
+    calls: list[bytes] = []
+
+    def handler(sample: Sample) -> None:
+        calls.append(sample.payload)
+        raise ValueError("bad frame")
+
+    net.subscribe("a", handler, "newest")
+    with caplog.at_level(logging.ERROR):
+        for number in range(3):
+            net.publish(Sample("a", bytes([number])))
+    assert calls == [b"\0", b"\1", b"\2"]
+    assert [str(error) for error in net.raised] == ["bad frame"] * 3
+    assert len(caplog.records) == 1
+
+
+def test_queries_are_answered_or_say_why_not() -> None:
+    net = FakeTransport()
+
+    def refuse(_: dict[str, str]) -> dict[str, object]:
+        raise ValueError("not now")
+
+    net.answer("r1/rpc/reset", lambda parameters: {"ok": True, **parameters})
+    net.answer("r1/rpc/relocalize", refuse)
+    assert net.query("r1/rpc/reset", {"why": "test"}) == {"ok": True, "why": "test"}
+    with pytest.raises(TransportError, match="refused: not now"):
+        net.query("r1/rpc/relocalize")
+    assert [str(error) for error in net.raised] == ["not now"]
+    with pytest.raises(TransportError, match="r2/rpc/reset"):
+        net.query("r2/rpc/reset")
+
+
+def test_the_network_goes_away_and_comes_back() -> None:
+    net = FakeTransport()
+    heard: list[Sample] = []
+    net.subscribe("a", heard.append, "all")
+    net.answer("q", lambda _: {})
+    net.announce("alive")
+    publisher = net.publisher("a", "data")
+    assert net.connection().routers == ("fake",)
+    net.go_away()
+    publisher.put(Encoded(b"lost"))
+    assert (net.connection().routers, net.announced, net.lost, heard) == ((), (), 1, [])
+    with pytest.raises(TransportError):
+        net.query("q")
+    assert net.tokens("**") == []
+    net.come_back()
+    assert net.tokens("*") == ["alive"]
+    publisher.put(Encoded(b"here"))
+    assert [sample.payload for sample in heard] == [b"here"]
+    assert (net.connection().routers, net.announced, net.query("q")) == (("fake",), ("alive",), {})
+
+
+def test_close_ends_everything_and_may_be_called_twice() -> None:
+    transport: Transport = (net := FakeTransport())  # mypy: it is one
+    heard: list[Sample] = []
+    transport.subscribe("a", heard.append, "all")
+    transport.announce("alive")
+    transport.close()
+    transport.close()
+    net.publish(Sample("a", b""))
+    assert (heard, net.announced, net.closed, transport.connection().routers) == ([], (), True, ())
+
+
+def test_a_key_that_zenoh_would_refuse_is_refused() -> None:
+    with pytest.raises(ConfigError):
+        FakeTransport().subscribe("a//b", print, "all")
+    with pytest.raises(ConfigError):
+        FakeTransport().publisher("a/*", "data")
+
+
+def test_guard_counts_what_it_does_not_log(caplog: pytest.LogCaptureFixture) -> None:
+    now = [0.0]
+    guard = Guard(logging.getLogger("guard"), interval=10.0, clock=lambda: now[0])
+
+    def fail() -> None:
+        raise ValueError("no")
+
+    for now[0] in (0.0, 1.0, 9.0, 11.0):
+        guard.run("a/key", fail)
+    guard.run("b/key", fail)
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines == [
+        "a/key: ValueError: no",
+        "a/key: ValueError: no (2 more since the last line)",
+        "b/key: ValueError: no",
+    ]
+
+
+def test_guard_survives_a_panic_but_not_an_interrupt() -> None:
+    class PanicException(BaseException):
+        pass
+
+    def panic() -> None:
+        raise PanicException("rust")
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    guard = Guard(logging.getLogger("guard"))
+    assert "rust" in str(guard.run("k", panic))
+    with pytest.raises(KeyboardInterrupt):
+        guard.run("k", interrupt)

@@ -1,0 +1,308 @@
+from __future__ import annotations
+
+import json
+import logging
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sockets import free_endpoint, until
+from zenoh_routers import Router, RouterProcess
+
+from coview_stream.errors import TransportError
+from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.transport.transport import Connection, Transport
+from coview_stream.stream.transport.zenoh_config import compose
+from coview_stream.stream.transport.zenoh_transport import ZenohTransport, open_transport
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[ZenohTransport, ZenohTransport]]:
+    """Two transports that talk: a listening peer and its client."""
+    endpoint = free_endpoint()
+    node = open_transport(listen=[endpoint])
+    robot = open_transport(connect=[endpoint])
+    yield node, robot
+    robot.close()
+    node.close()
+
+
+def ask(transport: ZenohTransport, selector: str) -> list[Any]:
+    return list(transport._session.get(selector, timeout=5.0))
+
+
+def alive(transport: ZenohTransport, key: str) -> bool:
+    return any(reply.ok for reply in transport._session.liveliness().get(key, timeout=1.0))
+
+
+def test_samples_arrive_as_they_were_sent(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+    node, robot = pair
+    got: list[Sample] = []
+    node.subscribe("r1/in/*", got.append, "all")
+    odometry = robot.publisher("r1/in/odom", "data")
+    cloud = robot.publisher("r1/in/cloud", "bulk")
+    frame = bytes(range(256)) * 8192  # 2 MB: fragmented
+    odometry.put(Encoded(b"{}", "application/json", b"\x01\x02"))
+    cloud.put(Encoded(frame, "application/octet-stream;layout=xyz"))
+    odometry.put(Encoded(b"bare"))
+    until(lambda: len(got) == 3)
+    assert sorted(got, key=lambda sample: len(sample.payload)) == [
+        Sample("r1/in/odom", b"{}", "application/json", b"\x01\x02"),
+        Sample("r1/in/odom", b"bare", "", None),
+        Sample("r1/in/cloud", frame, "application/octet-stream;layout=xyz", None),
+    ]
+
+
+def test_deletes_are_no_samples(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+    node, robot = pair
+    got: list[Sample] = []
+    node.subscribe("r1/in/odom", got.append, "all")
+    publisher = robot.publisher("r1/in/odom", "data")
+    robot._session.delete("r1/in/odom")
+    publisher.put(Encoded(b"after"))
+    until(lambda: got)
+    assert [sample.payload for sample in got] == [b"after"]
+
+
+def test_a_slow_reader_of_the_newest_skips_and_of_all_does_not(
+    pair: tuple[ZenohTransport, ZenohTransport],
+) -> None:
+    node, robot = pair
+    go = threading.Event()
+    newest: list[bytes] = []
+    every: list[bytes] = []
+
+    def slow(sample: Sample) -> None:
+        newest.append(sample.payload)
+        assert go.wait(10)
+
+    node.subscribe("r1/x", slow, "newest")
+    node.subscribe("r1/x", lambda sample: every.append(sample.payload), "all")
+    publisher = robot.publisher("r1/x", "data")
+    publisher.put(Encoded(b"first"))
+    until(lambda: newest)
+    for number in range(200):
+        publisher.put(Encoded(str(number).encode()))
+    until(lambda: len(every) == 201)
+    go.set()
+    until(lambda: newest[-1] == b"199")
+    assert newest[0] == b"first"
+    assert len(newest) <= 3  # the last may still have been on its way to this reader
+    assert every == [b"first", *(str(number).encode() for number in range(200))]
+
+
+def test_a_handler_that_raises_goes_on_and_is_logged_once(
+    pair: tuple[ZenohTransport, ZenohTransport], caplog: pytest.LogCaptureFixture
+) -> None:
+    node, robot = pair
+    got: list[bytes] = []
+
+    def handler(sample: Sample) -> None:
+        got.append(sample.payload)
+        raise ValueError("cannot decode this")
+
+    node.subscribe("r1/x", handler, "all")
+    publisher = robot.publisher("r1/x", "data")
+    for number in range(5):
+        publisher.put(Encoded(bytes([number])))
+    until(lambda: len(got) == 5)
+    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert lines == ["r1/x: ValueError: cannot decode this"]
+
+
+def test_queries_get_json_and_errors_are_replies_too(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+    node, robot = pair
+
+    def refuse(_: dict[str, str]) -> dict[str, Any]:
+        raise ValueError("not now")
+
+    node.answer("r1/rpc/reset", lambda parameters: {"got": parameters})
+    node.answer("r1/rpc/relocalize", refuse)
+    until(lambda: ask(robot, "r1/rpc/*"))
+    (reply,) = ask(robot, "r1/rpc/reset?why=test;x=1")
+    assert json.loads(reply.ok.payload.to_bytes()) == {"got": {"why": "test", "x": "1"}}
+    assert str(reply.ok.encoding) == "application/json"
+    (reply,) = ask(robot, "r1/rpc/relocalize")
+    assert json.loads(reply.err.payload.to_bytes()) == {"error": "not now"}
+    assert len(ask(robot, "r1/rpc/*")) == 2  # each on its own key
+
+
+def test_the_router_is_killed_and_everything_returns(caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = free_endpoint()
+    node = open_transport(connect=[endpoint])  # both before their router
+    robot = open_transport(connect=[endpoint])
+    clouds: list[Sample] = []
+    poses: list[Sample] = []
+    node.subscribe("r1/in/**", clouds.append, "newest")
+    node.answer("r1/rpc/reset", lambda _: {"ok": True})
+    node.announce("r1/alive")
+    pose = node.publisher("r1/out/pose", "realtime")
+    robot.subscribe("r1/out/pose", poses.append, "all")
+    cloud = robot.publisher("r1/in/cloud", "bulk")
+
+    def works() -> bool:
+        cloud.put(Encoded(b"cloud"))
+        pose.put(Encoded(b"pose"))
+        return bool(clouds and poses and ask(robot, "r1/rpc/reset") and alive(robot, "r1/alive"))
+
+    try:
+        assert node.connection() == Connection()
+        assert any("no router" in record.getMessage() for record in caplog.records)
+        for _ in range(3):
+            clouds.clear()
+            poses.clear()
+            pose.put(Encoded(b"nobody there"))  # never raises
+            with RouterProcess(endpoint):
+                until(lambda: node.connection().routers and robot.connection().routers)
+                until(works)
+            until(lambda: node.connection() == robot.connection() == Connection())
+        assert b"nobody there" not in [sample.payload for sample in poses]
+    finally:
+        node.close()
+        robot.close()
+
+
+def test_a_host_that_says_nothing_holds_nobody_up() -> None:
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        start = time.monotonic()
+        transport = open_transport(connect=[f"tcp/127.0.0.1:{silent.getsockname()[1]}"])
+        transport.subscribe("a", print, "all")
+        assert transport.connection() == Connection()
+        middle = time.monotonic()
+        transport.close()
+        assert time.monotonic() - middle < 1.0
+        assert middle - start < 5.0  # zenoh alone would wait for 10
+
+
+def test_a_process_that_forgets_to_close_ends_in_peace() -> None:
+    program = (
+        "import socket\n"
+        "from coview_stream.stream.transport.zenoh_transport import open_transport\n"
+        "silent = socket.socket(); silent.bind(('127.0.0.1', 0)); silent.listen()\n"
+        "a = open_transport(connect=[f'tcp/127.0.0.1:{silent.getsockname()[1]}'])\n"
+        "b = open_transport()\n"
+        "b.subscribe('x', print, 'newest')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, cwd=ROOT, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "FATAL" not in done.stderr
+
+
+def test_close_ends_all_threads_and_is_idempotent() -> None:
+    with Router() as router:
+        transport: Transport = open_transport(connect=[router.endpoint])
+        transport.subscribe("a", print, "all")
+        transport.subscribe("b", print, "newest")
+        transport.answer("c", lambda _: {})
+        publisher = transport.publisher("d", "data")
+        mine = {thread for thread in threading.enumerate() if thread.name.startswith("coview ")}
+        assert {"coview subscriber a", "coview subscriber b", "coview answers"} <= {
+            thread.name for thread in mine
+        }
+        start = time.monotonic()
+        transport.close()
+        assert time.monotonic() - start < 1.0
+        transport.close()
+        assert not any(thread.is_alive() for thread in mine)
+        publisher.put(Encoded(b"late"))
+        publisher.close()
+        assert transport.connection() == Connection()
+        with pytest.raises(TransportError, match="closed"):
+            transport.subscribe("a", print, "all")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"connect": ["127.0.0.1:7447"]}, "--connect.*tcp/127.0.0.1:7447"),
+        ({"connect": ["tcp/127.0.0.1"]}, "--connect.*<host>:<port>"),
+        ({"connect": ["tcp/127.0.0.1:70000"]}, "--connect.*1..65535"),
+        ({"listen": ["http/127.0.0.1:80"]}, "--listen.*protocols"),
+        ({"listen": ["tcp/203.0.113.7:7447"]}, "203.0.113.7.*assign"),
+        ({"connect": ["tls/127.0.0.1:1"], "config": '{mode: "client", '}, "expected"),
+        ({"config": "{nonsense: 1}"}, "nonsense"),
+        ({"config": '{connect: {endpoints: ["foo"]}}'}, "foo"),
+        ({"config": "{transport: {unicast: {lowlatency: true, qos: {enabled: false}}}}"}, "lowlatency"),
+        (
+            {"config": '{transport: {link: {tls: {root_ca_certificate: "no/ca.pem"}}}}'},
+            "root_ca_certificate.*no/ca.pem",
+        ),
+    ],
+)
+def test_mistakes_are_told_at_once(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+    if "config" in options:
+        path = tmp_path / "zenoh.json5"
+        path.write_text(options["config"])
+        options = {**options, "config": path}
+        message = f"zenoh.json5.*{message}"
+    with pytest.raises(TransportError, match=message) as caught:
+        open_transport(**options)
+    assert "\n" not in str(caught.value)
+    assert ".rs:" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_busy_port_are_named(tmp_path: Path) -> None:
+    with pytest.raises(TransportError, match=r"gone\.json5: No such file"):
+        open_transport(config=tmp_path / "gone.json5")
+    endpoint = free_endpoint()
+    first = open_transport(listen=[endpoint])
+    with pytest.raises(TransportError, match="in use"):
+        open_transport(listen=[endpoint])
+    first.close()
+
+
+def test_a_wrong_key_is_told_before_there_is_a_router() -> None:
+    transport = open_transport(connect=[free_endpoint()])
+    with pytest.raises(TransportError, match="a//b"):
+        transport.subscribe("a//b", print, "all")
+    transport.close()
+
+
+def settings(config: Any, *keys: str) -> list[Any]:
+    return [json.loads(config.get_json(key)) for key in keys]
+
+
+ENDPOINTS = ("mode", "connect/endpoints", "listen/endpoints")
+
+
+def test_mode_follows_from_the_endpoints() -> None:
+    assert settings(compose(["tcp/h:1"]), *ENDPOINTS) == ["client", ["tcp/h:1"], []]
+    assert settings(compose((), ["tcp/h:2"]), *ENDPOINTS) == ["peer", [], ["tcp/h:2"]]
+    assert settings(compose(["tcp/h:1"], ["tcp/h:2"]), *ENDPOINTS) == ["peer", ["tcp/h:1"], ["tcp/h:2"]]
+    assert settings(compose(), *ENDPOINTS) == ["peer", [], []]
+
+
+def test_a_file_wins_over_our_defaults_and_options_over_its_endpoints(tmp_path: Path) -> None:
+    keys = (
+        *ENDPOINTS,
+        "scouting/multicast/enabled",
+        "transport/shared_memory/enabled",
+        "transport/unicast/open_timeout",
+    )
+    assert settings(compose(), *keys)[3:] == [False, False, 3000]
+    path = tmp_path / "zenoh.json5"
+    path.write_text("""{ // a comment about shared_memory decides nothing
+        connect: { endpoints: ["tcp/h:1"], retry: { period_init_ms: 7 } },
+        scouting: { multicast: { enabled: true } },
+        transport: { unicast: { open_timeout: 1234 } },
+    }""")
+    composed = compose(path=path)
+    assert settings(composed, *keys) == ["client", ["tcp/h:1"], [], True, False, 1234]
+    assert settings(composed, "connect/retry")[0]["period_init_ms"] == 7
+    assert settings(compose(["tcp/h:9"], ["tcp/h:8"], path), *ENDPOINTS) == ["peer", ["tcp/h:9"], ["tcp/h:8"]]
+    path.write_text('{ mode: "router", transport: { shared_memory: { enabled: true } } }')
+    mode, _, listen, _, shared, _ = settings(compose(path=path), *keys)
+    assert (mode, shared) == ("router", True)
+    assert listen["router"] == ["tcp/[::]:7447"]

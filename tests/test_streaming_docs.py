@@ -1,0 +1,134 @@
+"""docs/streaming.md against the code: keys, encodings, counters, layouts and the client's five lines."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+
+from coview_stream.cli import build_parser
+from coview_stream.config import AcceptanceConfig
+from coview_stream.localization.result import KeyframeEvidence, State
+from coview_stream.messages import decode_cloud, decode_odometry, decode_pose, encode_pose
+from coview_stream.messages.json_messages import pose_record
+from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.stream.client import client
+from coview_stream.stream.node.counters import Counters
+from coview_stream.stream.node.robot_state import Transition
+from coview_stream.stream.transport.keys import PRESETS, robot_keys
+from coview_stream.stream.transport.memory_transport import FakeTransport
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+TEXT = (DOCS / "streaming.md").read_text(encoding="utf-8")
+
+
+def section(title):
+    return re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", TEXT, re.MULTILINE | re.DOTALL)[1]
+
+
+def test_every_preset_and_its_keys():
+    keys = section("Keys and encodings")
+    for name, preset in PRESETS.items():
+        assert f"`{name}`" in keys
+        for key in (preset.cloud, preset.odometry, preset.pose):
+            assert f"`{key}`" in keys
+    native = robot_keys("native", "{base}", "{robot}")
+    for key in (native.status, native.alive, native.relocalize, native.reset):
+        assert f"`{key}`" in keys
+
+
+def test_every_counter_and_no_other():
+    named = set(re.findall(r"`([a-z_]+)`", section("What the counters mean")))
+    counters = set(Counters().to_json())
+    assert counters <= named
+    assert named - counters == {"counters", "errors", "latency_ms", "engine_ms", "longest_wait_s"}
+
+
+def test_how_long_a_doubt_lasts_and_what_ends_it():
+    rule, words = AcceptanceConfig(), {2: "two", 3: "three", 10.0: "ten"}
+    rows = re.findall(r"^\|.*AMBIGUOUS.*\|$", section("How the node behaves"), re.MULTILINE)
+    rejected, blind, long = rows[:3]
+    assert f"{words[rule.patience]} rejected a metre apart" in rejected
+    assert f"{words[rule.patience_seconds]} seconds of doubt" in rejected
+    assert f"goes on for {rule.patience_blind:.0f} s without a pose" in blind
+    assert f"lasted {words[rule.patience_seconds]} seconds" in long
+    assert f"{words[rule.confirmations]} registrations" in long
+
+
+def test_every_field_of_a_transition():
+    told = re.search(r"^`transitions` in the status.*?\n\n", TEXT, re.MULTILINE | re.DOTALL)[0]
+    for name in Transition(1, None, State.TRACKING, State.LOST, "", None).to_json():
+        assert f"`{name}`" in told
+
+
+def test_every_field_of_the_evidence():
+    text = (DOCS / "method.md").read_text(encoding="utf-8")
+    table = text.split("### Fields of the evidence")[1].split("\n## ")[0]
+    named = [
+        name
+        for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+        for name in re.findall(r"`(\w+)`", row)
+    ]
+    assert sorted(named) == sorted(KeyframeEvidence(0.0, State.LOST, "").to_json())
+    assert f"above {AcceptanceConfig().keep_innovation:.0f} it is rejected" in table
+    assert "(method.md#fields-of-the-evidence)" in TEXT
+
+
+def test_the_layouts_as_documented():
+    encoding = re.search(r'z_encoding_from_str\(&encoding, "(.*?)"\)', TEXT)[1]
+    rows = np.arange(6, dtype="<f4").tobytes()
+    message = decode_cloud(Sample("k", rows, encoding, (5).to_bytes(8, "little", signed=True)))
+    assert message.stamp_ns == 5
+    assert message.points.tolist() == [[0, 1, 2], [3, 4, 5]]
+    odometry = re.search(r"```json\n(.*?)```", TEXT, re.DOTALL)[1]
+    assert decode_odometry(Sample("k", odometry.encode(), "application/json")).T_odom_body[0, 3] == 1.5
+
+
+def test_encodings_in_the_table_are_those_that_are_written():
+    pose = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32)
+    for name in ("json", "cdr", "foxglove"):
+        assert f"`{encode_pose(pose, name).encoding}`" in TEXT
+    assert f"`serve --pose-encoding cdr` ({len(encode_pose(pose, 'cdr').payload)} bytes)" in TEXT
+
+
+def test_what_smaller_poses_leave_out():
+    full = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32, 0.25)
+    missing = {}
+    for name in ("cdr", "foxglove"):
+        encoded = encode_pose(full, name)
+        record = pose_record(
+            decode_pose(Sample("k", encoded.payload, encoded.encoding)), Sample("k", encoded.payload)
+        )
+        missing[name] = {field for field, value in record.items() if not value} | {"state"}
+    assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s"}
+    assert missing["foxglove"] == missing["cdr"] | {"covariance"}
+    said = re.search(r"These leave out .*?`covariance`", TEXT, re.DOTALL)[0]
+    assert set(re.findall(r"`(\w+)`", said)) == missing["foxglove"]
+
+
+def test_the_clients_five_lines_run(monkeypatch, capsys):
+    net = FakeTransport()
+    monkeypatch.setattr(client, "open_client", lambda *endpoints: net)
+
+    def answer(sample):
+        pose = PoseMessage(
+            decode_cloud(sample).stamp_ns, "rover1", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab"
+        )
+        net.publish(Sample("coview/rover1/out/pose", encode_pose(pose, "json").payload))
+
+    net.subscribe("coview/rover1/in/cloud", answer, "newest")
+    code = re.search(r"<!-- client -->\n```python\n(.*?)```\n<!-- end -->", TEXT, re.DOTALL)[1]
+    names = {"T_odom_body": np.eye(4), "points": np.ones((3, 3)), "stamp": 2.5}
+    exec(compile(code.replace("timeout=1.0", "timeout=0"), "docs/streaming.md", "exec"), names)
+    assert capsys.readouterr().out.startswith("2500000000 [[1.")
+    assert net.closed  # a client closes what it opened
+
+
+def test_the_commands_are_understood():
+    block = re.search(r"```bash\n(.*?)```", section("Quick start"), re.DOTALL)[1]
+    calls = [line.split("#")[0].split("coview-stream ")[1] for line in block.splitlines()]
+    assert len(calls) == 4
+    for call in calls:
+        build_parser().parse_args(shlex.split(call))
