@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from coview_stream.errors import CoViewError
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.result import Fix, KeyframeEvidence, State
-    from coview_stream.localization.tracking.monitor import Cause
+    from coview_stream.localization.tracking.monitor import RejectionReason
     from coview_stream.stream.client.client import RobotClient
 
 __all__ = [
     "BaseMap",
-    "Cause",
+    "RejectionReason",
     "CoViewError",
     "Fix",
     "KeyframeEvidence",
@@ -39,7 +39,7 @@ __all__ = [
 
 _HOMES = {
     "BaseMap": "basemap.basemap",
-    "Cause": "localization.tracking.monitor",
+    "RejectionReason": "localization.tracking.monitor",
     "CoViewError": "errors",
     "Fix": "localization.result",
     "KeyframeEvidence": "localization.result",

@@ -62,7 +62,7 @@ class DependencyError(CoViewError, ImportError):
     """A library that this operation needs is missing; the message says how to get it."""
 
 
-def extra(module: str, requirement: str, purpose: str) -> Any:
+def require_library(module: str, requirement: str, purpose: str) -> Any:
     """Import a module that comes with one of the package's extras.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from coview_stream.geometry.transforms import transform
-from coview_stream.localization.registration.local_map import LocalMap, Source
+from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
 
 def plane(corner, a, b, spacing=0.25):
@@ -40,8 +40,10 @@ def local_map(points, normals) -> LocalMap:
     return LocalMap(points, normals)
 
 
-def source_of(points, T_map_source, ground=0.0) -> Source:
+def source_of(points, T_map_source, ground=0.0) -> RegistrationCloud:
     """Map points as a local scan sees them from another frame; heights are those above the map's ground."""
     height = (points[:, 2] - ground).astype(np.float32)
     T_source_map = np.linalg.inv(T_map_source)
-    return Source(transform(T_source_map, points.astype(np.float64)).astype(np.float32), height > 0.5, height)
+    return RegistrationCloud(
+        transform(T_source_map, points.astype(np.float64)).astype(np.float32), height > 0.5, height
+    )

@@ -9,9 +9,9 @@ import numpy as np
 from coview_stream.config import TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.result import Fix, KeyframeEvidence, State
-from coview_stream.localization.search.acceptance import Verdict
-from coview_stream.localization.search.request import Query
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.odometry_noise import Drift
 from coview_stream.messages import encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
@@ -65,11 +65,11 @@ def cloud(seconds, points=POINTS, codec="xyz", keys=KEYS, attachment=None, **fie
 
 
 def query(seconds=0.0):
-    return Query(seconds, np.eye(4), POINTS, POINTS, POINTS)
+    return SearchRequest(seconds, np.eye(4), POINTS, POINTS, POINTS)
 
 
 def verdict(seconds=0.0, reason="two places fit", accepted=None):
-    return Verdict(accepted, KeyframeEvidence(seconds, State.AMBIGUOUS, reason))
+    return SearchResult(accepted, KeyframeEvidence(seconds, State.AMBIGUOUS, reason))
 
 
 def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT, covariance=None):
@@ -88,7 +88,7 @@ def unknown(job, state=State.SEARCHING, reason="no place fits", ask=None):
     return FrameResult(Fix(job.stamp_ns * 1e-9, state, evidence=evidence), ask, 0.01)
 
 
-def doubted(job, cause=Cause.BLIND, reason="only 0 points to register"):
+def doubted(job, cause=RejectionReason.BLIND, reason="only 0 points to register"):
     """The engine's answer: here you were, but what is seen now does not show it."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.AMBIGUOUS, reason, cause=cause)
     return FrameResult(Fix(job.stamp_ns * 1e-9, State.AMBIGUOUS, evidence=evidence), None, 0.01)

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from coview_stream.errors import DependencyError, extra
+from coview_stream.errors import DependencyError, require_library
 
 
 def test_what_is_there_is_imported():
-    assert extra("math", "fast-sums>=2.1", "sums") is math
+    assert require_library("math", "fast-sums>=2.1", "sums") is math
 
 
 @pytest.mark.parametrize("module", ["fast_sums", "fast_sums.quick"])
 def test_what_is_missing_is_named_with_what_installs_it(module):
     with pytest.raises(DependencyError) as caught:
-        extra(module, "fast-sums>=2.1", "sums")
+        require_library(module, "fast-sums>=2.1", "sums")
     assert str(caught.value) == "sums: fast-sums is not installed; pip install 'fast-sums>=2.1'"
 
 
@@ -26,14 +26,14 @@ def test_what_cannot_be_loaded_says_why(tmp_path, monkeypatch):
     (tmp_path / "broken_sums.py").write_text("raise ImportError('libsums.so.3: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(DependencyError, match=r"broken-sums cannot be loaded \(libsums.so.3: no such file\)"):
-        extra("broken_sums", "broken-sums", "sums")
+        require_library("broken_sums", "broken-sums", "sums")
 
 
 def test_what_does_not_fit_may_raise_what_it_likes(tmp_path, monkeypatch):
     (tmp_path / "odd_sums.py").write_text("raise AttributeError('_ARRAY_API not found')")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(DependencyError, match=r"odd-sums cannot be loaded \(_ARRAY_API not found\)"):
-        extra("odd_sums", "odd-sums", "sums")
+        require_library("odd_sums", "odd-sums", "sums")
 
 
 def test_remedies_are_what_our_extras_ask_for():

@@ -108,7 +108,6 @@ def describe_stations(
         grid = kernels.station_bins(
             raster.top,
             raster.count,
-            raster.total,
             raster.cell,
             rows[part],
             columns[part],
@@ -126,7 +125,7 @@ def describe_stations(
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Greatest height, number of voxels and sum of voxel heights of square cells.
+    """Greatest height and number of voxels of square cells.
 
     Arrays are (H, W): row along y, column along x; cell (r, c) has its centre at
     ``corner + cell * (c + 1/2, r + 1/2)``. Metres in the map frame. Empty cells have count 0.
@@ -134,7 +133,6 @@ class HeightRaster:
 
     top: npt.NDArray[np.float32]
     count: npt.NDArray[np.int32]
-    total: npt.NDArray[np.float32]
     corner: npt.NDArray[np.float64]
     cell: float
 
@@ -169,9 +167,8 @@ def rasterise(
 ) -> HeightRaster:
     """Raster of (N, 3) map-frame points.
 
-    The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``, not points, lest the scan pattern
-    decides; ``total`` sums one height for each of those voxels. The raster reaches to the
-    farthest of ``extent`` (by default the points) and ``margin`` empty cells beyond.
+    The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of raw points depend on the scan
+    pattern. The raster reaches to the farthest of ``extent`` (by default the points) and ``margin`` empty cells beyond.
     """
     column, row = np.floor((points[:, :2] - corner) / cell).astype(np.int64).T
     level = np.floor(points[:, 2] / voxel).astype(np.int64)
@@ -183,14 +180,12 @@ def rasterise(
     _, first = np.unique(flat * (int(level.max()) + 1) + level, return_index=True)
     size = height * width
     count = np.bincount(flat[first], minlength=size)
-    total = np.bincount(flat[first], weights=points[first, 2], minlength=size)
     top = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(top, flat, points[:, 2])
     top[count == 0] = 0.0
     return HeightRaster(
         top.reshape(height, width),
         count.astype(np.int32).reshape(height, width),
-        total.astype(np.float32).reshape(height, width),
         corner,
         cell,
     )

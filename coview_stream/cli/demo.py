@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.localization.offline import Located
+    from coview_stream.localization.offline import RunResult
     from coview_stream.recordings.run import Run
     from coview_stream.report.evaluation import Evaluation, Trajectory
     from coview_stream.sim import SimulationConfig
@@ -98,7 +98,7 @@ def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
     print(f"[{number}/{_STEPS}] done in {seconds[name]:.1f} s", file=sys.stderr, flush=True)
 
 
-def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> Located:
+def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> RunResult:
     from tqdm import tqdm
 
     from coview_stream.localization.offline import locate
@@ -114,7 +114,7 @@ def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> Located:
         return locate(base_map, recorded, progress=step)
 
 
-def _live(recorded: Run, out: Path, shown: bool) -> Located:
+def _live(recorded: Run, out: Path, shown: bool) -> RunResult:
     """Serve, replay and watch; what was published, frame by frame."""
     from tqdm import tqdm
 
@@ -134,7 +134,7 @@ def _live(recorded: Run, out: Path, shown: bool) -> Located:
     return from_stream(stamps, recording.poses, recording.statuses)
 
 
-def _report(located: Located, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
+def _report(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
     """Write trajectory, evidence and pictures; return the evaluation."""
     import numpy as np
 
@@ -165,7 +165,7 @@ def _write_report(
         stream.write((json.dumps(facts, indent=1) + "\n").encode())
 
 
-def _text(verdict: Evaluation, located: Located, out: Path) -> str:
+def _text(verdict: Evaluation, located: RunResult, out: Path) -> str:
     from coview_stream.cli.evaluate import table
 
     lines = [table(verdict)]

@@ -17,8 +17,8 @@ from coview_stream.errors import ConfigError, MessageError
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
     from coview_stream.messages.types import PoseMessage, Sample
-    from coview_stream.stream.client.client import Mailbox
-    from coview_stream.stream.client.fleet import Fleet
+    from coview_stream.stream.client.client import LatestQueue
+    from coview_stream.stream.client.fleet import FleetTable
     from coview_stream.stream.transport.transport import Transport
 
 HELP = "see robots' poses live: a table, JSON lines, or a viewer"
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
     from coview_stream.cli.signals import stop_on_signals
-    from coview_stream.stream.client.fleet import Fleet
+    from coview_stream.stream.client.fleet import FleetTable
     from coview_stream.stream.transport.rpc import open_client
 
     if args.seconds is not None and not args.seconds > 0:
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     transport = open_client(args.connect, args.listen, args.config)
     try:
         with stop_on_signals() as stop:
-            watch = _Watch(args, Fleet(), sources, show_pose, transport)
+            watch = _Watch(args, FleetTable(), sources, show_pose, transport)
             watch.until(stop, None if args.seconds is None else time.monotonic() + args.seconds)
     finally:
         transport.close()
@@ -101,16 +101,16 @@ class _Watch:
     def __init__(
         self,
         args: argparse.Namespace,
-        fleet: Fleet,
+        fleet: FleetTable,
         sources: list[_Source],
         show_pose: Callable[[PoseMessage], None],
         transport: Transport,
     ) -> None:
-        from coview_stream.stream.client.client import Mailbox
+        from coview_stream.stream.client.client import LatestQueue
 
         self._args, self._fleet, self._sources = args, fleet, sources
         self._show_pose, self._transport = show_pose, transport
-        self._box: Mailbox[tuple[float, _Source, Sample]] = Mailbox(_KEPT)
+        self._box: LatestQueue[tuple[float, _Source, Sample]] = LatestQueue(_KEPT)
         self._terminal = sys.stdout.isatty() and not args.json
         self._drawn = 0  # lines of the table on the terminal
         self._complained: set[str] = set()

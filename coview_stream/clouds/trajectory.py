@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.files import atomic
 from coview_stream.errors import InputError, RunError
-from coview_stream.geometry.rotations import matrices, nearest_rotation
+from coview_stream.geometry.rotations import nearest_rotation, quat_to_matrix
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 
 Stamps = npt.NDArray[np.float64]
@@ -40,7 +40,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Stamps, Poses]:
     short = np.linalg.norm(quaternions, axis=1) < _SHORTEST_QUATERNION
     if short.any():
         raise RunError(f"{path}:{lines[int(np.argmax(short))]}: quaternion is zero; write qx qy qz qw")
-    return stamps, _poses(rows[:, 1:4], matrices(quaternions) if len(rows) else None)
+    return stamps, _poses(rows[:, 1:4], quat_to_matrix(quaternions) if len(rows) else None)
 
 
 def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:

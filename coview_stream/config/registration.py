@@ -25,7 +25,7 @@ class RegistrationConfig:
     what it moves at ``weak_lever`` metres) is one that the map hardly shows: its sigma is widened further, up to
     ``weak_sigma`` metres (see :func:`coview_stream.localization.registration.covariance.registration_covariance`). The ``shared`` sigmas are
     of the error that neighbouring registrations have in common (see
-    :class:`coview_stream.localization.tracking.shared_error.Shared`): a scanned map's points lie off its surfaces. Inflation,
+    :class:`coview_stream.localization.tracking.shared_error.SharedErrorModel`): a scanned map's points lie off its surfaces. Inflation,
     floors and shared sigmas are calibrated on simulated drives, seeds 5101 to 5110 of ``bench.tracking``; a real map's
     own error, against the ground truth that matters to you, comes on top.
     """

@@ -36,7 +36,7 @@ _UNDULATION = 8.0  # metres: relief is what differs from the mean of so far arou
 _RELIEF = 1.5  # metres of relief that fill the layer
 
 
-def bird_view(points: Points, corner: npt.NDArray[np.floating], shape: tuple[int, int]) -> Image:
+def birds_eye_view(points: Points, corner: npt.NDArray[np.floating], shape: tuple[int, int]) -> Image:
     """Draw a gravity-aligned cloud from above.
 
     Args:

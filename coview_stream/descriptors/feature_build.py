@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image, bird_view
-from coview_stream.descriptors.feature_map import TILE, packed, packed_sigma, weights_sha256
+from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image, birds_eye_view
+from coview_stream.descriptors.feature_map import TILE, quantized, quantized_sigma, weights_sha256
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL, Features, network
 from coview_stream.geometry.transforms import Points
 
@@ -76,7 +76,7 @@ def _drawn(points: Points, low: npt.NDArray[np.int64], high: npt.NDArray[np.int6
             if inside.any():
                 width, height = np.minimum(window, high - corner).tolist()
                 shape = ((height + 2 * _DRAW_MARGIN) * _CELLS, (width + 2 * _DRAW_MARGIN) * _CELLS)
-                whole = bird_view(part, (corner - _DRAW_MARGIN).astype(np.float32), shape)
+                whole = birds_eye_view(part, (corner - _DRAW_MARGIN).astype(np.float32), shape)
                 edge = _DRAW_MARGIN * _CELLS
                 views[column, row] = whole[:, edge:-edge, edge:-edge].copy()
     return views
@@ -119,9 +119,9 @@ def _stored(
     height, width = shape
     known = _known(image)
     core = (slice(_NET_MARGIN, _NET_MARGIN + height), slice(_NET_MARGIN, _NET_MARGIN + width))
-    vectors = packed(features.local[:, core[0], core[1]].transpose(1, 2, 0))
+    vectors = quantized(features.local[:, core[0], core[1]].transpose(1, 2, 0))
     local = np.where(known[core][..., None], vectors, np.int8(0))
-    sigma = np.where(known[core], packed_sigma(features.sigma[core]), 255).astype(np.uint8)
+    sigma = np.where(known[core], quantized_sigma(features.sigma[core]), 255).astype(np.uint8)
     numbers = np.stack(np.meshgrid(np.arange(width // TILE), np.arange(height // TILE)), axis=-1)
     full = _in_tiles(known[core]).any(axis=(1, 2))
     place, place_at = _places(features.place, known[core], shape)
@@ -163,4 +163,4 @@ def _places(
     wanted = known.reshape(height, side, width, side).any(axis=(1, 3))
     row, column = np.nonzero(wanted)
     at = np.asarray((np.column_stack([column, row]) + 0.5) * side, dtype=np.float64)
-    return packed(mean[:, row, column].T), at
+    return quantized(mean[:, row, column].T), at

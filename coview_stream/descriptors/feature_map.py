@@ -105,8 +105,8 @@ class FeatureMap:
         sigma = np.full((height, width), 255, dtype=np.uint8)
         self.index.gather(self._local, low, local)
         self.index.gather(self._sigma, low, sigma)
-        vectors = np.ascontiguousarray(unpacked(local).transpose(2, 0, 1))
-        return Patch(vectors, unpacked_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
+        vectors = np.ascontiguousarray(dequantized(local).transpose(2, 0, 1))
+        return Patch(vectors, dequantized_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
 
     def coarse(self, cell: float = 2.0) -> tuple[Vectors, npt.NDArray[np.float64]]:
         """Return means (C, H, W) over cells of ``cell`` metres, a divisor of 32, and their lower corner (2,), metres.
@@ -167,23 +167,23 @@ _LEAST, _MOST = 0.02, 50.0  # sigmas that a byte can tell: steps of 3 %
 _STEPS = 255.0 / np.log(_MOST / _LEAST)
 
 
-def packed(vectors: npt.NDArray[np.float32]) -> Bytes:
+def quantized(vectors: npt.NDArray[np.float32]) -> Bytes:
     """Numbers of magnitude 1 at most (any shape) as bytes; off by 0.004 each."""
     return np.asarray(np.rint(vectors * np.float32(_SCALE)), dtype=np.int8)
 
 
-def unpacked(vectors: npt.NDArray[np.int8]) -> npt.NDArray[np.float32]:
+def dequantized(vectors: npt.NDArray[np.int8]) -> npt.NDArray[np.float32]:
     """Undo :func:`packed`."""
     return np.asarray(vectors * np.float32(1.0 / _SCALE), dtype=np.float32)
 
 
-def packed_sigma(sigma: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+def quantized_sigma(sigma: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Positive sigmas (any shape) as bytes on a logarithmic scale; off by 1.5 % between 0.02 and 50."""
     steps = np.log(np.clip(sigma, _LEAST, _MOST) / _LEAST) * _STEPS
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
 
-def unpacked_sigma(sigma: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     """Undo :func:`packed_sigma`."""
     return np.asarray(_LEAST * np.exp(sigma / _STEPS), dtype=np.float32)
 

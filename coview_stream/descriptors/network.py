@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from coview_kernels.runtime import workers
 from coview_stream.descriptors.birds_eye_view import LAYERS, Image
-from coview_stream.errors import ConfigError, DependencyError, InputError, extra
+from coview_stream.errors import ConfigError, DependencyError, InputError, require_library
 
 ViewName = Literal["aerial", "ground"]
 
@@ -140,7 +140,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _runtime() -> Any:
-    runtime = extra("onnxruntime", "onnxruntime>=1.18", "learned re-localization")
+    runtime = require_library("onnxruntime", "onnxruntime>=1.18", "learned re-localization")
     if not hasattr(runtime, "InferenceSession"):  # an uninstallation may leave an empty folder behind
         raise DependencyError(
             "learned re-localization: onnxruntime is not complete; "

@@ -14,9 +14,9 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.doctor.capture import Heard, Seen
 from coview_stream.doctor.finding import Finding
 from coview_stream.messages.types import CloudMessage, OdometryMessage
-from coview_stream.odometry.buffer import Intake, OdometryBuffer
+from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters
-from coview_stream.stream.node.frame_sync import Pairing
+from coview_stream.stream.node.frame_sync import FrameSync
 from coview_stream.version import __version__
 
 _LAG = 1.0  # seconds that a cloud may come after the odometry of its stamp; drivers take 0.05 to 0.3
@@ -70,13 +70,13 @@ def pairing_finding(clouds: list[Seen], odometry: list[Seen], ended: float, robo
     """Play the messages to the node's own pairing, in order of arrival, and see what becomes of the clouds."""
     config, counters = NodeConfig(horizon=60.0), Counters()
     buffer = OdometryBuffer(config)
-    pairing = Pairing(config, buffer, counters)
+    pairing = FrameSync(config, buffer, counters)
     # what was under way when listening began or ended says nothing
     first = min(s.stamp_ns or 0 for s in odometry)
     clouds = [s for s in clouds if (s.stamp_ns or 0) >= first and s.arrived <= ended - config.pairing_wait]
     if not clouds:
         return Finding("warn", "pairing", "too few clouds to say", "listen longer: --seconds 10", robot)
-    intake: dict[Intake, int] = dict.fromkeys(Intake, 0)
+    intake: dict[SampleKind, int] = dict.fromkeys(SampleKind, 0)
     paired = 0
     for seen in heapq.merge(odometry, clouds, key=lambda s: s.arrived):
         if seen.T_odom_body is not None:
@@ -89,7 +89,7 @@ def pairing_finding(clouds: list[Seen], odometry: list[Seen], ended: float, robo
     lost = [f"{getattr(counters, name)} {name}" for name in _EVENTS if getattr(counters, name)]
     if lost:
         found += f" ({', '.join(lost)})"
-    if jumps := intake[Intake.JUMP]:
+    if jumps := intake[SampleKind.JUMP]:
         found += f"; odometry jumps {jumps} times"
         remedy = "two senders of odometry, or one that starts anew: after each jump the robot is LOST"
         return Finding("FAIL", "pairing", found, remedy, robot)

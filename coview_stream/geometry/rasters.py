@@ -15,12 +15,12 @@ from coview_stream.geometry.transforms import Points
 Raster = npt.NDArray[np.float32]
 
 
-def lowest_around(raster: Raster, size: int) -> Raster:
+def min_filter(raster: Raster, size: int) -> Raster:
     """Smallest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
     return _sliding(np.minimum, raster, size, np.float32(np.inf))
 
 
-def highest_around(raster: Raster, size: int) -> Raster:
+def max_filter(raster: Raster, size: int) -> Raster:
     """Greatest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
     return _sliding(np.maximum, raster, size, np.float32(-np.inf))
 

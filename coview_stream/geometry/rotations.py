@@ -36,7 +36,7 @@ def exp_so3(rotvec: npt.ArrayLike) -> Array:
 
 def log_so3(R: npt.NDArray[np.floating]) -> Array:
     """Rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
-    turn = quaternions(R)
+    turn = matrix_to_quat(R)
     turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
     sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, turn[..., 3:])
@@ -45,7 +45,7 @@ def log_so3(R: npt.NDArray[np.floating]) -> Array:
     )
 
 
-def matrices(quaternions: npt.ArrayLike) -> Array:
+def quat_to_matrix(quaternions: npt.ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
     q = np.asarray(quaternions, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
@@ -61,7 +61,7 @@ def matrices(quaternions: npt.ArrayLike) -> Array:
     return R
 
 
-def quaternions(R: npt.NDArray[np.floating]) -> Array:
+def matrix_to_quat(R: npt.NDArray[np.floating]) -> Array:
     """Return unit quaternions (..., 4) of rotation matrices (..., 3, 3); the largest component is positive."""
     M = np.asarray(R, dtype=np.float64)
     xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
@@ -82,7 +82,7 @@ def quaternions(R: npt.NDArray[np.floating]) -> Array:
     return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
 
 
-def between(start: npt.NDArray[np.floating], end: npt.NDArray[np.floating], share: npt.ArrayLike) -> Array:
+def slerp(start: npt.NDArray[np.floating], end: npt.NDArray[np.floating], share: npt.ArrayLike) -> Array:
     """Rotations (..., 3, 3) a ``share`` (...) of the way from ``start`` to ``end`` (..., 3, 3), the short way round."""
     rotvec = log_so3(np.swapaxes(start, -1, -2) @ end)
     return np.asarray(start @ exp_so3(np.asarray(share, dtype=np.float64)[..., None] * rotvec))

@@ -26,28 +26,28 @@ Vector6 = npt.NDArray[np.float64]
 
 def along_body(covariance: Matrix6, T_map_body: Pose) -> Matrix6:
     """Covariance (6, 6) in the body's tangent of one that is given along the map's axes."""
-    return turned(covariance, T_map_body[:3, :3].T)
+    return rotate_covariance(covariance, T_map_body[:3, :3].T)
 
 
 def along_map(covariance: Matrix6, T_map_body: Pose) -> Matrix6:
     """Covariance (6, 6) along the map's axes of one that is given in the body's tangent."""
-    return turned(covariance, T_map_body[:3, :3])
+    return rotate_covariance(covariance, T_map_body[:3, :3])
 
 
-def turned(covariance: Matrix6, R: Array) -> Matrix6:
+def rotate_covariance(covariance: Matrix6, R: Array) -> Matrix6:
     """Both halves of a covariance (6, 6) along axes that ``R`` (3, 3) turns into: diag(R, R) C diag(R, R)^T."""
     blocks = covariance.reshape(2, 3, 2, 3).transpose(0, 2, 1, 3)
     moved = (R @ blocks @ R.T).transpose(0, 2, 1, 3).reshape(6, 6)
     return np.asarray(0.5 * (moved + moved.T))
 
 
-def difference(T_map_body: Pose, T_map_reference: Pose) -> Vector6:
+def boxminus(T_map_body: Pose, T_map_reference: Pose) -> Vector6:
     """(6,) by which a pose differs from a reference, along the map's axes: see the module."""
     turn = log_so3(T_map_body[:3, :3] @ T_map_reference[:3, :3].T)
     return np.asarray(np.concatenate([turn, T_map_body[:3, 3] - T_map_reference[:3, 3]]))
 
 
-def shifted(T_map_body: Pose, step: Vector6) -> Pose:
+def boxplus(T_map_body: Pose, step: Vector6) -> Pose:
     """Return the pose that differs by ``step`` (6,) along the map's axes; undoes :func:`difference`."""
     moved: Pose = T_map_body.copy()
     moved[:3, :3] = exp_so3(step[:3]) @ T_map_body[:3, :3]

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.rotations import matrices, nearest_rotation, quaternions
+from coview_stream.geometry.rotations import matrix_to_quat, nearest_rotation, quat_to_matrix
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -46,7 +46,7 @@ def transform(T: Pose, points: npt.NDArray[_Real]) -> npt.NDArray[_Real]:
     return moved
 
 
-def lengths(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) -> npt.NDArray[_Real]:
+def norms(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) -> npt.NDArray[_Real]:
     """Distance (N,) of each of (N, 3) points from ``origin`` (3,), by default the frame's, in the points' precision."""
     # by columns: np.linalg.norm along the short axis takes ten times as long, for the same numbers
     x, y, z = (points[:, d].copy() if origin is None else points[:, d] - origin[d] for d in range(3))
@@ -102,21 +102,23 @@ def is_pose(T: npt.NDArray[np.floating]) -> bool:
 
 def pose_to_tum(T: Pose) -> npt.NDArray[np.float64]:
     """(7,) x y z qx qy qz qw of a pose."""
-    return np.concatenate([T[:3, 3], quaternions(T[:3, :3])])
+    return np.concatenate([T[:3, 3], matrix_to_quat(T[:3, :3])])
 
 
 def pose_from_tum(row: npt.ArrayLike) -> Pose:
     """Pose from (7,) x y z qx qy qz qw; the quaternion need not be normalised."""
     values = np.asarray(row, dtype=np.float64)
-    return pose_from(matrices(values[3:]), values[:3])
+    return pose_from(quat_to_matrix(values[3:]), values[:3])
 
 
-def relative_to(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:
+def to_local(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:
     """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
     return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
 
 
-def unanchored(T_map_local: Pose, anchor: npt.NDArray[np.float64], origin: npt.NDArray[np.float64]) -> Pose:
+def to_map_origin(
+    T_map_local: Pose, anchor: npt.NDArray[np.float64], origin: npt.NDArray[np.float64]
+) -> Pose:
     """Return ``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
     shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
     return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)

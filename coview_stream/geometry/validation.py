@@ -14,7 +14,7 @@ _FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
 _OTHER_WORLD = 1e7  # metres from the map's origin: no place on this planet
 
 
-def checked_cloud(cloud: npt.ArrayLike) -> Points:
+def validate_cloud(cloud: npt.ArrayLike) -> Points:
     """Return a frame's finite points, a copy (N, 3) float32 in rows; CloudError where it is no cloud."""
     try:
         with np.errstate(over="ignore"):
@@ -33,7 +33,7 @@ def checked_cloud(cloud: npt.ArrayLike) -> Points:
     return finite
 
 
-def checked_odometry(T_odom_body: npt.ArrayLike, stamp: float) -> Pose:
+def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float) -> Pose:
     """Return a frame's pose (4, 4), exactly rigid; RunError where it is not, or its stamp (seconds) not finite."""
     try:
         T = np.asarray(T_odom_body, dtype=np.float64)
@@ -47,7 +47,7 @@ def checked_odometry(T_odom_body: npt.ArrayLike, stamp: float) -> Pose:
     return orthonormal(T)
 
 
-def checked_place(T_map_body: npt.ArrayLike, origin: npt.NDArray[np.float64]) -> Pose:
+def validate_pose(T_map_body: npt.ArrayLike, origin: npt.NDArray[np.float64]) -> Pose:
     """Return a place (4, 4), given in the frame of the map's sources, about the map's ``origin`` (3,).
 
     RunError where it is not rigid or not on this planet.

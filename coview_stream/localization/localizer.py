@@ -10,17 +10,17 @@ import numpy.typing as npt
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
-from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_from, relative_to, unanchored
-from coview_stream.geometry.validation import checked_cloud, checked_odometry, checked_place
+from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_from, to_local, to_map_origin
+from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import Fix, KeyframeEvidence, State
-from coview_stream.localization.search.acceptance import Verdict
+from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.keyframes import Continuity, KeyframeBuffer
-from coview_stream.localization.search.pose_hints import Suggestions
-from coview_stream.localization.search.recognizers import Knowledge
-from coview_stream.localization.search.request import Query
-from coview_stream.localization.tracking.monitor import Cause, Doubt, Judgement
+from coview_stream.localization.search.keyframes import KeyframeBuffer, OdometryCheck
+from coview_stream.localization.search.pose_hints import PoseHints
+from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.tracking.monitor import LossMonitor, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.tracker import Tracker
 
 _HURRIED = 3.0  # times as far apart are registrations in a hurry
@@ -47,7 +47,7 @@ class Localizer:
         base_map: BaseMap,
         config: LocalizerConfig | None = None,
         local_maps: LocalMaps | None = None,
-        knowledge: Knowledge | None = None,
+        knowledge: SearchIndex | None = None,
     ) -> None:
         """Localize on a map; those of one thread may share ``local_maps``, its cache of crops, and ``knowledge``.
 
@@ -70,9 +70,9 @@ class Localizer:
         self._anchor: npt.NDArray[np.float64] | None = None
         self._evidence: KeyframeEvidence | None = None
         self._newest: _Frame | None = None
-        self._suggestions = Suggestions()
-        self._continuity = Continuity()
-        self._doubt = Doubt(self.config.acceptance, self.config.tracking)
+        self._suggestions = PoseHints()
+        self._continuity = OdometryCheck()
+        self._doubt = LossMonitor(self.config.acceptance, self.config.tracking)
         self._registered = 0.0  # stamp of the newest registration
         self._generation += 1
 
@@ -106,7 +106,9 @@ class Localizer:
             self.adopt(self._search.update(query))
         return self.fix()
 
-    def take(self, cloud: Points, T_odom_body: Pose, stamp: float, hurry: bool = False) -> Query | None:
+    def take(
+        self, cloud: Points, T_odom_body: Pose, stamp: float, hurry: bool = False
+    ) -> SearchRequest | None:
         """First half of :meth:`step`, which never searches the map and so is quick.
 
         Args:
@@ -144,12 +146,12 @@ class Localizer:
         if keyframe is None:
             return None
         needs, travelled = self._search.needs, self._tracker.travelled
-        return Query.of(self._buffer, keyframe, cloud, needs, travelled, self._generation, suggested)
+        return SearchRequest.of(self._buffer, keyframe, cloud, needs, travelled, self._generation, suggested)
 
     def _suggested(self, T_odom_body: Pose) -> tuple[Pose, ...]:
         return () if self._anchor is None else self._suggestions.about(self._anchor, T_odom_body)
 
-    def adopt(self, verdict: Verdict) -> None:
+    def adopt(self, verdict: SearchResult) -> None:
         """Second half of :meth:`step`: take note of a search, and start tracking when one place stands alone.
 
         A verdict from before a loss or a :meth:`reset` is ignored, and so is one that comes while tracking.
@@ -181,7 +183,7 @@ class Localizer:
         Raises:
             RunError: it is not a finite rigid transform, or no place on this planet.
         """
-        local = checked_place(T_map_body, self.base_map.origin)
+        local = validate_pose(T_map_body, self.base_map.origin)
         if self.state is not State.TRACKING:
             self._suggestions.robot_at(local)
 
@@ -205,7 +207,7 @@ class Localizer:
         """
         self._note(self._tracker.update(cloud, T_odom_body, idle, alone), stamp)
 
-    def _note(self, judgement: Judgement, stamp: float, found: KeyframeEvidence | None = None) -> None:
+    def _note(self, judgement: MatchVerdict, stamp: float, found: KeyframeEvidence | None = None) -> None:
         """Draw the consequences of a registration; one that confirms what the search has ``found`` adds nothing."""
         self._registered = stamp
         reason = self._doubt.note(judgement, stamp, self._tracker.travelled)
@@ -240,7 +242,7 @@ class Localizer:
         if self.state is State.AMBIGUOUS:
             self.state = State.SEARCHING
         reason = "searching anew: frames do not fit together where odometry puts them"
-        self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=Cause.ODOMETRY)
+        self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=RejectionReason.ODOMETRY)
 
     def _fix(self, T_odom_body: Pose, stamp: float) -> Fix:
         evidence = self._evidence
@@ -255,7 +257,7 @@ class Localizer:
             stamp,
             self.state,
             pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
-            unanchored(T_map_local, self._anchor, self.base_map.origin),
+            to_map_origin(T_map_local, self._anchor, self.base_map.origin),
             self._tracker.reported_covariance(),
             confidence,
             evidence,
@@ -264,7 +266,7 @@ class Localizer:
 
     def _checked(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:
         """Finite float32 points, and the pose relative to the first one so that float32 stays exact."""
-        finite, T = checked_cloud(cloud), checked_odometry(T_odom_body, stamp)
+        finite, T = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
-        return finite, relative_to(T, self._anchor)
+        return finite, to_local(T, self._anchor)

@@ -31,7 +31,7 @@ _PICTURES = ("trajectory.png", "descriptors.png")
 
 
 @dataclass
-class Located:
+class RunResult:
     """What localizing a run gave.
 
     Attributes:
@@ -90,7 +90,7 @@ class Located:
 
 def locate(
     base_map: BaseMap, run: Run, config: LocalizerConfig | None = None, progress: Progress | None = None
-) -> Located:
+) -> RunResult:
     """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
 
     A run of one frame is localized by the stationary path. A frame that cannot be read is skipped and noted.
@@ -102,7 +102,7 @@ def locate(
     if len(run) == 1:
         config = replace(config, stationary=True)
     localizer = Localizer(base_map, config)
-    located = Located(len(run), sources=localizer.sources)
+    located = RunResult(len(run), sources=localizer.sources)
     for index in range(len(run)):
         try:
             frame = run.read(index)
@@ -126,7 +126,7 @@ def locate(
 
 def from_stream(
     stamps: Sequence[float], poses: Sequence[dict[str, Any]], statuses: Sequence[dict[str, Any]]
-) -> Located:
+) -> RunResult:
     """Sort what a node published (JSON poses and statuses) under a run's frames, by stamp in seconds.
 
     A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. The others
@@ -134,7 +134,7 @@ def from_stream(
     """
     known = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
     told = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
-    located = Located(len(stamps))
+    located = RunResult(len(stamps))
     for stamp in stamps:
         pose = known.get(round(stamp * 1e6))
         if pose is None:
@@ -152,7 +152,7 @@ def from_stream(
     return located
 
 
-def write(located: Located, base_map: BaseMap, out: str | os.PathLike[str], pictures: bool = True) -> None:
+def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str], pictures: bool = True) -> None:
     """Write ``trajectory.tum`` (posed frames only), ``result.json`` and, unless unwanted, pictures into ``out``.
 
     Raises:
@@ -178,7 +178,7 @@ def write(located: Located, base_map: BaseMap, out: str | os.PathLike[str], pict
         draw(located, base_map, folder)
 
 
-def draw(located: Located, base_map: BaseMap, folder: Path, truth: Any = None) -> None:
+def draw(located: RunResult, base_map: BaseMap, folder: Path, truth: Any = None) -> None:
     """Draw ``trajectory.png`` and, after a fix, ``descriptors.png``."""
     from coview_stream.report.plots import plot_descriptor_pair, plot_trajectory
 
@@ -199,7 +199,7 @@ def _named(message: str, path: Path) -> str:
     return message if path.name in message else f"{path}: {message}"
 
 
-def _note(located: Located, localizer: Localizer, fix: Fix) -> None:
+def _note(located: RunResult, localizer: Localizer, fix: Fix) -> None:
     if fix.evidence is not None and (not located.keyframes or located.keyframes[-1] is not fix.evidence):
         located.keyframes.append(fix.evidence)
     if fix.T_map_body is not None and located.winner is None:
@@ -217,7 +217,7 @@ def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
     return replace(fix, T_map_body=fix.T_map_body @ away, T_map_odom=T_map_odom)
 
 
-def summary(located: Located) -> str:
+def summary(located: RunResult) -> str:
     """Say it in a few lines for a person."""
     posed = located.posed
     lines = [

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.odometry_noise import Drift
 
 _SHARES = tuple(f.name for f in fields(Evidence))
@@ -56,7 +56,7 @@ class KeyframeEvidence:
     evidence: Evidence | None = None
     station: int | None = None
     shift: int | None = None
-    cause: Cause | None = None
+    cause: RejectionReason | None = None
     innovation: float | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class KeyframeEvidence:
         return cls(
             float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
             float(data["rival"]), parts, data["station"], data["shift"],
-            None if data.get("cause") is None else Cause(data["cause"]), data.get("innovation"),
+            None if data.get("cause") is None else RejectionReason(data["cause"]), data.get("innovation"),
         )  # fmt: skip
 
 

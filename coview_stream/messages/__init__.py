@@ -25,13 +25,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from coview_stream.errors import ConfigError, MessageError
-from coview_stream.messages import (
-    foxglove,
-    json_messages,
-    keelson,
-    raw,
-    ros2,
-)
+from coview_stream.messages import foxglove, json_messages, keelson, raw, ros2
 from coview_stream.messages.choose import Channel, codec_for
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import (

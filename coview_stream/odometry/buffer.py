@@ -10,7 +10,7 @@ from enum import StrEnum
 import numpy as np
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.geometry.rotations import between
+from coview_stream.geometry.rotations import slerp
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rotation_angle, yaw_of
 from coview_stream.messages.types import OdometryMessage
 
@@ -23,7 +23,7 @@ _RECENT = 2 * _NS
 _JUMP_ANGLE = np.radians(20.0)
 
 
-class Intake(StrEnum):
+class SampleKind(StrEnum):
     """What an odometry sample was to the samples before it."""
 
     CONTINUES = "continues"
@@ -81,16 +81,16 @@ class OdometryBuffer:
         self._strange: deque[tuple[float, int]] = deque(maxlen=_STEADY)  # local time, stamp
         self._strange_since = float("inf")
 
-    def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> Intake:
+    def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> SampleKind:
         """Take in a sample that came at local time ``now``; only duplicates and strays leave no trace.
 
         ``unreachable``: none could have come since the last one, for nobody was connected.
         """
         longest = self.config.max_network_outage if unreachable else self.config.max_outage
         verdict = self._classify(sample, now, longest)
-        if verdict in (Intake.DUPLICATE, Intake.OUT_OF_ORDER):
+        if verdict in (SampleKind.DUPLICATE, SampleKind.OUT_OF_ORDER):
             return verdict
-        if verdict in (Intake.JUMP, Intake.RESTART, Intake.OUTAGE):
+        if verdict in (SampleKind.JUMP, SampleKind.RESTART, SampleKind.OUTAGE):
             self.clear()
         elif self.newest is not None:
             step = inverse(self.newest.T_odom_body) @ sample.T_odom_body
@@ -105,25 +105,25 @@ class OdometryBuffer:
             self._samples.popleft()
         return verdict
 
-    def _classify(self, sample: OdometryMessage, now: float, longest: float) -> Intake:
+    def _classify(self, sample: OdometryMessage, now: float, longest: float) -> SampleKind:
         last = self.newest
         if last is None:
-            return Intake.CONTINUES
+            return SampleKind.CONTINUES
         if sample.stamp_ns == last.stamp_ns:
-            return Intake.DUPLICATE
+            return SampleKind.DUPLICATE
         seconds = (sample.stamp_ns - last.stamp_ns) / _NS
         # a single stray stamp must not shut out all that follow, so one far ahead has to be confirmed as well
         ahead = seconds > self.config.horizon + 2.0 * (now - self.arrived)
         if seconds < 0 or ahead:
             if not self._runs_on(sample.stamp_ns, now):
-                return Intake.OUT_OF_ORDER
-            return Intake.RESTART if seconds < 0 else Intake.OUTAGE
+                return SampleKind.OUT_OF_ORDER
+            return SampleKind.RESTART if seconds < 0 else SampleKind.OUTAGE
         if seconds > longest:
-            return Intake.OUTAGE
+            return SampleKind.OUTAGE
         step = inverse(last.T_odom_body) @ sample.T_odom_body
         if self._impossible(step, seconds):
-            return Intake.JUMP
-        return Intake.GAP if seconds > self.config.odometry_timeout else Intake.CONTINUES
+            return SampleKind.JUMP
+        return SampleKind.GAP if seconds > self.config.odometry_timeout else SampleKind.CONTINUES
 
     def _runs_on(self, stamp_ns: int, now: float) -> bool:
         """Whether the samples that did not continue the buffer continue each other, for long enough."""
@@ -185,5 +185,5 @@ class OdometryBuffer:
 
 def _between(a: OdometryMessage, b: OdometryMessage, stamp_ns: int) -> Pose:
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-    turn = between(a.T_odom_body[:3, :3], b.T_odom_body[:3, :3], share)
+    turn = slerp(a.T_odom_body[:3, :3], b.T_odom_body[:3, :3], share)
     return pose_from(turn, (1 - share) * a.T_odom_body[:3, 3] + share * b.T_odom_body[:3, 3])

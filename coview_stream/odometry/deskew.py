@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.rotations import between
+from coview_stream.geometry.rotations import slerp
 from coview_stream.geometry.transforms import Points, Pose, inverse
 from coview_stream.odometry.buffer import Segment
 
@@ -38,7 +38,7 @@ def deskew(
     relative = T_body_odom @ segment.poses
     k = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, len(at) - 2)
     share = (grid - at[k]) / (at[k + 1] - at[k])
-    turns = between(relative[k, :3, :3], relative[k + 1, :3, :3], share).astype(np.float32)
+    turns = slerp(relative[k, :3, :3], relative[k + 1, :3, :3], share).astype(np.float32)
     shifts = np.column_stack([np.interp(grid, at, relative[:, k, 3]) for k in range(3)]).astype(np.float32)
     step = np.rint((known - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
     return np.asarray(np.einsum("nij,nj->ni", turns[step], points) + shifts[step], dtype=np.float32)

@@ -85,7 +85,7 @@ def find_ground(points: npt.NDArray[np.floating]) -> Ground | str:
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(lowest[inside].T))[1])
     if spread < _LEAST_SPREAD:
         return f"the best plane is a strip, {spread:.1f} m wide (one sigma)"
-    corrected, walls = upright(points, up)
+    corrected, walls = gravity_from_walls(points, up)
     return Ground(corrected, float(height), share, int(inside.sum()), walls)
 
 
@@ -158,7 +158,9 @@ _WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
 _WALL_ROUNDS = 10
 
 
-def upright(points: npt.NDArray[np.floating], up: Array, sigma: float = SLOPE) -> tuple[Array, int]:
+def gravity_from_walls(
+    points: npt.NDArray[np.floating], up: Array, sigma: float = SLOPE
+) -> tuple[Array, int]:
     """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
 
     Where there are none, or all face one way, it stays as it is in the directions that they say nothing of.

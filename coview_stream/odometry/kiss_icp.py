@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import extra
+from coview_stream.errors import require_library
 from coview_stream.geometry.transforms import Pose, inverse
 
 _NO_TIMES = np.zeros(0)
@@ -55,7 +55,8 @@ class KissRegistration:
 def _settings(config: LidarOdometryConfig) -> tuple[Any, Any]:
     """Return the class ``KissICP`` and its configuration; DependencyError where there is no kiss-icp."""
     pipeline, configuration = (
-        extra(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry") for module in ("kiss_icp", "config")
+        require_library(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry")
+        for module in ("kiss_icp", "config")
     )
     settings = configuration.KISSConfig()
     settings.data.min_range, settings.data.max_range = config.min_range, config.max_range

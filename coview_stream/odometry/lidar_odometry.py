@@ -9,20 +9,20 @@ import numpy.typing as npt
 
 from coview_stream.config.odometry import LidarOdometryConfig, down
 from coview_stream.errors import CloudError, RunError
-from coview_stream.geometry.rotations import between, exp_so3
+from coview_stream.geometry.rotations import exp_so3, slerp
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
     inverse,
     is_pose,
-    lengths,
+    norms,
     orthonormal,
     pose_from,
     rotation_angle,
 )
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
-from coview_stream.odometry.gravity import Ground, aligned, find_ground, upright
+from coview_stream.odometry.gravity import Ground, aligned, find_ground, gravity_from_walls
 from coview_stream.odometry.kiss_icp import KissRegistration, Registration
 
 _NS = 1e9
@@ -93,7 +93,7 @@ class LidarOdometry:
                 robot makes. RunError: the stamp is not finite, or not later than the one before. The odometry is as
                 good as before: skip the frame and go on.
         """
-        finite, times = checked(points, point_times, self.config)
+        finite, times = validate(points, point_times, self.config)
         if not np.isfinite(stamp):
             raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
         if self._pose is None:
@@ -141,7 +141,7 @@ class LidarOdometry:
         """Turn the pose about where it is until walls stand upright again, as far as they are believed."""
         assert self._pose is not None
         up = self._pose[2, :3]
-        better, _ = upright(points, up, _DRIFT)
+        better, _ = gravity_from_walls(points, up, _DRIFT)
         axis = np.cross(better, up)
         sine = float(np.linalg.norm(axis))
         if sine > 0.0:
@@ -151,11 +151,11 @@ class LidarOdometry:
     def _motion(self, seconds: float) -> Pose:
         """Motion over ``seconds``, which may be negative, if it goes on like the last one."""
         share = seconds / self._step_seconds
-        turn = between(np.eye(3), self._step[:3, :3], share)
+        turn = slerp(np.eye(3), self._step[:3, :3], share)
         return pose_from(turn, share * self._step[:3, 3])
 
     def _deskewed(self, points: Points, times: npt.NDArray[np.float64]) -> Points:
-        ends = dated(times)
+        ends = sweep_interval(times)
         if ends is None:
             return points
         stamps = np.array([round(_NS * t) for t in ends], dtype=np.int64)
@@ -192,7 +192,7 @@ _INSTANT = 1e-4  # seconds: times that differ by less are one
 _LONGEST_SWEEP = 1.0  # seconds from the stamp: points farther away in time have another clock
 
 
-def checked(points: Points, times: Times | None, config: LidarOdometryConfig) -> tuple[Points, Times | None]:
+def validate(points: Points, times: Times | None, config: LidarOdometryConfig) -> tuple[Points, Times | None]:
     """Finite points (N, 3) float32, and their times (N,).
 
     Raises:
@@ -214,7 +214,7 @@ def checked(points: Points, times: Times | None, config: LidarOdometryConfig) ->
     if not finite.all():
         rows, at = rows[finite], None if at is None else at[finite]
     with np.errstate(over="ignore"):
-        ranges = lengths(rows)
+        ranges = norms(rows)
     usable = int(((ranges > config.min_range) & (ranges < config.max_range)).sum())
     if usable < config.least_points:
         raise CloudError(
@@ -224,7 +224,7 @@ def checked(points: Points, times: Times | None, config: LidarOdometryConfig) ->
     return rows, at
 
 
-def dated(times: Times) -> tuple[float, float] | None:
+def sweep_interval(times: Times) -> tuple[float, float] | None:
     """First and last of times (N,) in seconds around the stamp; None if they do not differ, or are no such times."""
     known = times[np.isfinite(times)]
     if not len(known) or np.abs(known).max() > _LONGEST_SWEEP or np.ptp(known) < _INSTANT:

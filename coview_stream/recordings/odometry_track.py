@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.trajectory import Poses
 from coview_stream.config.node import NodeConfig
-from coview_stream.geometry.rotations import between
+from coview_stream.geometry.rotations import slerp
 from coview_stream.odometry.buffer import Segment
 
 StampsNs = npt.NDArray[np.int64]
@@ -67,6 +67,6 @@ class Track:
 
 def _between(a: Poses, b: Poses, share: npt.NDArray[np.float64]) -> Poses:
     poses = np.array(a)
-    poses[:, :3, :3] = between(a[:, :3, :3], b[:, :3, :3], share)
+    poses[:, :3, :3] = slerp(a[:, :3, :3], b[:, :3, :3], share)
     poses[:, :3, 3] += share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
     return poses

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.errors import extra
+from coview_stream.errors import require_library
 from coview_stream.geometry.transforms import pose_to_tum
 from coview_stream.messages.types import PoseMessage
 
@@ -22,7 +22,7 @@ class PoseViewer:
     """
 
     def __init__(self, application: str = "coview_stream") -> None:
-        self._rerun = extra("rerun", "rerun-sdk>=0.20", "--rerun")
+        self._rerun = require_library("rerun", "rerun-sdk>=0.20", "--rerun")
         self._origin: np.ndarray | None = None
         self._strips: dict[str, list[np.ndarray]] = {}
         self._pieces: dict[str, int] = {}

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.descriptors.birds_eye_view import CELL, Image, bird_view
+from coview_stream.descriptors.birds_eye_view import CELL, Image, birds_eye_view
 from coview_stream.errors import InputError
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.worlds import base_scan, draw_world, submaps
@@ -66,9 +66,9 @@ def world_views(seed: int, recipe: Recipe) -> WorldViews:
     driven = list(submaps(world, seed, recipe))
     shape = (QUERY_CELLS, QUERY_CELLS)
     return WorldViews(
-        aerial=bird_view(base, corner, (cells, cells)),
+        aerial=birds_eye_view(base, corner, (cells, cells)),
         corner=corner,
-        queries=np.stack([bird_view(submap.points, _CORNER, shape) for _, submap in driven]),
+        queries=np.stack([birds_eye_view(submap.points, _CORNER, shape) for _, submap in driven]),
         poses=np.stack([submap.pose for _, submap in driven]),
         sensor=np.array([sensor for sensor, _ in driven]),
         kind=world.kind,

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from coview_stream.descriptors.birds_eye_view import Image
 from coview_stream.descriptors.network import Features
-from coview_stream.localization.search.learned.correlation import coarser, correlate
-from coview_stream.localization.search.learned.feature_index import CoarseMap
+from coview_stream.localization.search.learned.correlation import correlate, downsample
+from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.training.dataset import WorldViews
 
 HEADINGS = 36
@@ -59,11 +59,11 @@ def seek(
     yaws = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     sought = []
     for number, world in enumerate(worlds):
-        features, _ = coarser(aerial(_even(world.aerial)).local)
-        coarse = CoarseMap(features, world.corner, _CELL)
+        features, _ = downsample(aerial(_even(world.aerial)).local)
+        coarse = FeatureIndex(features, world.corner, _CELL)
         for k in range(len(world.queries))[:most]:
             query = ground(world.queries[k])
-            volume = correlate(*coarser(query.local, weights(query.sigma)), coarse, yaws)
+            volume = correlate(*downsample(query.local, weights(query.sigma)), coarse, yaws)
             found, scores = best_places(volume, yaws, world.corner)
             sought.append(
                 Sought(number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.config.checks import counts
-from coview_stream.errors import ConfigError, InputError, extra
+from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.training.dataset import WorldViews, read_world, write_dataset
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.training import TrainingConfig
@@ -102,8 +102,8 @@ def train_session(
             another recipe or another training.
         DependencyError: PyTorch, ONNX or Open3D is not installed.
     """
-    torch = extra("torch", "torch==2.13.0", "training (extra learn-train)")
-    extra("onnx", "onnx>=1.16", "training (extra learn-train)")
+    torch = require_library("torch", "torch==2.13.0", "training (extra learn-train)")
+    require_library("onnx", "onnx>=1.16", "training (extra learn-train)")
     from coview_stream.training.networks import encoder, export
     from coview_stream.training.training import train
 

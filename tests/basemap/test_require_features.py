@@ -19,7 +19,7 @@ from coview_stream.descriptors.network import CARD, VIEW_NAMES, Network, file_sh
 from coview_stream.doctor.map_checks import node_memory, site_findings
 from coview_stream.errors import ConfigError, CoViewError, InputError, TransportError
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.search.recognizers import Knowledge
+from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.stream.node import serve
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine
 from coview_stream.stream.transport.keys import robot_keys
@@ -95,7 +95,7 @@ def judged(base_map, text):
     with pytest.raises(type(caught.value)):
         Localizer(base_map, LocalizerConfig(reloc="learned"))
     with pytest.warns(UserWarning, match="going without") as warned:
-        known = Knowledge.of(base_map, LocalizerConfig())
+        known = SearchIndex.of(base_map, LocalizerConfig())
     assert len(warned) == 1
     assert known.learned is None
     assert known.retrieval is not None
@@ -120,9 +120,9 @@ def test_features_that_are_damaged(learned_map, weights):
 def test_all_is_well(learned_map, world_map, weights):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert Knowledge.of(learned_map, LocalizerConfig()).learned is not None
-        assert Knowledge.of(learned_map, LocalizerConfig(reloc="coview")).learned is None
-        assert Knowledge.of(world_map, LocalizerConfig()).learned is None
+        assert SearchIndex.of(learned_map, LocalizerConfig()).learned is not None
+        assert SearchIndex.of(learned_map, LocalizerConfig(reloc="coview")).learned is None
+        assert SearchIndex.of(world_map, LocalizerConfig()).learned is None
     for base_map, text in ((learned_map, "of the installed networks"), (world_map, "none")):
         assert check_reloc(base_map, "auto") is None
         (finding,) = [f for f in site_findings(base_map, int(1e6), None) if f.what == "map features"]

@@ -7,12 +7,12 @@ from bench.forest.chains import APART, chosen, of_places, of_volume
 from bench.forest.scale import CUT, home, repeated, scale_table
 from coview_stream.geometry.transforms import pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.request import SearchRequest
 
 
 def query_at(xyz):
     none = np.empty((0, 3), dtype=np.float32)
-    return Query(0.0, pose_from(rot_z(0.2), xyz), none, none, none, 0.0)
+    return SearchRequest(0.0, pose_from(rot_z(0.2), xyz), none, none, none, 0.0)
 
 
 def test_tiles_are_repeated_in_both_directions():

@@ -8,7 +8,7 @@ import pytest
 
 from coview_stream.cli import main, serve
 from coview_stream.errors import CoViewError
-from coview_stream.stream.node.engine_process import ProcessLane
+from coview_stream.stream.node.engine_process import EngineProcess
 
 
 def test_locate_says_at_once_what_is_missing(world_file, tmp_path, monkeypatch, capsys):
@@ -31,7 +31,7 @@ def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
 def test_it_travels_to_a_lanes_process(world_file):
     """Which refuses what is no method."""
     wrong = {"registration": "guesswork"}
-    lane = ProcessLane("track", str(world_file), "0" * 64, **wrong)
+    lane = EngineProcess("track", str(world_file), "0" * 64, **wrong)
     try:
         lane.start()
         with pytest.raises(CoViewError, match="'guesswork'"):

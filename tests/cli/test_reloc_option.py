@@ -14,7 +14,7 @@ from coview_stream.descriptors.network import network
 from coview_stream.errors import CoViewError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.acceptance import BY_FEATURES
-from coview_stream.stream.node.engine_process import ProcessLane
+from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.node.jobs import SearchJob
 
 
@@ -43,7 +43,7 @@ def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
 
 def test_it_travels_to_a_lanes_process(world_file):
     """Which refuses what is none."""
-    lane = ProcessLane("search", str(world_file), "0" * 64, reloc="guesswork")
+    lane = EngineProcess("search", str(world_file), "0" * 64, reloc="guesswork")
     try:
         lane.start()
         with pytest.raises(CoViewError, match="'guesswork'"):
@@ -56,7 +56,7 @@ def test_a_search_in_its_own_process_uses_them(learned_file, world_drive):
     base_map = BaseMap.load(learned_file)
     localizer = Localizer(base_map, LocalizerConfig(reloc="learned"))
     query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
-    lane = ProcessLane("search", str(learned_file), base_map.sha256, reloc="learned")
+    lane = EngineProcess("search", str(learned_file), base_map.sha256, reloc="learned")
     try:
         lane.start()
         lane.wait_ready()

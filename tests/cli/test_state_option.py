@@ -10,7 +10,7 @@ import pytest
 from coview_stream.cli import main, serve
 from coview_stream.cli import options as state
 from coview_stream.stream.node import serve as opening
-from coview_stream.stream.node.engine_process import ProcessLane
+from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import FakeTransport
@@ -91,7 +91,7 @@ def test_the_node_runs_it_beside_its_clocks(monkeypatch, world_file, tmp_path, k
     monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: FakeTransport())
     monkeypatch.setattr(opening, "warn_of_others", lambda *args: None)
     for name in ("start", "wait_ready", "close"):
-        monkeypatch.setattr(ProcessLane, name, lambda self, *args: None)
+        monkeypatch.setattr(EngineProcess, name, lambda self, *args: None)
     options = opening.ServeOptions(
         world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None
     )

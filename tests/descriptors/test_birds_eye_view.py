@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, SLABS, bird_view
+from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, SLABS, birds_eye_view
 
 SHAPE = (128, 128)
 CORNER = np.array([-32.0, -32.0])
@@ -33,7 +33,7 @@ def cell_of(x: float, y: float) -> tuple[int, int]:
 def test_pole_stands_in_its_cell_and_layers_whatever_the_slope(slope: tuple[float, float]) -> None:
     x, y = 10.1, -4.9
     base = slope[0] * x + slope[1] * y
-    image = bird_view(np.concatenate([ground(slope), pole(x, y, base, 0.5, 7.0)]), CORNER, SHAPE)
+    image = birds_eye_view(np.concatenate([ground(slope), pole(x, y, base, 0.5, 7.0)]), CORNER, SHAPE)
     row, column = cell_of(x, y)
     filled = [k for k, bounds in enumerate(pairwise(SLABS)) if bounds[1] <= 7.0]
     assert all(image[k, row, column] >= 200 for k in filled)
@@ -45,7 +45,10 @@ def test_pole_stands_in_its_cell_and_layers_whatever_the_slope(slope: tuple[floa
 
 def test_how_often_a_place_was_hit_does_not_matter() -> None:
     cloud = np.concatenate([ground(), pole(3.1, 3.1, 0.0, 0.5, 9.0)])
-    once, often = bird_view(cloud, CORNER, SHAPE), bird_view(np.repeat(cloud, 5, axis=0), CORNER, SHAPE)
+    once, often = (
+        birds_eye_view(cloud, CORNER, SHAPE),
+        birds_eye_view(np.repeat(cloud, 5, axis=0), CORNER, SHAPE),
+    )
     assert np.array_equal(once[:SEEN], often[:SEEN])
 
 
@@ -53,7 +56,7 @@ def test_edge_of_a_roof_is_high_above_the_ground_beside_it() -> None:
     cloud = ground()
     roof = (np.abs(cloud[:, 0]) < 8) & (np.abs(cloud[:, 1]) < 6)
     cloud[roof, 2] = 6.0
-    image = bird_view(cloud, CORNER, SHAPE)
+    image = birds_eye_view(cloud, CORNER, SHAPE)
     row, column = cell_of(0.1, 5.6)
     assert image[TOP, row, column] > 4.0 / SLABS[-1] * 255
     assert image[SEEN, row, column] == 0
@@ -64,22 +67,22 @@ def test_edge_of_a_roof_is_high_above_the_ground_beside_it() -> None:
 
 def test_relief_rises_over_a_ridge_and_not_over_a_slope() -> None:
     cloud = ground((0.25, 0.0))
-    plain = bird_view(cloud, CORNER, SHAPE)[RELIEF].astype(int)
+    plain = birds_eye_view(cloud, CORNER, SHAPE)[RELIEF].astype(int)
     middle = slice(40, 88)
     assert np.abs(plain[middle, middle] - 128).max() < 12
     cloud[:, 2] += 1.5 * np.exp(-((cloud[:, 1] / 4.0) ** 2))
-    ridge = bird_view(cloud, CORNER, SHAPE)[RELIEF].astype(int)
+    ridge = birds_eye_view(cloud, CORNER, SHAPE)[RELIEF].astype(int)
     assert ridge[64, middle].mean() > 128 + 30
     assert ridge[64 + 24, middle].mean() < 128
 
 
 def test_points_outside_are_ignored_and_nothing_is_nothing() -> None:
-    empty = bird_view(np.empty((0, 3), dtype=np.float32), CORNER, SHAPE)
+    empty = birds_eye_view(np.empty((0, 3), dtype=np.float32), CORNER, SHAPE)
     assert empty.shape == (LAYERS, *SHAPE)
     assert not empty[:RELIEF].any()
     assert (empty[RELIEF] == 128).all()
     far = np.array([[100.0, 0.0, 1.0], [0.0, -33.0, 1.0]], dtype=np.float32)
     cloud = ground()
     assert np.array_equal(
-        bird_view(np.concatenate([cloud, far]), CORNER, SHAPE), bird_view(cloud, CORNER, SHAPE)
+        birds_eye_view(np.concatenate([cloud, far]), CORNER, SHAPE), birds_eye_view(cloud, CORNER, SHAPE)
     )

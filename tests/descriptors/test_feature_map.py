@@ -11,10 +11,10 @@ from coview_stream.descriptors.feature_build import feature_arrays
 from coview_stream.descriptors.feature_map import (
     TILE,
     FeatureMap,
-    packed,
-    packed_sigma,
-    unpacked,
-    unpacked_sigma,
+    dequantized,
+    dequantized_sigma,
+    quantized,
+    quantized_sigma,
 )
 from coview_stream.descriptors.network import Features, network
 from coview_stream.errors import MapError
@@ -56,10 +56,10 @@ def by_place(arrays):
 
 def test_bytes_hold_vectors_and_sigmas():
     vectors = np.linspace(-1.0, 1.0, 501, dtype=np.float32)
-    assert np.abs(unpacked(packed(vectors)) - vectors).max() <= 0.5 / 127 + 1e-6
+    assert np.abs(dequantized(quantized(vectors)) - vectors).max() <= 0.5 / 127 + 1e-6
     sigma = np.geomspace(0.02, 50.0, 300).astype(np.float32)
-    assert np.abs(np.log(unpacked_sigma(packed_sigma(sigma)) / sigma)).max() < 0.016
-    beyond = unpacked_sigma(packed_sigma(np.array([1e-6, 1e6], dtype=np.float32)))
+    assert np.abs(np.log(dequantized_sigma(quantized_sigma(sigma)) / sigma)).max() < 0.016
+    beyond = dequantized_sigma(quantized_sigma(np.array([1e-6, 1e6], dtype=np.float32)))
     np.testing.assert_allclose(beyond, [0.02, 50.0], rtol=1e-5)
 
 
@@ -147,7 +147,7 @@ def test_coarse_cells_are_means(features, cell):
 
 
 def test_places_are_of_unit_norm_and_lie_in_the_map(points, features):
-    assert np.abs(np.linalg.norm(unpacked(features.place), axis=1) - 1.0).max() < 0.05
+    assert np.abs(np.linalg.norm(dequantized(features.place), axis=1) - 1.0).max() < 0.05
     assert len(features.place) == len(np.unique(features.place_at, axis=0))
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     assert ((features.place_at > low - 8.0) & (features.place_at < high + 8.0)).all()

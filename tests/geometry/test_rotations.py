@@ -3,12 +3,12 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from coview_stream.geometry.rotations import (
-    between,
     exp_so3,
     log_so3,
-    matrices,
+    matrix_to_quat,
     nearest_rotation,
-    quaternions,
+    quat_to_matrix,
+    slerp,
 )
 
 RNG = np.random.default_rng(3)
@@ -34,15 +34,15 @@ def test_exponential_is_scipys():
 
 def test_quaternions_and_back():
     R = Rotation.from_rotvec(VECTORS).as_matrix()
-    q = quaternions(R)
+    q = matrix_to_quat(R)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-15)
     theirs = Rotation.from_matrix(R).as_quat()
     np.testing.assert_allclose(np.abs((q * theirs).sum(axis=1)), 1.0, atol=1e-14)
-    np.testing.assert_allclose(matrices(q), R, atol=1e-14)
-    np.testing.assert_allclose(matrices(-7.0 * q), R, atol=1e-14)
-    np.testing.assert_array_equal(quaternions(R[0]), q[0])
-    assert quaternions(R[:0]).shape == (0, 4)
-    assert matrices(np.empty((0, 4))).shape == (0, 3, 3)
+    np.testing.assert_allclose(quat_to_matrix(q), R, atol=1e-14)
+    np.testing.assert_allclose(quat_to_matrix(-7.0 * q), R, atol=1e-14)
+    np.testing.assert_array_equal(matrix_to_quat(R[0]), q[0])
+    assert matrix_to_quat(R[:0]).shape == (0, 4)
+    assert quat_to_matrix(np.empty((0, 4))).shape == (0, 3, 3)
 
 
 def test_the_logarithm_is_scipys():
@@ -54,13 +54,13 @@ def test_the_logarithm_is_scipys():
 def test_the_way_between_is_slerp():
     R = Rotation.from_rotvec(VECTORS[:270]).as_matrix()
     start, end, share = R[:-1], R[1:], RNG.random(len(R) - 1)
-    found = between(start, end, share)
+    found = slerp(start, end, share)
     for k in range(len(start)):
         path = Slerp([0.0, 1.0], Rotation.from_matrix(R[k : k + 2]))
         np.testing.assert_allclose(found[k], path(share[k]).as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(between(start, end, np.zeros(len(start))), start, atol=1e-15)
-    np.testing.assert_allclose(between(start, end, np.ones(len(start))), end, atol=1e-13)
-    np.testing.assert_allclose(between(start[3], end[3], 0.25), between(start[3:4], end[3:4], [0.25])[0])
+    np.testing.assert_allclose(slerp(start, end, np.zeros(len(start))), start, atol=1e-15)
+    np.testing.assert_allclose(slerp(start, end, np.ones(len(start))), end, atol=1e-13)
+    np.testing.assert_allclose(slerp(start[3], end[3], 0.25), slerp(start[3:4], end[3:4], [0.25])[0])
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-3])

@@ -12,10 +12,10 @@ from coview_stream.geometry.se3 import (
     adjoint,
     along_body,
     along_map,
+    boxminus,
+    boxplus,
     checked_covariance,
     checked_pose,
-    difference,
-    shifted,
 )
 from coview_stream.geometry.transforms import pose_from
 
@@ -42,7 +42,7 @@ def test_a_covariance_along_the_bodys_axes_is_that_of_the_same_motions():
     """Samples drawn in the body's tangent scatter along the map's axes as the converted covariance says."""
     body = random_covariance()
     draws = np.random.default_rng(1).multivariate_normal(np.zeros(6), body, 20_000)
-    gaps = np.array([difference(T @ exp_se3(xi), T) for xi in draws[:4000]])
+    gaps = np.array([boxminus(T @ exp_se3(xi), T) for xi in draws[:4000]])
     predicted = along_map(body, T)
     sigma = np.sqrt(np.diag(predicted))
     np.testing.assert_allclose(
@@ -69,7 +69,7 @@ def test_gtsams_tangent_is_the_bodys():
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 2.5, np.pi - 1e-6])
 def test_difference_and_shift_undo_each_other(angle):
     step = np.array([0.0, 0.6 * angle, -0.8 * angle, 1.0, 2.0, -3.0])
-    np.testing.assert_allclose(difference(shifted(T, step), T), step, atol=1e-9)
+    np.testing.assert_allclose(boxminus(boxplus(T, step), T), step, atol=1e-9)
 
 
 def test_the_adjoint_moves_an_increment_to_the_other_side():

@@ -94,9 +94,9 @@ def test_what_is_a_pose():
 def test_lengths_are_those_of_numpy_and_leave_the_points_alone(dtype):
     points = np.random.default_rng(1).normal(0, 30, (500, 3)).astype(dtype)
     before, origin = points.copy(), np.array([3.0, -2.0, 1.0], dtype)
-    found = g.lengths(points), g.lengths(points, origin)
+    found = g.norms(points), g.norms(points, origin)
     assert found[0].dtype == found[1].dtype == dtype
     np.testing.assert_allclose(found[0], np.linalg.norm(points, axis=1), rtol=1e-6)
     np.testing.assert_allclose(found[1], np.linalg.norm(points - origin, axis=1), rtol=1e-6)
     np.testing.assert_array_equal(points, before)
-    assert g.lengths(points[:0]).shape == (0,)
+    assert g.norms(points[:0]).shape == (0,)

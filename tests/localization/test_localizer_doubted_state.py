@@ -12,7 +12,7 @@ from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import State
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.monitor import RejectionReason
 
 RULE = AcceptanceConfig()
 
@@ -50,7 +50,11 @@ def test_while_the_newest_registration_is_doubtful_there_is_no_pose(found, world
     assert doubtful.drift is None
     assert doubtful.confidence == 0.0
     assert doubtful.evidence.score < RULE.keep_score
-    assert doubtful.evidence.cause in (Cause.GROUND, Cause.FITNESS, Cause.FREE_SPACE)
+    assert doubtful.evidence.cause in (
+        RejectionReason.GROUND,
+        RejectionReason.FITNESS,
+        RejectionReason.FREE_SPACE,
+    )
     known = found.step(world_drive.clouds[6], world_drive.T_odom_body[6], 3.0)
     assert known.state is State.TRACKING
     assert right(known, world_drive.T_map_body[6])
@@ -69,13 +73,13 @@ def test_doubt_is_looked_into_without_driving_on(found, world_drive):
 
 def test_what_a_registration_says_is_told(found, world_drive):
     fix = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 2.5)
-    assert fix.evidence.cause is Cause.VERIFIED
+    assert fix.evidence.cause is RejectionReason.VERIFIED
     assert fix.evidence.reason == "verified"
     assert 0.0 < fix.evidence.innovation < RULE.keep_innovation
     assert fix.evidence.stamp == 2.5
     assert fix.drift is not None
     doubtful = found.step(garbage(), world_drive.T_odom_body[6], 3.0)
-    assert doubtful.evidence.cause is not Cause.VERIFIED
+    assert doubtful.evidence.cause is not RejectionReason.VERIFIED
     assert doubtful.evidence.reason != "verified"
 
 
@@ -109,7 +113,7 @@ def test_odometry_that_starts_anew_far_away_is_lost_and_found(found, world_drive
     anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
     fixes = [found.step(anew.clouds[0], anew.T_odom_body[0], 3.0 + k) for k in range(12)]
     assert all(fix.T_map_body is None for fix in fixes)
-    assert fixes[0].evidence.cause is Cause.OFF_MAP
+    assert fixes[0].evidence.cause is RejectionReason.OFF_MAP
     states = [fix.state for fix in fixes]
     assert states.index(State.LOST) == round(RULE.patience_seconds)
     again = follow(found, anew, range(1, 5), 15.0)
@@ -133,7 +137,11 @@ def test_carried_between_two_frames_there_is_no_wrong_pose_at_all(world_map, wor
     lost = [fix for fix in fixes if fix.state is State.LOST]
     assert lost
     assert f"{RULE.patience} registrations rejected" in lost[0].evidence.reason
-    assert lost[0].evidence.cause in (Cause.FITNESS, Cause.FREE_SPACE, Cause.GROUND)
+    assert lost[0].evidence.cause in (
+        RejectionReason.FITNESS,
+        RejectionReason.FREE_SPACE,
+        RejectionReason.GROUND,
+    )
     assert went[-1].state is State.TRACKING
 
 
@@ -164,7 +172,7 @@ def test_wheels_stand_while_the_robot_moves_and_no_pose_is_far_off(world_map, sl
     assert len(fixes) > 8
     for fix, T in zip(fixes, truth[begin:], strict=True):
         assert fix.T_map_body is None or pose_error(fix.T_map_body, T)[0] < 0.3
-    assert any(fix.evidence.cause is Cause.ODOMETRY for fix in fixes)
+    assert any(fix.evidence.cause is RejectionReason.ODOMETRY for fix in fixes)
     assert fixes[-1].T_map_body is None
     # it is set down: the lidar has followed it all the way
     still = localizer.step(clouds[-1], slow_drive.T_odom_body[begin - 1], 0.1 * len(clouds) + 0.1)
@@ -185,7 +193,7 @@ def test_a_covered_sensor_costs_the_pose_and_in_the_end_the_place_which_is_found
     seconds = np.arange(2.5, 2.5 + RULE.patience_blind + 2.0, 1.0)
     fixes = [found.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
     assert all(fix.T_map_body is None for fix in fixes)
-    assert fixes[0].evidence.cause is Cause.BLIND
+    assert fixes[0].evidence.cause is RejectionReason.BLIND
     blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.patience_blind]
     assert {fix.state for fix in blind} == {State.AMBIGUOUS}
     assert fixes[-1].state is State.LOST
@@ -216,7 +224,7 @@ def test_driving_on_with_a_covered_sensor_is_no_tracking(found, world_drive):
     """What was seen before is no evidence of where the robot is now."""
     first = found.step(covered(0), world_drive.T_odom_body[5], 2.5)
     assert first.state is State.AMBIGUOUS
-    assert first.evidence.cause is Cause.BLIND
+    assert first.evidence.cause is RejectionReason.BLIND
     assert found.step(covered(1), world_drive.T_odom_body[6], 3.0).T_map_body is None
     known = found.step(world_drive.clouds[7], world_drive.T_odom_body[7], 3.5)
     assert right(known, world_drive.T_map_body[7])
@@ -234,7 +242,7 @@ def test_beyond_the_edge_of_the_map_there_is_no_pose_and_back_on_it_there_is(wor
         assert fix.T_map_body is None or right(fix, out.T_map_body[k], 0.15)
         if out.T_map_body[k][0, 3] > small_world.HALF + 25.0:
             assert fix.T_map_body is None
-    assert any(fix.evidence.cause is Cause.OFF_MAP for fix in fixes)
+    assert any(fix.evidence.cause is RejectionReason.OFF_MAP for fix in fixes)
     assert any(fix.state is State.LOST for fix in fixes)
     assert fixes[-1].state is State.TRACKING
 

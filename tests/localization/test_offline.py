@@ -15,7 +15,7 @@ from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config import AcceptanceConfig, LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
-from coview_stream.localization.offline import Located, locate, summary, write
+from coview_stream.localization.offline import RunResult, locate, summary, write
 from coview_stream.localization.result import Fix, State
 from coview_stream.recordings.open_run import open_run
 
@@ -78,7 +78,7 @@ def test_the_summary_says_state_place_and_time(located):
     assert "TRACKING" in text
     assert f"{len(located.posed)} of 7 frames" in text
     assert "step time" in text
-    nothing = Located(3, [Fix(0.0, State.SEARCHING)], skipped=["000001.ply: empty"])
+    nothing = RunResult(3, [Fix(0.0, State.SEARCHING)], skipped=["000001.ply: empty"])
     assert "0 of 3 frames" in summary(nothing)
     assert "000001.ply: empty" in summary(nothing)
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from coview_stream.localization.result import KeyframeEvidence, State
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.monitor import RejectionReason
 
 
-@pytest.mark.parametrize("cause", [None, *Cause])
+@pytest.mark.parametrize("cause", [None, *RejectionReason])
 def test_evidence_is_read_back_as_it_was_written(world_fixes, cause):
     known = world_fixes[-1].evidence
     rounded = replace(
@@ -31,7 +31,7 @@ def test_evidence_of_an_earlier_version_can_be_read(world_fixes):
     data = world_fixes[0].evidence.to_json()
     del data["cause"], data["innovation"]
     assert KeyframeEvidence.from_json(data).cause is None
-    blind = KeyframeEvidence(1.5, State.TRACKING, "only 3 points to register", cause=Cause.BLIND)
+    blind = KeyframeEvidence(1.5, State.TRACKING, "only 3 points to register", cause=RejectionReason.BLIND)
     short = {key: value for key, value in blind.to_json().items() if value is not None}
     assert "near" not in short
     assert KeyframeEvidence.from_json(short | {"station": None, "shift": None}) == blind

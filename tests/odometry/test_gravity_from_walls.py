@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.odometry.gravity import upright
+from coview_stream.odometry.gravity import gravity_from_walls
 
 TRUE = np.array([0.05, -0.03, 1.0]) / np.linalg.norm([0.05, -0.03, 1.0])
 
@@ -29,7 +29,7 @@ GROUND = np.array([-0.03, 0.02, 1.0]) / np.linalg.norm([-0.03, 0.02, 1.0])  # th
 
 def test_two_walls_correct_a_slope():
     cloud = np.concatenate([wall(np.array([1.0, 0, 0]), 8.0), wall(np.array([0, 1.0, 0]), -9.0)])
-    up, count = upright(cloud, GROUND)
+    up, count = gravity_from_walls(cloud, GROUND)
     assert lean(GROUND) > 5
     assert lean(up) < 0.3
     assert count > 15
@@ -37,23 +37,23 @@ def test_two_walls_correct_a_slope():
 
 
 def test_one_wall_corrects_across_it_and_leaves_the_rest():
-    up, _ = upright(wall(np.array([1.0, 0, 0]), 8.0), GROUND)
+    up, _ = gravity_from_walls(wall(np.array([1.0, 0, 0]), 8.0), GROUND)
     assert abs(up[0] - TRUE[0]) < 0.01
     assert abs(up[1] - GROUND[1]) < 0.01
 
 
 def test_without_walls_nothing_changes():
     flat = np.random.default_rng(0).uniform([-20, -20, -1.7], [20, 20, -1.69], (5000, 3))
-    up, count = upright(flat, GROUND)
+    up, count = gravity_from_walls(flat, GROUND)
     assert np.allclose(up, GROUND)
     assert count == 0
-    assert np.allclose(upright(np.empty((0, 3)), GROUND)[0], GROUND)
+    assert np.allclose(gravity_from_walls(np.empty((0, 3)), GROUND)[0], GROUND)
 
 
 def test_what_leans_is_outvoted():
     cloud = [wall(np.array([1.0, 0, 0]), 8.0), wall(np.array([0, 1.0, 0]), -9.0)]
     cloud.append(wall(np.array([1.0, 0, 0.2]), -8.0)[:600] @ _turn(10.0))
-    up, _ = upright(np.concatenate(cloud), GROUND)
+    up, _ = gravity_from_walls(np.concatenate(cloud), GROUND)
     assert lean(up) < 0.6
 
 

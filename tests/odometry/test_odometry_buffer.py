@@ -13,9 +13,9 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.messages.types import OdometryMessage
-from coview_stream.odometry.buffer import Intake, OdometryBuffer
+from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 
-STRAYS = (Intake.OUT_OF_ORDER, Intake.DUPLICATE)
+STRAYS = (SampleKind.OUT_OF_ORDER, SampleKind.DUPLICATE)
 
 
 def buffer(*samples, **limits):
@@ -76,7 +76,7 @@ def test_nothing_is_interpolated_across_a_gap():
 
 def test_steady_samples_continue():
     odometry = buffer()
-    assert set(steady(odometry, 0.0, 2.0)) == {Intake.CONTINUES}
+    assert set(steady(odometry, 0.0, 2.0)) == {SampleKind.CONTINUES}
     assert odometry.newest.stamp_ns == ns(2.0)
     assert odometry.arrived == 2.0
     assert odometry.travelled == pytest.approx(4.0)
@@ -92,11 +92,11 @@ def test_turns_add_up_whatever_their_sense():
 @pytest.mark.parametrize(
     ("pause", "intake"),
     [
-        (0.5, Intake.CONTINUES),
-        (0.51, Intake.GAP),
-        (1.9, Intake.GAP),
-        (2.1, Intake.OUTAGE),
-        (4.9, Intake.OUTAGE),
+        (0.5, SampleKind.CONTINUES),
+        (0.51, SampleKind.GAP),
+        (1.9, SampleKind.GAP),
+        (2.1, SampleKind.OUTAGE),
+        (4.9, SampleKind.OUTAGE),
     ],
 )
 def test_a_pause_of_the_stamps_is_a_gap(pause, intake):
@@ -107,34 +107,38 @@ def test_a_pause_of_the_stamps_is_a_gap(pause, intake):
 
 def test_a_long_pause_in_both_clocks_is_an_outage():
     odometry = buffer((1.0, 0.0))
-    assert odometry.add(message(601.0, 0.0), 601.0) is Intake.OUTAGE
+    assert odometry.add(message(601.0, 0.0), 601.0) is SampleKind.OUTAGE
     assert odometry.covers(ns(1.0)) == -1
 
 
 def test_a_duplicate_leaves_no_trace():
     odometry = buffer((0.0, 0.0), (0.1, 0.1))
-    assert odometry.add(message(0.1, 0.7), 0.4) is Intake.DUPLICATE
+    assert odometry.add(message(0.1, 0.7), 0.4) is SampleKind.DUPLICATE
     assert odometry.arrived == 0.1
     np.testing.assert_array_equal(odometry.at(ns(0.1)), pose(0.1))
 
 
 def test_an_older_sample_leaves_no_trace():
     odometry = buffer((0.0, 0.0), (0.2, 0.2))
-    assert odometry.add(message(0.1, 0.7), 0.25) is Intake.OUT_OF_ORDER
+    assert odometry.add(message(0.1, 0.7), 0.25) is SampleKind.OUT_OF_ORDER
     assert odometry.arrived == 0.2
     assert odometry.travelled == pytest.approx(0.2)
     np.testing.assert_allclose(odometry.at(ns(0.1)), pose(0.1), atol=1e-12)
-    assert odometry.add(message(0.3, 0.3), 0.3) is Intake.CONTINUES
+    assert odometry.add(message(0.3, 0.3), 0.3) is SampleKind.CONTINUES
 
 
 @pytest.mark.parametrize(
     ("x", "yaw", "intake"),
     [
-        (0.95, 0.0, Intake.CONTINUES),
-        (1.05, 0.0, Intake.JUMP),
-        (-1.05, 0.0, Intake.JUMP),
-        (0.0, np.radians(23), Intake.JUMP),  # 20 rad/s for 10 ms are 11 degrees, and 20 are always allowed
-        (0.0, np.radians(19), Intake.CONTINUES),
+        (0.95, 0.0, SampleKind.CONTINUES),
+        (1.05, 0.0, SampleKind.JUMP),
+        (-1.05, 0.0, SampleKind.JUMP),
+        (
+            0.0,
+            np.radians(23),
+            SampleKind.JUMP,
+        ),  # 20 rad/s for 10 ms are 11 degrees, and 20 are always allowed
+        (0.0, np.radians(19), SampleKind.CONTINUES),
     ],
 )
 def test_farther_than_the_robot_can_have_come_is_a_jump(x, yaw, intake):
@@ -143,17 +147,17 @@ def test_farther_than_the_robot_can_have_come_is_a_jump(x, yaw, intake):
 
 
 def test_what_is_possible_grows_with_time():
-    assert buffer((0.0, 0.0)).add(message(0.1, 5.4), 0.1) is Intake.CONTINUES
-    assert buffer((0.0, 0.0)).add(message(0.1, 5.6), 0.1) is Intake.JUMP
-    assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 1.9), 0.1) is Intake.CONTINUES
-    assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 2.1), 0.1) is Intake.JUMP
+    assert buffer((0.0, 0.0)).add(message(0.1, 5.4), 0.1) is SampleKind.CONTINUES
+    assert buffer((0.0, 0.0)).add(message(0.1, 5.6), 0.1) is SampleKind.JUMP
+    assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 1.9), 0.1) is SampleKind.CONTINUES
+    assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 2.1), 0.1) is SampleKind.JUMP
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0])
 def test_what_is_possible_depends_on_what_the_robot_does(speed):
     """Half a metre, and three times its speed of the last seconds and three metres per second more."""
     most = 0.5 + 0.1 * (3.0 * speed + 3.0)
-    for off, intake in ((-0.05, Intake.CONTINUES), (0.05, Intake.JUMP)):
+    for off, intake in ((-0.05, SampleKind.CONTINUES), (0.05, SampleKind.JUMP)):
         odometry = buffer(*((0.1 * k, 0.1 * k * speed) for k in range(11)))
         fast = min(most, 0.5 + 0.1 * 50.0)
         assert odometry.add(message(1.1, speed + fast + off), 1.1) is intake
@@ -161,11 +165,11 @@ def test_what_is_possible_depends_on_what_the_robot_does(speed):
 
 def test_a_jump_forgets_what_was_before():
     odometry = buffer((0.0, 0.0), (0.1, 0.5))
-    assert odometry.add(message(0.2, 500.0), 0.2) is Intake.JUMP
+    assert odometry.add(message(0.2, 500.0), 0.2) is SampleKind.JUMP
     assert odometry.covers(ns(0.1)) == -1
     assert odometry.travelled == 0.0
     np.testing.assert_array_equal(odometry.at(ns(0.2)), pose(500.0))
-    assert odometry.add(message(0.3, 500.1), 0.3) is Intake.CONTINUES
+    assert odometry.add(message(0.3, 500.1), 0.3) is SampleKind.CONTINUES
 
 
 @pytest.mark.parametrize("stray", [3600.0, 1e9, -3600.0, -1e9, 8.0])
@@ -173,7 +177,7 @@ def test_one_stray_stamp_does_not_shut_out_what_follows(stray):
     odometry = buffer()
     steady(odometry, 0.0, 1.0)
     assert odometry.add(message(stray, 2.0), 1.01) in STRAYS
-    assert set(steady(odometry, 1.05, 3.0)) == {Intake.CONTINUES}
+    assert set(steady(odometry, 1.05, 3.0)) == {SampleKind.CONTINUES}
 
 
 def test_strays_that_come_again_and_again_are_no_clock_of_their_own():
@@ -181,8 +185,8 @@ def test_strays_that_come_again_and_again_are_no_clock_of_their_own():
     odometry = buffer()
     for k in range(100):
         t = 0.05 * k
-        assert odometry.add(message(t), t) is Intake.CONTINUES
-        assert odometry.add(message(t - 3600.0, 7.0), t + 0.01) is not Intake.RESTART
+        assert odometry.add(message(t), t) is SampleKind.CONTINUES
+        assert odometry.add(message(t - 3600.0, 7.0), t + 0.01) is not SampleKind.RESTART
 
 
 def test_a_clock_that_started_anew_is_believed_once_it_has_run_on():
@@ -191,10 +195,10 @@ def test_a_clock_that_started_anew_is_believed_once_it_has_run_on():
     verdicts = []
     for k in range(25):
         verdicts.append(odometry.add(message(1.0 + 0.05 * k, 0.1 * k), 101.05 + 0.05 * k))
-    at = verdicts.index(Intake.RESTART)
-    assert set(verdicts[:at]) == {Intake.OUT_OF_ORDER}
+    at = verdicts.index(SampleKind.RESTART)
+    assert set(verdicts[:at]) == {SampleKind.OUT_OF_ORDER}
     assert 20 <= at <= 21  # after a second, not before
-    assert set(verdicts[at + 1 :]) == {Intake.CONTINUES}
+    assert set(verdicts[at + 1 :]) == {SampleKind.CONTINUES}
     assert odometry.covers(ns(100.5)) == 1  # the old clock's samples are gone
     assert odometry.newest.stamp_ns == ns(2.2)
 
@@ -202,17 +206,17 @@ def test_a_clock_that_started_anew_is_believed_once_it_has_run_on():
 def test_a_slow_clock_needs_five_samples():
     odometry = buffer((100.0, 0.0))
     verdicts = [odometry.add(message(float(k), 0.0), 101.0 + k) for k in range(6)]
-    assert verdicts == [Intake.OUT_OF_ORDER] * 4 + [Intake.RESTART, Intake.GAP]
+    assert verdicts == [SampleKind.OUT_OF_ORDER] * 4 + [SampleKind.RESTART, SampleKind.GAP]
 
 
 def test_a_clock_set_forward_is_an_outage_once_it_has_run_on():
     odometry = buffer()
     steady(odometry, 0.0, 1.0)
     verdicts = [odometry.add(message(3600.0 + 0.05 * k, 2.0), 1.05 + 0.05 * k) for k in range(23)]
-    at = verdicts.index(Intake.OUTAGE)
-    assert set(verdicts[:at]) == {Intake.OUT_OF_ORDER}
+    at = verdicts.index(SampleKind.OUTAGE)
+    assert set(verdicts[:at]) == {SampleKind.OUT_OF_ORDER}
     assert 20 <= at <= 21
-    assert set(verdicts[at + 1 :]) == {Intake.CONTINUES}
+    assert set(verdicts[at + 1 :]) == {SampleKind.CONTINUES}
 
 
 def test_stamps_that_run_backwards_for_ever_are_no_restart():
@@ -277,7 +281,7 @@ def test_whatever_stamps_come_the_buffer_stays_in_order(samples):
             assert odometry.newest is newest
         else:
             assert odometry.newest.stamp_ns == ns(seconds)
-        if intake in (Intake.CONTINUES, Intake.GAP) and newest is not None:
+        if intake in (SampleKind.CONTINUES, SampleKind.GAP) and newest is not None:
             assert odometry.newest.stamp_ns > newest.stamp_ns
             assert odometry.travelled >= travelled
         travelled = odometry.travelled

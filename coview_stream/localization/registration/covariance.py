@@ -12,7 +12,7 @@ import numpy as np
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import InputError
-from coview_stream.geometry.se3 import Matrix6, Vector6, cross, difference, shifted
+from coview_stream.geometry.se3 import Matrix6, Vector6, boxminus, boxplus, cross
 from coview_stream.geometry.transforms import Pose
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
@@ -28,12 +28,12 @@ class Measured(NamedTuple):
     """(6, 6), positive semi-definite, before inflation."""
 
 
-def angles_first(covariance: Matrix6) -> Matrix6:
+def swap_rotation_translation(covariance: Matrix6) -> Matrix6:
     """(6, 6) over (x, y, z, roll, pitch, yaw) as over (rx, ry, rz, x, y, z), or the other way round."""
     return np.asarray(covariance[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)])
 
 
-def without_prior(
+def remove_prior(
     T_map_body: Pose,
     information: Matrix6,
     T_map_prior: Pose,
@@ -75,9 +75,9 @@ def without_prior(
     share, directions = np.linalg.eigh(half @ (0.5 * (alone + alone.T)) @ half.T)
     share = np.clip(share, 0.0, 1.0)
     back, spread = L @ directions, half.T @ directions
-    pull = told @ difference(T_map_body, T_map_prior)
+    pull = told @ boxminus(T_map_body, T_map_prior)
     step = spread @ (share / (share**2 + _LEAST_SHARE**2) * (spread.T @ pull))
-    return Measured(shifted(T_map_body, step), np.asarray((back * share) @ back.T))
+    return Measured(boxplus(T_map_body, step), np.asarray((back * share) @ back.T))
 
 
 def registration_covariance(information: Matrix6, config: RegistrationConfig) -> Matrix6:
@@ -112,7 +112,7 @@ def registration_covariance(information: Matrix6, config: RegistrationConfig) ->
     return np.asarray((spread * variance) @ spread.T + np.diag(floor))
 
 
-def carried_along(covariance: Matrix6, shift: Vector6) -> Matrix6:
+def propagate(covariance: Matrix6, shift: Vector6) -> Matrix6:
     """Covariance (6, 6) after a known motion by ``shift`` (3,), metres along the map's axes.
 
     An error in the heading at its beginning is one in the place at its end: s' = s + r x shift.

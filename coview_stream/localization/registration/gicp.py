@@ -34,10 +34,10 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.errors import extra
-from coview_stream.geometry.se3 import Matrix6, Vector6, cross, difference, shifted
+from coview_stream.errors import require_library
+from coview_stream.geometry.se3 import Matrix6, Vector6, boxminus, boxplus, cross
 from coview_stream.geometry.transforms import Points, Pose, orthonormal
-from coview_stream.localization.registration.result import LEAST_PAIRS, Registration
+from coview_stream.localization.registration.result import MIN_PAIRS, Registration
 
 _NEIGHBOURS = 10  # that a point's covariance is made of; small_gicp's own choice
 
@@ -74,7 +74,7 @@ class Surfaces(NamedTuple):
 
 def library() -> Any:
     """Return the module ``small_gicp``; DependencyError where it is missing."""
-    return extra("small_gicp", "small-gicp>=1.0.1", "registration by GICP")
+    return require_library("small_gicp", "small-gicp>=1.0.1", "registration by GICP")
 
 
 def surfaces(points: Points) -> Surfaces | None:
@@ -132,7 +132,7 @@ def register_surfaces(
             if pairs is None:
                 return None
             step, information = fused_step(pairs.information, pairs.gradient, T, pivot, prior)
-            T = moved(T, step, pivot)
+            T = retract(T, step, pivot)
             if not np.isfinite(T).all():
                 return None
             total += 1
@@ -182,12 +182,12 @@ def _pairs(
         off = np.einsum("ij,ij->i", gap, normals[partner[near]])
         share = min(0.5 * points / len(near), _MOST_SHARE)
         turned, slope = about_pivot(answer.H, answer.b, T, pivot)
-        pull, drag = pulls(there, gap, about)
+        pull, drag = point_to_point_system(there, gap, about)
         H = H + share * _INFORMATION * (turned - _ALONG * pull)
         b = b + share * _INFORMATION * (slope - _ALONG * drag)
         kept += len(near)
         squares, weights = squares + share * float(off @ off), weights + share * len(near)
-    return _Pairs(H, b, kept, float(np.sqrt(squares / weights))) if kept >= LEAST_PAIRS else None
+    return _Pairs(H, b, kept, float(np.sqrt(squares / weights))) if kept >= MIN_PAIRS else None
 
 
 _TINY = 1e-6  # information: keeps what has none solvable
@@ -217,16 +217,16 @@ def fused_step(
 ) -> tuple[Vector6, Matrix6]:
     """Gauss-Newton's step (6,) to the most probable pose by pairs and prior, and the information of both (6, 6)."""
     if prior is not None:
-        away = difference(_with_pivot(T, pivot), _with_pivot(prior.mean, pivot))
+        away = boxminus(_with_pivot(T, pivot), _with_pivot(prior.mean, pivot))
         belief = np.asarray(prior.information, dtype=np.float64)
         information, gradient = information + belief, gradient + belief @ away
     step = -np.linalg.solve(information + _TINY * np.eye(6), gradient)
     return np.asarray(step, dtype=np.float64), information
 
 
-def moved(T: Pose, step: Vector6, pivot: npt.NDArray[np.float64]) -> Pose:
+def retract(T: Pose, step: Vector6, pivot: npt.NDArray[np.float64]) -> Pose:
     """Return the pose turned about its moved pivot and shifted, by ``step`` (6,) along the map's axes."""
-    there = shifted(_with_pivot(T, pivot), step)
+    there = boxplus(_with_pivot(T, pivot), step)
     there[:3, 3] -= there[:3, :3] @ pivot
     return there
 
@@ -237,7 +237,7 @@ def _with_pivot(T: npt.ArrayLike, pivot: npt.NDArray[np.float64]) -> Pose:
     return there
 
 
-def pulls(
+def point_to_point_system(
     moved_points: npt.NDArray[np.float64], gap: npt.NDArray[np.float64], about: npt.NDArray[np.float64]
 ) -> tuple[Matrix6, Vector6]:
     """Hessian and gradient of |gap|^2 / 2 of pairs: points (N, 3) in the map, gaps (N, 3), the moved pivot (3,)."""

@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationMethod
-from coview_stream.geometry.rasters import highest_around, lowest_around
+from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
-from coview_stream.localization.registration.result import LEAST_PAIRS
+from coview_stream.localization.registration.result import MIN_PAIRS
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -41,7 +41,7 @@ _NOTHING = -1e6
 
 
 @dataclass(frozen=True)
-class EdgeRaster:
+class RoofEdges:
     """Height of the edges (H, W) of a map crop, metres; row along x, column along y from ``corner`` (2,)."""
 
     height: npt.NDArray[np.float32]
@@ -55,7 +55,7 @@ class EdgeRaster:
         return np.asarray(inside & (self.height[cells[:, 0], cells[:, 1]] > points[:, 2] - _SLACK))
 
 
-def edge_raster(points: Points) -> EdgeRaster:
+def roof_edges(points: Points) -> RoofEdges:
     """Edges of (K, 3) map points. Cells without points count as low: below a roof's edge there often are none."""
     corner = np.array([points[:, d].min() for d in range(2)], dtype=np.float64) - 2 * _CELL
     i, j = (np.floor((points[:, d] - corner[d]) / _CELL).astype(np.int64) for d in range(2))
@@ -63,8 +63,8 @@ def edge_raster(points: Points) -> EdgeRaster:
     flat = np.full(rows * columns, _NOTHING, dtype=np.float32)
     np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
     top = flat.reshape(rows, columns)
-    edge = np.where(top - lowest_around(top, _REACH) > _DROP, top, np.float32(_NOTHING))
-    return EdgeRaster(highest_around(edge, _OVERHANG), corner)
+    edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
+    return RoofEdges(max_filter(edge, _OVERHANG), corner)
 
 
 _CACHED_CROPS = 12
@@ -96,9 +96,9 @@ class LocalMap:
         return True
 
     @cached_property
-    def edges(self) -> EdgeRaster:
+    def edges(self) -> RoofEdges:
         """Where the map must have walls that it does not show."""
-        return edge_raster(self.points)
+        return roof_edges(self.points)
 
     @cached_property
     def surfaces(self) -> Surfaces | None:
@@ -123,7 +123,7 @@ class LocalMaps:
         if key not in self._crops:
             centre = np.array([key[0], key[1]]) * _CROP_STEP
             points, normals = self._map.crop(centre, self._radius + 0.75 * _CROP_STEP)
-            enough = len(points) >= LEAST_PAIRS
+            enough = len(points) >= MIN_PAIRS
             self._crops[key] = LocalMap(points, normals) if enough else None
             if len(self._crops) > self._most:
                 self._crops.popitem(last=False)
@@ -132,17 +132,17 @@ class LocalMaps:
 
 
 @dataclass(frozen=True)
-class Source:
+class RegistrationCloud:
     """Points (N, 3) float32 of a local scan, which of them stand above the ground, and how high (metres)."""
 
     points: Points
     above: npt.NDArray[np.bool_]
     height: npt.NDArray[np.float32]
 
-    def every(self, nth: int) -> Source:
+    def every(self, nth: int) -> RegistrationCloud:
         """Return a thinner scan: every ``nth`` point of each kind."""
         order = np.concatenate((np.flatnonzero(self.above), np.flatnonzero(~self.above)))[::nth]
-        return Source(self.points[order], self.above[order], self.height[order])
+        return RegistrationCloud(self.points[order], self.above[order], self.height[order])
 
     @cached_property
     def surfaces(self) -> list[Surfaces]:

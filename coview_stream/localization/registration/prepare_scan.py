@@ -7,9 +7,9 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig, RegistrationConfig
-from coview_stream.geometry.rasters import lowest_around
-from coview_stream.geometry.transforms import Points, Pose, lengths
-from coview_stream.localization.registration.local_map import Source
+from coview_stream.geometry.rasters import min_filter
+from coview_stream.geometry.transforms import Points, Pose, norms
+from coview_stream.localization.registration.local_map import RegistrationCloud
 
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
 
@@ -18,7 +18,9 @@ _CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, no
 _SEED = 20240
 
 
-def local_source(points: Points, position: npt.NDArray[np.float64], config: RegistrationConfig) -> Source:
+def prepare_scan(
+    points: Points, position: npt.NDArray[np.float64], config: RegistrationConfig
+) -> RegistrationCloud:
     """Thin a local scan to at most ``source_points`` points within ``source_range`` metres of ``position``.
 
     Args:
@@ -30,14 +32,14 @@ def local_source(points: Points, position: npt.NDArray[np.float64], config: Regi
         The thinned points and, for each, its height above the lowest ground nearby. The choice is random but
         seeded: equal input gives equal output.
     """
-    near = points.compress(lengths(points, position.astype(np.float32)) < config.source_range, axis=0)
+    near = points.compress(norms(points, position.astype(np.float32)) < config.source_range, axis=0)
     thin, _ = kernels.transform_unique(near, np.eye(4), config.source_voxel)
     height = height_above_lowest(thin)
     if len(thin) > config.source_points:
         chosen = np.random.default_rng(_SEED).choice(len(thin), config.source_points, replace=False)
         chosen.sort()
         thin, height = thin[chosen], height[chosen]
-    return Source(thin, height > _CLEAR, height)
+    return RegistrationCloud(thin, height > _CLEAR, height)
 
 
 def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
@@ -54,11 +56,11 @@ def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
     cell = i * columns + j
     lowest = np.full(rows * columns, np.inf, dtype=np.float32)
     np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
-    around = lowest_around(lowest.reshape(rows, columns), 3)
+    around = min_filter(lowest.reshape(rows, columns), 3)
     height: npt.NDArray[np.float32] = points[:, 2] - around.ravel()[cell]
     return height
 
 
-def thinned(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Points:
+def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Points:
     """Points (K, 3) of a frame (N, 3) in the odometry frame, one per voxel, without those near the sensor."""
     return kernels.transform_unique(cloud, T_odom_body, config.voxel, config.range_min)[0]

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.registration.local_map import LocalMap, Source
-from coview_stream.localization.registration.result import LEAST_PAIRS, Prior, Registration
+from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.result import MIN_PAIRS, Prior, Registration
 
 if TYPE_CHECKING:
     pass
@@ -29,7 +29,7 @@ _WIDTH_SHARE = 0.33  # of a scale, width of its weights: narrow ones from the st
 
 
 def register(
-    source: Source,
+    source: RegistrationCloud,
     T_map_source: Pose,
     target: LocalMap,
     config: RegistrationConfig,
@@ -75,14 +75,14 @@ def register(
         _stages(scales, config),
         keep=config.keep,
         iterations=iterations or config.iterations,
-        min_pairs=LEAST_PAIRS,
+        min_pairs=MIN_PAIRS,
         prior=belief,
     )
     return None if found is None else Registration(*found)
 
 
 def _by_gicp(
-    source: Source,
+    source: RegistrationCloud,
     T_map_source: Pose,
     target: LocalMap,
     config: RegistrationConfig,

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     pass
 
 
-LEAST_PAIRS = 50
+MIN_PAIRS = 50
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.geometry.transforms import Points, Pose, inverse, lengths, transform
-from coview_stream.localization.registration.local_map import LocalMap, Source
+from coview_stream.geometry.transforms import Points, Pose, inverse, norms, transform
+from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
 _STRUCTURE_HEIGHT = 1.0  # metres above the ground
 
@@ -64,7 +64,7 @@ class Evidence:
 
 
 def verify(
-    source: Source,
+    source: RegistrationCloud,
     T_map_source: Pose,
     seen: RangeImage,
     T_map_body: Pose,
@@ -91,7 +91,7 @@ def verify(
     covered = 0.0 if few else float((found | target.edges.above(moved[high])).mean())
     grounded = float(_on_surface(moved[low], partner[low], target).sum())
     ground = (grounded + 0.5 * _PSEUDO) / (float(low.sum()) + _PSEUDO)
-    met, passed = rays_against_map(seen, T_map_body, target.points)
+    met, passed = free_space(seen, T_map_body, target.points)
     free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
     return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)
 
@@ -149,7 +149,7 @@ class RangeImage:
     def of(cls, cloud: Points) -> RangeImage:
         """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
         cloud = cloud[:: max(1, -(-len(cloud) // _MOST_RAYS))]
-        ranges = lengths(cloud)
+        ranges = norms(cloud)
         usable = ranges > 1.0
         ranges = ranges[usable]
         cell = _beam_cells(cloud.compress(usable, axis=0), ranges)
@@ -160,7 +160,7 @@ class RangeImage:
         return cls(nearest, farthest, np.bincount(cell, minlength=_CELLS), _floor_below(cloud))
 
 
-def rays_against_map(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int, int]:
+def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int, int]:
     """How many map points the frame's rays met, and how many they passed through.
 
     A map point is passed through where every return in its 2-degree cell of the frame's range image lies clearly
@@ -176,7 +176,7 @@ def rays_against_map(seen: RangeImage, T_map_body: Pose, points: Points) -> tupl
     dx, dy = points[:, 0] - position[0], points[:, 1] - position[1]
     wanted = (dx * dx + dy * dy < _FREE_RANGE**2) & (points[:, 2] > position[2] + seen.floor + _FREE_HEIGHT)
     body = transform(inverse(T_map_body), points.compress(wanted, axis=0).astype(np.float64))
-    distance = lengths(body)
+    distance = norms(body)
     off = distance > 1.0
     body, distance = body.compress(off, axis=0), distance[off]
     cell = _beam_cells(body, distance)

@@ -9,14 +9,14 @@ from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.result import KeyframeEvidence, State
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.refinement import Candidate
-from coview_stream.localization.search.request import Query, same_place
+from coview_stream.localization.search.request import SearchRequest, same_place
 
 BY_FEATURES = " (by learned features)"
 """What an evidence's reason ends with where learned features have named the best hypothesis."""
 
 
 @dataclass(frozen=True)
-class Verdict:
+class SearchResult:
     """What one keyframe's search came to: the accepted candidate if any, why, and the query's book-keeping."""
 
     accepted: Candidate | None
@@ -25,7 +25,7 @@ class Verdict:
     generation: int = 0
 
 
-class Decision:
+class AcceptanceTest:
     """Judges keyframe by keyframe, and remembers the favourite and what has spoken for it."""
 
     def __init__(self, config: LocalizerConfig) -> None:
@@ -38,12 +38,12 @@ class Decision:
         self._confirmed = 0
         self._proof = 0.0
 
-    def judge(self, candidates: list[Candidate], query: Query, votes: int) -> Verdict:
+    def judge(self, candidates: list[Candidate], query: SearchRequest, votes: int) -> SearchResult:
         """Take in a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
         if not candidates:
             self.clear()
             reason = "no hypothesis fits the map" if votes else "too few points to search with"
-            return Verdict(None, KeyframeEvidence(query.stamp, State.SEARCHING, reason))
+            return SearchResult(None, KeyframeEvidence(query.stamp, State.SEARCHING, reason))
         best = candidates[0]
         here = [same_place(c.T_map_odom, best.T_map_odom, query) for c in candidates]
         rival = max(
@@ -65,7 +65,7 @@ class Decision:
             doubt += FROM_THERE
         elif best.hypothesis.learned:
             doubt += BY_FEATURES
-        return Verdict(
+        return SearchResult(
             best if state is State.TRACKING else None,
             KeyframeEvidence(
                 query.stamp, state, doubt, best.evidence.score, rival, best.evidence,
@@ -89,7 +89,9 @@ class Decision:
             return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
         return State.AMBIGUOUS, None
 
-    def _has_rivals(self, best: Candidate, candidates: list[Candidate], query: Query, votes: int) -> bool:
+    def _has_rivals(
+        self, best: Candidate, candidates: list[Candidate], query: SearchRequest, votes: int
+    ) -> bool:
         """Whether enough keyframes have voted for what else it might be; a place found by votes needs no more."""
         voted = any(
             c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, query)
@@ -114,7 +116,7 @@ class Decision:
         enough = self._confirmed >= rule.confirmations and self._proof >= rule.proof
         return State.TRACKING if enough else State.AMBIGUOUS, reason
 
-    def _agrees(self, best: Candidate, query: Query) -> bool:
+    def _agrees(self, best: Candidate, query: SearchRequest) -> bool:
         rule = self.config.acceptance
         return self._favourite is not None and same_place(
             best.T_map_odom, self._favourite.T_map_odom, query, rule.agree_distance, rule.agree_angle

@@ -49,7 +49,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class _Ballot:
+class _Vote:
     centre: npt.NDArray[np.float64]  # (3,) odometry frame, z on the ground
     votes: Values  # standardised distances (S, ...), spread over the grid
     smallest: float  # smallest raw distance of any channel, for the paper's single-minimum rule
@@ -64,7 +64,7 @@ class Consensus:
         self.config = config
         self.stations = stations
         self.grid = StationGrid(stations, block)
-        self._ballots: deque[_Ballot] = deque(maxlen=config.window)
+        self._ballots: deque[_Vote] = deque(maxlen=config.window)
 
     def __len__(self) -> int:
         """Return how many keyframes have voted."""
@@ -86,10 +86,10 @@ class Consensus:
         station, shift = np.unravel_index(int(best.argmin()), best.shape)
         votes = np.zeros_like(best)
         for volume in distances.values():
-            votes += standardised(volume)
+            votes += robust_zscore(volume)
         votes *= np.float32(1.0 / len(distances))
         spread = self.grid.spread(np.ascontiguousarray(votes.T))
-        ballot = _Ballot(centre, spread, float(best.min()), (int(station), int(shift)), best.shape[1])
+        ballot = _Vote(centre, spread, float(best.min()), (int(station), int(shift)), best.shape[1])
         self._ballots.append(ballot)
 
     def vote_nearest(
@@ -98,7 +98,7 @@ class Consensus:
         """Add what ``single`` makes of one keyframe: the nearest station of each channel, out of ``sectors`` shifts."""
         best = min(nearest.values(), key=lambda found: float(found.distance[0]))
         where = int(best.station[0]), int(best.shift[0])
-        self._ballots.append(_Ballot(centre, _NO_VOTES, float(best.distance[0]), where, sectors))
+        self._ballots.append(_Vote(centre, _NO_VOTES, float(best.distance[0]), where, sectors))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
@@ -127,7 +127,7 @@ class Consensus:
     def _peaks(self, scores: Volume, centre: npt.NDArray[np.float64]) -> list[Hypothesis]:
         stations, sectors = scores.shape
         flat = np.ascontiguousarray(scores.T).ravel()
-        shortlist = smallest(flat, _SHORTLIST)
+        shortlist = argsmallest(flat, _SHORTLIST)
         shift, station = np.divmod(shortlist, stations)
         xyz = self.stations[station].astype(np.float64)
         yaw = yaw_of_shift(shift, sectors)
@@ -155,7 +155,7 @@ def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> npt.NDArray[np.float64]:
     return np.asarray(shift, dtype=np.float64) * (-2.0 * np.pi / sectors)
 
 
-def standardised(volume: Volume) -> Volume:
+def robust_zscore(volume: Volume) -> Volume:
     """How many robust standard deviations each distance lies from the median of all, negative is better."""
     sample = _sample(volume)
     if not len(sample):
@@ -178,7 +178,7 @@ def _sample(volume: Volume) -> npt.NDArray[np.float32]:
     return np.asarray(scored.ravel())
 
 
-def smallest(values: npt.NDArray[np.float32], count: int) -> npt.NDArray[np.int64]:
+def argsmallest(values: npt.NDArray[np.float32], count: int) -> npt.NDArray[np.int64]:
     """Return the indices of the ``count`` smallest of (N,) values, smallest first; equal ones by index."""
     if count >= len(values):
         return np.asarray(np.argsort(values, kind="stable"))

@@ -119,7 +119,7 @@ _PATIENCE = 3  # frames in a row: one may be dust
 _BITS = 21  # of a coordinate in a voxel's key
 
 
-class Continuity:
+class OdometryCheck:
     """Remembers one frame and compares the next ones with it."""
 
     def __init__(self) -> None:

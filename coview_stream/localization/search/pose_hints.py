@@ -17,7 +17,7 @@ FROM_THERE = " (from the last known place)"
 """What an evidence's reason ends with where the best hypothesis began as a suggestion."""
 
 
-class Suggestions:
+class PoseHints:
     """What a localizer offers its search: poses ``T_map_odom`` in an odometry frame that keeps its origin.
 
     The localizer's own odometry frame has its origin moved to an anchor; here it is undone, for after a loss there is
@@ -51,7 +51,7 @@ class Suggestions:
         return tuple(T @ pose_from(np.eye(3), anchor) for T in self._known)
 
 
-class Trials:
+class HintSchedule:
     """Which suggestions a search tries at a keyframe: all, until a few keyframes in a row have refuted them.
 
     Then at every fifth, not never: the sensor may only have been covered.
@@ -79,6 +79,6 @@ class Trials:
             self._wait = _PAUSE
 
 
-def robot_in(T_map_odom: Pose, T_odom_body: Pose) -> npt.NDArray[np.float64]:
+def robot_position(T_map_odom: Pose, T_odom_body: Pose) -> npt.NDArray[np.float64]:
     """Return where (1, 2) in the map a suggestion puts the robot."""
     return transform(T_map_odom, T_odom_body[None, :3, 3])[:, :2]

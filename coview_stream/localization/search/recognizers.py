@@ -10,17 +10,17 @@ from coview_stream.basemap.basemap import BaseMap, check_reloc
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, describe, on_ground
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval
 
 if TYPE_CHECKING:  # it brings half of SciPy along
-    from coview_stream.localization.search.learned.matcher import LearnedMap
+    from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
-class Source(Protocol):
+class PlaceRecognizer(Protocol):
     """Takes in keyframes and names the places they speak for."""
 
-    def vote(self, query: Query) -> None:
+    def vote(self, query: SearchRequest) -> None:
         """Take in one keyframe; one with too few points says nothing."""
         ...
 
@@ -38,7 +38,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class SearchIndex:
     """What all searches of one map share; None for what is not used.
 
     Attributes:
@@ -47,10 +47,10 @@ class Knowledge:
     """
 
     retrieval: Retrieval | None
-    learned: LearnedMap | None
+    learned: FeatureMatcher | None
 
     @classmethod
-    def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> Knowledge:
+    def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> SearchIndex:
         """Choose by ``config.reloc``; the network is loaded if ``load``, the map's spectra are not made yet.
 
         ``auto`` warns if the map has learned features that cannot be used, and goes without them.
@@ -64,10 +64,12 @@ class Knowledge:
             warnings.warn(missing, stacklevel=2)
         if missing is not None or config.reloc == "coview" or base_map.learned is None:
             return cls(retrieval, None)
-        from coview_stream.localization.search.learned.matcher import LearnedMap
+        from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
         block = base_map.config.block
-        return cls(retrieval, LearnedMap(base_map.learned, base_map.stations, config.learned, block=block))
+        return cls(
+            retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block)
+        )
 
     def prepare(self) -> None:
         """Make now what would make the first query slow; raises :class:`CoViewError` if something is missing."""
@@ -77,7 +79,7 @@ class Knowledge:
             self.learned.prepare()
 
 
-class CoView:
+class CoViewRecognizer:
     """Votes by the paper's descriptors (eqs 1-12).
 
     Attributes:
@@ -93,7 +95,7 @@ class CoView:
         )
         self.last_query: dict[Channel, Descriptor] = {}
 
-    def vote(self, query: Query) -> None:
+    def vote(self, query: SearchRequest) -> None:
         """Compare the virtual local scan with every station's."""
         descriptor = self.base_map.descriptor_config
         if len(query.scan) < self.config.keyframe.min_points:

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
-from coview_stream.localization.registration.local_map import LocalMaps, Source
+from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior, Registration
 from coview_stream.localization.registration.verification import Evidence, verify
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.request import SearchRequest
 
 _COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through
 _COARSE_EVERY = 3  # of the source's points, for the coarse scales only every third
@@ -47,7 +47,9 @@ class Refinement:
         self.config = config
         self.local_maps = local_maps
 
-    def refine(self, hypotheses: list[Hypothesis], source: Source, query: Query) -> list[Candidate]:
+    def refine(
+        self, hypotheses: list[Hypothesis], source: RegistrationCloud, query: SearchRequest
+    ) -> list[Candidate]:
         """Return verified candidates, best first. All go through the coarse scales, the promising ones through all."""
         scales = self.config.registration.search
         rough = source.every(_COARSE_EVERY)
@@ -73,9 +75,9 @@ class Refinement:
     def _candidate(
         self,
         hypothesis: Hypothesis,
-        moving: Source,
-        source: Source,
-        query: Query,
+        moving: RegistrationCloud,
+        source: RegistrationCloud,
+        query: SearchRequest,
         scales: tuple[float, ...],
     ) -> Candidate | None:
         """Register ``moving`` from the hypothesis and verify with ``source``; None if it finds no hold or tilts."""

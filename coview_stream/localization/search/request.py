@@ -23,7 +23,7 @@ def _nothing() -> Points:
 
 
 @dataclass(frozen=True)
-class Needs:
+class RequestSpec:
     """What queries have to bring: a scan for ``descriptor``, surroundings up to ``reach`` metres; None for neither."""
 
     descriptor: DescriptorConfig | None
@@ -31,7 +31,7 @@ class Needs:
 
 
 @dataclass(frozen=True)
-class Query:
+class SearchRequest:
     """All that a search needs to know of one keyframe; whoever searches may do it later and elsewhere.
 
     Attributes:
@@ -73,11 +73,11 @@ class Query:
         buffer: KeyframeBuffer,
         keyframe: Keyframe,
         cloud: Points,
-        needs: Needs,
+        needs: RequestSpec,
         travelled: float = 0.0,
         generation: int = 0,
         suggested: tuple[Pose, ...] = (),
-    ) -> Query:
+    ) -> SearchRequest:
         """Ask about the newest keyframe of a buffer; ``cloud`` (N, 3) is its newest frame, body frame."""
         scan = surroundings = _nothing()
         if needs.descriptor is not None:
@@ -95,7 +95,7 @@ class Query:
 def same_place(
     T_a: Pose,
     T_b: Pose,
-    query: Query,
+    query: SearchRequest,
     distance: float = _SAME_DISTANCE,
     angle: float = float(_SAME_ANGLE),
 ) -> bool:

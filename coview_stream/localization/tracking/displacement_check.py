@@ -27,7 +27,7 @@ _HABIT = 0.3  # of a new share in the usual one: about the last three registrati
 _DROP = 0.7  # of the usual share
 
 
-class Glance:
+class DisplacementCheck:
     """The usual share of points on the map, and whether a frame has much less.
 
     Attributes:
@@ -73,7 +73,7 @@ def share_on_map(
 ) -> float | None:
     """Share of the points above the ground that have a map point near them; None if they are too few to tell.
 
-    Arguments are those of :meth:`Glance.learn`.
+    Arguments are those of :meth:`DisplacementCheck.learn`.
     """
     x, y = points[:, 0] - np.float32(position[0]), points[:, 1] - np.float32(position[1])
     square = x * x + y * y

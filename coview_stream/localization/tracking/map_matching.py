@@ -12,20 +12,20 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.se3 import Matrix6
 from coview_stream.geometry.transforms import Points, Pose, inverse, tilt_of, transform
-from coview_stream.localization.registration.covariance import registration_covariance, without_prior
-from coview_stream.localization.registration.local_map import LocalMap, Source
+from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
+from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.registration.verification import Evidence, RangeImage, verify
-from coview_stream.localization.tracking.monitor import Cause, Habit, Judgement
+from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
 
 @dataclass(frozen=True)
-class Scan:
+class ScanInput:
     """What is registered: the newest frames' points (odometry frame), the newest frame (body), its odometry (4, 4)."""
 
-    source: Source
+    source: RegistrationCloud
     cloud: Points
     T_odom_body: Pose
 
@@ -36,7 +36,7 @@ class Scan:
 
 
 @dataclass(frozen=True)
-class Attempt:
+class MapMatch:
     """A registration and its judgement.
 
     Attributes:
@@ -46,14 +46,14 @@ class Attempt:
         innovation: squared Mahalanobis distance from where the graph predicts the pose.
     """
 
-    judgement: Judgement
+    judgement: MatchVerdict
     T_map_body: Pose
     covariance: Matrix6
     innovation: float
 
 
 @dataclass(frozen=True)
-class Registrar:
+class MapMatcher:
     """Registers, verifies and judges scans on a base map.
 
     Attributes:
@@ -66,13 +66,13 @@ class Registrar:
 
     def attempt(
         self,
-        scan: Scan,
+        scan: ScanInput,
         belief: Estimate,
         target: LocalMap,
         scales: tuple[float, ...],
-        habit: Habit,
+        habit: EvidenceBaseline,
         graph: PoseGraph,
-    ) -> Attempt:
+    ) -> MapMatch:
         """Register, verify and judge; where the numbers leave nothing to hold on to, the belief stays.
 
         Args:
@@ -95,26 +95,29 @@ class Registrar:
         evidence = verify(scan.source, T, scan.seen, T @ scan.T_odom_body, target, surveyed)
         cause, reason = habit.judge(evidence, acceptance)
         if found is None:
-            if cause is Cause.VERIFIED:
+            if cause is RejectionReason.VERIFIED:
                 return _unheld(belief, "too few points have a partner in the map", evidence)
-            return Attempt(Judgement(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
+            return MapMatch(MatchVerdict(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
         if tilt_of(T) > acceptance.most_tilt:
-            cause, reason = Cause.TILT, f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity"
+            cause, reason = (
+                RejectionReason.TILT,
+                f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity",
+            )
         try:
-            alone = without_prior(
+            alone = remove_prior(
                 T @ scan.T_odom_body, found.information, belief.T_map_body, information, settings
             )
             covariance = registration_covariance(alone.information, settings)
             innovation = graph.innovation(alone.T_map_body, covariance)
         except InputError as error:
             return _unheld(belief, str(error), evidence)
-        judgement = Judgement(cause, reason, evidence, innovation)
-        return Attempt(judgement, alone.T_map_body, covariance, innovation)
+        judgement = MatchVerdict(cause, reason, evidence, innovation)
+        return MapMatch(judgement, alone.T_map_body, covariance, innovation)
 
 
-def _unheld(belief: Estimate, reason: str, evidence: Evidence | None = None) -> Attempt:
-    judgement = Judgement(Cause.FITNESS, f"no hold: {reason}", evidence)
-    return Attempt(judgement, belief.T_map_body, belief.covariance, 0.0)
+def _unheld(belief: Estimate, reason: str, evidence: Evidence | None = None) -> MapMatch:
+    judgement = MatchVerdict(RejectionReason.FITNESS, f"no hold: {reason}", evidence)
+    return MapMatch(judgement, belief.T_map_body, belief.covariance, 0.0)
 
 
 def _inverted(covariance: Matrix6) -> Matrix6 | None:

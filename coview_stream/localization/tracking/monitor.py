@@ -20,7 +20,7 @@ _HABIT = 0.2  # of a new score in what is usual: the last five registrations
 
 
 @dataclass(frozen=True)
-class Judgement:
+class MatchVerdict:
     """What became of one registration.
 
     Attributes:
@@ -30,7 +30,7 @@ class Judgement:
         innovation: squared Mahalanobis distance to the prediction; None likewise.
     """
 
-    cause: Cause
+    cause: RejectionReason
     reason: str
     evidence: Evidence | None = None
     innovation: float | None = None
@@ -38,7 +38,7 @@ class Judgement:
     @property
     def verified(self) -> bool:
         """Whether the registration is believed."""
-        return self.cause is Cause.VERIFIED
+        return self.cause is RejectionReason.VERIFIED
 
     @property
     def score(self) -> float:
@@ -46,7 +46,7 @@ class Judgement:
         return self.evidence.score if self.evidence else 0.0
 
 
-class Habit:
+class EvidenceBaseline:
     """What evidence has been like on the last metres."""
 
     def __init__(self) -> None:
@@ -64,16 +64,16 @@ class Habit:
         before, now = vars(self.usual), vars(evidence)
         self.usual = Evidence(**{name: before[name] + _HABIT * (now[name] - before[name]) for name in now})
 
-    def judge(self, evidence: Evidence, rule: AcceptanceConfig) -> tuple[Cause, str]:
+    def judge(self, evidence: Evidence, rule: AcceptanceConfig) -> tuple[RejectionReason, str]:
         """Say whether evidence is good enough, and as good as usual; the cause and one clause."""
         if evidence.inside < rule.inside:
-            return Cause.OFF_MAP, f"only {evidence.inside:.0%} of what is seen lies on the map"
+            return RejectionReason.OFF_MAP, f"only {evidence.inside:.0%} of what is seen lies on the map"
         if evidence.ground < rule.keep_ground:
-            return Cause.GROUND, f"only {evidence.ground:.0%} of the ground lies on the map's"
+            return RejectionReason.GROUND, f"only {evidence.ground:.0%} of the ground lies on the map's"
         usual = self.usual
         least = max(rule.keep_score, rule.keep_share * usual.score if usual else 0.0)
         if evidence.score >= least:
-            return Cause.VERIFIED, "verified"
+            return RejectionReason.VERIFIED, "verified"
         told = f"score {evidence.score:.2f}, {least:.2f} needed"
         # which part has fallen furthest below what it was
         structure = (
@@ -84,16 +84,16 @@ class Habit:
         worst = min(structure, ground, space)
         if worst == space:
             return (
-                Cause.FREE_SPACE,
+                RejectionReason.FREE_SPACE,
                 f"rays pass through {1 - evidence.free_space:.0%} of the map's points: {told}",
             )
         if worst == ground:
-            return Cause.GROUND, f"{evidence.ground:.0%} of the ground lies on the map's: {told}"
+            return RejectionReason.GROUND, f"{evidence.ground:.0%} of the ground lies on the map's: {told}"
         here = f"{evidence.near:.0%} of what stands above the ground is on the map"
-        return Cause.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if usual else ''}: {told}"
+        return RejectionReason.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if usual else ''}: {told}"
 
 
-class Cause(StrEnum):
+class RejectionReason(StrEnum):
     """What decided about a registration while tracking; docs/tracking.md says what an operator can do about each."""
 
     VERIFIED = "verified"
@@ -114,10 +114,13 @@ class Cause(StrEnum):
     """The place fits, but not where odometry says that the robot has moved."""
 
 
-_NEUTRAL = (Cause.BLIND, Cause.ODOMETRY)  # they begin a doubt, but do not speak against the place
+_NEUTRAL = (
+    RejectionReason.BLIND,
+    RejectionReason.ODOMETRY,
+)  # they begin a doubt, but do not speak against the place
 
 
-class Doubt:
+class LossMonitor:
     """Weighs what speaks against the place since the newest registration that spoke for it.
 
     Every frame may clear a doubt, but only driving on with a place that does not fit adds to it: a covered frame loses
@@ -150,7 +153,7 @@ class Doubt:
         """Doubt from the next registration on, because of something that none of them knows of."""
         self.active = True
 
-    def note(self, judgement: Judgement, stamp: float, travelled: float) -> str:
+    def note(self, judgement: MatchVerdict, stamp: float, travelled: float) -> str:
         """Take note of a registration, made ``travelled`` metres into the drive; one clause about what it came to."""
         if judgement.verified:
             return self._spoken_for(judgement, stamp, travelled)
@@ -158,7 +161,7 @@ class Doubt:
         self._proofs = 0
         if self._since is None:
             self._since = self._seen_since = stamp
-        blind = judgement.cause is Cause.BLIND
+        blind = judgement.cause is RejectionReason.BLIND
         if blind:
             self._seen_since = stamp
         elif judgement.cause not in _NEUTRAL:
@@ -179,7 +182,7 @@ class Doubt:
             self._against += 1
             self._against_at = travelled
 
-    def _spoken_for(self, judgement: Judgement, stamp: float, travelled: float) -> str:
+    def _spoken_for(self, judgement: MatchVerdict, stamp: float, travelled: float) -> str:
         if not self._proofs:
             self._lasted = 0.0 if self._since is None else stamp - self._since
         if self._lasted >= self._rule.patience_seconds:

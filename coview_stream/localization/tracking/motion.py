@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.config import TrackingConfig
-from coview_stream.geometry.se3 import Matrix6, difference
+from coview_stream.geometry.se3 import Matrix6, boxminus
 from coview_stream.geometry.transforms import Points, Pose, inverse, yaw_of
 from coview_stream.localization.tracking.odometry_noise import Drift, DriftEstimator, worth_learning
 
@@ -36,7 +36,7 @@ class _Registered:
     mark: _Mark
 
 
-class Odometer:
+class OdometryTracker:
     """Counts what odometry drives and turns, altogether and since the newest keyframe, and measures its drift.
 
     Attributes:
@@ -90,7 +90,7 @@ class Odometer:
             if not worth_learning(driven, turned):
                 return
             step = inverse(before.mark.T_odom_body) @ now.T_odom_body
-            gap = difference(T_map_body, before.T_map_body @ step)
+            gap = boxminus(T_map_body, before.T_map_body @ step)
             noise = _OWN_NOISE * (variances + before.variances)
             self._rates.add(gap, noise, driven, turned)
         self._registered = _Registered(T_map_body, variances, now)
@@ -100,25 +100,25 @@ class Odometer:
         self._registered = None
 
 
-MOST_FRAMES = 40
+MAX_FRAMES = 40
 
 
 @dataclass(frozen=True)
-class _Recent:
+class _BufferedScan:
     travelled: float
     points: Points  # (N, 3) odometry frame
 
 
-class RecentFrames:
+class ScanBuffer:
     """Points of at most 40 frames, odometry frame, newest last."""
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
-        self._frames: deque[_Recent] = deque(maxlen=MOST_FRAMES)
+        self._frames: deque[_BufferedScan] = deque(maxlen=MAX_FRAMES)
 
     def add(self, points: Points, travelled: float) -> None:
         """Take in a frame (N, 3), seen after ``travelled`` metres."""
-        self._frames.append(_Recent(travelled, points))
+        self._frames.append(_BufferedScan(travelled, points))
 
     def clear(self) -> None:
         """Forget them all."""

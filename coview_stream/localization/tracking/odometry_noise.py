@@ -14,7 +14,7 @@ import numpy as np
 
 from coview_stream.config import TrackingConfig
 from coview_stream.geometry.se3 import Matrix6, Vector6
-from coview_stream.localization.registration.covariance import angles_first
+from coview_stream.localization.registration.covariance import swap_rotation_translation
 
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
 # of the configured rate; a scale error is no random walk, and needs a pull
@@ -63,7 +63,7 @@ class Drift:
 
     def reported(self, driven: float, turned: float) -> Matrix6:
         """Return the same covariance over (x, y, z, roll, pitch, yaw)."""
-        return angles_first(self.covariance(driven, turned))
+        return swap_rotation_translation(self.covariance(driven, turned))
 
 
 class DriftEstimator:

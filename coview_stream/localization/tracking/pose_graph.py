@@ -27,15 +27,15 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.config import GraphConfig
-from coview_stream.errors import extra
+from coview_stream.errors import require_library
 from coview_stream.geometry.se3 import (
     Matrix6,
     adjoint,
     along_body,
     along_map,
+    boxminus,
     checked_covariance,
     checked_pose,
-    difference,
 )
 from coview_stream.geometry.transforms import Pose, inverse, orthonormal
 
@@ -94,7 +94,7 @@ class PoseGraph:
         """
         self.config = config or GraphConfig()
         # gtsam has no types that mypy reads everywhere, hence Any
-        self._gtsam: Any = extra("gtsam", "gtsam>=4.3", "tracking")
+        self._gtsam: Any = require_library("gtsam", "gtsam>=4.3", "tracking")
         self._kernel: Any = self._gtsam.noiseModel.mEstimator.Huber.Create(self.config.huber)
         self.clear()
 
@@ -152,7 +152,7 @@ class PoseGraph:
 
         Args:
             T_map_body: (4, 4) as the map alone has it: a pose in whose search the prediction took part counts it
-                twice (see :func:`coview_stream.localization.registration.covariance.without_prior`).
+                twice (see :func:`coview_stream.localization.registration.covariance.remove_prior`).
             covariance: of that measurement alone (see :func:`coview_stream.localization.registration.covariance.registration_covariance`).
         """
         T = checked_pose("T_map_body", T_map_body)
@@ -181,7 +181,7 @@ class PoseGraph:
         T = checked_pose("T_map_body", T_map_body)
         spread = checked_covariance("covariance", covariance)
         expected = self.estimate
-        gap: npt.NDArray[np.float64] = difference(T, expected.T_map_body)
+        gap: npt.NDArray[np.float64] = boxminus(T, expected.T_map_body)
         return float(gap @ np.linalg.solve(expected.covariance + spread, gap))
 
     def _newest(self) -> _Keyframe:

@@ -15,7 +15,7 @@ import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.se3 import Matrix6
 from coview_stream.geometry.transforms import Pose, transform
-from coview_stream.localization.registration.local_map import LocalMap, Source
+from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
 _CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 answer much alike
 _EVERY = 2  # of the points: more change nothing
@@ -23,7 +23,7 @@ _HABIT = 0.3  # of a new covariance in that of late
 _LEAST_CLUSTERS = 8  # six unknowns need more
 
 
-class Shared:
+class SharedErrorModel:
     """The error that neighbouring registrations share, and that does not average out over them."""
 
     def __init__(self, config: RegistrationConfig) -> None:
@@ -35,7 +35,7 @@ class Shared:
         self._clustered = None
 
     def learn(
-        self, source: Source, T_map_source: Pose, target: LocalMap, pivot: npt.NDArray[np.float64]
+        self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: npt.NDArray[np.float64]
     ) -> None:
         """Take note of a registration; arguments are those of :func:`clustered_covariance`."""
         now = clustered_covariance(source, T_map_source, target, pivot, self._config)
@@ -62,7 +62,7 @@ class Shared:
 
 
 def clustered_covariance(
-    source: Source,
+    source: RegistrationCloud,
     T_map_source: Pose,
     target: LocalMap,
     pivot: npt.NDArray[np.float64],

@@ -6,23 +6,23 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.se3 import Matrix6, difference
+from coview_stream.geometry.se3 import Matrix6, boxminus
 from coview_stream.geometry.transforms import Points, Pose, inverse, transform
 from coview_stream.localization.registration.covariance import (
-    angles_first,
-    carried_along,
+    propagate,
     registration_covariance,
+    swap_rotation_translation,
 )
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import local_source, thinned
+from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.result import Registration
-from coview_stream.localization.tracking.displacement_check import Glance
-from coview_stream.localization.tracking.map_matching import Attempt, Registrar, Scan
-from coview_stream.localization.tracking.monitor import Cause, Habit, Judgement
-from coview_stream.localization.tracking.motion import MOST_FRAMES, Odometer, RecentFrames
+from coview_stream.localization.tracking.displacement_check import DisplacementCheck
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, ScanInput
+from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.odometry_noise import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
-from coview_stream.localization.tracking.shared_error import Shared
+from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 _LEAST_SOURCE = 100  # points to register
 _IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
@@ -44,12 +44,12 @@ class Tracker:
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
         self._graph = PoseGraph(config.graph)
-        self._odometer = Odometer(config.tracking)
-        self._habit = Habit()
-        self._glance = Glance()
-        self._recent = RecentFrames(config.tracking)
+        self._odometer = OdometryTracker(config.tracking)
+        self._habit = EvidenceBaseline()
+        self._glance = DisplacementCheck()
+        self._recent = ScanBuffer(config.tracking)
         self._unseen = 0  # frames since the last update
-        self._shared = Shared(config.registration)
+        self._shared = SharedErrorModel(config.registration)
 
     @property
     def travelled(self) -> float:
@@ -61,10 +61,10 @@ class Tracker:
     def observe(self, cloud: Points, T_odom_body: Pose, thin: Points | None = None) -> None:
         """Remember a frame's points (body frame) and how far odometry has driven.
 
-        ``thin`` is what :func:`coview_stream.localization.registration.prepare_scan.thinned` makes of it, if that is known already.
+        ``thin`` is what :func:`coview_stream.localization.registration.prepare_scan.voxelized` makes of it, if that is known already.
         """
         self._odometer.move(T_odom_body)
-        points = thinned(cloud, T_odom_body, self.config.keyframe) if thin is None else thin
+        points = voxelized(cloud, T_odom_body, self.config.keyframe) if thin is None else thin
         self._recent.add(points, self.travelled)
         self._unseen += 1
 
@@ -117,7 +117,9 @@ class Tracker:
         drifted = self.drift.covariance(self.travelled - travelled, 0.0)
         self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
 
-    def update(self, cloud: Points, T_odom_body: Pose, idle: bool = False, alone: bool = False) -> Judgement:
+    def update(
+        self, cloud: Points, T_odom_body: Pose, idle: bool = False, alone: bool = False
+    ) -> MatchVerdict:
         """Register the newest frames from the predicted pose, judge, and correct the belief if that went well.
 
         Args:
@@ -128,19 +130,19 @@ class Tracker:
             alone: use the newest frame alone: something is wrong with it, or with what came before.
         """
         graph = self._moved(T_odom_body, idle)
-        most = 1 if alone else max(1, self._unseen) if idle else MOST_FRAMES
+        most = 1 if alone else max(1, self._unseen) if idle else MAX_FRAMES
         self._recent.keep(most)
         self._unseen = 0
         target = self._target(T_odom_body)
         if target is None:
-            return Judgement(Cause.OFF_MAP, "the map is empty here")
+            return MatchVerdict(RejectionReason.OFF_MAP, "the map is empty here")
         newest = self._recent.newest
-        source = local_source(self._recent.window(), T_odom_body[:3, 3], self.config.registration)
+        source = prepare_scan(self._recent.window(), T_odom_body[:3, 3], self.config.registration)
         # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
         seen = 0 if newest is None else min(len(source.points), len(newest))
         if newest is None or seen < _LEAST_SOURCE:
-            return self._rejected(Judgement(Cause.BLIND, f"only {seen} points to register"))
-        scan = Scan(source, cloud, T_odom_body)
+            return self._rejected(MatchVerdict(RejectionReason.BLIND, f"only {seen} points to register"))
+        scan = ScanInput(source, cloud, T_odom_body)
         belief = graph.estimate
         tried = self._attempt(scan, belief, target, self.config.registration.track)
         limit = self.config.acceptance.keep_innovation
@@ -166,12 +168,12 @@ class Tracker:
             return np.asarray(_START.copy())
         belief = self._graph.estimate
         here = self.T_map_odom @ last
-        carried = carried_along(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
+        carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
         return np.asarray(carried + self.drift.covariance(*self._odometer.since_keyframe()))
 
     def reported_covariance(self) -> Matrix6:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
-        return angles_first(self.predicted_covariance() + self._shared.covariance)
+        return swap_rotation_translation(self.predicted_covariance() + self._shared.covariance)
 
     @property
     def drift(self) -> Drift:
@@ -198,33 +200,35 @@ class Tracker:
         self._odometer.mark(T_odom_body)
         return self._graph
 
-    def _attempt(self, scan: Scan, belief: Estimate, target: LocalMap, scales: tuple[float, ...]) -> Attempt:
-        registrar = Registrar(self.base_map, self.config)
+    def _attempt(
+        self, scan: ScanInput, belief: Estimate, target: LocalMap, scales: tuple[float, ...]
+    ) -> MapMatch:
+        registrar = MapMatcher(self.base_map, self.config)
         return registrar.attempt(scan, belief, target, scales, self._habit, self._graph)
 
     def _believe(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self._graph.estimate.T_map_body @ inverse(T_odom_body)
 
-    def _learn(self, tried: Attempt) -> None:
+    def _learn(self, tried: MapMatch) -> None:
         """Take note of what a registration says of odometry, and of what evidence is like here."""
         assert tried.judgement.evidence is not None  # it was verified
         self._habit.learn(tried.judgement.evidence)
         self._odometer.learn(tried.T_map_body, tried.covariance)
 
-    def _rejected(self, judgement: Judgement) -> Judgement:
+    def _rejected(self, judgement: MatchVerdict) -> MatchVerdict:
         """Believe nothing of it: bad frames among the newest must not spoil the next registration too."""
         self._recent.clear()
         return judgement
 
-    def _slipped(self, tried: Attempt, belief: Estimate, T_odom_body: Pose) -> Judgement:
+    def _slipped(self, tried: MapMatch, belief: Estimate, T_odom_body: Pose) -> MatchVerdict:
         """Go on where the lidar says, for the next frame to confirm: odometry says otherwise."""
-        gap = difference(tried.T_map_body, belief.T_map_body)
+        gap = boxminus(tried.T_map_body, belief.T_map_body)
         metres, degrees = float(np.linalg.norm(gap[3:])), np.degrees(float(np.linalg.norm(gap[:3])))
         self._restart(tried.T_map_body, tried.covariance + self._shared.covariance, T_odom_body)
         self._recent.clear()
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
-        return Judgement(Cause.ODOMETRY, reason, tried.judgement.evidence, tried.innovation)
+        return MatchVerdict(RejectionReason.ODOMETRY, reason, tried.judgement.evidence, tried.innovation)
 
 
-def _rank(tried: Attempt) -> tuple[bool, float]:
+def _rank(tried: MapMatch) -> tuple[bool, float]:
     return tried.judgement.verified, tried.judgement.score

@@ -83,8 +83,8 @@ class RobotClient:
         self.keys: RobotKeys = robot_keys(preset, base, robot)
         self._owned = transport is None
         self._transport = transport if transport is not None else open_client(endpoint, listen, config)
-        self._poses: Mailbox[PoseMessage] = Mailbox(POSES_KEPT)
-        self._statuses: Mailbox[dict[str, Any]] = Mailbox(STATUSES_KEPT)
+        self._poses: LatestQueue[PoseMessage] = LatestQueue(POSES_KEPT)
+        self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(STATUSES_KEPT)
         self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
         self._latest_status: dict[str, Any] | None = None
         self._malformed = 0
@@ -248,12 +248,12 @@ class RobotClient:
             _log.warning("%s: %s", sample.key, error)
 
 
-def _drain(box: Mailbox[_Item], timeout: float | None) -> Iterator[_Item]:
+def _drain(box: LatestQueue[_Item], timeout: float | None) -> Iterator[_Item]:
     while (item := box.get(timeout)) is not None:
         yield item
 
 
-class Mailbox(Generic[_Item]):
+class LatestQueue(Generic[_Item]):
     """Holds up to ``size`` items in order of arrival; when it is full, the oldest goes.
 
     ``put`` never blocks, so that a subscription is never held up by its reader.

@@ -56,7 +56,7 @@ class RobotView:
         return None if lost else self.pose
 
 
-class Fleet:
+class FleetTable:
     """All robots heard of so far."""
 
     def __init__(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import ConfigError
-from coview_stream.geometry.rotations import between
+from coview_stream.geometry.rotations import slerp
 from coview_stream.geometry.transforms import Pose, pose_from
 from coview_stream.recordings.run import Run
 
@@ -123,4 +123,4 @@ def _between(run: Run, dues: Times, k: int, rate: float) -> Iterator[Beat]:
         due, stamp, position = (
             a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps, run.poses[:, :3, 3])
         )
-        yield Beat(float(due), float(stamp), pose_from(between(start, end, share), position), None)
+        yield Beat(float(due), float(stamp), pose_from(slerp(start, end, share), position), None)

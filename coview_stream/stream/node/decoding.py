@@ -23,7 +23,7 @@ log = logging.getLogger("coview_stream.node")
 Message = TypeVar("Message")
 
 
-class Complaints:
+class ErrorLog:
     """The newest different complaints, each once; the first few are logged as well."""
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ def received(
         return None, "malformed", str(error)
 
 
-def note(counters: Counters, complaints: Complaints, prefix: str, name: str, key: str, reason: str) -> None:
+def note(counters: Counters, complaints: ErrorLog, prefix: str, name: str, key: str, reason: str) -> None:
     """Count what could not be decoded; name it, unless every such message would have a reason of its own."""
     counters.count(prefix + name)
     if name == "unknown_encoding":

@@ -61,7 +61,7 @@ class Lane(Protocol):
         ...
 
 
-class ProcessLane:
+class EngineProcess:
     """Runs jobs in a child process. A child that hangs, wherever, is killed.
 
     Args:

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.search.acceptance import Verdict
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.request import SearchRequest
 from coview_stream.stream.node.counters import Counters, Latency
-from coview_stream.stream.node.decoding import Complaints, last_line
+from coview_stream.stream.node.decoding import ErrorLog, last_line
 from coview_stream.stream.node.frame_sync import Paired
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, SearchJob
 
@@ -29,7 +29,7 @@ class Work:
         processed_at: local time of the newest fix; None before the first.
     """
 
-    def __init__(self, robot: str, epochs: Iterator[int], counters: Counters, complaints: Complaints) -> None:
+    def __init__(self, robot: str, epochs: Iterator[int], counters: Counters, complaints: ErrorLog) -> None:
         """Begin with nothing to do; ``epochs`` numbers odometry frames, all resets through."""
         self.robot = robot
         self._epochs = epochs
@@ -39,13 +39,13 @@ class Work:
         self.engine_latency = Latency()
         self.longest_wait = 0.0
         self.processed_at: float | None = None
-        self.desk = Desk(robot, next(epochs))
+        self.desk = _Slots(robot, next(epochs))
         self._first = self.desk.epoch
 
     def begin_anew(self) -> None:
         """Drop what waits: there is another odometry frame."""
         self._counters.dropped += self.desk.waiting
-        self.desk = Desk(self.robot, next(self._epochs))
+        self.desk = _Slots(self.robot, next(self._epochs))
 
     def frame_done(self, job: FrameJob, result: FrameResult, now: float) -> Ready | None:
         """Take note of a frame's end; return what it was, if its fix still matters."""
@@ -74,7 +74,7 @@ class Work:
         self.desk.frame_over(unused=job.verdict)
         return True
 
-    def search_done(self, job: SearchJob, verdict: Verdict | None) -> None:
+    def search_done(self, job: SearchJob, verdict: SearchResult | None) -> None:
         """Take note of a verdict; None if the search failed."""
         if job.epoch < self._first:
             return
@@ -109,7 +109,7 @@ class Ready:
     turned: float
 
 
-class Desk:
+class _Slots:
     """One robot's work in one odometry frame; with another odometry frame comes another desk.
 
     Of frames and of queries only the newest waits; one of each is under way.
@@ -120,9 +120,9 @@ class Desk:
         self.epoch = epoch
         self._ready: Ready | None = None
         self._busy: Ready | None = None
-        self._query: Query | None = None
+        self._query: SearchRequest | None = None
         self._searching = False
-        self._verdict: Verdict | None = None
+        self._verdict: SearchResult | None = None
 
     @property
     def waiting(self) -> int:
@@ -150,13 +150,13 @@ class Desk:
         self._verdict = None
         return job
 
-    def frame_over(self, unused: Verdict | None = None) -> Ready | None:
+    def frame_over(self, unused: SearchResult | None = None) -> Ready | None:
         """Return what was under way; ``unused`` is a verdict that was not taken note of and goes with the next one."""
         busy, self._busy = self._busy, None
         self._verdict = self._verdict or unused
         return busy
 
-    def put_query(self, query: Query) -> bool:
+    def put_query(self, query: SearchRequest) -> bool:
         """Make a query the next one; return whether another had to make room for it."""
         before, self._query = self._query, query
         return before is not None
@@ -169,7 +169,7 @@ class Desk:
         self._query, self._searching = None, True
         return job
 
-    def search_over(self, verdict: Verdict | None) -> None:
+    def search_over(self, verdict: SearchResult | None) -> None:
         """Take in a verdict, None if the search failed; it goes with the next frame.
 
         An acceptance that still waits is kept: what is found after it comes from a search begun anew.

@@ -17,9 +17,9 @@ from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.search.acceptance import Verdict
+from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.recognizers import Knowledge
+from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.tracking.pose_graph import PoseGraph
 from coview_stream.odometry.deskew import deskew
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, Job, Result, SearchJob
@@ -58,7 +58,7 @@ class TrackEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, Localizer]] = {}
-        self._knowledge = Knowledge.of(
+        self._knowledge = SearchIndex.of(
             base_map, self.config, load=False
         )  # what queries have to bring: others search
 
@@ -113,9 +113,9 @@ class SearchEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, GlobalSearch]] = {}
-        self._knowledge = Knowledge.of(base_map, self.config)
+        self._knowledge = SearchIndex.of(base_map, self.config)
 
-    def run(self, job: Job) -> Verdict:
+    def run(self, job: Job) -> SearchResult:
         """Search for one keyframe."""
         if not isinstance(job, SearchJob):
             raise TypeError(f"{type(job).__name__} is no search")

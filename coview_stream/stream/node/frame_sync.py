@@ -34,7 +34,7 @@ class Paired:
     segment: Segment | None
 
 
-class Pairing:
+class FrameSync:
     """Keeps frames in order of their stamps until odometry covers them; counts those that end here."""
 
     def __init__(self, config: NodeConfig, odometry: OdometryBuffer, counters: Counters) -> None:

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.result import Fix
-from coview_stream.localization.search.acceptance import Verdict
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.request import SearchRequest
 from coview_stream.odometry.buffer import Segment
 
 
@@ -42,7 +42,7 @@ class FrameJob:
     times: npt.NDArray[np.float64] | None = None
     segment: Segment | None = None
     suspect: bool = False
-    verdict: Verdict | None = None
+    verdict: SearchResult | None = None
     hurry: bool = False
     suggested: Pose | None = None
 
@@ -52,7 +52,7 @@ class FrameResult:
     """The fix after a frame, what has to be searched for (if anything), and the seconds it took."""
 
     fix: Fix
-    query: Query | None
+    query: SearchRequest | None
     seconds: float
 
 
@@ -62,11 +62,11 @@ class SearchJob:
 
     robot: str
     epoch: int
-    query: Query
+    query: SearchRequest
 
 
 @dataclass(frozen=True)
-class SweepJob:
+class OdometryJob:
     """One frame to make odometry of, for robots that send none.
 
     Attributes:
@@ -87,7 +87,7 @@ class SweepJob:
 
 
 @dataclass(frozen=True)
-class SweepResult:
+class OdometryResult:
     """Where a frame was taken.
 
     Attributes:
@@ -103,5 +103,5 @@ class SweepResult:
     seconds: float
 
 
-Job: TypeAlias = FrameJob | SearchJob | SweepJob
-Result: TypeAlias = FrameResult | Verdict | SweepResult
+Job: TypeAlias = FrameJob | SearchJob | OdometryJob
+Result: TypeAlias = FrameResult | SearchResult | OdometryResult

@@ -159,7 +159,7 @@ def _parsed(data: bytes) -> LastPose:
 
 
 @dataclass(frozen=True)
-class Recollection:
+class LastKnownPose:
     """What a session knows of a robot's place, to be kept for the next start.
 
     Attributes:
@@ -173,7 +173,7 @@ class Recollection:
     T_map_body: Pose | None = None
 
 
-class LastPlace:
+class PoseHint:
     """A place that is suggested to the engine once in every odometry frame, until somebody asks to forget it.
 
     The engine treats it as a hypothesis (:meth:`coview_stream.localization.localizer.Localizer.suggest`).

@@ -13,7 +13,7 @@ import numpy as np
 from coview_stream.geometry.transforms import Pose, inverse, rotation_angle
 from coview_stream.stream.node.last_pose import LastPose, forget, load, save
 from coview_stream.stream.node.session import Session
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.node")
 
@@ -22,7 +22,7 @@ _MOVED = 0.1  # metres; a robot that stands shall not wear its card out
 _TURNED = float(np.radians(1.0))
 
 
-class Memory:
+class LastPoseKeeper:
     """Suggests to every robot at start where it was last known to be, and writes down where it is.
 
     Args:
@@ -35,7 +35,7 @@ class Memory:
         self.folder = folder
         self._sessions = sessions
         self._interval = interval
-        self._guard = Guard(log)
+        self._guard = RateLimitedErrors(log)
         self._kept: dict[str, Pose] = {}
         self._forgotten: dict[str, int] = {}
         self._failing = False

@@ -12,10 +12,10 @@ import numpy as np
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.messages.types import CloudMessage, OdometryMessage
-from coview_stream.odometry.buffer import Intake, OdometryBuffer
+from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.decoding import last_line
-from coview_stream.stream.node.jobs import SweepJob, SweepResult
+from coview_stream.stream.node.jobs import OdometryJob, OdometryResult
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.keys import RobotKeys
 
@@ -45,22 +45,22 @@ class LidarSession(Session):
         super()._clear()
         self._generation += 1
         self._first_generation = self._generation  # what was under way before is nobody's
-        self._sweeps = Sweeps(self.keys.robot, self.config, self.lidar, self.counters)
+        self._sweeps = LidarFrameQueue(self.keys.robot, self.config, self.lidar, self.counters)
         self._seen = float("-inf")  # local time of the newest readable cloud
 
     def _take_in(self, message: CloudMessage, now: float) -> None:
         """Have a cloud's odometry made first."""
         self._seen = now
-        if self._sweeps.put(message, now) is Intake.RESTART:
+        if self._sweeps.put(message, now) is SampleKind.RESTART:
             self.counters.clock_restarts += 1
             self._odometry_anew("the sender's clock started anew")
 
-    def take_sweep(self) -> SweepJob | None:
+    def take_sweep(self) -> OdometryJob | None:
         """Hand out a frame to make odometry of; its result or failure must be reported before the next one."""
         with self._lock:
             return self._sweeps.take(self._generation)
 
-    def sweep_done(self, job: SweepJob, result: SweepResult, now: float) -> None:
+    def sweep_done(self, job: OdometryJob, result: OdometryResult, now: float) -> None:
         """Take in the odometry of a frame, and the frame."""
         with self._lock:
             if job.generation < self._first_generation:
@@ -78,7 +78,7 @@ class LidarSession(Session):
             self._pairing.add(_placed(sweep.message, result), sweep.received)
             self._pair(now)
 
-    def sweep_failed(self, job: SweepJob, reason: str, rejected: bool) -> None:
+    def sweep_failed(self, job: OdometryJob, reason: str, rejected: bool) -> None:
         """Take note that no odometry could be made of a frame; if not ``rejected``, the robot's has been forgotten."""
         with self._lock:
             if job.generation < self._first_generation:
@@ -113,7 +113,7 @@ class LidarSession(Session):
         return f"lidar odometry has placed no frame for {timeout:g} s; see errors and counters"
 
 
-def _placed(message: CloudMessage, result: SweepResult) -> CloudMessage:
+def _placed(message: CloudMessage, result: OdometryResult) -> CloudMessage:
     """Return the frame as odometry left it: with nothing to be deskewed any more."""
     points = message.points if result.points is None else result.points
     return replace(message, points=points, times=None, rings=None)
@@ -123,14 +123,14 @@ _WAITING = 2  # frames at most: odometry wants every one, and yet none that is o
 
 
 @dataclass(frozen=True)
-class Sweep:
+class LidarFrame:
     """A frame and the local time at which it came, seconds."""
 
     message: CloudMessage
     received: float
 
 
-class Sweeps:
+class LidarFrameQueue:
     """Keeps a robot's newest frames until their turn, one of which is under way; counts those that end here.
 
     What a stamp is to those before it is asked of an :class:`OdometryBuffer`: the same strays, pauses and clocks that
@@ -145,36 +145,36 @@ class Sweeps:
         self.lidar = lidar
         self.counters = counters
         self._stamps = OdometryBuffer(config)
-        self._waiting: deque[Sweep] = deque()
-        self._busy: Sweep | None = None
+        self._waiting: deque[LidarFrame] = deque()
+        self._busy: LidarFrame | None = None
 
-    def put(self, message: CloudMessage, now: float) -> Intake:
+    def put(self, message: CloudMessage, now: float) -> SampleKind:
         """Take in a frame that came at local time ``now``, and say what it was to those before it."""
         intake = self._stamps.add(OdometryMessage(message.stamp_ns, np.eye(4)), now)
-        if intake is Intake.DUPLICATE:
+        if intake is SampleKind.DUPLICATE:
             self.counters.duplicate += 1
-        elif intake is Intake.OUT_OF_ORDER:
+        elif intake is SampleKind.OUT_OF_ORDER:
             self.counters.out_of_order += 1
         else:
-            if intake is Intake.RESTART:
+            if intake is SampleKind.RESTART:
                 self.counters.dropped += len(self._waiting)
                 self._waiting.clear()
             elif len(self._waiting) == _WAITING:
                 self.counters.dropped += 1
                 self._waiting.popleft()
-            self._waiting.append(Sweep(message, now))
+            self._waiting.append(LidarFrame(message, now))
         return intake
 
-    def take(self, generation: int) -> SweepJob | None:
+    def take(self, generation: int) -> OdometryJob | None:
         """Hand out the oldest frame; None while one is under way."""
         if self._busy is not None or not self._waiting:
             return None
         self._busy = self._waiting.popleft()
         message = self._busy.message
         times = message.times if self.config.deskew else None
-        return SweepJob(self.robot, generation, message.stamp_ns, message.points, times, self.lidar)
+        return OdometryJob(self.robot, generation, message.stamp_ns, message.points, times, self.lidar)
 
-    def over(self) -> Sweep | None:
+    def over(self) -> LidarFrame | None:
         """Return what was under way."""
         busy, self._busy = self._busy, None
         return busy

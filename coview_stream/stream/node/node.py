@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.search.acceptance import Verdict
+from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.node.decoding import last_line
@@ -26,17 +26,17 @@ from coview_stream.stream.node.jobs import (
     FrameJob,
     FrameResult,
     Job,
+    OdometryJob,
+    OdometryResult,
     Result,
     SearchJob,
-    SweepJob,
-    SweepResult,
 )
 from coview_stream.stream.node.lidar_session import LidarSession
-from coview_stream.stream.node.scheduling import Metronome, Turns
+from coview_stream.stream.node.scheduling import Rate, RoundRobin
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
 from coview_stream.stream.transport import rmw
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import Publisher, Transport
 
@@ -87,8 +87,8 @@ class Node:
         self._lanes = {"track": track, "search": search} | ({"odometry": odometry} if odometry else {})
         self._wake = threading.Condition()
         self._deaths = dict.fromkeys(self._lanes, 0)  # in a row
-        self._turns = {name: Turns(len(self.sessions)) for name in self._lanes}
-        self._guard = Guard(log)
+        self._turns = {name: RoundRobin(len(self.sessions)) for name in self._lanes}
+        self._guard = RateLimitedErrors(log)
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._aside = dict(aside or {})
@@ -243,7 +243,7 @@ class Node:
         # zenoh and of a router hold for urgent messages, and those that came last would be dropped
         rate = self.config.pose_rate
         groups = max(1, min(len(self.sessions), int(_MOST_BEATS / rate)))
-        clock = Metronome(rate * groups, time.monotonic(), slack=0.5 / rate)
+        clock = Rate(rate * groups, time.monotonic(), slack=0.5 / rate)
         group = 0
         while not self._stopping.wait(clock.remaining(time.monotonic())):
             now = time.monotonic()
@@ -270,7 +270,7 @@ class Node:
             self._reporter.changed.set()
 
 
-def take_sweep(session: Session) -> SweepJob | None:
+def take_sweep(session: Session) -> OdometryJob | None:
     """Hand out a frame to make odometry of, for a robot that sends none."""
     return session.take_sweep() if isinstance(session, LidarSession) else None
 
@@ -279,9 +279,13 @@ def tell_done(session: Session, job: Job, result: Result, now: float) -> None:
     """Hand a result over at local time ``now``."""
     if isinstance(job, FrameJob) and isinstance(result, FrameResult):
         session.frame_done(job, result, now)
-    elif isinstance(job, SearchJob) and isinstance(result, Verdict):
+    elif isinstance(job, SearchJob) and isinstance(result, SearchResult):
         session.search_done(job, result)
-    elif isinstance(job, SweepJob) and isinstance(result, SweepResult) and isinstance(session, LidarSession):
+    elif (
+        isinstance(job, OdometryJob)
+        and isinstance(result, OdometryResult)
+        and isinstance(session, LidarSession)
+    ):
         session.sweep_done(job, result, now)
 
 

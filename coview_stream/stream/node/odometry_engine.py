@@ -8,7 +8,7 @@ from collections.abc import Callable
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.odometry.kiss_icp import KissRegistration, Registration
 from coview_stream.odometry.lidar_odometry import LidarOdometry
-from coview_stream.stream.node.jobs import Job, SweepJob, SweepResult
+from coview_stream.stream.node.jobs import Job, OdometryJob, OdometryResult
 
 
 class OdometryEngine:
@@ -31,13 +31,13 @@ class OdometryEngine:
         self._placed: dict[str, tuple[int, int]] = {}  # generation and restarts at the newest pose
         registration(LidarOdometryConfig())  # whether there is one shows now rather than at the first frame
 
-    def run(self, job: Job) -> SweepResult:
+    def run(self, job: Job) -> OdometryResult:
         """Place one frame.
 
         Raises:
             CloudError, RunError: it cannot be placed; the next one may be.
         """
-        if not isinstance(job, SweepJob):
+        if not isinstance(job, OdometryJob):
             raise TypeError(f"{type(job).__name__} is no sweep")
         begin = time.perf_counter()
         lidar = self._lidar(job)
@@ -46,7 +46,7 @@ class OdometryEngine:
         begun = self._placed.get(job.robot) != now
         self._placed[job.robot] = now
         points = None if job.times is None else lidar.points
-        return SweepResult(pose, points, begun, time.perf_counter() - begin)
+        return OdometryResult(pose, points, begun, time.perf_counter() - begin)
 
     def forget(self, robot: str) -> None:
         """Drop a robot's odometry."""
@@ -56,7 +56,7 @@ class OdometryEngine:
     def prepare(self) -> None:
         """Nothing: local maps grow with the frames."""
 
-    def _lidar(self, job: SweepJob) -> LidarOdometry:
+    def _lidar(self, job: OdometryJob) -> LidarOdometry:
         generation, lidar = self._robots.get(job.robot, (None, None))
         if lidar is None:
             lidar = LidarOdometry(job.config, self._registration(job.config))

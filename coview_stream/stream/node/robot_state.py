@@ -14,17 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.registration.covariance import angles_first, carried_along
+from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence, State
 from coview_stream.localization.tracking.odometry_noise import Drift
 from coview_stream.messages.types import PoseMessage
 from coview_stream.odometry.buffer import OdometryBuffer
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.engine_queue import Ready
-from coview_stream.stream.node.last_pose import LastPlace, Recollection
+from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
 
 
-class Whereabouts:
+class RobotState:
     """State and correction of a robot, from one reset of its session to the next, and the reasons for them.
 
     Attributes:
@@ -33,7 +33,7 @@ class Whereabouts:
         suspect: whether a frame has to verify the place before there is a pose again.
     """
 
-    def __init__(self, robot: str, map_sha256: str, counters: Counters, place: LastPlace) -> None:
+    def __init__(self, robot: str, map_sha256: str, counters: Counters, place: PoseHint) -> None:
         """Know nothing, but keep account of ``place``, which outlives resets."""
         self.robot = robot
         self.map_sha256 = map_sha256
@@ -50,7 +50,7 @@ class Whereabouts:
         """Forget all that refers to the odometry frame, which is no more."""
         self._place.begin_anew()
         self.evidence: KeyframeEvidence | None = None
-        self._correction: Correction | None = None
+        self._correction: OdomCorrection | None = None
         self.suspect = self._doubted = False
         self._trusted_from = -(1 << 63)
         self._published: PoseMessage | None = None
@@ -93,7 +93,7 @@ class Whereabouts:
         elif not self.suspect and stamp_ns >= self._trusted_from:
             self._counters.fixes += self._correction is None
             self._lost = None
-            self._correction = Correction.of(fix, stamp_ns, ready.travelled, ready.turned)
+            self._correction = OdomCorrection.of(fix, stamp_ns, ready.travelled, ready.turned)
             if fix.T_map_body is not None:
                 self._place.seen(fix.T_map_body)
 
@@ -162,18 +162,18 @@ class Whereabouts:
         newest, known = odometry.newest, self._correction
         return None if newest is None or known is None else known.age(newest.stamp_ns)
 
-    def recall(self, odometry: OdometryBuffer) -> Recollection:
+    def recall(self, odometry: OdometryBuffer) -> LastKnownPose:
         """Say where the robot is, if that is known, for the next start."""
         forgotten, known = self._place.forgotten, self._correction
         pose = known and known.pose(odometry, self.robot, self.map_sha256)
-        return Recollection(forgotten, pose.stamp_ns, pose.T_map_body) if pose else Recollection(forgotten)
+        return LastKnownPose(forgotten, pose.stamp_ns, pose.T_map_body) if pose else LastKnownPose(forgotten)
 
 
 _NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Correction:
+class OdomCorrection:
     """The newest ``T_map_odom``, and how far odometry had driven when it was right.
 
     Attributes:
@@ -197,7 +197,7 @@ class Correction:
     drift: Drift
 
     @classmethod
-    def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> Correction:
+    def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> OdomCorrection:
         """Take over a fix that has a pose; ``stamp_ns`` is its frame's."""
         if fix.T_map_odom is None or fix.T_map_body is None or fix.covariance is None or fix.drift is None:
             raise ValueError("a fix without a pose corrects nothing")
@@ -219,7 +219,7 @@ class Correction:
         turned = max(0.0, odometry.turned - self.turned)
         T_map_body = self.T_map_odom @ newest.T_odom_body
         shift = T_map_body[:3, 3] - self.T_map_body[:3, 3]
-        carried = angles_first(carried_along(angles_first(self.covariance), shift))
+        carried = swap_rotation_translation(propagate(swap_rotation_translation(self.covariance), shift))
         return PoseMessage(
             stamp_ns=newest.stamp_ns,
             robot=robot,
@@ -267,7 +267,7 @@ class Transition:
         }
 
 
-class Transitions:
+class StateHistory:
     """Takes note of states and keeps the newest changes."""
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ Robot = TypeVar("Robot")
 Job = TypeVar("Job")
 
 
-class Turns:
+class RoundRobin:
     """Serves who has waited longest; every second time, who is urgent comes first.
 
     Args:
@@ -44,7 +44,7 @@ class Turns:
         return None
 
 
-class Metronome:
+class Rate:
     """Absolute deadlines: what takes long delays one beat, not all the later ones.
 
     Args:

@@ -14,8 +14,8 @@ from coview_stream.config import RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, TransportError
-from coview_stream.stream.node.engine_process import CancelledError, DiedError, ProcessLane
-from coview_stream.stream.transport.keys import RobotKeys, check_apart
+from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineProcess
+from coview_stream.stream.transport.keys import RobotKeys, check_disjoint
 from coview_stream.stream.transport.transport import Transport
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
         CancelledError: as asked. CoViewError: a library that the options ask for is missing.
     """
-    check_apart(options.keys)
+    check_disjoint(options.keys)
     names = [k.robot for k in options.keys]
     begin = time.monotonic()
     base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
@@ -85,14 +85,14 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     path, method = str(options.map_path), options.registration
     reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
     lanes = [
-        track := ProcessLane("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
-        search := ProcessLane(
+        track := EngineProcess("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
+        search := EngineProcess(
             "search", path, base_map.sha256, _SEARCH_NICE, registration=method, reloc=reloc
         ),
     ]
     odometry = None
     if options.lidar is not None:
-        odometry = ProcessLane("odometry", path, base_map.sha256, _ODOMETRY_NICE)
+        odometry = EngineProcess("odometry", path, base_map.sha256, _ODOMETRY_NICE)
         lanes.append(odometry)
     transport = None
     try:
@@ -100,7 +100,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
             lane.start()
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
-        from coview_stream.stream.node.last_pose_keeper import Memory
+        from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
         from coview_stream.stream.node.node import Node
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
@@ -115,7 +115,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         track.wait_ready(cancelled)  # the other one has until the first keyframe
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        aside = {} if options.state is None else {"memory": Memory(options.state, sessions).run}
+        aside = {} if options.state is None else {"memory": LastPoseKeeper(options.state, sessions).run}
         node = Node(sessions, transport, track, search, options.node, options.pose_codec, odometry, aside)
         node.start()
     except BaseException as error:

@@ -14,17 +14,17 @@ from itertools import count
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.result import State
-from coview_stream.localization.search.acceptance import Verdict
+from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, PoseMessage, Sample
-from coview_stream.odometry.buffer import Intake, OdometryBuffer
+from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters, Missing
-from coview_stream.stream.node.decoding import Complaints, note, received, voxelized_cloud
+from coview_stream.stream.node.decoding import ErrorLog, note, received, voxelized_cloud
 from coview_stream.stream.node.engine_queue import Work
-from coview_stream.stream.node.frame_sync import Pairing
+from coview_stream.stream.node.frame_sync import FrameSync
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, SearchJob
-from coview_stream.stream.node.last_pose import LastPlace, Recollection
-from coview_stream.stream.node.robot_state import Transitions, Whereabouts
+from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
+from coview_stream.stream.node.robot_state import RobotState, StateHistory
 from coview_stream.stream.transport.keys import RobotKeys
 
 
@@ -58,18 +58,18 @@ class Session:
         self.options = options
         self._lock = threading.RLock()
         self._epochs = count(1)
-        self._place = LastPlace()
+        self._place = PoseHint()
         self._clear()
 
     def _clear(self) -> None:
         """Forget everything."""
         self.counters = Counters()
-        self.complaints = Complaints()
-        self.transitions = Transitions()
+        self.complaints = ErrorLog()
+        self.transitions = StateHistory()
         self.odometry = OdometryBuffer(self.config)
-        self._pairing = Pairing(self.config, self.odometry, self.counters)
+        self._pairing = FrameSync(self.config, self.odometry, self.counters)
         self.work = Work(self.keys.robot, self._epochs, self.counters, self.complaints)
-        self.whereabouts = Whereabouts(self.keys.robot, self.map_sha256, self.counters, self._place)
+        self.whereabouts = RobotState(self.keys.robot, self.map_sha256, self.counters, self._place)
         self._missing = Missing()
         self._unreachable = float("-inf")  # local time at which nobody was connected
 
@@ -106,11 +106,11 @@ class Session:
             self._pair(now)
             self._look()
 
-    def _continue(self, intake: Intake, message: OdometryMessage) -> None:
+    def _continue(self, intake: SampleKind, message: OdometryMessage) -> None:
         """Draw the consequences of what an odometry sample was."""
         if intake in COUNTED_AS:
             self.counters.count(COUNTED_AS[intake])
-        if intake is Intake.GAP and self.whereabouts.found:
+        if intake is SampleKind.GAP and self.whereabouts.found:
             self.whereabouts.doubt(message.stamp_ns)
         elif intake in WHY_ANEW:
             self.begin_anew(WHY_ANEW[intake])
@@ -125,7 +125,7 @@ class Session:
         with self._lock:
             self.whereabouts.begin_anew(reason)
             self.counters.dropped += len(self._pairing)
-            self._pairing = Pairing(self.config, self.odometry, self.counters)
+            self._pairing = FrameSync(self.config, self.odometry, self.counters)
             self.work.begin_anew()
             self._look()
 
@@ -206,7 +206,7 @@ class Session:
                     self._place.drop()  # for it may be the reason
                 self.begin_anew("the engine failed on a frame")
 
-    def search_done(self, job: SearchJob, verdict: Verdict | None) -> None:
+    def search_done(self, job: SearchJob, verdict: SearchResult | None) -> None:
         """Take note of a verdict; None if the search failed, which costs this keyframe's vote only."""
         with self._lock:
             self.work.search_done(job, verdict)
@@ -238,14 +238,14 @@ class Session:
         """Return the state and one clause that gives its reason."""
         with self._lock:
             has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
-            return self.whereabouts.state(lambda: why_nothing(self.keys, self.counters, has_odometry))
+            return self.whereabouts.state(lambda: status_text(self.keys, self.counters, has_odometry))
 
     def age(self) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
         with self._lock:
             return self.whereabouts.age(self.odometry)
 
-    def recall(self) -> Recollection:
+    def recall(self) -> LastKnownPose:
         """Say where the robot is, if that is known, for the next start."""
         with self._lock:
             return self.whereabouts.recall(self.odometry)
@@ -257,26 +257,26 @@ class Session:
 
 
 COUNTED_AS = {
-    Intake.GAP: "odometry_gaps",
-    Intake.OUTAGE: "odometry_gaps",
-    Intake.JUMP: "odometry_jumps",
-    Intake.RESTART: "clock_restarts",
-    Intake.DUPLICATE: "odometry_duplicate",
-    Intake.OUT_OF_ORDER: "odometry_out_of_order",
+    SampleKind.GAP: "odometry_gaps",
+    SampleKind.OUTAGE: "odometry_gaps",
+    SampleKind.JUMP: "odometry_jumps",
+    SampleKind.RESTART: "clock_restarts",
+    SampleKind.DUPLICATE: "odometry_duplicate",
+    SampleKind.OUT_OF_ORDER: "odometry_out_of_order",
 }
 """Counter of an odometry sample that does not just continue."""
 
 WHY_ANEW = {
     # frames from before and after a pause must not be searched for as one place
-    Intake.GAP: "odometry paused",
-    Intake.OUTAGE: "odometry was away for too long",
-    Intake.JUMP: "odometry jumped",
-    Intake.RESTART: "the sender's clock started anew",
+    SampleKind.GAP: "odometry paused",
+    SampleKind.OUTAGE: "odometry was away for too long",
+    SampleKind.JUMP: "odometry jumped",
+    SampleKind.RESTART: "the sender's clock started anew",
 }
 """Why the search begins anew with such a sample; after a gap only where no place is known that could be verified."""
 
 
-def why_nothing(keys: RobotKeys, counted: Counters, has_odometry: bool) -> str:
+def status_text(keys: RobotKeys, counted: Counters, has_odometry: bool) -> str:
     """Say what a robot that has not had one frame processed is waiting for."""
     unread = counted.malformed + counted.oversized + counted.unknown_encoding
     if not counted.received:

@@ -17,9 +17,9 @@ from typing import Any
 from coview_stream.localization.result import State
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node import status as statuses
-from coview_stream.stream.node.scheduling import Metronome
+from coview_stream.stream.node.scheduling import Rate
 from coview_stream.stream.node.session import Session
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Publisher, Transport
 from coview_stream.version import __version__
 
@@ -43,14 +43,14 @@ class Reporter:
         rates: of each robot's poses; whoever publishes them adds to it.
     """
 
-    def __init__(self, sessions: Sequence[Session], transport: Transport, guard: Guard) -> None:
+    def __init__(self, sessions: Sequence[Session], transport: Transport, guard: RateLimitedErrors) -> None:
         self.changed = threading.Event()
         self.rates = {s.keys.robot: statuses.PoseRate() for s in sessions}
         self._sessions = sessions
         self._transport = transport
         self._guard = guard
         self._started = time.monotonic()
-        self._link = Link()
+        self._link = ConnectionMonitor()
         self._told: dict[str, State] = {}
         self._publishers: dict[str, Publisher] = {}
 
@@ -64,7 +64,7 @@ class Reporter:
 
     def run(self, rate: float, stopping: threading.Event) -> None:
         """Publish at ``rate``, and at once what has changed, until ``stopping``; set ``changed`` as well, to end."""
-        clock = Metronome(rate, time.monotonic())
+        clock = Rate(rate, time.monotonic())
         while not stopping.is_set():
             self.changed.wait(timeout=clock.remaining(time.monotonic()))
             self.changed.clear()
@@ -111,7 +111,7 @@ class Reporter:
         self._publishers[robot].put(Encoded(json.dumps(document).encode(), _JSON))
 
 
-class Link:
+class ConnectionMonitor:
     """Compares whom we are connected to with whom we were.
 
     Attributes:

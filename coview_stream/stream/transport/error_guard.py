@@ -14,7 +14,7 @@ def is_panic(error: BaseException) -> bool:
     return type(error).__name__ == "PanicException"
 
 
-class Guard:
+class RateLimitedErrors:
     """Runs handlers and logs what they raise: the first of each kind at once, then at most one line per ``interval``.
 
     Args:

@@ -218,7 +218,7 @@ def _filled(template: str, values: dict[str, str], option: str, wildcards: bool 
 _OPTIONS = ("--cloud-key", "--odometry-key")
 
 
-def check_apart(keys: Sequence[RobotKeys]) -> None:
+def check_disjoint(keys: Sequence[RobotKeys]) -> None:
     """Check the keys of all robots that one node serves.
 
     Raises:

@@ -10,7 +10,7 @@ from typing import Any
 
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.key_expressions import check_expression, matches
 from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
 
@@ -57,7 +57,7 @@ class FakeTransport:
         self._tokens: list[str] = []
         self._subscriptions: list[tuple[str, Callable[[Sample], None], Policy]] = []
         self._answers: dict[str, Callable[[dict[str, str]], dict[str, Any]]] = {}
-        self._guard = Guard(_log)
+        self._guard = RateLimitedErrors(_log)
 
     # what the node under test uses
 

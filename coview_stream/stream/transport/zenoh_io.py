@@ -12,7 +12,7 @@ from typing import Any
 
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
@@ -21,7 +21,7 @@ _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
 class ZenohPublisher:
     """A publisher that may exist before the session does."""
 
-    def __init__(self, key: str, guard: Guard) -> None:
+    def __init__(self, key: str, guard: RateLimitedErrors) -> None:
         self._key = key
         self._guard = guard
         self._publisher: Any = None
@@ -94,7 +94,7 @@ Answer = Callable[[dict[str, str]], dict[str, Any]]
 class Answers:
     """Queries that wait for their answer, and the thread's work on them."""
 
-    def __init__(self, guard: Guard) -> None:
+    def __init__(self, guard: RateLimitedErrors) -> None:
         self._guard = guard
         self._queries: SimpleQueue[tuple[str, Any, Answer] | None] = SimpleQueue()
 

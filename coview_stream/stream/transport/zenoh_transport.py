@@ -15,7 +15,7 @@ from typing import Any
 from coview_stream.errors import TransportError
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport import zenoh_config
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
 from coview_stream.stream.transport.zenoh_config import zenoh_errors
 from coview_stream.stream.transport.zenoh_io import Answers, ZenohPublisher, first_reply, plain, quality
@@ -67,7 +67,7 @@ class ZenohTransport:
         self._config = config
         self._max_payload = max_payload
         self._waits = zenoh_config.mode_of(config) == "client"
-        self._guard = Guard(_log)
+        self._guard = RateLimitedErrors(_log)
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []

@@ -8,15 +8,15 @@ from courtyard import courtyard, local_map, source_of
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.geometry.se3 import checked_covariance, difference, shifted
+from coview_stream.geometry.se3 import boxminus, boxplus, checked_covariance
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.registration.covariance import (
-    angles_first,
-    carried_along,
+    propagate,
     registration_covariance,
-    without_prior,
+    remove_prior,
+    swap_rotation_translation,
 )
-from coview_stream.localization.registration.local_map import LocalMap, Source
+from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 
@@ -30,8 +30,8 @@ FLOOR = np.array([CONFIG.sigma_floor_angle] * 3 + [CONFIG.sigma_floor] * 3)
 
 def test_the_reports_order_is_the_same_covariance():
     C = np.arange(36.0).reshape(6, 6)
-    np.testing.assert_array_equal(angles_first(angles_first(C)), C)
-    assert angles_first(C)[0, 3] == C[3, 0]
+    np.testing.assert_array_equal(swap_rotation_translation(swap_rotation_translation(C)), C)
+    assert swap_rotation_translation(C)[0, 3] == C[3, 0]
 
 
 def test_an_error_in_heading_becomes_one_in_place_further_on():
@@ -42,8 +42,8 @@ def test_an_error_in_heading_becomes_one_in_place_further_on():
     step = pose_from(rot_z(0.3), [10.0, 2.0, 0.5])
     shift = (TRUTH @ step)[:3, 3] - TRUTH[:3, 3]
     drawn = np.random.default_rng(0).multivariate_normal(np.zeros(6), C, 4000)
-    ends = np.array([difference(shifted(TRUTH, d) @ step, TRUTH @ step) for d in drawn])
-    expected = carried_along(C, shift)
+    ends = np.array([boxminus(boxplus(TRUTH, d) @ step, TRUTH @ step) for d in drawn])
+    expected = propagate(C, shift)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         np.cov(ends.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.06
@@ -150,7 +150,7 @@ def scan(target):
     some = np.random.default_rng(1).permutation(len(target.points))[:3000]
     exact = source_of(target.points[np.sort(some)], TRUTH)
     noise = np.random.default_rng(2).normal(0, 0.02, exact.points.shape).astype(np.float32)
-    return Source(exact.points + noise, exact.above, exact.height)
+    return RegistrationCloud(exact.points + noise, exact.above, exact.height)
 
 
 @pytest.mark.parametrize("tight", [1.0, 0.1])
@@ -158,13 +158,13 @@ def test_a_registration_without_its_prior_is_the_one_that_had_none(target, scan,
     """The prior is off by centimetres and, at its tightest, knows more than the pairs do."""
     config = RegistrationConfig(inflation=8.0)
     sigma = tight * np.array([0.003, 0.003, 0.005, 0.05, 0.05, 0.05])
-    mean = shifted(TRUTH, np.array([0.002, -0.001, 0.004, 0.04, -0.03, 0.02]))
+    mean = boxplus(TRUTH, np.array([0.002, -0.001, 0.004, 0.04, -0.03, 0.02]))
     prior = Prior(mean, np.diag(sigma**-2))
     alone = register(scan, mean, target, config, config.track, centre=np.zeros(3), iterations=40)
     fused = register(scan, mean, target, config, config.track, prior, np.zeros(3), iterations=40)
-    found = without_prior(fused.T_map_source, fused.information, mean, prior.information, config)
-    pulled = np.linalg.norm(difference(fused.T_map_source, alone.T_map_source)[3:])
-    left = np.linalg.norm(difference(found.T_map_body, alone.T_map_source)[3:])
+    found = remove_prior(fused.T_map_source, fused.information, mean, prior.information, config)
+    pulled = np.linalg.norm(boxminus(fused.T_map_source, alone.T_map_source)[3:])
+    left = np.linalg.norm(boxminus(found.T_map_body, alone.T_map_source)[3:])
     ratio = np.diag(found.information) / np.diag(alone.information)
     if tight == 1.0:
         assert left < 0.001
@@ -182,14 +182,14 @@ def test_fusing_the_measurement_with_its_prior_gives_the_registration_back():
     A, B = (m @ m.T + 50 * np.eye(6) for m in rng.standard_normal((2, 6, 6)) * 10)
     a = CONFIG.inflation**2
     mean, gap = TRUTH, np.array([0.0, 0.0, 1e-5, 0.03, -0.02, 0.05])
-    measured = shifted(mean, gap)
+    measured = boxplus(mean, gap)
     total = A + a * B
-    T = shifted(mean, np.linalg.solve(total, A @ gap))
-    found = without_prior(T, total, mean, B, CONFIG)
+    T = boxplus(mean, np.linalg.solve(total, A @ gap))
+    found = remove_prior(T, total, mean, B, CONFIG)
     np.testing.assert_allclose(found.information, A, rtol=1e-6, atol=1e-6 * np.abs(A).max())
     share = np.linalg.eigvals(np.linalg.solve(total, A)).real.min()
     slack = (0.01 / share) ** 2 * np.linalg.norm(gap) * np.linalg.cond(total)
-    assert np.abs(difference(found.T_map_body, measured)).max() < slack
+    assert np.abs(boxminus(found.T_map_body, measured)).max() < slack
 
 
 def test_where_the_map_says_nothing_the_measurement_says_nothing():
@@ -198,15 +198,15 @@ def test_where_the_map_says_nothing_the_measurement_says_nothing():
     floor = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     points = np.column_stack([floor, np.zeros(len(floor))]).astype(np.float32)
     target = LocalMap(points, np.tile(np.float32([0, 0, 1]), (len(points), 1)))
-    scan = Source(points[::7], np.zeros(len(points[::7]), bool), points[::7, 2])
-    mean = shifted(np.eye(4), np.array([0.0, 0.0, 0.01, 0.1, -0.1, 0.03]))
+    scan = RegistrationCloud(points[::7], np.zeros(len(points[::7]), bool), points[::7, 2])
+    mean = boxplus(np.eye(4), np.array([0.0, 0.0, 0.01, 0.1, -0.1, 0.03]))
     prior = Prior(mean, np.diag(np.array([0.01, 0.01, 0.02, 0.2, 0.3, 0.1]) ** -2))
     fused = register(scan, mean, target, CONFIG, (0.4,), prior, np.zeros(3))
-    found = without_prior(fused.T_map_source, fused.information, mean, prior.information, CONFIG)
+    found = remove_prior(fused.T_map_source, fused.information, mean, prior.information, CONFIG)
     sigma = np.sqrt(np.diag(registration_covariance(found.information, CONFIG)))
     assert (sigma[[0, 1, 5]] < 2 * FLOOR[[0, 1, 5]]).all()
     assert (sigma[3:5] > 9.0).all()
     assert sigma[2] > 0.9 * CONFIG.weak_sigma / CONFIG.weak_lever
-    gap = difference(found.T_map_body, mean)
+    gap = boxminus(found.T_map_body, mean)
     assert abs(gap[5] + 0.03) < 0.005  # the floor is where it is
     assert np.abs(gap[2:5]).max() < 0.01  # the rest stays with the prior

@@ -17,13 +17,13 @@ from coview_kernels import Belief
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.se3 import difference, shifted
+from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
 from coview_stream.localization.registration import gicp as pivot
-from coview_stream.localization.registration.covariance import registration_covariance, without_prior
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, Source
+from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.result import State
@@ -63,7 +63,7 @@ def scan_of(target, T=TRUTH, count=3000, noise=0.02):
     some = np.sort(np.random.default_rng(1).permutation(len(target.points))[:count])
     exact = source_of(target.points[some], T)
     error = np.random.default_rng(2).normal(0, noise, exact.points.shape).astype(np.float32)
-    return Source(exact.points + error, exact.above, exact.height)
+    return RegistrationCloud(exact.points + error, exact.above, exact.height)
 
 
 # ---- our arithmetic
@@ -89,7 +89,7 @@ def test_hessian_and_gradient_are_of_our_tangent():
 
     r = residuals(TILTED)
     theirs = slope(lambda d: TILTED @ exp_se3(d))
-    ours = slope(lambda d: pivot.moved(TILTED, d, PIVOT))
+    ours = slope(lambda d: pivot.retract(TILTED, d, PIVOT))
     H, b = pivot.about_pivot(theirs.T @ theirs, theirs.T @ r, TILTED, PIVOT)
     np.testing.assert_allclose(H, ours.T @ ours, rtol=1e-6, atol=1e-5 * np.abs(H).max())
     np.testing.assert_allclose(b, ours.T @ r, rtol=1e-6, atol=1e-6 * np.abs(b).max())
@@ -102,20 +102,20 @@ def test_the_pull_of_pairs_is_that_of_their_gaps():
         return (transform(T, p) - q).ravel()
 
     h = 1e-6
-    moves = [(pivot.moved(TILTED, h * e, PIVOT), pivot.moved(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
+    moves = [(pivot.retract(TILTED, h * e, PIVOT), pivot.retract(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
     slope = np.column_stack([(gaps(a) - gaps(b)) / (2 * h) for a, b in moves])
     there = transform(TILTED, p)
-    H, b = pivot.pulls(there, there - q, transform(TILTED, PIVOT[None])[0])
+    H, b = pivot.point_to_point_system(there, there - q, transform(TILTED, PIVOT[None])[0])
     np.testing.assert_allclose(H, slope.T @ slope, rtol=1e-6, atol=1e-5)
     np.testing.assert_allclose(b, slope.T @ gaps(TILTED), rtol=1e-6, atol=1e-5)
 
 
 def test_a_move_turns_about_the_pivot_and_shifts_it_along_the_maps_axes():
     step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
-    there = pivot.moved(TILTED, step, PIVOT)
+    there = pivot.retract(TILTED, step, PIVOT)
     gap = transform(there, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
     np.testing.assert_allclose(gap, step[3:], atol=1e-12)
-    np.testing.assert_allclose(difference(there, TILTED)[:3], step[:3], atol=1e-9)
+    np.testing.assert_allclose(boxminus(there, TILTED)[:3], step[:3], atol=1e-9)
 
 
 def test_pairs_and_prior_fuse_as_two_gaussians():
@@ -123,16 +123,16 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
     rng = np.random.default_rng(4)
     A, B = (m @ m.T + 50 * np.eye(6) for m in 10 * rng.standard_normal((2, 6, 6)))
     gap = np.array([1e-6, -2e-6, 3e-6, 0.003, -0.002, 0.005])  # small: turns add up to first order only
-    measured = pivot.moved(TILTED, gap, PIVOT)
+    measured = pivot.retract(TILTED, gap, PIVOT)
     prior = Belief(TILTED, B)
     wanted = np.linalg.solve(A + B, A @ gap)
     for begin, gradient in ((TILTED, -A @ gap), (measured, np.zeros(6))):
         step, information = pivot.fused_step(A, gradient, begin, PIVOT, prior)
         np.testing.assert_array_equal(information, A + B)
-        found = pivot.moved(begin, step, PIVOT)
+        found = pivot.retract(begin, step, PIVOT)
         away = transform(found, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
         np.testing.assert_allclose(away, wanted[3:], atol=1e-7)
-        np.testing.assert_allclose(difference(found, TILTED)[:3], wanted[:3], atol=1e-7)
+        np.testing.assert_allclose(boxminus(found, TILTED)[:3], wanted[:3], atol=1e-7)
 
 
 def test_without_a_prior_the_step_is_the_pairs():
@@ -169,7 +169,7 @@ def test_what_the_map_does_not_have_is_trimmed(target):
     air = rng.uniform([-12, -12, 0.6], [12, 12, 5], (500, 3)).astype(np.float32)
     near = scan.points[scan.above][:500] + np.float32([0.25, 0.25, 0.0])
     stray = np.concatenate([air, near])
-    crowd = Source(
+    crowd = RegistrationCloud(
         np.concatenate([scan.points, stray]),
         np.concatenate([scan.above, np.ones(len(stray), bool)]),
         np.concatenate([scan.height, np.full(len(stray), 2.0, np.float32)]),
@@ -182,7 +182,7 @@ def test_what_the_map_does_not_have_is_trimmed(target):
 def test_rows_without_numbers_change_nothing(target):
     scan = scan_of(target)
     hole = np.full((7, 3), np.nan, np.float32)
-    holed = Source(
+    holed = RegistrationCloud(
         np.concatenate([hole, scan.points]),
         np.concatenate([np.ones(7, bool), scan.above]),
         np.concatenate([hole[:, 0], scan.height]),
@@ -194,7 +194,7 @@ def test_rows_without_numbers_change_nothing(target):
 @pytest.mark.parametrize("count", [0, 1, 19, 45])
 def test_too_few_points_are_refused(target, count):
     scan = scan_of(target)
-    few = Source(scan.points[:count], scan.above[:count], scan.height[:count])
+    few = RegistrationCloud(scan.points[:count], scan.above[:count], scan.height[:count])
     assert register(few, TRUTH, target, CONFIG, CONFIG.track, centre=np.zeros(3)) is None
     assert register(scan, pose_from(np.eye(3), [500, 0, 0]), target, CONFIG, CONFIG.track) is None
     tiny = LocalMap(target.points[:count], target.normals[:count])
@@ -228,11 +228,11 @@ def inside(corridor):
 
 def test_along_a_corridor_the_prior_decides(corridor):
     """It is off to the side, too, and there the walls do."""
-    mean = shifted(np.eye(4), np.array([0.0, 0.0, 0.01, 0.5, 0.1, 0.05]))
-    start = shifted(np.eye(4), np.array([0.0, 0.0, 0.01, 0.2, 0.1, 0.05]))
+    mean = boxplus(np.eye(4), np.array([0.0, 0.0, 0.01, 0.5, 0.1, 0.05]))
+    start = boxplus(np.eye(4), np.array([0.0, 0.0, 0.01, 0.2, 0.1, 0.05]))
     prior = Prior(mean, np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
     found = register(inside(corridor), start, corridor, DISTRUSTING, DISTRUSTING.track, prior, np.zeros(3))
-    gap = difference(found.T_map_source, np.eye(4))
+    gap = boxminus(found.T_map_source, np.eye(4))
     assert gap[3] == pytest.approx(0.5, abs=0.03)
     assert np.abs(gap[[0, 1, 2, 4, 5]]).max() < 0.01
 
@@ -240,7 +240,7 @@ def test_along_a_corridor_the_prior_decides(corridor):
 def test_what_a_corridor_does_not_show_is_not_measured(corridor):
     prior = Prior(np.eye(4), np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
     fused = register(inside(corridor), np.eye(4), corridor, CONFIG, (0.4,), prior, np.zeros(3))
-    found = without_prior(fused.T_map_source, fused.information, np.eye(4), prior.information, CONFIG)
+    found = remove_prior(fused.T_map_source, fused.information, np.eye(4), prior.information, CONFIG)
     sigma = np.sqrt(np.diag(registration_covariance(found.information, CONFIG)))
     assert sigma[3] > 10 * sigma[4]
     assert sigma[4] < 0.02
@@ -249,14 +249,14 @@ def test_what_a_corridor_does_not_show_is_not_measured(corridor):
 def test_without_its_prior_a_registration_is_the_one_that_had_none(target):
     """The prior is off by centimetres and knows as much as the pairs."""
     scan = scan_of(target, TILTED, noise=0.01)
-    mean = shifted(TILTED, np.array([0.001, -0.001, 0.002, 0.03, -0.02, 0.015]))
+    mean = boxplus(TILTED, np.array([0.001, -0.001, 0.002, 0.03, -0.02, 0.015]))
     prior = Prior(mean, np.diag(np.array([0.002, 0.002, 0.002, 0.01, 0.01, 0.01]) ** -2))
     origin = np.zeros(3)
     alone = register(scan, mean, target, DISTRUSTING, DISTRUSTING.track, centre=origin, iterations=40)
     fused = register(scan, mean, target, DISTRUSTING, DISTRUSTING.track, prior, origin, iterations=40)
-    found = without_prior(fused.T_map_source, fused.information, mean, prior.information, DISTRUSTING)
-    pulled = np.linalg.norm(difference(fused.T_map_source, alone.T_map_source)[3:])
-    left = np.linalg.norm(difference(found.T_map_body, alone.T_map_source)[3:])
+    found = remove_prior(fused.T_map_source, fused.information, mean, prior.information, DISTRUSTING)
+    pulled = np.linalg.norm(boxminus(fused.T_map_source, alone.T_map_source)[3:])
+    left = np.linalg.norm(boxminus(found.T_map_body, alone.T_map_source)[3:])
     assert pulled > 0.003
     assert left < 0.3 * pulled
     np.testing.assert_allclose(np.diag(found.information) / np.diag(alone.information), 1.0, atol=0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.config import RegistrationConfig
-from coview_stream.localization.registration.prepare_scan import height_above_lowest, local_source
+from coview_stream.localization.registration.prepare_scan import height_above_lowest, prepare_scan
 
 
 def ground(slope=0.0, half=30.0, z=5.0):
@@ -24,7 +24,7 @@ def test_walls_stand_above_and_the_ground_does_not():
     height = height_above_lowest(points)
     np.testing.assert_allclose(height[: len(ground())], 0.0, atol=1e-5)
     np.testing.assert_allclose(height[len(ground()) :], wall()[:, 2] - 5.0, atol=1e-5)
-    source = local_source(points, np.array([0.0, 0.0, 7.0]), RegistrationConfig(source_points=50_000))
+    source = prepare_scan(points, np.array([0.0, 0.0, 7.0]), RegistrationConfig(source_points=50_000))
     np.testing.assert_array_equal(source.above, source.height > 0.5)
     assert source.above.sum() > 200
     assert np.abs(source.points[source.above][:, 0] - 10.2).max() < 0.3
@@ -44,7 +44,7 @@ def test_range_and_number_are_limited_and_the_choice_repeats():
     points = ground(half=60.0)
     settings = RegistrationConfig(source_range=20.0, source_points=700, source_voxel=0.5)
     position = np.array([10.0, -5.0, 6.0])
-    one, two = (local_source(points, position, settings) for _ in range(2))
+    one, two = (prepare_scan(points, position, settings) for _ in range(2))
     assert len(one.points) == len(one.above) == len(one.height) == 700
     np.testing.assert_array_equal(one.points, two.points)
     assert np.linalg.norm(one.points - position, axis=1).max() < 20.0 + 0.5
@@ -53,7 +53,7 @@ def test_range_and_number_are_limited_and_the_choice_repeats():
 
 
 def test_one_point_per_voxel():
-    source = local_source(
+    source = prepare_scan(
         np.repeat(ground(half=5.0), 4, axis=0), np.zeros(3), RegistrationConfig(source_voxel=1.0)
     )
     assert len(np.unique(np.floor(source.points / 1.0), axis=0)) == len(source.points)
@@ -61,6 +61,6 @@ def test_one_point_per_voxel():
 
 @pytest.mark.parametrize("points", [np.empty((0, 3), np.float32), np.full((1, 3), 900, np.float32)])
 def test_nothing_near_is_an_empty_source(points):
-    source = local_source(points, np.zeros(3), RegistrationConfig())
+    source = prepare_scan(points, np.zeros(3), RegistrationConfig())
     assert source.points.shape == (0, 3)
     assert len(source.above) == len(source.height) == 0

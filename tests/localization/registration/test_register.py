@@ -10,7 +10,7 @@ from se3 import exp_se3
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
-from coview_stream.localization.registration.local_map import LocalMaps, Source
+from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 
@@ -38,7 +38,7 @@ def with_outliers(scan, share):
     rng = np.random.default_rng(2)
     n = int(len(scan.points) * share / (1 - share))
     stray = rng.uniform([-12, -12, 0.6], [12, 12, 5], (n, 3)).astype(np.float32)
-    return Source(
+    return RegistrationCloud(
         np.concatenate([scan.points, stray]),
         np.concatenate([scan.above, np.ones(n, bool)]),
         np.concatenate([scan.height, stray[:, 2]]),
@@ -94,7 +94,7 @@ def test_information_is_symmetric_and_says_where_the_pose_is_sure(target, scan):
 
 def test_empty_surroundings_are_refused(target, scan):
     assert register(scan, pose_from(np.eye(3), [500, 0, 0]), target, CONFIG, (1.0,)) is None
-    few = Source(scan.points[:20], scan.above[:20], scan.height[:20])
+    few = RegistrationCloud(scan.points[:20], scan.above[:20], scan.height[:20])
     assert register(few, TRUTH, target, CONFIG, (1.0,)) is None
 
 

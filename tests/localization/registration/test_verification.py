@@ -10,9 +10,9 @@ from courtyard import local_map, parts, plane
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.registration import verification as rays
-from coview_stream.localization.registration.local_map import LocalMaps, Source
-from coview_stream.localization.registration.prepare_scan import local_source
-from coview_stream.localization.registration.verification import RangeImage, rays_against_map, verify
+from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
+from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.verification import RangeImage, free_space, verify
 
 CONFIG = RegistrationConfig()
 
@@ -29,7 +29,7 @@ def seen(world_map, world_drive):
     T, cloud = world_drive.T_map_body[2], world_drive.clouds[2]
     zero = pose_from(np.eye(3), -world_map.origin)
     maps = LocalMaps(world_map, CONFIG.source_range)
-    source = local_source(small_world.in_map(world_drive, 3), T[:3, 3], CONFIG)
+    source = prepare_scan(small_world.in_map(world_drive, 3), T[:3, 3], CONFIG)
 
     def evidence(dx=0.0, dy=0.0, degrees=0.0):
         about = pose_from(np.eye(3), T[:3, 3] + [dx, dy, 0]) @ pose_from(
@@ -88,33 +88,33 @@ BODY = pose_from(np.eye(3), [0, 0, 1.5])
 
 
 def test_rays_that_end_at_the_wall_met_it():
-    met, passed = rays_against_map(RangeImage.of(fan(10.2)), BODY, WALL)
+    met, passed = free_space(RangeImage.of(fan(10.2)), BODY, WALL)
     assert passed == 0
     assert met > 0.9 * len(WALL)
 
 
 def test_rays_that_end_behind_the_wall_passed_through_it():
-    met, passed = rays_against_map(RangeImage.of(fan(25.0)), BODY, WALL)
+    met, passed = free_space(RangeImage.of(fan(25.0)), BODY, WALL)
     assert met == 0
     assert passed > 0.5 * len(WALL)
 
 
 def test_a_wall_behind_the_returns_is_hidden():
-    assert rays_against_map(RangeImage.of(fan(4.0)), BODY, WALL) == (0, 0)
+    assert free_space(RangeImage.of(fan(4.0)), BODY, WALL) == (0, 0)
 
 
 def test_where_no_ray_went_nothing_is_said():
-    assert rays_against_map(RangeImage.of(fan(25.0)), pose_from(rot_z(np.pi), [0, 0, 1.5]), WALL) == (0, 0)
-    assert rays_against_map(RangeImage.of(fan(25.0)), pose_from(np.eye(3), [-40, 0, 1.5]), WALL) == (0, 0)
+    assert free_space(RangeImage.of(fan(25.0)), pose_from(rot_z(np.pi), [0, 0, 1.5]), WALL) == (0, 0)
+    assert free_space(RangeImage.of(fan(25.0)), pose_from(np.eye(3), [-40, 0, 1.5]), WALL) == (0, 0)
 
 
 def test_the_heading_of_the_robot_counts():
     """Body x ahead: a robot that looks along +y meets a wall that stands at +y."""
     turned = transform(pose_from(rot_z(np.pi / 2), [0, 0, 0]), WALL)
-    met, passed = rays_against_map(RangeImage.of(fan(10.2)), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
+    met, passed = free_space(RangeImage.of(fan(10.2)), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
     assert met > 0
     assert passed == 0
-    assert rays_against_map(RangeImage.of(fan(10.2)), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (
+    assert free_space(RangeImage.of(fan(10.2)), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (
         0,
         0,
     )
@@ -126,7 +126,7 @@ def test_little_structure_proves_nothing():
     )
     target = local_map(*field)
     height = field[0][:, 2].copy()
-    source = Source(field[0], height > 0.5, height)
+    source = RegistrationCloud(field[0], height > 0.5, height)
     everywhere = np.ones(len(height), bool)
     sparse = verify(source, np.eye(4), RangeImage.of(fan(25.0)), BODY, target, everywhere)
     assert sparse.ground > 0.99
@@ -141,7 +141,7 @@ def test_points_off_the_survey_do_not_count(seen):
     elsewhere = target.points + np.array([0, 0, 300], np.float32)
     points = np.concatenate([target.points, elsewhere])
     height = np.tile(target.points[:, 2], 2)
-    source = Source(points, height > 0.5, height)
+    source = RegistrationCloud(points, height > 0.5, height)
     surveyed = np.arange(len(points)) < len(target.points)
     found = verify(source, np.eye(4), RangeImage.of(fan(25.0, 5.0)), BODY, target, surveyed)
     assert found.near == 1.0
@@ -151,12 +151,12 @@ def test_points_off_the_survey_do_not_count(seen):
 
 def test_a_dense_frame_is_judged_by_a_part_of_it(monkeypatch):
     cloud = np.repeat(fan(10.2), 9, axis=0)
-    whole = rays_against_map(RangeImage.of(cloud), BODY, WALL)
+    whole = free_space(RangeImage.of(cloud), BODY, WALL)
     monkeypatch.setattr(rays, "_MOST_RAYS", len(fan(10.2)) * 3)
     part = RangeImage.of(cloud)
     assert 0.2 * len(cloud) < part.hits.sum() < 0.4 * len(cloud)
-    assert rays_against_map(part, BODY, WALL) == whole
+    assert free_space(part, BODY, WALL) == whole
 
 
 def test_a_frame_without_points_has_no_rays():
-    assert rays_against_map(RangeImage.of(np.empty((0, 3), np.float32)), BODY, WALL) == (0, 0)
+    assert free_space(RangeImage.of(np.empty((0, 3), np.float32)), BODY, WALL) == (0, 0)

@@ -12,14 +12,14 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.result import State
-from coview_stream.localization.search.acceptance import Decision
+from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.refinement import Candidate
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.request import SearchRequest
 
 RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), dtype=np.float32)
-QUERY = Query(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
+QUERY = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
 HERE, ELSEWHERE = (pose_from(rot_z(-0.8), [x, 9.0, 0.5]) for x in (3.0, 40.0))
 WEAK = RULE.score + 0.03
 
@@ -34,7 +34,7 @@ def candidate(
 
 def keyframes_needed(*candidates: Candidate) -> int | None:
     """Keyframes of the same candidates, best first, until the first is accepted; None if 40 are not enough."""
-    decision = Decision(LocalizerConfig())
+    decision = AcceptanceTest(LocalizerConfig())
     for count in range(1, 41):
         if decision.judge(list(candidates), QUERY, count).accepted is not None:
             return count
@@ -90,6 +90,6 @@ def test_a_lower_score_is_enough_only_where_features_favour_the_place_clearly() 
 
 
 def test_one_scan_alone_gains_nothing_by_votes() -> None:
-    decision = Decision(replace(LocalizerConfig(), stationary=True))
+    decision = AcceptanceTest(replace(LocalizerConfig(), stationary=True))
     verdict = decision.judge([candidate(RULE.single_score - 0.02, lead=100.0)], QUERY, 1)
     assert verdict.evidence.state is State.SEARCHING

@@ -11,8 +11,8 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transfo
 from coview_stream.localization.search.consensus import (
     Consensus,
     StationGrid,
-    smallest,
-    standardised,
+    argsmallest,
+    robust_zscore,
     yaw_of_shift,
 )
 
@@ -185,7 +185,7 @@ def test_smallest_is_a_stable_sort(kind, count, monkeypatch):
         "few": np.where(np.arange(10_000) % 100, 1.0, 2.0),  # the sample sees only what is large
         "rising": np.arange(10_000),
     }[kind].astype(np.float32)
-    np.testing.assert_array_equal(smallest(values, count), np.argsort(values, kind="stable")[:count])
+    np.testing.assert_array_equal(argsmallest(values, count), np.argsort(values, kind="stable")[:count])
 
 
 def test_storeys_are_told_apart_by_the_height_gained():
@@ -251,7 +251,7 @@ def test_channels_count_alike_whatever_their_spread():
 def test_standardised_is_robust():
     values = np.random.default_rng(1).normal(5.0, 2.0, (300, 60)).astype(np.float32)
     values[0] = -500.0
-    z = standardised(values)[1:]
+    z = robust_zscore(values)[1:]
     assert np.median(z) == pytest.approx(0.0, abs=0.02)
     assert z.std() == pytest.approx(1.0, abs=0.05)
-    assert np.isfinite(standardised(np.ones((3, 4), np.float32))).all()
+    assert np.isfinite(robust_zscore(np.ones((3, 4), np.float32))).all()

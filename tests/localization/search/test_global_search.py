@@ -28,7 +28,7 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.localization.search.refinement import Candidate, gravity_information
-from coview_stream.localization.search.request import Needs, Query
+from coview_stream.localization.search.request import RequestSpec, SearchRequest
 
 RULE = AcceptanceConfig()
 KEYFRAME = Keyframe(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), np.empty((0, 3), np.float32))
@@ -243,7 +243,7 @@ def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM):
     for k in range(frames):
         T = inverse(T_map_odom) @ world_drive.T_map_body[k]
         cloud = world_drive.clouds[k]
-        yield Query.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, Needs(descriptor))
+        yield SearchRequest.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, RequestSpec(descriptor))
 
 
 def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive, monkeypatch):

@@ -18,7 +18,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import State
 from coview_stream.localization.search import pose_hints as suggestions
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.pose_hints import Suggestions, Trials
+from coview_stream.localization.search.pose_hints import HintSchedule, PoseHints
 from coview_stream.localization.search.request import same_place
 
 # ---- what a localizer keeps
@@ -79,7 +79,7 @@ def test_a_loss_keeps_the_odometrys_frame_whatever_the_anchor():
     rng = np.random.default_rng(3)
     T_map_odom, T_odom_body = (exp_se3(rng.uniform(-1, 1, 6) * [0, 0, 3, 50, 50, 3]) for _ in range(2))
     first, second = rng.uniform(-1e3, 1e3, (2, 3))
-    kept = Suggestions()
+    kept = PoseHints()
     kept.frames_were(T_map_odom, first)
     (again,) = kept.about(second, np.eye(4))
     moved = pose_from(np.eye(3), first - second) @ T_odom_body  # the same pose about the second anchor
@@ -91,7 +91,7 @@ def test_a_loss_keeps_the_odometrys_frame_whatever_the_anchor():
 
 
 def test_tried_at_once_then_now_and_then():
-    trials = Trials()
+    trials = HintSchedule()
     tried = []
     for _ in range(100):
         due = trials.due((np.eye(4),))
@@ -104,7 +104,7 @@ def test_tried_at_once_then_now_and_then():
 
 
 def test_one_keyframe_that_does_not_speak_against_it_starts_the_count_anew():
-    trials = Trials()
+    trials = HintSchedule()
     for refuted in [*[True] * (suggestions._TRIES - 1), False] * 3:
         assert trials.due((np.eye(4),))
         trials.tried(refuted)
@@ -112,7 +112,7 @@ def test_one_keyframe_that_does_not_speak_against_it_starts_the_count_anew():
 
 
 def test_another_suggestion_is_tried_at_once():
-    trials = Trials()
+    trials = HintSchedule()
     for _ in range(suggestions._TRIES):
         trials.due((np.eye(4),))
         trials.tried(refuted=True)
@@ -188,7 +188,7 @@ def test_one_scan_alone_never_believes_a_suggestion_that_no_vote_supports(world_
 
 def test_inverse_of_a_suggestion_is_where_odometry_began():
     """The robot at the suggested place, whatever odometry says where it is."""
-    kept = Suggestions()
+    kept = PoseHints()
     T_map_body, T_odom_body = pose_from(rot_z(2.5), [40, -7, 3]), pose_from(rot_z(-1.0), [5, 6, 0.2])
     kept.robot_at(T_map_body)
     (T,) = kept.about(np.array([100.0, 200.0, 5.0]), T_odom_body)

@@ -7,7 +7,7 @@ import pytest
 from small_world import ODOM_FAR
 
 from coview_stream.geometry.transforms import pose_from, transform
-from coview_stream.localization.search.keyframes import _PATIENCE, Continuity
+from coview_stream.localization.search.keyframes import _PATIENCE, OdometryCheck
 
 T_LOCAL = pose_from(ODOM_FAR[:3, :3], np.zeros(3))
 
@@ -25,14 +25,14 @@ def frames(slow_drive):
 
 
 def test_a_drive_goes_on(frames, world_drive):
-    continuity = Continuity()
+    continuity = OdometryCheck()
     assert not any(continuity.broken(*frame) for frame in frames)
-    wide = Continuity()
+    wide = OdometryCheck()
     assert not any(wide.broken(*frame) for frame in frames_of(world_drive))
 
 
 def test_another_place_is_noticed_after_a_few_frames_and_once(frames, elsewhere):
-    continuity = Continuity()
+    continuity = OdometryCheck()
     for frame in frames[:10]:
         continuity.broken(*frame)
     other, _ = list(frames_of(elsewhere))[2]
@@ -44,7 +44,7 @@ def test_another_place_is_noticed_after_a_few_frames_and_once(frames, elsewhere)
 
 
 def test_one_strange_frame_is_dust(frames):
-    continuity = Continuity()
+    continuity = OdometryCheck()
     rng = np.random.default_rng(0)
     dust = rng.uniform(-3.0, 3.0, (4000, 3)).astype(np.float32) + np.float32([0.0, 0.0, 20.0])
     for k, frame in enumerate(frames):
@@ -54,7 +54,7 @@ def test_one_strange_frame_is_dust(frames):
 
 
 def test_a_handful_of_points_says_nothing(frames):
-    continuity = Continuity()
+    continuity = OdometryCheck()
     assert not continuity.broken(frames[0][0][:5], frames[0][1])
     for frame in frames[:3]:
         continuity.broken(*frame)
@@ -65,11 +65,11 @@ def test_a_handful_of_points_says_nothing(frames):
 def test_a_jump_of_odometry_is_noticed_and_can_be_forgotten(frames):
     jump = np.float32([40.0, 0.0, 0.0])
     jumped = [(points + jump, place + jump) for points, place in frames]
-    continuity = Continuity()
+    continuity = OdometryCheck()
     for frame in frames[:10]:
         continuity.broken(*frame)
     assert [continuity.broken(*frame) for frame in jumped[10:16]].count(True) == 1
-    cleared = Continuity()
+    cleared = OdometryCheck()
     for frame in frames[:10]:
         cleared.broken(*frame)
     cleared.clear()

@@ -16,7 +16,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.result import State
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.learned.matcher import LearnedMap
+from coview_stream.localization.search.learned.matcher import FeatureMatcher
 from coview_stream.stream.node.engines import SearchEngine
 from coview_stream.stream.node.jobs import SearchJob
 
@@ -42,8 +42,8 @@ def knowing(monkeypatch, world_drive):
         found[station, shift] = -1.0
         return found
 
-    monkeypatch.setattr(LearnedMap, "distances", distances)
-    monkeypatch.setattr(LearnedMap, "sharpened", lambda self, hypotheses, view: hypotheses)
+    monkeypatch.setattr(FeatureMatcher, "distances", distances)
+    monkeypatch.setattr(FeatureMatcher, "sharpened", lambda self, hypotheses, view: hypotheses)
 
 
 def follow(localizer, drive):
@@ -123,7 +123,7 @@ def test_what_features_miss_the_descriptors_find(learned_map, world_drive, world
         named.append(wrong)
         return found.astype(np.float32)
 
-    monkeypatch.setattr(LearnedMap, "distances", distances)
+    monkeypatch.setattr(FeatureMatcher, "distances", distances)
     fixes = follow(Localizer(learned_map), world_drive)
     assert right(fixes, world_drive)
     assert named

@@ -8,7 +8,7 @@ import numpy as np
 from se3 import exp_se3
 
 from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.se3 import shifted
+from coview_stream.geometry.se3 import boxplus
 from coview_stream.geometry.transforms import inverse, pose_from
 
 START = pose_from(exp_so3([0.1, -0.2, 2.2]), [120.0, -40.0, 7.0])
@@ -43,10 +43,10 @@ def drive(
         step = exp_se3(np.array([0.004 * np.sin(k / 9), 0.002, 0.05 * np.sin(k / 20), 0.5, 0.0, 0.01]))
         truth.append(truth[-1] @ step)
         noise = rng.standard_normal(6) * np.sqrt(np.diag(odometry)) + (0.0 if bias is None else bias)
-        steps.append(inverse(truth[-2]) @ shifted(truth[-1], noise))
+        steps.append(inverse(truth[-2]) @ boxplus(truth[-1], noise))
         gap = rng.standard_normal(6) * np.sqrt(np.diag(registration))
         gap[3:] += stray * rng.standard_normal(3) * (rng.random() < outliers)
-        seen.append(shifted(truth[-1], gap) if k % every == 0 else None)
+        seen.append(boxplus(truth[-1], gap) if k % every == 0 else None)
     return Drive(truth, steps, seen)
 
 

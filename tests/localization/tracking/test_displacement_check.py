@@ -7,14 +7,14 @@ import pytest
 from courtyard import courtyard, local_map
 from small_world import boxes, scan
 
-from coview_stream.geometry.se3 import shifted
+from coview_stream.geometry.se3 import boxplus
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.tracking import displacement_check as module
-from coview_stream.localization.tracking.displacement_check import Glance, share_on_map
+from coview_stream.localization.tracking.displacement_check import DisplacementCheck, share_on_map
 
 T_MAP_ODOM = pose_from(rot_z(0.7), [2.0, -1.0, 0.4])
-ELSEWHERE = shifted(T_MAP_ODOM, np.array([0.0, 0.0, 1.0, 4.3, -3.7, 0.0]))
+ELSEWHERE = boxplus(T_MAP_ODOM, np.array([0.0, 0.0, 1.0, 4.3, -3.7, 0.0]))
 HERE = np.array([0.0, 0.0, 1.7])
 
 
@@ -40,7 +40,7 @@ def test_what_is_where_the_map_has_it_counts(target):
 
 def test_the_further_off_the_less_of_it(target):
     off = [
-        np.mean(shares(target, shifted(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0]))))
+        np.mean(shares(target, boxplus(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0]))))
         for x in (0.0, 0.6, 5.3)
     ]
     assert off[0] > 1.2 * off[1]
@@ -74,7 +74,7 @@ def test_a_handful_of_points_says_nothing(target):
 
 def used_to(target, frames=5):
     """A glance that has seen the yard a few times."""
-    glance = Glance()
+    glance = DisplacementCheck()
     for k in range(frames):
         glance.learn(yard(100 + k), HERE, T_MAP_ODOM, target)
     return glance
@@ -90,7 +90,7 @@ def test_a_frame_that_is_elsewhere_alarms_and_teaches_nothing(target):
 
 
 def test_where_nothing_has_been_learnt_there_is_nothing_to_compare_with(target):
-    glance = Glance()
+    glance = DisplacementCheck()
     assert not glance.alarming(yard(), HERE, ELSEWHERE, target)
     assert glance.usual is None
 
@@ -105,7 +105,7 @@ def cluttered(share, seed):
 
 
 def test_what_changes_slowly_becomes_usual_and_what_changes_at_once_alarms(target):
-    glance, alarms = Glance(), []
+    glance, alarms = DisplacementCheck(), []
     for k, share in enumerate(np.linspace(0.0, 0.6, 40)):
         frame = cluttered(share, k)
         alarms.append(glance.alarming(frame, HERE, T_MAP_ODOM, target))
@@ -134,7 +134,7 @@ def test_what_was_usual_can_be_forgotten(target):
 def test_a_frame_of_another_world_alarms_on_a_real_scan(world_map, world_drive, scene):
     T, cloud = world_drive.T_map_body[4], world_drive.clouds[4]
     around = LocalMaps(world_map, 50.0).around(T[:3, 3])
-    glance, other = Glance(), scan(boxes(seed=77), T)
+    glance, other = DisplacementCheck(), scan(boxes(seed=77), T)
 
     def arguments(cloud):
         level = transform(pose_from(T[:3, :3], np.zeros(3)), cloud).astype(np.float32)

@@ -5,17 +5,23 @@ from __future__ import annotations
 import pytest
 
 from coview_stream.config import AcceptanceConfig, TrackingConfig
-from coview_stream.localization.tracking.monitor import Cause, Doubt, Judgement
+from coview_stream.localization.tracking.monitor import LossMonitor, MatchVerdict, RejectionReason
 
 RULE = AcceptanceConfig(patience=3, patience_seconds=10.0, patience_blind=60.0, confirmations=3)
-GOOD = Judgement(Cause.VERIFIED, "verified")
-BAD = Judgement(Cause.FITNESS, "nothing fits")
-AGAINST = [Cause.FITNESS, Cause.GROUND, Cause.FREE_SPACE, Cause.TILT, Cause.OFF_MAP]
+GOOD = MatchVerdict(RejectionReason.VERIFIED, "verified")
+BAD = MatchVerdict(RejectionReason.FITNESS, "nothing fits")
+AGAINST = [
+    RejectionReason.FITNESS,
+    RejectionReason.GROUND,
+    RejectionReason.FREE_SPACE,
+    RejectionReason.TILT,
+    RejectionReason.OFF_MAP,
+]
 
 
 @pytest.fixture
 def doubt():
-    return Doubt(RULE, TrackingConfig(distance=2.0, seconds=5.0))
+    return LossMonitor(RULE, TrackingConfig(distance=2.0, seconds=5.0))
 
 
 def test_at_first_there_is_none(doubt):
@@ -25,9 +31,11 @@ def test_at_first_there_is_none(doubt):
     assert not doubt.active
 
 
-@pytest.mark.parametrize("cause", [cause for cause in Cause if cause is not Cause.VERIFIED])
+@pytest.mark.parametrize(
+    "cause", [cause for cause in RejectionReason if cause is not RejectionReason.VERIFIED]
+)
 def test_one_registration_begins_it_and_one_clears_it(doubt, cause):
-    assert doubt.note(Judgement(cause, "why"), 1.0, 0.0) == "why"
+    assert doubt.note(MatchVerdict(cause, "why"), 1.0, 0.0) == "why"
     assert doubt.active
     assert not doubt.hopeless
     assert doubt.note(GOOD, 2.0, 0.0) == "verified"
@@ -36,7 +44,7 @@ def test_one_registration_begins_it_and_one_clears_it(doubt, cause):
 
 @pytest.mark.parametrize("cause", AGAINST)
 def test_driving_on_with_what_does_not_fit_is_too_much(doubt, cause):
-    against = Judgement(cause, "why")
+    against = MatchVerdict(cause, "why")
     for metres in (0.0, 1.9, 2.0, 3.9):
         doubt.note(against, 0.1 * metres, metres)
         assert not doubt.hopeless
@@ -44,10 +52,10 @@ def test_driving_on_with_what_does_not_fit_is_too_much(doubt, cause):
     assert doubt.hopeless
 
 
-@pytest.mark.parametrize("cause", [Cause.BLIND, Cause.ODOMETRY])
+@pytest.mark.parametrize("cause", [RejectionReason.BLIND, RejectionReason.ODOMETRY])
 def test_driving_on_adds_nothing_where_nothing_speaks_against_the_place(doubt, cause):
     for k in range(9):
-        doubt.note(Judgement(cause, "why"), 1.0 * k, 5.0 * k)
+        doubt.note(MatchVerdict(cause, "why"), 1.0 * k, 5.0 * k)
     assert doubt.active
     assert not doubt.hopeless
     # and what does speak against it is counted from nothing
@@ -64,10 +72,11 @@ def test_a_good_one_between_starts_the_count_anew(doubt):
 
 
 @pytest.mark.parametrize(
-    ("cause", "longest"), [(Cause.FITNESS, 10.0), (Cause.ODOMETRY, 10.0), (Cause.BLIND, 60.0)]
+    ("cause", "longest"),
+    [(RejectionReason.FITNESS, 10.0), (RejectionReason.ODOMETRY, 10.0), (RejectionReason.BLIND, 60.0)],
 )
 def test_standing_still_time_is_too_much(doubt, cause, longest):
-    judgement = Judgement(cause, "why")
+    judgement = MatchVerdict(cause, "why")
     doubt.note(judgement, 100.0, 7.0)
     doubt.note(judgement, 100.0 + longest - 0.1, 7.0)
     assert not doubt.hopeless
@@ -96,7 +105,7 @@ def test_a_suspicion_is_cleared_by_the_first_registration(doubt):
 
 def blinded(doubt, seconds):
     for k in range(round(seconds) + 1):
-        doubt.note(Judgement(Cause.BLIND, "covered"), float(k), 0.0)
+        doubt.note(MatchVerdict(RejectionReason.BLIND, "covered"), float(k), 0.0)
 
 
 def test_after_a_long_one_a_single_registration_is_not_enough(doubt):
@@ -125,7 +134,7 @@ def test_one_against_it_undoes_the_proof(doubt):
     blinded(doubt, 30.0)
     doubt.note(GOOD, 31.0, 0.0)
     doubt.note(GOOD, 32.0, 2.0)
-    doubt.note(Judgement(Cause.BLIND, "covered"), 33.0, 4.0)
+    doubt.note(MatchVerdict(RejectionReason.BLIND, "covered"), 33.0, 4.0)
     assert doubt.note(GOOD, 34.0, 6.0).startswith("verified 1 of 3")
     assert doubt.active
 

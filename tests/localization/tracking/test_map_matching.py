@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.se3 import checked_covariance, difference, shifted
+from coview_stream.geometry.se3 import boxminus, boxplus, checked_covariance
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import local_source, thinned
+from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.tracking import map_matching as attempt
-from coview_stream.localization.tracking.map_matching import Attempt, Registrar, Scan
-from coview_stream.localization.tracking.monitor import Cause, Habit
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, ScanInput
+from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
 CONFIG = LocalizerConfig()
@@ -30,29 +30,29 @@ def scan(world_drive):
     return scan_of(world_drive.clouds[4], world_drive.T_map_body[4])
 
 
-def scan_of(cloud, truth) -> Scan:
+def scan_of(cloud, truth) -> ScanInput:
     T_odom_body = inverse(T_MAP_ODOM) @ truth
-    points = thinned(cloud, T_odom_body, CONFIG.keyframe)
-    return Scan(local_source(points, T_odom_body[:3, 3], CONFIG.registration), cloud, T_odom_body)
+    points = voxelized(cloud, T_odom_body, CONFIG.keyframe)
+    return ScanInput(prepare_scan(points, T_odom_body[:3, 3], CONFIG.registration), cloud, T_odom_body)
 
 
-def attempted(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> Attempt:
+def attempted(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
     """Attempt it from a belief, which is what the graph predicts unless that is given too."""
     pose_graph = PoseGraph(CONFIG.graph)
     pose_graph.start(*(graph or belief))
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
     scales = CONFIG.registration.track
-    return Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), pose_graph)
+    return MapMatcher(world_map, CONFIG).attempt(scan, belief, target, scales, EvidenceBaseline(), pose_graph)
 
 
 def off(found, truth):
-    return float(np.linalg.norm(difference(found, truth)[3:]))
+    return float(np.linalg.norm(boxminus(found, truth)[3:]))
 
 
 def test_the_map_alone_speaks_whatever_was_believed(world_map, world_drive, scan):
     """The belief is off by centimetres and claims to be sure; registered with it, the pose is pulled there."""
     truth = world_drive.T_map_body[4]
-    believed = shifted(truth, np.array([0.001, -0.001, 0.002, 0.05, -0.04, 0.03]))
+    believed = boxplus(truth, np.array([0.001, -0.001, 0.002, 0.05, -0.04, 0.03]))
     sure = np.diag([0.001, 0.001, 0.001, 0.003, 0.003, 0.003]) ** 2
     settings = CONFIG.registration
     prior = Prior(believed @ inverse(scan.T_odom_body), np.linalg.inv(sure))
@@ -61,7 +61,7 @@ def test_the_map_alone_speaks_whatever_was_believed(world_map, world_drive, scan
     fused = register(*arguments, prior, scan.T_odom_body[:3, 3]).T_map_source @ scan.T_odom_body
     loose = attempted(world_map, scan, Estimate(believed, LOOSE))
     found = attempted(world_map, scan, Estimate(believed, sure))
-    assert loose.judgement.cause is found.judgement.cause is Cause.VERIFIED
+    assert loose.judgement.cause is found.judgement.cause is RejectionReason.VERIFIED
     assert off(loose.T_map_body, truth) < 0.01
     assert off(fused, truth) > 0.003
     assert off(found.T_map_body, truth) < 0.5 * off(fused, truth)
@@ -77,26 +77,26 @@ def test_its_covariance_is_the_maps_and_not_the_beliefs(world_map, world_drive, 
 def test_innovation_is_the_distance_from_what_the_graph_predicts(world_map, world_drive, scan):
     """Which need not be what the attempt began with."""
     truth = world_drive.T_map_body[4]
-    away = shifted(truth, np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
+    away = boxplus(truth, np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
     near = attempted(world_map, scan, Estimate(truth, LOOSE), Estimate(truth, TIGHT))
     far = attempted(world_map, scan, Estimate(truth, LOOSE), Estimate(away, TIGHT))
     assert near.innovation < 1.0
-    gap = difference(far.T_map_body, away)
+    gap = boxminus(far.T_map_body, away)
     expected = gap @ np.linalg.solve(TIGHT + far.covariance, gap)
     assert far.innovation == pytest.approx(expected, rel=1e-6)
     assert far.innovation > CONFIG.acceptance.keep_innovation
     assert far.judgement.innovation == far.innovation
     # the place fits: what to think of odometry is another question
-    assert far.judgement.cause is Cause.VERIFIED
+    assert far.judgement.cause is RejectionReason.VERIFIED
 
 
 def test_where_there_is_nothing_to_hold_on_to_the_belief_stays(world_map, world_drive, scan):
     """Ten metres above everything."""
     truth = world_drive.T_map_body[4]
-    belief = Estimate(shifted(truth, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])), TIGHT)
+    belief = Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])), TIGHT)
     found = attempted(world_map, scan, belief)
     assert not found.judgement.verified
-    assert found.judgement.cause in (Cause.GROUND, Cause.FITNESS)
+    assert found.judgement.cause in (RejectionReason.GROUND, RejectionReason.FITNESS)
     assert found.judgement.innovation is None
     assert found.innovation == 0.0
     np.testing.assert_array_equal(found.T_map_body, belief.T_map_body)
@@ -120,7 +120,7 @@ def test_pairs_without_an_inverse_are_no_hold(world_map, world_drive, scan, bad,
 
 
 def assert_unheld(found, truth):
-    assert found.judgement.cause is Cause.FITNESS
+    assert found.judgement.cause is RejectionReason.FITNESS
     assert found.judgement.reason.startswith("no hold: ")
     assert found.judgement.innovation is None
     np.testing.assert_array_equal(found.T_map_body, truth)
@@ -130,12 +130,14 @@ def test_beyond_what_was_surveyed_nothing_is_held_against_the_place(world_map, w
     truth = world_drive.T_map_body[4]
     edge = np.array([0.0, 0.0, 0.0, 60.0 - truth[0, 3], 0.0, 0.0])
     pose_graph = PoseGraph(CONFIG.graph)
-    belief = Estimate(shifted(truth, edge), TIGHT)
+    belief = Estimate(boxplus(truth, edge), TIGHT)
     pose_graph.start(*belief)
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
     scales = CONFIG.registration.track
-    found = Registrar(world_map, CONFIG).attempt(scan, belief, target, scales, Habit(), pose_graph)
-    assert found.judgement.cause is Cause.OFF_MAP
+    found = MapMatcher(world_map, CONFIG).attempt(
+        scan, belief, target, scales, EvidenceBaseline(), pose_graph
+    )
+    assert found.judgement.cause is RejectionReason.OFF_MAP
 
 
 def test_a_scan_is_looked_at_by_direction_once(scan):

@@ -8,7 +8,7 @@ import pytest
 
 from coview_stream.config import AcceptanceConfig
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.tracking.monitor import Cause, Habit, Judgement
+from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 
 RULE = AcceptanceConfig(keep_score=0.22, keep_share=0.5, keep_ground=0.5, inside=0.3)
 GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
@@ -17,7 +17,7 @@ GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
 @pytest.fixture
 def used():
     """Used to places that fit well."""
-    habit = Habit()
+    habit = EvidenceBaseline()
     for _ in range(10):
         habit.learn(GOOD)
     return habit
@@ -25,65 +25,68 @@ def used():
 
 @pytest.mark.parametrize("habit", ["fresh", "used"])
 def test_what_is_as_it_should_be_is_verified(habit, used):
-    cause, reason = (used if habit == "used" else Habit()).judge(GOOD, RULE)
-    assert cause is Cause.VERIFIED
+    cause, reason = (used if habit == "used" else EvidenceBaseline()).judge(GOOD, RULE)
+    assert cause is RejectionReason.VERIFIED
     assert reason == "verified"
 
 
 @pytest.mark.parametrize(
     ("changes", "cause", "told"),
     [
-        ({"inside": 0.25}, Cause.OFF_MAP, "25% of what is seen lies on the map"),
-        ({"ground": 0.4}, Cause.GROUND, "only 40% of the ground"),
-        ({"near": 0.1, "covered": 0.2}, Cause.FITNESS, "10% of what stands above the ground"),
-        ({"free_space": 0.05}, Cause.FREE_SPACE, "rays pass through 95% of the map"),
+        ({"inside": 0.25}, RejectionReason.OFF_MAP, "25% of what is seen lies on the map"),
+        ({"ground": 0.4}, RejectionReason.GROUND, "only 40% of the ground"),
+        ({"near": 0.1, "covered": 0.2}, RejectionReason.FITNESS, "10% of what stands above the ground"),
+        ({"free_space": 0.05}, RejectionReason.FREE_SPACE, "rays pass through 95% of the map"),
     ],
 )
 @pytest.mark.parametrize("habit", ["fresh", "used"])
 def test_each_share_that_has_gone_is_named(changes, cause, told, habit, used):
-    found, reason = (used if habit == "used" else Habit()).judge(replace(GOOD, **changes), RULE)
+    found, reason = (used if habit == "used" else EvidenceBaseline()).judge(replace(GOOD, **changes), RULE)
     assert found is cause
     assert told in reason
 
 
 def test_off_the_map_says_more_than_that_nothing_fits():
     """What the map does not cover is no evidence against the place."""
-    cause, _ = Habit().judge(replace(GOOD, inside=0.1, ground=0.0, near=0.0), RULE)
-    assert cause is Cause.OFF_MAP
+    cause, _ = EvidenceBaseline().judge(replace(GOOD, inside=0.1, ground=0.0, near=0.0), RULE)
+    assert cause is RejectionReason.OFF_MAP
 
 
 def test_what_would_do_elsewhere_does_not_where_places_fit_better(used):
     """A score of 0.3: right in a street where half of everything is hidden, wrong where 0.8 is usual."""
     poor = Evidence(near=0.3, covered=0.45, ground=0.85, free_space=0.8, inside=1.0)
     assert RULE.keep_score < poor.score < RULE.keep_share * used.usual.score
-    assert Habit().judge(poor, RULE)[0] is Cause.VERIFIED
+    assert EvidenceBaseline().judge(poor, RULE)[0] is RejectionReason.VERIFIED
     cause, reason = used.judge(poor, RULE)
-    assert cause is Cause.FITNESS
+    assert cause is RejectionReason.FITNESS
     assert f"score {poor.score:.2f}, {RULE.keep_share * GOOD.score:.2f} needed" in reason
     assert "80% usual here" in reason
-    poor_habit = Habit()
+    poor_habit = EvidenceBaseline()
     poor_habit.learn(poor)
-    assert poor_habit.judge(poor, RULE)[0] is Cause.VERIFIED
+    assert poor_habit.judge(poor, RULE)[0] is RejectionReason.VERIFIED
 
 
 def test_a_poor_habit_does_not_lower_what_is_asked_in_any_case():
     bad = replace(GOOD, near=0.05, covered=0.5)
     assert bad.score < RULE.keep_score
-    habit = Habit()
+    habit = EvidenceBaseline()
     habit.learn(bad)
     cause, reason = habit.judge(bad, RULE)
-    assert cause is not Cause.VERIFIED
+    assert cause is not RejectionReason.VERIFIED
     assert f"{RULE.keep_score:.2f} needed" in reason
 
 
 def test_the_cause_is_what_has_fallen_furthest_below_what_is_usual():
     """Where hardly anything above the ground is ever on the map, rays through what it shows are the news."""
-    habit, usual = Habit(), Evidence(near=0.45, covered=0.6, ground=0.9, free_space=0.9, inside=1.0)
+    habit, usual = (
+        EvidenceBaseline(),
+        Evidence(near=0.45, covered=0.6, ground=0.9, free_space=0.9, inside=1.0),
+    )
     habit.learn(usual)
     tight = replace(RULE, keep_share=0.9)
-    assert habit.judge(replace(usual, free_space=0.5, near=0.4), tight)[0] is Cause.FREE_SPACE
-    assert habit.judge(replace(usual, ground=0.6, near=0.42), tight)[0] is Cause.GROUND
-    assert habit.judge(replace(usual, free_space=0.8, near=0.2), tight)[0] is Cause.FITNESS
+    assert habit.judge(replace(usual, free_space=0.5, near=0.4), tight)[0] is RejectionReason.FREE_SPACE
+    assert habit.judge(replace(usual, ground=0.6, near=0.42), tight)[0] is RejectionReason.GROUND
+    assert habit.judge(replace(usual, free_space=0.8, near=0.2), tight)[0] is RejectionReason.FITNESS
 
 
 def test_a_habit_follows_slowly_and_is_forgotten_at_once(used):
@@ -107,9 +110,9 @@ def test_judging_teaches_nothing(used):
     assert used.usual == before
 
 
-@pytest.mark.parametrize("cause", list(Cause))
+@pytest.mark.parametrize("cause", list(RejectionReason))
 def test_a_judgement_says_whether_it_is_for_or_against_the_place(cause):
-    judgement = Judgement(cause, "why", GOOD)
-    assert judgement.verified == (cause is Cause.VERIFIED)
+    judgement = MatchVerdict(cause, "why", GOOD)
+    assert judgement.verified == (cause is RejectionReason.VERIFIED)
     assert judgement.score == GOOD.score
-    assert Judgement(cause, "why").score == 0.0
+    assert MatchVerdict(cause, "why").score == 0.0

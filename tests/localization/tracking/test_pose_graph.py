@@ -11,7 +11,7 @@ from se3 import exp_se3
 
 from coview_stream.config import GraphConfig
 from coview_stream.errors import ConfigError, DependencyError, InputError
-from coview_stream.geometry.se3 import difference, shifted
+from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.tracking.pose_graph import PoseGraph
 
@@ -57,11 +57,11 @@ def test_a_correction_fuses_as_two_gaussians_do(graph):
     gap = np.array([0.0005, -0.0003, 0.002, 0.02, -0.01, 0.015])
     P, R = START_COVARIANCE, np.diag([0.004, 0.004, 0.01, 0.1, 0.2, 0.05]) ** 2
     graph.start(START, P)
-    graph.correct(shifted(START, gap), R)
+    graph.correct(boxplus(START, gap), R)
     expected = np.linalg.inv(np.linalg.inv(P) + np.linalg.inv(R))
     T, covariance = graph.estimate
     assert relative(covariance, expected) < 1e-3
-    np.testing.assert_allclose(difference(T, START), expected @ np.linalg.solve(R, gap), atol=1e-5)
+    np.testing.assert_allclose(boxminus(T, START), expected @ np.linalg.solve(R, gap), atol=1e-5)
 
 
 def test_an_outlier_pulls_no_more_than_the_kernel_allows(graph):
@@ -70,8 +70,8 @@ def test_an_outlier_pulls_no_more_than_the_kernel_allows(graph):
     moved = []
     for far in (10.0, 50.0):
         graph.start(START, P)
-        graph.correct(shifted(START, np.array([0, 0, 0, far, 0, 0])), R)
-        moved.append(difference(graph.estimate.T_map_body, START)[3])
+        graph.correct(boxplus(START, np.array([0, 0, 0, far, 0, 0])), R)
+        moved.append(boxminus(graph.estimate.T_map_body, START)[3])
     np.testing.assert_allclose(moved, HUBER * 0.01 / 0.01, rtol=0.02)
 
 
@@ -81,7 +81,7 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
     T, covariance = graph.estimate
     gap = np.array([0.01, 0.0, -0.02, 0.3, -0.2, 0.1])
     expected = gap @ np.linalg.solve(covariance + REGISTRATION, gap)
-    assert graph.innovation(shifted(T, gap), REGISTRATION) == pytest.approx(expected, rel=1e-6)
+    assert graph.innovation(boxplus(T, gap), REGISTRATION) == pytest.approx(expected, rel=1e-6)
     assert graph.innovation(T, REGISTRATION) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(graph.estimate.T_map_body, T)
 
@@ -89,7 +89,7 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
 def test_innovations_are_chi_square_if_the_covariances_are_right():
     graph = PoseGraph(GraphConfig(window=5, restart=20))
     way = drive(400, seed=4, every=3)
-    graph.start(shifted(START, np.linalg.cholesky(START_COVARIANCE)[:, 3] * 0.5), START_COVARIANCE)
+    graph.start(boxplus(START, np.linalg.cholesky(START_COVARIANCE)[:, 3] * 0.5), START_COVARIANCE)
     found = []
     for step, seen in zip(way.steps, way.seen[1:], strict=True):
         graph.move(step, ODOMETRY)

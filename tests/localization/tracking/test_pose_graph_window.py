@@ -16,7 +16,7 @@ from graph_drives import (
 )
 
 from coview_stream.config import GraphConfig
-from coview_stream.geometry.se3 import along_body, along_map, difference, shifted
+from coview_stream.geometry.se3 import along_body, along_map, boxminus, boxplus
 from coview_stream.localization.tracking.pose_graph import _RELINEARIZE, PoseGraph
 
 HUBER = GraphConfig().huber
@@ -36,12 +36,10 @@ def dense(way, start=START_COVARIANCE):
     }
 
     def residuals(X):
-        rows = [np.linalg.inv(np.linalg.cholesky(start)) @ difference(X[0], START)]
-        rows += [
-            whitener["z"] @ difference(X[k], X[k - 1] @ step) for k, step in enumerate(way.steps, start=1)
-        ]
+        rows = [np.linalg.inv(np.linalg.cholesky(start)) @ boxminus(X[0], START)]
+        rows += [whitener["z"] @ boxminus(X[k], X[k - 1] @ step) for k, step in enumerate(way.steps, start=1)]
         return rows + [
-            whitener["y"] @ difference(X[k], seen) for k, seen in enumerate(way.seen) if seen is not None
+            whitener["y"] @ boxminus(X[k], seen) for k, seen in enumerate(way.seen) if seen is not None
         ]
 
     for _ in range(15):
@@ -51,14 +49,14 @@ def dense(way, start=START_COVARIANCE):
             h = np.zeros(6)
             h[column % 6] = 1e-5
             k = column // 6
-            ahead, behind = ([*X[:k], shifted(X[k], s * h), *X[k + 1 :]] for s in (1, -1))
+            ahead, behind = ([*X[:k], boxplus(X[k], s * h), *X[k + 1 :]] for s in (1, -1))
             J[:, column] = (np.concatenate(residuals(ahead)) - np.concatenate(residuals(behind))) / 2e-5
         w = np.ones(len(r))
         w[n:] = [HUBER / max(HUBER, np.linalg.norm(one)) for one in r[n:]]
         W = np.repeat(w, 6)
         H = J.T @ (W[:, None] * J)
         step = -np.linalg.solve(H, J.T @ (W * np.concatenate(r)))
-        X = [shifted(T, step[6 * k : 6 * k + 6]) for k, T in enumerate(X)]
+        X = [boxplus(T, step[6 * k : 6 * k + 6]) for k, T in enumerate(X)]
         if np.abs(step).max() < 1e-8:
             break
     return X[-1], np.linalg.inv(H)[-6:, -6:]
@@ -67,10 +65,10 @@ def dense(way, start=START_COVARIANCE):
 def test_the_newest_pose_is_the_dense_solutions(graph):
     """With an outlier of metres among the corrections; residuals here are along the map's axes, not the body's."""
     way = drive(8, seed=2, every=2)
-    way.seen[4] = shifted(way.seen[4], np.array([0, 0, 0, 3.0, -2.0, 1.0]))
+    way.seen[4] = boxplus(way.seen[4], np.array([0, 0, 0, 3.0, -2.0, 1.0]))
     T, covariance = dense(way)
     found = run(graph, way)[-1]
-    gap = np.abs(difference(found.T_map_body, T))
+    gap = np.abs(boxminus(found.T_map_body, T))
     assert gap[:3].max() < 1e-4
     assert gap[3:].max() < 2e-3
     assert relative(found.covariance, covariance) < 0.02
@@ -118,7 +116,7 @@ def test_two_thousand_keyframes_are_as_in_a_graph_that_never_forgets():
     way = drive(2000, seed=6, every=10, outliers=0.05)
     pose_graph = PoseGraph()
     found, full = run(pose_graph, way), full_isam2(way)
-    gaps = np.abs([difference(e.T_map_body, T) for e, (T, _) in zip(found, full, strict=True)])
+    gaps = np.abs([boxminus(e.T_map_body, T) for e, (T, _) in zip(found, full, strict=True)])
     sigmas = np.sqrt([np.diag(C) for _, C in full])
     assert (gaps / sigmas).max() < 0.01
     assert gaps[:, 3:].max() < 1e-3
@@ -153,5 +151,5 @@ def test_a_short_window_forgets_nothing_that_matters(every):
     short = run(PoseGraph(GraphConfig(window=3, restart=5, huber=100.0)), way)
     for a, b in zip(long, short, strict=True):
         sigma = np.sqrt(np.diag(a.covariance))
-        assert (np.abs(difference(a.T_map_body, b.T_map_body)) < 0.05 * sigma).all()
+        assert (np.abs(boxminus(a.T_map_body, b.T_map_body)) < 0.05 * sigma).all()
         np.testing.assert_allclose(np.sqrt(np.diag(b.covariance)), sigma, rtol=0.03)

@@ -7,11 +7,11 @@ import pytest
 from courtyard import courtyard, local_map, source_of
 
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry.se3 import difference
+from coview_stream.geometry.se3 import boxminus
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.register import register
-from coview_stream.localization.tracking.shared_error import Shared, clustered_covariance
+from coview_stream.localization.tracking.shared_error import SharedErrorModel, clustered_covariance
 
 CONFIG = RegistrationConfig()
 PIVOT = np.array([0.0, 0.0, 1.5])
@@ -46,7 +46,7 @@ def registered(seed, off):
     found = register(source, np.eye(4), target, CONFIG, CONFIG.track, centre=PIVOT)
     T_body = found.T_map_source @ pose_from(np.eye(3), PIVOT)
     spread = clustered_covariance(source, found.T_map_source, target, PIVOT, CONFIG)
-    return difference(T_body, pose_from(np.eye(3), PIVOT)), spread, np.linalg.inv(found.information)
+    return boxminus(T_body, pose_from(np.eye(3), PIVOT)), spread, np.linalg.inv(found.information)
 
 
 def nees(errors, covariances):
@@ -84,7 +84,7 @@ def test_what_is_shared_is_so_many_times_what_was_seen_of_late_and_the_rest():
         shared=2.0, shared_position=0.03, shared_height=0.02, shared_tilt=0.002, shared_yaw=0.001
     )
     rest = np.square([0.002, 0.002, 0.001, 0.03, 0.03, 0.02])
-    shared = Shared(config)
+    shared = SharedErrorModel(config)
     np.testing.assert_allclose(shared.covariance, np.diag(rest))
     source, target = street(np.random.default_rng(0), 0.03)
     now = clustered_covariance(source, np.eye(4), target, PIVOT, config)
@@ -100,7 +100,7 @@ def test_what_is_shared_is_so_many_times_what_was_seen_of_late_and_the_rest():
 
 def test_a_scan_of_nothing_new_teaches_nothing():
     source, target = street(np.random.default_rng(0), 0.03)
-    shared = Shared(CONFIG)
+    shared = SharedErrorModel(CONFIG)
     shared.learn(source, np.eye(4), target, PIVOT)
     before = shared.covariance
     shared.learn(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT)

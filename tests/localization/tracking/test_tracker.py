@@ -11,7 +11,7 @@ from trackers import OFF, Ride, garbage, on_the_way, refused, registration, ride
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import inverse, pose_from
 from coview_stream.localization.registration.covariance import registration_covariance
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.monitor import RejectionReason
 
 RULE = AcceptanceConfig()
 
@@ -29,7 +29,7 @@ def test_a_good_registration_is_believed(world_map, world_drive):
     before = ride.tracker.predicted_covariance()
     assert ride.error(truth)[0] == pytest.approx(0.25)
     judgement = ride.update(cloud, truth)
-    assert judgement.cause is Cause.VERIFIED
+    assert judgement.cause is RejectionReason.VERIFIED
     assert judgement.verified
     assert judgement.reason == "verified"
     assert judgement.score == judgement.evidence.score > 0.8
@@ -86,7 +86,7 @@ def test_the_map_is_cropped_before_it_is_needed(world_map, world_drive, monkeypa
 
 @pytest.mark.parametrize(
     ("rule", "cause"),
-    [("keep_score", None), ("inside", Cause.OFF_MAP), ("keep_ground", Cause.GROUND)],
+    [("keep_score", None), ("inside", RejectionReason.OFF_MAP), ("keep_ground", RejectionReason.GROUND)],
 )
 def test_the_same_registration_held_to_a_higher_standard(world_map, world_drive, rule, cause):
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
@@ -99,7 +99,7 @@ def test_the_same_registration_held_to_a_higher_standard(world_map, world_drive,
 def test_garbage_is_not_believed(world_map, world_drive):
     ride = ride_of(world_map, world_drive)
     judgement = refused(ride, garbage(), world_drive.T_map_body[4], alone=True)
-    assert judgement.cause in (Cause.GROUND, Cause.FITNESS, Cause.FREE_SPACE)
+    assert judgement.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
     assert judgement.score < RULE.keep_score
 
 
@@ -107,7 +107,7 @@ def test_another_world_does_not_fit_by_what_stands_there(world_map, world_drive,
     ride = ride_of(world_map, world_drive)
     assert ride.update(world_drive.clouds[4], world_drive.T_map_body[4]).verified
     judgement = refused(ride, elsewhere.clouds[2], world_drive.T_map_body[4], alone=True)
-    assert judgement.cause in (Cause.FITNESS, Cause.FREE_SPACE)
+    assert judgement.cause in (RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
     assert "usual here" in judgement.reason or "rays pass" in judgement.reason
 
 
@@ -118,7 +118,7 @@ def test_rays_that_pass_through_what_the_map_shows_are_named(world_map, world_dr
     ride = ride_of(world_map, world_drive, ruled(keep_share=0.95))
     assert ride.update(world_drive.clouds[4], truth).verified
     judgement = refused(ride, scan(near[4:], truth), truth, alone=True)
-    assert judgement.cause is Cause.FREE_SPACE
+    assert judgement.cause is RejectionReason.FREE_SPACE
     assert judgement.evidence.near > 0.9
 
 
@@ -129,7 +129,7 @@ def test_a_frame_that_sees_nothing_is_blind_whatever_the_ones_before_saw(world_m
     truth = world_drive.T_map_body
     assert ride.update(world_drive.clouds[4], truth[4]).verified
     judgement = refused(ride, world_drive.clouds[5][:seen], truth[5])
-    assert judgement.cause is Cause.BLIND
+    assert judgement.cause is RejectionReason.BLIND
     assert judgement.evidence is None
     assert judgement.innovation is None
     assert judgement.score == 0.0
@@ -140,7 +140,7 @@ def test_off_the_map_nothing_is_compared(world_map, world_drive):
     far = pose_from(np.eye(3), [5000.0, 0.0, 1.7])
     ride = Ride.begin(world_map, None, world_drive.clouds[4], far)
     judgement = refused(ride, world_drive.clouds[4], far)
-    assert judgement.cause is Cause.OFF_MAP
+    assert judgement.cause is RejectionReason.OFF_MAP
     assert "empty" in judgement.reason
 
 
@@ -164,7 +164,7 @@ def test_a_pose_that_leans_more_than_the_limit_is_not_believed(world_map, world_
         assert ride.error(truth)[0] < 0.1
     else:
         judgement = refused(ride, world_drive.clouds[4], truth)
-        assert judgement.cause is Cause.TILT
+        assert judgement.cause is RejectionReason.TILT
         assert "leans 3 degrees" in judgement.reason
 
 

@@ -8,8 +8,8 @@ from trackers import Ride, registration, tracker_of
 
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.registration.covariance import angles_first
-from coview_stream.localization.tracking.shared_error import Shared
+from coview_stream.localization.registration.covariance import swap_rotation_translation
+from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
 SETTINGS = TrackingConfig()
 NOTHING = np.zeros((20, 3), np.float32)
@@ -189,8 +189,8 @@ def test_what_is_reported_has_metres_first_and_what_registrations_share(started,
     tracker, covariance = started
     predicted = covariance(pose_from(rot_z(0.3), [2.0, 1.0, 0.0]))
     reported = tracker.reported_covariance()
-    shared = Shared(tracker.config.registration).covariance  # nothing has been registered yet
-    np.testing.assert_allclose(reported, angles_first(predicted + shared))
+    shared = SharedErrorModel(tracker.config.registration).covariance  # nothing has been registered yet
+    np.testing.assert_allclose(reported, swap_rotation_translation(predicted + shared))
     assert reported[0, 0] == pytest.approx(predicted[3, 3] + shared[3, 3])
     assert reported[0, 5] == pytest.approx(predicted[3, 2])
 
@@ -199,7 +199,7 @@ def test_however_many_registrations_the_report_keeps_what_they_share(world_map, 
     ride = Ride.begin(world_map, None, slow_drive.clouds[0], slow_drive.T_map_body[0])
     for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):
         assert ride.update(cloud, truth).verified
-    shared = np.diag(angles_first(Shared(ride.tracker.config.registration).covariance))
+    shared = np.diag(swap_rotation_translation(SharedErrorModel(ride.tracker.config.registration).covariance))
     variances = np.diag(ride.tracker.reported_covariance())
     assert (variances > shared).all()
     assert np.sqrt(variances[:3]).max() < 0.05

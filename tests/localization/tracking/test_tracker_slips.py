@@ -11,7 +11,7 @@ from trackers import garbage, on_the_way, refused, ride_of
 
 from coview_stream.config import AcceptanceConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.monitor import RejectionReason
 
 RULE = AcceptanceConfig()
 SIDEWAYS = pose_from(np.eye(3), [0.0, 0.5, 0.0])
@@ -36,7 +36,7 @@ def test_a_slip_is_found_and_the_next_frame_is_right(world_map, slow_drive, slip
     metres, degrees = pose_error(slip, np.eye(4))
     ride.slips(slip, truth[k - 1])
     judgement = ride.update(clouds[k], truth[k])
-    assert judgement.cause is Cause.ODOMETRY
+    assert judgement.cause is RejectionReason.ODOMETRY
     assert not judgement.verified
     assert judgement.innovation > RULE.keep_innovation
     told = [float(word) for word in judgement.reason.split() if word[0].isdigit()]
@@ -46,7 +46,7 @@ def test_a_slip_is_found_and_the_next_frame_is_right(world_map, slow_drive, slip
     assert judgement.score > 0.8
     assert ride.error(truth[k])[0] < 0.03
     assert ride.tracker.drift == drift  # it was no drift
-    assert ride.update(clouds[k + 1], truth[k + 1]).cause is Cause.VERIFIED
+    assert ride.update(clouds[k + 1], truth[k + 1]).cause is RejectionReason.VERIFIED
     assert ride.tracker.drift == drift  # nor is it told from the step across it
     metres, degrees = ride.error(truth[k + 1])
     assert metres < 0.03
@@ -57,7 +57,9 @@ def test_a_slip_that_is_not_real_is_not_believed(world_map, slow_drive, elsewher
     """Garbage and another world may register anywhere within reach: that is no slip."""
     ride = on_the_way(world_map, slow_drive)
     for cloud in (garbage(), *elsewhere.clouds):
-        assert refused(ride, cloud, slow_drive.T_map_body[8], alone=True).cause is not Cause.ODOMETRY
+        assert (
+            refused(ride, cloud, slow_drive.T_map_body[8], alone=True).cause is not RejectionReason.ODOMETRY
+        )
 
 
 def test_what_may_be_odometrys_drift_is_no_slip(world_map, slow_drive):
@@ -71,7 +73,7 @@ def test_what_may_be_odometrys_drift_is_no_slip(world_map, slow_drive):
         ride = on_the_way(world_map, slow_drive, config)
         ride.slips(small, slow_drive.T_map_body[7])
         causes.append(ride.update(slow_drive.clouds[8], slow_drive.T_map_body[8]).cause)
-    assert causes == [Cause.ODOMETRY, Cause.VERIFIED]
+    assert causes == [RejectionReason.ODOMETRY, RejectionReason.VERIFIED]
 
 
 def test_a_frame_off_its_place_alarms_after_a_good_one_and_not_before(world_map, slow_drive):

@@ -13,7 +13,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record, read_status
 from coview_stream.messages.types import PoseMessage, Sample
-from coview_stream.stream.client.fleet import SILENT, STALE, Fleet, printable
+from coview_stream.stream.client.fleet import SILENT, STALE, FleetTable, printable
 
 T = pose_from(rot_z(math.radians(30)), [412_000.123, 5_318_000.456, 7.891])
 POSE = PoseMessage(5, "r1", "TRACKING", T, np.eye(6), 0.93, "ab", 0.12)
@@ -26,7 +26,7 @@ STATUS = {
 
 
 def test_a_robot_that_tracks():
-    fleet = Fleet()
+    fleet = FleetTable()
     fleet.add_status("r1", STATUS, 9.0)
     for k in range(60):
         fleet.add_pose(POSE, 10.0 + 0.1 * k)
@@ -39,7 +39,7 @@ def test_a_robot_that_tracks():
 
 
 def test_a_stale_pose_is_no_longer_shown():
-    fleet = Fleet()
+    fleet = FleetTable()
     fleet.add_pose(POSE, 10.0)
     assert "412000.12" in fleet.table(10.0 + STALE - 0.1)[1]
     fleet.add_status("r1", {"state": "LOST"}, 10.0 + STALE)
@@ -49,7 +49,7 @@ def test_a_stale_pose_is_no_longer_shown():
 
 
 def test_a_robot_that_got_lost_shows_no_pose():
-    fleet = Fleet()
+    fleet = FleetTable()
     fleet.add_pose(POSE, 10.0)
     fleet.add_status("r1", {"state": "LOST"}, 10.1)
     assert "412000.12" not in fleet.table(10.2)[1]
@@ -58,7 +58,7 @@ def test_a_robot_that_got_lost_shows_no_pose():
 
 
 def test_a_robot_that_went_silent_says_so():
-    fleet = Fleet()
+    fleet = FleetTable()
     fleet.add_status("r1", STATUS, 10.0)
     assert "TRACKING" in fleet.table(10.0 + SILENT)[1]
     assert "silent 7 s" in fleet.table(17.2)[1]
@@ -74,13 +74,13 @@ def test_a_robot_that_went_silent_says_so():
     ],
 )
 def test_any_status_can_be_shown(status):
-    fleet = Fleet()
+    fleet = FleetTable()
     fleet.add_status("r1", status, 1.0)
     assert fleet.table(1.5)[1].startswith("r1 ")
 
 
 def test_robots_are_sorted_and_text_from_the_network_is_harmless():
-    fleet = Fleet()
+    fleet = FleetTable()
     fleet.add_status("zoe", {"state": "\x1b[2JSEARCHING\n", "reason": "a\tb"}, 1.0)
     fleet.add_status("ada", {}, 1.0)
     lines = fleet.table(1.0, header=False)
@@ -90,7 +90,7 @@ def test_robots_are_sorted_and_text_from_the_network_is_harmless():
 
 
 def test_a_pose_without_confidence_shows_none():
-    fleet = Fleet()
+    fleet = FleetTable()
     message = decode_pose(Sample("k", encode_pose(POSE, "foxglove").payload), hint="foxglove")
     fleet.add_pose(PoseMessage(**{**vars(message), "robot": "r1"}), 1.0)
     assert fleet.table(1.1)[1].split()[-4:] == ["0.0", "-", "-/-", "-"]

@@ -7,11 +7,11 @@ import threading
 import pytest
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.client.client import Mailbox
+from coview_stream.stream.client.client import LatestQueue
 
 
 def test_in_order_and_the_newest_win():
-    box = Mailbox[int](3)
+    box = LatestQueue[int](3)
     for k in range(5):
         box.put(k)
     assert [box.get(0), box.get(0), box.get(0), box.get(0)] == [2, 3, 4, None]
@@ -19,7 +19,7 @@ def test_in_order_and_the_newest_win():
 
 
 def test_closing_wakes_a_reader_and_leaves_what_is_inside():
-    box = Mailbox[int](3)
+    box = LatestQueue[int](3)
     found: list[int | None] = [7]
     reader = threading.Thread(target=lambda: found.append(box.get()))
     reader.start()
@@ -27,7 +27,7 @@ def test_closing_wakes_a_reader_and_leaves_what_is_inside():
     reader.join(5)
     assert found == [7, None]
 
-    full = Mailbox[int](3)
+    full = LatestQueue[int](3)
     full.put(1)
     full.close()
     full.put(2)
@@ -35,7 +35,7 @@ def test_closing_wakes_a_reader_and_leaves_what_is_inside():
 
 
 def test_a_reader_is_woken_by_what_arrives():
-    box = Mailbox[int](3)
+    box = LatestQueue[int](3)
     found: list[int | None] = []
     reader = threading.Thread(target=lambda: found.append(box.get(timeout=10)))
     reader.start()
@@ -46,4 +46,4 @@ def test_a_reader_is_woken_by_what_arrives():
 
 def test_size_is_checked():
     with pytest.raises(ConfigError, match="mailbox size"):
-        Mailbox[int](0)
+        LatestQueue[int](0)

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from coview_stream.stream.node.status import Link
+from coview_stream.stream.node.status import ConnectionMonitor
 from coview_stream.stream.transport.transport import Connection
 
 
@@ -23,12 +23,12 @@ def said(caplog):
 
 
 def test_the_first_router_is_no_reconnection(said):
-    assert looks(Link(), ("", ""), ("A", ""), ("A", "")) == 0
+    assert looks(ConnectionMonitor(), ("", ""), ("A", ""), ("A", "")) == 0
     assert said() == [("INFO", "connected to router A")]
 
 
 def test_a_router_that_comes_back(said):
-    assert looks(Link(), ("A", ""), ("", ""), ("A", ""), ("", ""), ("A", "")) == 2
+    assert looks(ConnectionMonitor(), ("A", ""), ("", ""), ("A", ""), ("", ""), ("A", "")) == 2
     assert said()[1:3] == [
         ("WARNING", "router A is gone: nobody can hear us"),
         ("INFO", "connected to router A again"),
@@ -36,27 +36,27 @@ def test_a_router_that_comes_back(said):
 
 
 def test_a_router_replaced_between_two_looks(said):
-    assert looks(Link(), ("A", ""), ("B", ""), ("B", "")) == 1
+    assert looks(ConnectionMonitor(), ("A", ""), ("B", ""), ("B", "")) == 1
     assert said()[-1] == ("INFO", "connected to router B instead of A")
 
 
 def test_a_router_replaced_after_a_while_and_another_besides():
-    link = Link()
+    link = ConnectionMonitor()
     assert looks(link, ("A", ""), ("", ""), ("B", "")) == 1
     assert looks(link, ("BC", "")) == 1  # nobody was missed
 
 
 def test_one_of_two_routers(said):
-    link = Link()
+    link = ConnectionMonitor()
     assert looks(link, ("AB", ""), ("A", ""), ("AB", "")) == 1
     assert said()[-2:] == [("WARNING", "router B is gone"), ("INFO", "connected to router B again")]
 
 
 def test_peers_come_and_go(said):
-    assert looks(Link(), ("", "p"), ("", ""), ("", "pq"), ("", "q")) == 0
+    assert looks(ConnectionMonitor(), ("", "p"), ("", ""), ("", "pq"), ("", "q")) == 0
     assert {level for level, _ in said()} == {"INFO"}
     assert said()[-1][1] == "peer p is gone"
 
 
 def test_a_peer_that_stays_hides_no_router():
-    assert looks(Link(), ("A", "p"), ("", "p"), ("A", "p")) == 1
+    assert looks(ConnectionMonitor(), ("A", "p"), ("", "p"), ("A", "p")) == 1

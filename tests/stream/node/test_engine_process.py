@@ -23,8 +23,8 @@ from coview_stream.stream.node import worker
 from coview_stream.stream.node.engine_process import (
     CancelledError,
     DiedError,
+    EngineProcess,
     FailedError,
-    ProcessLane,
     RejectedError,
 )
 from coview_stream.stream.node.jobs import FrameJob
@@ -85,7 +85,7 @@ def alive(pid):
 
 
 def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
-    lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256)
+    lane = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
     good = job(world_drive.clouds[0])
     try:
         lane.start()
@@ -121,7 +121,7 @@ def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
 def test_a_map_that_cannot_be_opened(tmp_path):
     broken = tmp_path / "broken.coview"
     broken.write_bytes(b"no map at all")
-    lane = ProcessLane("search", str(broken), "0" * 64)
+    lane = EngineProcess("search", str(broken), "0" * 64)
     try:
         lane.start()
         with pytest.raises(CoViewError, match=r"broken\.coview"):
@@ -149,8 +149,8 @@ def test_an_engine_that_cannot_prepare_says_why_each_time(monkeypatch):
         threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
         lane._pipe, lane._awaited = Connection(ours.detach()), ["ready", "prepared"]
 
-    monkeypatch.setattr(ProcessLane, "start", start)
-    lane = ProcessLane("search", "unused", "0" * 64)
+    monkeypatch.setattr(EngineProcess, "start", start)
+    lane = EngineProcess("search", "unused", "0" * 64)
     for times in (1, 2):
         with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):
             lane.run(job())
@@ -159,7 +159,7 @@ def test_an_engine_that_cannot_prepare_says_why_each_time(monkeypatch):
 
 
 def test_a_map_that_was_replaced_is_named_each_time(world_file):
-    lane = ProcessLane("track", str(world_file), "0" * 64)
+    lane = EngineProcess("track", str(world_file), "0" * 64)
     try:
         for _ in range(2):
             with pytest.raises(
@@ -171,7 +171,7 @@ def test_a_map_that_was_replaced_is_named_each_time(world_file):
 
 
 def test_a_worker_that_stands_still_is_ended_even_with_a_frame_half_sent(world_file, world_drive):
-    lane = ProcessLane("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
+    lane = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
     good = job(world_drive.clouds[0])
     try:
         lane.start()
@@ -198,7 +198,7 @@ def with_child(lane, program):
 
 
 def test_an_answer_that_breaks_off_ends_the_worker():
-    lane = ProcessLane("search", "unused", "0" * 64, patience=0.3)
+    lane = EngineProcess("search", "unused", "0" * 64, patience=0.3)
     with_child(lane, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
     child = lane.pid
     with pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
@@ -208,7 +208,7 @@ def test_an_answer_that_breaks_off_ends_the_worker():
 
 
 def test_opening_has_a_limit_of_its_own_and_can_be_cancelled():
-    lane = ProcessLane("track", "unused", "0" * 64, patience=0.01, opening=0.3)
+    lane = EngineProcess("track", "unused", "0" * 64, patience=0.01, opening=0.3)
     with_child(lane, "time.sleep(60)")
     lane._awaited = ["ready", "prepared"]
     asked = []
@@ -225,7 +225,7 @@ def test_opening_has_a_limit_of_its_own_and_can_be_cancelled():
 
 
 def test_closing_ends_a_job_under_way():
-    lane = ProcessLane("track", "unused", "0" * 64)
+    lane = EngineProcess("track", "unused", "0" * 64)
     with_child(lane, "time.sleep(60)")
     timer = threading.Timer(0.2, lane.close)
     timer.start()

@@ -18,7 +18,7 @@ from coview_stream.stream.node import last_pose_keeper as memory
 from coview_stream.stream.node.engines import TrackEngine
 from coview_stream.stream.node.jobs import FrameJob
 from coview_stream.stream.node.last_pose import LastPose, file_of, load, save
-from coview_stream.stream.node.last_pose_keeper import Memory
+from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
 
 BEFORE = pose_from(rot_z(1.0), [30.0, 40.0, 1.5])
 
@@ -158,7 +158,7 @@ def test_the_localizer_hears_of_it(world_map, world_drive):
 def remembering(folder, *names, **more):
     site = Site(*names)
     site.node.declare()
-    return site, Memory(folder, list(site.sessions.values()), **more)
+    return site, LastPoseKeeper(folder, list(site.sessions.values()), **more)
 
 
 def test_saved_and_handed_over_at_the_next_start(tmp_path, caplog):
@@ -288,7 +288,7 @@ def running(site, kept):
 
 def test_a_running_node_keeps_it_now_and_then_and_at_its_end(tmp_path):
     site = Site("r1")
-    kept = Memory(tmp_path, list(site.sessions.values()), interval=0.05)
+    kept = LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.05)
     running(site, kept)
     try:
         site.sees("r1", 0.0)
@@ -310,7 +310,7 @@ def test_a_disk_that_hangs_holds_up_nobody(tmp_path, monkeypatch):
 
     monkeypatch.setattr(memory, "save", hang)
     site = Site("r1")
-    running(site, Memory(tmp_path, list(site.sessions.values()), interval=0.02))
+    running(site, LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
     try:
         site.sees("r1", 0.0)
         until(hanging.is_set)
@@ -328,7 +328,7 @@ def test_a_disk_that_hangs_at_the_start_holds_up_nobody(tmp_path, monkeypatch):
     released = threading.Event()
     monkeypatch.setattr(memory, "load", lambda *args: released.wait(30.0))
     site = Site("r1")
-    running(site, Memory(tmp_path, list(site.sessions.values()), interval=0.02))
+    running(site, LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.02))
     try:
         site.sees("r1", 0.0)
         until(lambda: site.net.samples("coview/r1/out/pose"))

@@ -17,8 +17,8 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import CoViewError
 from coview_stream.geometry.transforms import inverse
-from coview_stream.stream.node.engine_process import DiedError, ProcessLane, RejectedError
-from coview_stream.stream.node.jobs import SweepJob, SweepResult
+from coview_stream.stream.node.engine_process import DiedError, EngineProcess, RejectedError
+from coview_stream.stream.node.jobs import OdometryJob, OdometryResult
 from coview_stream.stream.node.lidar_session import LidarSession
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.transport.memory_transport import FakeTransport
@@ -58,7 +58,7 @@ def stand_in(tmp_path, monkeypatch):
 
 
 def sweep(points, seconds, times=None, config=LEVEL):
-    return SweepJob("r1", 1, ns(seconds), points, times, config)
+    return OdometryJob("r1", 1, ns(seconds), points, times, config)
 
 
 class Lane:
@@ -78,8 +78,8 @@ class Lane:
 
 
 def placing(job):
-    assert isinstance(job, SweepJob)
-    return SweepResult(message((job.stamp_ns - ns(0)) * 1e-9).T_odom_body, None, False, 0.01)
+    assert isinstance(job, OdometryJob)
+    return OdometryResult(message((job.stamp_ns - ns(0)) * 1e-9).T_odom_body, None, False, 0.01)
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def test_rpc_reset(quiet):
 
 
 def test_an_engine_that_aborts_is_started_again(stand_in):
-    lane = ProcessLane("odometry", "unused", "")
+    lane = EngineProcess("odometry", "unused", "")
     try:
         assert lane.run(sweep(CLOUD, 0.0)).begun
         assert not lane.run(sweep(CLOUD, 0.1)).begun
@@ -168,7 +168,7 @@ def test_a_node_survives_its_odometry_engine(stand_in):
     net = FakeTransport()
     config = NodeConfig(odometry_timeout=30.0, coast=30.0, max_outage=30.0, pose_rate=50.0)
     session = LidarSession(KEYS, SHA, config, lidar=LEVEL)
-    track, lane = Lane(tracking), ProcessLane("odometry", "unused", "")
+    track, lane = Lane(tracking), EngineProcess("odometry", "unused", "")
     node = Node([session], net, track, track, config, odometry=lane)
     node.start()
     stamps = iter(0.1 * k for k in range(100_000))
@@ -198,7 +198,7 @@ def test_without_kiss_icp_it_says_so_in_a_line(tmp_path, monkeypatch):
     (tmp_path / "kiss_icp").mkdir()
     (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
     monkeypatch.syspath_prepend(tmp_path)
-    lane = ProcessLane("odometry", "unused", "")
+    lane = EngineProcess("odometry", "unused", "")
     try:
         lane.start()
         with pytest.raises(CoViewError, match="pip install 'kiss-icp>=") as caught:
@@ -210,7 +210,7 @@ def test_without_kiss_icp_it_says_so_in_a_line(tmp_path, monkeypatch):
 
 def test_kiss_icp_itself(world_drive):
     pytest.importorskip("kiss_icp.kiss_icp", reason="kiss-icp is not installed")
-    lane = ProcessLane("odometry", "unused", "")
+    lane = EngineProcess("odometry", "unused", "")
     try:
         poses = []
         for k in range(3):

@@ -9,7 +9,7 @@ from fake_robot import KEYS, POINTS, SHA, cloud, counted, ends, message, ns, sta
 from coview_stream.config.node import NodeConfig
 from coview_stream.localization.result import State
 from coview_stream.messages.types import Sample
-from coview_stream.stream.node.jobs import SweepResult
+from coview_stream.stream.node.jobs import OdometryResult
 from coview_stream.stream.node.lidar_session import LidarSession
 
 TIMES = np.linspace(0.0, 0.1, len(POINTS))
@@ -39,7 +39,7 @@ class Robot:
         begun, self.first = (self.first if begun is None else begun), False
         pose = message((job.stamp_ns - ns(0)) * 1e-9, **place).T_odom_body
         deskewed = None if job.times is None else job.points + np.float32(1.0)
-        self.session.sweep_done(job, SweepResult(pose, deskewed, begun, 0.01), self.now + 0.04)
+        self.session.sweep_done(job, OdometryResult(pose, deskewed, begun, 0.01), self.now + 0.04)
         return job
 
     def tracked(self):
@@ -179,7 +179,7 @@ def test_a_result_of_a_generation_that_is_over_is_dropped():
     robot.saw(1.1)
     job = robot.session.take_sweep()
     robot.session.engine_restarted("odometry")
-    robot.session.sweep_done(job, SweepResult(np.eye(4), None, True, 0.0), robot.now)
+    robot.session.sweep_done(job, OdometryResult(np.eye(4), None, True, 0.0), robot.now)
     assert robot.session.odometry.newest is None
     assert robot.counters.dropped == 1
     assert robot.frame(1.2, begun=True) is not None
@@ -190,7 +190,7 @@ def test_reset_forgets_odometry_and_what_is_under_way():
     robot.saw(1.1)
     job = robot.session.take_sweep()
     robot.session.reset()
-    robot.session.sweep_done(job, SweepResult(np.eye(4), None, False, 0.0), robot.now)
+    robot.session.sweep_done(job, OdometryResult(np.eye(4), None, False, 0.0), robot.now)
     assert counted(robot) == {}
     robot.saw(0.3)  # whatever the stamp
     assert robot.session.take_sweep().generation > job.generation

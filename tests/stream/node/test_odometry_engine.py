@@ -12,7 +12,7 @@ from coview_stream.errors import CloudError, DependencyError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.odometry import kiss_icp as kiss
 from coview_stream.stream.node.engines import open_engine
-from coview_stream.stream.node.jobs import FrameJob, SweepJob
+from coview_stream.stream.node.jobs import FrameJob, OdometryJob
 from coview_stream.stream.node.odometry_engine import OdometryEngine
 
 LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
@@ -28,7 +28,7 @@ def moved(x, yaw=0.0):
 
 
 def job(cloud, seconds, robot="r1", generation=1, times=None, config=LEVEL):
-    return SweepJob(robot, generation, round(1e9 * seconds), cloud, times, config)
+    return OdometryJob(robot, generation, round(1e9 * seconds), cloud, times, config)
 
 
 def engine_of(*poses):

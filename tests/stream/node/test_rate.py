@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.stream.node.scheduling import Metronome
+from coview_stream.stream.node.scheduling import Rate
 
 
 def beats(metronome, times):
@@ -12,7 +12,7 @@ def beats(metronome, times):
 
 
 def test_the_first_beat_is_at_once_and_the_others_are_a_period_apart():
-    metronome = Metronome(4.0, 100.0)
+    metronome = Rate(4.0, 100.0)
     assert beats(metronome, [100.0, 100.1, 100.25, 100.3, 100.5, 100.74, 100.75]) == [
         100.0,
         100.25,
@@ -22,20 +22,20 @@ def test_the_first_beat_is_at_once_and_the_others_are_a_period_apart():
 
 
 def test_late_beats_do_not_delay_the_later_ones():
-    metronome = Metronome(4.0, 0.0)
+    metronome = Rate(4.0, 0.0)
     # each 0.2 s late: due times stay multiples of a period
     assert beats(metronome, [0.2, 0.45, 0.7, 0.95]) == [0.2, 0.45, 0.7, 0.95]
     assert metronome.due == pytest.approx(1.0)
 
 
 def test_after_a_pause_of_the_machine_nothing_is_caught_up():
-    metronome = Metronome(4.0, 0.0)
+    metronome = Rate(4.0, 0.0)
     assert metronome.beat(0.0)
     assert beats(metronome, [60.0, 60.01, 60.1, 60.24, 60.25]) == [60.0, 60.25]
 
 
 def test_how_long_to_wait():
-    metronome = Metronome(4.0, 0.0)
+    metronome = Rate(4.0, 0.0)
     assert metronome.remaining(0.0) == 0.0
     metronome.beat(0.0)
     assert metronome.remaining(0.1) == pytest.approx(0.15)
@@ -43,7 +43,7 @@ def test_how_long_to_wait():
 
 
 def test_with_slack_a_late_beat_does_not_shift_the_later_ones():
-    clock = Metronome(100.0, 0.0, slack=0.05)
+    clock = Rate(100.0, 0.0, slack=0.05)
     assert clock.beat(0.0)
     assert clock.beat(0.045)  # due at 0.01; the next ones are caught up
     assert [clock.beat(0.045), clock.beat(0.0451), clock.beat(0.0452), clock.beat(0.0453)] == [

@@ -7,7 +7,7 @@ from fake_robot import Robot, counted, doubted, ns, reason, state, tracking, unk
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.localization.result import Fix, KeyframeEvidence, State
-from coview_stream.localization.tracking.monitor import Cause
+from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.stream.node.status import status
 from coview_stream.stream.transport.transport import Connection
 
@@ -30,11 +30,11 @@ def test_a_doubt_is_told_from_a_search():
     def fix(state, cause):
         return Fix(0.0, state, evidence=KeyframeEvidence(0.0, state, "so", cause=cause))
 
-    assert fix(State.AMBIGUOUS, Cause.BLIND).doubted
-    assert fix(State.AMBIGUOUS, Cause.VERIFIED).doubted  # a long doubt takes more than one
+    assert fix(State.AMBIGUOUS, RejectionReason.BLIND).doubted
+    assert fix(State.AMBIGUOUS, RejectionReason.VERIFIED).doubted  # a long doubt takes more than one
     assert not fix(State.AMBIGUOUS, None).doubted
-    assert not fix(State.TRACKING, Cause.VERIFIED).doubted
-    assert not fix(State.LOST, Cause.FITNESS).doubted
+    assert not fix(State.TRACKING, RejectionReason.VERIFIED).doubted
+    assert not fix(State.LOST, RejectionReason.FITNESS).doubted
     assert not Fix(0.0, State.AMBIGUOUS).doubted
 
 

@@ -7,8 +7,8 @@ import json
 from fake_robot import Robot, ns, unknown
 
 from coview_stream.localization.result import KeyframeEvidence, State
-from coview_stream.localization.tracking.monitor import Cause
-from coview_stream.stream.node.robot_state import Transitions
+from coview_stream.localization.tracking.monitor import RejectionReason
+from coview_stream.stream.node.robot_state import StateHistory
 from coview_stream.stream.node.status import status
 from coview_stream.stream.transport.transport import Connection
 
@@ -54,8 +54,10 @@ def test_a_jump_of_odometry_is_told():
 
 
 def test_the_newest_five_are_kept_and_numbers_go_on():
-    changes = Transitions()
-    evidence = KeyframeEvidence(1.0, State.TRACKING, "verified", cause=Cause.VERIFIED, innovation=3.25)
+    changes = StateHistory()
+    evidence = KeyframeEvidence(
+        1.0, State.TRACKING, "verified", cause=RejectionReason.VERIFIED, innovation=3.25
+    )
     for k in range(9):
         state = (State.TRACKING, State.AMBIGUOUS)[k % 2]
         changes.note(state, f"reason {k}", k, evidence)

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.transport.keys import PRESETS, check_apart, robot_keys
+from coview_stream.stream.transport.keys import PRESETS, check_disjoint, robot_keys
 
 
 def fleet(preset="native", names=("r1", "r2"), **given):
@@ -16,12 +16,12 @@ def fleet(preset="native", names=("r1", "r2"), **given):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_keeps_robots_apart(preset):
-    check_apart(fleet(preset, ("r1", "r2", "r10")))
+    check_disjoint(fleet(preset, ("r1", "r2", "r10")))
 
 
 def test_wide_keys_of_one_robot_or_with_its_name_are_fine():
-    check_apart(fleet(names=["r1"], cloud="**/cloud", odometry="*/odom"))
-    check_apart(fleet(cloud="site/*/{robot}/**", odometry="{robot}$*/odom", pose="poses/{robot}"))
+    check_disjoint(fleet(names=["r1"], cloud="**/cloud", odometry="*/odom"))
+    check_disjoint(fleet(cloud="site/*/{robot}/**", odometry="{robot}$*/odom", pose="poses/{robot}"))
 
 
 @pytest.mark.parametrize(
@@ -38,15 +38,15 @@ def test_wide_keys_of_one_robot_or_with_its_name_are_fine():
 )
 def test_refused(given, message):
     with pytest.raises(ConfigError, match=re.sub(r"([{}])", r"\\\1", message)):
-        check_apart(fleet(**given))
+        check_disjoint(fleet(**given))
 
 
 def test_a_pose_that_another_robot_would_read():
     first = robot_keys("native", "coview", "r1", pose="coview/r2/in/odom")
     with pytest.raises(ConfigError, match=r"poses of robot r1 .* input of r2"):
-        check_apart([first, robot_keys("native", "coview", "r2")])
+        check_disjoint([first, robot_keys("native", "coview", "r2")])
 
 
 def test_a_name_given_twice():
     with pytest.raises(ConfigError, match="each name once"):
-        check_apart(fleet(names=("r1", "r1")))
+        check_disjoint(fleet(names=("r1", "r1")))

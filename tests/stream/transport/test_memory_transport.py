@@ -6,7 +6,7 @@ import pytest
 
 from coview_stream.errors import ConfigError, TransportError
 from coview_stream.messages.types import Encoded, Sample
-from coview_stream.stream.transport.error_guard import Guard
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.memory_transport import FakeTransport
 from coview_stream.stream.transport.transport import Transport
 
@@ -111,7 +111,7 @@ def test_a_key_that_zenoh_would_refuse_is_refused() -> None:
 
 def test_guard_counts_what_it_does_not_log(caplog: pytest.LogCaptureFixture) -> None:
     now = [0.0]
-    guard = Guard(logging.getLogger("guard"), interval=10.0, clock=lambda: now[0])
+    guard = RateLimitedErrors(logging.getLogger("guard"), interval=10.0, clock=lambda: now[0])
 
     def fail() -> None:
         raise ValueError("no")
@@ -137,7 +137,7 @@ def test_guard_survives_a_panic_but_not_an_interrupt() -> None:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    guard = Guard(logging.getLogger("guard"))
+    guard = RateLimitedErrors(logging.getLogger("guard"))
     assert "rust" in str(guard.run("k", panic))
     with pytest.raises(KeyboardInterrupt):
         guard.run("k", interrupt)

@@ -208,7 +208,7 @@ def _coloured(candidates: int, neighbours: list[int], spare: int) -> tuple[list[
 F64 = npt.NDArray[np.float64]
 
 
-def consistency(query: F64, known: F64, config: LearnedMatchConfig) -> F32:
+def consistency_graph(query: F64, known: F64, config: LearnedMatchConfig) -> F32:
     """Weigh how well every two pairs of points agree: a turn about the vertical and a shift keep distances.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from coview_stream.localization.search.learned.feature_index import CoarseMap, transformed
+from coview_stream.localization.search.learned.feature_index import FeatureIndex, transformed
 
 F32 = npt.NDArray[np.float32]
 
@@ -29,7 +29,7 @@ _LEAST = 1e-6  # weight of nothing
 def correlate(
     query: F32,
     weight: F32,
-    coarse_map: CoarseMap,
+    coarse_map: FeatureIndex,
     yaws: npt.ArrayLike,
     blocks: Indices | None = None,
     covered: float | None = COVERED,
@@ -49,7 +49,7 @@ def correlate(
         weight: (h, h) not negative. What lies more than h / 2 cells from the middle is left out.
         coarse_map: of the same cells and channels, with a margin of at least h / 2.
         yaws: (K,) headings of the query's frame in the map, radians.
-        blocks: blocks of the map to score (all); see :meth:`CoarseMap.blocks_near`.
+        blocks: blocks of the map to score (all); see :meth:`FeatureIndex.blocks_near`.
         covered: least share of the weight on surveyed cells; None divides by all the weight, wherever it lies.
 
     Returns:
@@ -80,7 +80,7 @@ class _Wave:
 
 
 def _waves(
-    query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.float64]
+    query: F32, weight: F32, coarse_map: FeatureIndex, yaws: npt.NDArray[np.float64]
 ) -> tuple[_Wave] | tuple[_Wave, _Wave]:
     """Spectra of a turned query, the weight's last, over the sum of the weights."""
     half, size = len(weight) // 2, len(yaws) // 2
@@ -88,7 +88,7 @@ def _waves(
     twice = len(yaws) == 2 * size and np.allclose(
         np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9
     )
-    images = turned(np.concatenate([query, weight[None]]), yaws[:size] if twice else yaws)
+    images = rotate_images(np.concatenate([query, weight[None]]), yaws[:size] if twice else yaws)
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _LEAST).all():
         raise ValueError("no cell of the query has a weight")
@@ -98,7 +98,7 @@ def _waves(
     return (before, _Wave(spectra, coarse_map.margin + half)) if twice else (before,)
 
 
-def _check(query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.float64]) -> None:
+def _check(query: F32, weight: F32, coarse_map: FeatureIndex, yaws: npt.NDArray[np.float64]) -> None:
     if query.ndim != 3 or weight.shape != query.shape[1:] or yaws.ndim != 1 or not len(yaws):
         raise ValueError(
             f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit"
@@ -111,7 +111,7 @@ def _check(query: F32, weight: F32, coarse_map: CoarseMap, yaws: npt.NDArray[np.
         )
 
 
-def _score(scores: F32, group: Indices, coarse_map: CoarseMap, wave: _Wave, covered: float | None) -> None:
+def _score(scores: F32, group: Indices, coarse_map: FeatureIndex, wave: _Wave, covered: float | None) -> None:
     """Fill in the places (H, W, K) that some blocks answer for."""
     spectra = wave.spectra
     mean = _back(np.matmul(coarse_map.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), coarse_map, wave)
@@ -129,7 +129,7 @@ def _score(scores: F32, group: Indices, coarse_map: CoarseMap, wave: _Wave, cove
         scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
 
 
-def _back(product: C64, coarse_map: CoarseMap, wave: _Wave) -> F32:
+def _back(product: C64, coarse_map: FeatureIndex, wave: _Wave) -> F32:
     """Correlations (places, places, blocks, K) from products of spectra (bins, blocks, K)."""
     size, last = coarse_map.block, wave.first + coarse_map.places
     grid = product.reshape(size, -1, *product.shape[1:])
@@ -140,7 +140,7 @@ def _back(product: C64, coarse_map: CoarseMap, wave: _Wave) -> F32:
 F64 = npt.NDArray[np.float64]
 
 
-def coarser(local: npt.NDArray[np.floating], weight: F32 | None = None, ratio: int = 2) -> tuple[F32, F32]:
+def downsample(local: npt.NDArray[np.floating], weight: F32 | None = None, ratio: int = 2) -> tuple[F32, F32]:
     """Mean of ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and of the weights.
 
     Returns:
@@ -161,7 +161,7 @@ def coarser(local: npt.NDArray[np.floating], weight: F32 | None = None, ratio: i
     return np.asarray(weighted), np.asarray(weight.reshape(parts).mean(axis=(1, 3), dtype=np.float32))
 
 
-def turned(images: F32, yaws: F64) -> F32:
+def rotate_images(images: F32, yaws: F64) -> F32:
     """Sample images on a grid of odd size about their middle, turned by each heading.
 
     Args:

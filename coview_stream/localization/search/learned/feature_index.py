@@ -21,7 +21,7 @@ MARGIN = 16
 KEPT_BYTES = 512 << 20
 
 
-class CoarseMap:
+class FeatureIndex:
     """Features of a map on a coarse grid, ready to be correlated with queries.
 
     The places of a block are ``block - 2 margin`` cells on a side; with the margin around them they are transformed

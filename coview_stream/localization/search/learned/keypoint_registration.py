@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.geometry.transforms import wrap_angle
-from coview_stream.localization.search.learned.consistent_pairs import consistency, maximum_clique
+from coview_stream.localization.search.learned.consistent_pairs import consistency_graph, maximum_clique
 from coview_stream.localization.search.learned.keypoints import Keypoints, Pairs, nearest_pairs
 
 Start = tuple[float, float, float]
@@ -20,7 +20,7 @@ Start = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Match:
+class KeypointMatch:
     """``p_map = R(yaw) p_query + (x, y)``, and what it rests on."""
 
     x: float
@@ -35,9 +35,9 @@ class Match:
     """Root mean square of their residuals in the plane, metres."""
 
 
-def sharpen(
+def refine_by_keypoints(
     query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig | None = None
-) -> Match | None:
+) -> KeypointMatch | None:
     """Match the keypoints of a query with those of the map around ``start``.
 
     Args:
@@ -56,7 +56,7 @@ def sharpen(
     if len(pairs) < config.least_inliers:
         return None
     left, right = query.where(pairs[:, 0]), near.where(pairs[:, 1])
-    clique = maximum_clique(consistency(left.xy, right.xy, config), config.nodes)
+    clique = maximum_clique(consistency_graph(left.xy, right.xy, config), config.nodes)
     members = pairs[clique.members]
     while len(members) >= config.least_inliers:
         found = _aligned(query, near, members)
@@ -79,27 +79,27 @@ def _meeting(
     return np.asarray(gap <= config.most_shift + config.tolerance + swing[:, None])
 
 
-def _aligned(query: Keypoints, known: Keypoints, members: Pairs) -> Alignment:
+def _aligned(query: Keypoints, known: Keypoints, members: Pairs) -> RigidFit2D:
     """Lay the members (P, 2) on each other, the certain ones more firmly."""
     left, right = query.where(members[:, 0]), known.where(members[:, 1])
     weights = 1.0 / (left.sigma.astype(np.float64) ** 2 + right.sigma.astype(np.float64) ** 2)
-    return align(left.xy, right.xy, weights)
+    return fit_rigid_2d(left.xy, right.xy, weights)
 
 
-def _close(found: Alignment, start: Start, config: LearnedMatchConfig) -> bool:
+def _close(found: RigidFit2D, start: Start, config: LearnedMatchConfig) -> bool:
     shift = math.hypot(found.x - start[0], found.y - start[1])
     return shift <= config.most_shift and abs(wrap_angle(found.yaw - start[2])) <= config.most_turn
 
 
-def _match(found: Alignment, inliers: int, exact: bool) -> Match:
-    return Match(found.x, found.y, found.yaw, inliers, exact, found.rms)
+def _match(found: RigidFit2D, inliers: int, exact: bool) -> KeypointMatch:
+    return KeypointMatch(found.x, found.y, found.yaw, inliers, exact, found.rms)
 
 
 F64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Alignment:
+class RigidFit2D:
     """``p_map = R(yaw) p_query + (x, y)``."""
 
     x: float
@@ -115,7 +115,7 @@ class Alignment:
         return float(np.sqrt(np.mean(self.residuals**2)))
 
 
-def align(query: F64, known: F64, weights: F64 | None = None) -> Alignment:
+def fit_rigid_2d(query: F64, known: F64, weights: F64 | None = None) -> RigidFit2D:
     """Weighted least squares in the plane.
 
     Args:
@@ -140,4 +140,4 @@ def align(query: F64, known: F64, weights: F64 | None = None) -> Alignment:
     turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
     x, y = other - turn @ middle
     missed = b - a @ turn.T
-    return Alignment(float(x), float(y), yaw, np.hypot(missed[:, 0], missed[:, 1]))
+    return RigidFit2D(float(x), float(y), yaw, np.hypot(missed[:, 0], missed[:, 1]))

@@ -12,14 +12,14 @@ import numpy.typing as npt
 
 from coview_stream.config import LearnedConfig
 from coview_stream.config.search import LearnedMatchConfig
-from coview_stream.descriptors.birds_eye_view import CELL, bird_view
+from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import LOCAL_CELL, Features, Network, network
 from coview_stream.geometry.transforms import Points, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
-from coview_stream.localization.search.learned.correlation import coarser, correlate
-from coview_stream.localization.search.learned.feature_index import CoarseMap
-from coview_stream.localization.search.learned.keypoint_registration import sharpen
+from coview_stream.localization.search.learned.correlation import correlate, downsample
+from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.keypoint_registration import refine_by_keypoints
 from coview_stream.localization.search.learned.keypoints import Keypoints, keypoints
 from coview_stream.localization.search.retrieval import Volume
 
@@ -34,7 +34,7 @@ _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # what a tile's blocks have to reach fr
 
 
 @dataclass(frozen=True)
-class View:
+class QueryFeatures:
     """What the ground network saw around ``centre``.
 
     Attributes:
@@ -60,7 +60,7 @@ class View:
         return np.asarray(mean / (np.linalg.norm(mean) + 1e-9), dtype=np.float32)
 
 
-class LearnedMap:
+class FeatureMatcher:
     """All that searches of one map share: the map's features, ready to be searched, and the ground network.
 
     Nothing is loaded or made before the first query, or :meth:`prepare`.
@@ -95,13 +95,15 @@ class LearnedMap:
         return network("ground", self._directory, 1)
 
     @cached_property
-    def coarse(self) -> CoarseMap:
+    def coarse(self) -> FeatureIndex:
         """The map's features on coarse cells, with their spectra."""
         whole, corner = self.features.coarse(self.config.cell)
         margin = round(0.5 * _SIZE / self.config.cell)
         surveyed = (whole != 0).any(axis=0)
         # halves: the whole is kept beside its spectra, and its numbers come from single bytes anyway
-        return CoarseMap(whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin)
+        return FeatureIndex(
+            whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin
+        )
 
     @cached_property
     def _everywhere(self) -> npt.NDArray[np.int64]:
@@ -121,27 +123,27 @@ class LearnedMap:
         """
         _ = self.network, self._everywhere if self.dense else self.coarse
 
-    def view(self, points: Points, centre: npt.NDArray[np.float64]) -> View:
+    def view(self, points: Points, centre: npt.NDArray[np.float64]) -> QueryFeatures:
         """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot.
 
         Raises:
             InputError, DependencyError: as :meth:`prepare`.
         """
         size = round(_SIZE / CELL)
-        features = self.network(bird_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
+        features = self.network(birds_eye_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
         axis = (np.arange(features.sigma.shape[0]) + 0.5) * LOCAL_CELL - 0.5 * _SIZE
         inside = np.hypot(axis[:, None], axis[None]) <= self.config.reach
         weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
-        return View(features, weight, centre)
+        return QueryFeatures(features, weight, centre)
 
-    def distances(self, view: View, suggested: npt.ArrayLike = ()) -> Volume:
+    def distances(self, view: QueryFeatures, suggested: npt.ArrayLike = ()) -> Volume:
         """(M, S) of all stations and headings, lower is more alike; shift n means yaw -2 pi n / S.
 
         Where the map is too large to be searched all over, it is searched around ``suggested`` (N, 2) as well, metres.
         Their median is 1, which is also the distance where nothing was compared: it speaks neither for nor against.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
-        query, weight = coarser(view.features.local, view.weight, ratio)
+        query, weight = downsample(view.features.local, view.weight, ratio)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
         blocks = self._everywhere if self.dense else self._alike(view, suggested)
         read = self._at_stations(correlate(query, weight, self.coarse, yaws, blocks))
@@ -172,7 +174,7 @@ class LearnedMap:
             read[inside] = np.maximum(read[inside], grid[row[inside], column[inside]])
         return read
 
-    def sharpened(self, hypotheses: list[Hypothesis], view: View) -> list[Hypothesis]:
+    def sharpened(self, hypotheses: list[Hypothesis], view: QueryFeatures) -> list[Hypothesis]:
         """Move each hypothesis to where keypoints around it agree; where too few do, it stays."""
         local, sigma = view.features.local, view.features.sigma
         ours = keypoints(local, sigma, view.corner, mask=view.weight > 0, count=self.match.keypoints)
@@ -186,7 +188,7 @@ class LearnedMap:
         patch = self.features.patch(np.array([x, y]), self.match.reach + self.match.most_shift)
         known = (patch.local != 0).any(axis=0)
         theirs = keypoints(patch.local, patch.sigma, patch.corner, mask=known, count=None)
-        found = sharpen(ours, theirs, (x, y, yaw_of(T)), self.match)
+        found = refine_by_keypoints(ours, theirs, (x, y, yaw_of(T)), self.match)
         if found is None:
             return hypothesis
         z = self._ground(np.array([found.x, found.y]), np.array([x, y, z]))
@@ -204,7 +206,7 @@ class LearnedMap:
         nearest = same[np.lexsort((rise[same], np.round(away[same], 2)))[0]]
         return float(self.stations[nearest, 2])
 
-    def _alike(self, view: View, suggested: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    def _alike(self, view: QueryFeatures, suggested: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Blocks of the coarse map around suggestions, and around the tiles that look most like the view."""
         likeness = self.features.place.astype(np.float32) @ view.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)

@@ -12,23 +12,23 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import on_ground
 from coview_stream.geometry.transforms import pose_from, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.learned.matcher import LearnedMap, View
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
+from coview_stream.localization.search.request import SearchRequest
 
 _MOST = 2  # times as many hypotheses as peaks, where stations lie above each other
 
 
-class Learned:
+class LearnedRecognizer:
     """Votes by learned features; its peaks are made exact by keypoints of the newest keyframe that voted."""
 
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: LearnedMap) -> None:
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: FeatureMatcher) -> None:
         self.config = config
         self.learned = learned
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
         self.consensus = Consensus(base_map.stations, base_map.config.block, peaks)
-        self._view: View | None = None
+        self._view: QueryFeatures | None = None
 
-    def vote(self, query: Query) -> None:
+    def vote(self, query: SearchRequest) -> None:
         """Compare what the ground network sees around the robot with the map's features."""
         if len(query.surroundings) < self.config.keyframe.min_points:
             return
@@ -69,7 +69,7 @@ class Learned:
             for k, rise in rises.items()
         ]
 
-    def _same_but_height(self, one: Hypothesis, other: Hypothesis, view: View) -> bool:
+    def _same_but_height(self, one: Hypothesis, other: Hypothesis, view: QueryFeatures) -> bool:
         here, there = (transform(each.T_map_odom, view.centre[None])[0, :2] for each in (one, other))
         turn = abs(wrap_angle(yaw_of(one.T_map_odom) - yaw_of(other.T_map_odom)))
         rule = self.consensus.config

@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from coview_stream.descriptors.feature_map import TILE, FeatureMap, packed, packed_sigma, weights_sha256
+from coview_stream.descriptors.feature_map import (
+    TILE,
+    FeatureMap,
+    quantized,
+    quantized_sigma,
+    weights_sha256,
+)
 from coview_stream.descriptors.network import Features
-from coview_stream.localization.search.learned.matcher import View
+from coview_stream.localization.search.learned.matcher import QueryFeatures
 
 CHANNELS = 16
 TILES = 6  # along an edge: 192 m
@@ -48,10 +54,10 @@ class Planted:
         self.place = place / np.linalg.norm(place, axis=1, keepdims=True)
         self.place_at = at + LOW * TILE
         arrays = {
-            "learned.local": in_tiles(packed(self.local.transpose(1, 2, 0))),
-            "learned.sigma": in_tiles(packed_sigma(self.sigma)),
+            "learned.local": in_tiles(quantized(self.local.transpose(1, 2, 0))),
+            "learned.sigma": in_tiles(quantized_sigma(self.sigma)),
             "learned.tiles": tiles,
-            "learned.place": packed(self.place),
+            "learned.place": quantized(self.place),
             "learned.place_at": self.place_at.astype(np.float32),
         }
         self.features = FeatureMap(arrays, {"weights": weights_sha256(), "cell": 1.0})
@@ -76,4 +82,6 @@ class Planted:
         place = np.repeat(self.place[nearest][:, None], 256, axis=1).reshape(-1, 16, 16)
         inside = np.hypot(u, v) <= 30.0
         weight = np.where(inside, 1.0 / sigma, 0.0).astype(np.float32)
-        return View(Features(local.astype(np.float32), sigma, place.astype(np.float32)), weight, centre)
+        return QueryFeatures(
+            Features(local.astype(np.float32), sigma, place.astype(np.float32)), weight, centre
+        )

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from coview_stream.localization.search.learned.correlation import coarser, correlate, turned
-from coview_stream.localization.search.learned.feature_index import CoarseMap
+from coview_stream.localization.search.learned.correlation import correlate, downsample, rotate_images
+from coview_stream.localization.search.learned.feature_index import FeatureIndex
 
 YAWS = np.arange(12) * (np.pi / 6)
 
@@ -84,9 +84,9 @@ def test_it_equals_direct_sums(covered, most_bytes, headings):
     known[:, :5, :9] = 0.0
     surveyed = (known != 0).any(axis=0)
     local, weights = features(rng, 3, 12, 12), rng.uniform(0.1, 1.0, (12, 12)).astype(np.float32)
-    query, weight = coarser(local, weights)
+    query, weight = downsample(local, weights)
     yaws = np.asarray(headings)
-    made = CoarseMap(known, (0.0, 0.0), block=15, margin=4, most_bytes=most_bytes)
+    made = FeatureIndex(known, (0.0, 0.0), block=15, margin=4, most_bytes=most_bytes)
     assert len(made) == 2 * 3
     assert (made.nbytes > 0) == (most_bytes > 0)
     ours = correlate(query, weight, made, yaws, covered=covered)
@@ -107,7 +107,7 @@ def test_a_planted_place_is_found_with_its_heading(row, col, k):
     query = seen_at(known, row, col, YAWS[k], 32)
     query += rng.normal(0, 0.2, query.shape).astype(np.float32)
     weight = disk(32)
-    scores = correlate(query * weight, weight, CoarseMap(known, (0, 0)), YAWS)
+    scores = correlate(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS)
     assert np.unravel_index(scores.argmax(), scores.shape) == (k, row, col)
 
 
@@ -116,7 +116,7 @@ def test_it_works_on_single_cells_of_half_precision_on_a_map_smaller_than_a_quer
     known = features(rng, 8, 20, 9).astype(np.float16)
     query = seen_at(known.astype(np.float32), 11, 4, YAWS[2], 32)
     weight = disk(32)
-    scores = correlate(query * weight, weight, CoarseMap(known, (0, 0)), YAWS, covered=0.1)
+    scores = correlate(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS, covered=0.1)
     assert np.unravel_index(scores.argmax(), scores.shape) == (2, 11, 4)
 
 
@@ -125,7 +125,7 @@ def test_the_maps_edge_neither_favours_nor_punishes():
     rng = np.random.default_rng(4)
     known = features(rng, 8, 100, 100)
     weight = disk(32)
-    coarse = CoarseMap(known, (0, 0))
+    coarse = FeatureIndex(known, (0, 0))
     inside, edge = (
         correlate(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col]
         for col in (50, 5)
@@ -149,7 +149,7 @@ def centre_of(coarse, row, col):
 def test_only_the_blocks_asked_for_are_scored_and_like_in_the_whole():
     rng = np.random.default_rng(5)
     known, corner = features(rng, 4, 150, 90), (100.0, -50.0)
-    coarse = CoarseMap(known, corner, block=64)
+    coarse = FeatureIndex(known, corner, block=64)
     query, weight = features(rng, 4, 32, 32) * disk(32), disk(32)
     whole = correlate(query, weight, coarse, YAWS[:3])
     place = centre_of(coarse, 70, 33)
@@ -166,7 +166,7 @@ def test_only_the_blocks_asked_for_are_scored_and_like_in_the_whole():
 
 
 def test_each_block_answers_for_its_own_cells_only():
-    coarse = CoarseMap(np.ones((1, 70, 130), np.float16), (0, 0), block=64)
+    coarse = FeatureIndex(np.ones((1, 70, 130), np.float16), (0, 0), block=64)
     answered = np.zeros((70, 130), int)
     for block in range(len(coarse)):
         answered[coarse.place_of(block)] += 1
@@ -180,7 +180,7 @@ def test_turning_goes_from_x_to_y():
     image = np.zeros((1, 32, 32), np.float32)
     image[0, 15:17, 24:26] = 1.0  # 9 cells along x from the middle
     for yaw, (row, col) in ((0.0, (16, 25)), (np.pi / 2, (25, 16)), (np.pi, (16, 7))):
-        seen = turned(image, np.array([yaw]))[:, :, 0, 0]
+        seen = rotate_images(image, np.array([yaw]))[:, :, 0, 0]
         assert seen.shape == (33, 33)
         assert np.unravel_index(seen.argmax(), seen.shape) == (row, col)
 
@@ -189,14 +189,14 @@ def test_coarser_cells_are_weighted_means():
     local = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
     weight = np.zeros((4, 4), np.float32)
     weight[0, 0], weight[1, 1] = 2.0, 1.0
-    query, total = coarser(local, weight)
+    query, total = downsample(local, weight)
     assert query[0].tolist() == [[(0 * 2 + 5 * 1) / 4, 0], [0, 0]]
     assert total.tolist() == [[0.75, 0], [0, 0]]
-    np.testing.assert_allclose(coarser(local)[0][0, 1, 1], np.mean([10, 11, 14, 15]))
+    np.testing.assert_allclose(downsample(local)[0][0, 1, 1], np.mean([10, 11, 14, 15]))
 
 
 def test_what_does_not_fit_is_refused():
-    coarse = CoarseMap(np.ones((2, 40, 40), np.float32), (0, 0))
+    coarse = FeatureIndex(np.ones((2, 40, 40), np.float32), (0, 0))
     query, weight = np.ones((2, 32, 32), np.float32), np.ones((32, 32), np.float32)
     for wrong in (
         lambda: correlate(query, weight[1:], coarse, [0.0]),
@@ -205,11 +205,11 @@ def test_what_does_not_fit_is_refused():
         lambda: correlate(query, weight, coarse, []),
         lambda: correlate(np.ones((2, 34, 34), np.float32), np.ones((34, 34), np.float32), coarse, [0.0]),
         lambda: correlate(query[:, 1:, 1:], weight[1:, 1:], coarse, [0.0]),
-        lambda: CoarseMap(np.ones((2, 0, 4), np.float32), (0, 0)),
-        lambda: CoarseMap(np.ones((2, 4, 4), np.float32), (0, 0), block=32),
-        lambda: CoarseMap(np.ones((2, 4, 4), np.float32), (0, 0), surveyed=np.ones((3, 4), bool)),
-        lambda: coarser(np.ones((1, 5, 4), np.float32)),
-        lambda: coarser(np.ones((1, 4, 4), np.float32), np.ones((2, 2), np.float32)),
+        lambda: FeatureIndex(np.ones((2, 0, 4), np.float32), (0, 0)),
+        lambda: FeatureIndex(np.ones((2, 4, 4), np.float32), (0, 0), block=32),
+        lambda: FeatureIndex(np.ones((2, 4, 4), np.float32), (0, 0), surveyed=np.ones((3, 4), bool)),
+        lambda: downsample(np.ones((1, 5, 4), np.float32)),
+        lambda: downsample(np.ones((1, 4, 4), np.float32), np.ones((2, 2), np.float32)),
     ):
         with pytest.raises(ValueError, match=r"."):
             wrong()

@@ -7,8 +7,11 @@ import pytest
 
 from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.geometry.transforms import wrap_angle
-from coview_stream.localization.search.learned.consistent_pairs import consistency, maximum_clique
-from coview_stream.localization.search.learned.keypoint_registration import align, sharpen
+from coview_stream.localization.search.learned.consistent_pairs import consistency_graph, maximum_clique
+from coview_stream.localization.search.learned.keypoint_registration import (
+    fit_rigid_2d,
+    refine_by_keypoints,
+)
 from coview_stream.localization.search.learned.keypoints import Keypoints
 
 CONFIG = LearnedMatchConfig()
@@ -32,12 +35,12 @@ def paired(rng, count, share, noise=0.3):
 def test_a_planted_pose_is_recovered_among_wrong_pairs(count, share):
     for seed in range(3):
         here, there, pose, right = paired(np.random.default_rng(seed), count, share)
-        clique = maximum_clique(consistency(here, there, CONFIG), CONFIG.nodes)
+        clique = maximum_clique(consistency_graph(here, there, CONFIG), CONFIG.nodes)
         chosen = clique.members
         assert clique.exact
         assert right[chosen].mean() >= 0.9
         assert right[chosen].sum() >= 0.7 * right.sum()
-        found = align(here[chosen], there[chosen])
+        found = fit_rigid_2d(here[chosen], there[chosen])
         assert np.hypot(found.x - pose[0], found.y - pose[1]) < 0.3
         assert abs(wrap_angle(found.yaw - pose[2])) < np.radians(1.0)
         assert found.rms < 0.8
@@ -46,7 +49,7 @@ def test_a_planted_pose_is_recovered_among_wrong_pairs(count, share):
 def test_consistency_is_what_it_says():
     here = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 1.5], [0.0, 20.0]])
     there = np.array([[5.0, 5.0], [5.0, 15.5], [3.0, 9.0], [5.0, 30.0]])
-    weights = consistency(here, there, CONFIG)
+    weights = consistency_graph(here, there, CONFIG)
     assert weights.dtype == np.float32
     np.testing.assert_array_equal(weights, weights.T)
     assert not weights.diagonal().any()
@@ -54,38 +57,38 @@ def test_consistency_is_what_it_says():
     assert weights[0, 2] == 0  # too close in the scan
     assert weights[0, 3] == 0  # 20 m against 25 m
     close = np.array([[0.0, 0.0], [0.0, 2.5]]), np.array([[0.0, 0.0], [1.9, 0.0]])
-    assert not consistency(*close, CONFIG).any()  # too close in the map
-    assert not consistency(*close[::-1], CONFIG).any()  # in the scan
-    assert consistency(here[:0], there[:0], CONFIG).shape == (0, 0)
+    assert not consistency_graph(*close, CONFIG).any()  # too close in the map
+    assert not consistency_graph(*close[::-1], CONFIG).any()  # in the scan
+    assert consistency_graph(here[:0], there[:0], CONFIG).shape == (0, 0)
     with pytest.raises(ValueError, match="pairs of points"):
-        consistency(here, there[1:], CONFIG)
+        consistency_graph(here, there[1:], CONFIG)
 
 
 def test_alignment_is_exact_without_noise_and_follows_weights():
     rng = np.random.default_rng(0)
     here = rng.uniform(-20, 20, (30, 2))
     there = here @ turn(-2.5).T + (700.0, -90.0)
-    found = align(here, there)
+    found = fit_rigid_2d(here, there)
     assert (found.x, found.y, found.yaw) == pytest.approx((700.0, -90.0, -2.5))
     assert found.residuals.max() < 1e-9
     there[:5] += 30.0
     weights = np.ones(30)
     weights[:5] = 0.0
-    apart = align(here, there, weights)
+    apart = fit_rigid_2d(here, there, weights)
     assert (apart.x, apart.y, apart.yaw) == pytest.approx((700.0, -90.0, -2.5))
     np.testing.assert_allclose(apart.residuals[:5], np.hypot(30, 30))
-    assert align(here, there).rms > 5.0
-    two = align(here[:2], here[:2] + 1.0)
+    assert fit_rigid_2d(here, there).rms > 5.0
+    two = fit_rigid_2d(here[:2], here[:2] + 1.0)
     assert (two.x, two.y, two.yaw) == pytest.approx((1.0, 1.0, 0.0))
 
 
 def test_too_little_to_align_is_refused():
     points = np.zeros((3, 2))
     for wrong in (
-        lambda: align(points[:1], points[:1]),
-        lambda: align(points, points[:2]),
-        lambda: align(points, points, np.array([1.0, 0.0, 0.0])),
-        lambda: align(points, points, np.array([1.0, 1.0, -1.0])),
+        lambda: fit_rigid_2d(points[:1], points[:1]),
+        lambda: fit_rigid_2d(points, points[:2]),
+        lambda: fit_rigid_2d(points, points, np.array([1.0, 0.0, 0.0])),
+        lambda: fit_rigid_2d(points, points, np.array([1.0, 1.0, -1.0])),
     ):
         with pytest.raises(ValueError, match=r"points|weights"):
             wrong()
@@ -112,14 +115,14 @@ def test_a_place_becomes_a_pose(seed):
     pose = (*rng.uniform(-300, 300, 2), rng.uniform(-np.pi, np.pi))
     query, known = views(rng, pose)
     start = (pose[0] + 3.0, pose[1] - 2.0, pose[2] + 0.15)
-    found = sharpen(query, known, start)
+    found = refine_by_keypoints(query, known, start)
     assert found is not None
     assert np.hypot(found.x - pose[0], found.y - pose[1]) < 0.25
     assert abs(wrap_angle(found.yaw - pose[2])) < np.radians(1.0)
     assert found.inliers >= 20
     assert found.exact
     assert found.rms < 0.7
-    assert found == sharpen(query, known, start)
+    assert found == refine_by_keypoints(query, known, start)
 
 
 @pytest.mark.parametrize("off", [(9.0, 0.0, 0.0), (0.0, 0.0, 0.6), (0.0, 0.0, np.pi)])
@@ -128,24 +131,24 @@ def test_a_pose_too_far_from_the_start_is_none(off):
     query, known = views(np.random.default_rng(1), pose)
     start = tuple(np.add(pose, off))
     config = LearnedMatchConfig(least_inliers=10)
-    assert sharpen(query, known, start, config) is None
+    assert refine_by_keypoints(query, known, start, config) is None
 
 
 def test_a_mirror_image_is_no_match():
     pose = (0.0, 0.0, 0.0)
     query, known = views(np.random.default_rng(2), pose, own=0)
-    assert sharpen(query, known, pose) is not None
+    assert refine_by_keypoints(query, known, pose) is not None
     mirrored = Keypoints(known.xy * (1.0, -1.0), known.descriptors, known.sigma)
     config = LearnedMatchConfig(least_inliers=12, most_shift=50.0, most_turn=4.0)
-    assert sharpen(query, known, pose, config) is not None
-    assert sharpen(query, mirrored, pose, config) is None
+    assert refine_by_keypoints(query, known, pose, config) is not None
+    assert refine_by_keypoints(query, mirrored, pose, config) is None
 
 
 def test_chance_agreement_is_not_enough():
     found = []
     for seed in range(12):
         query, known = views(np.random.default_rng(seed), (0.0, 0.0, 0.0), shared=0)
-        found.append(sharpen(query, known, (0.0, 0.0, 0.0)))
+        found.append(refine_by_keypoints(query, known, (0.0, 0.0, 0.0)))
     assert found == [None] * 12
 
 
@@ -157,5 +160,5 @@ def test_nothing_matches_nothing():
         (query, known.where(none)),
         (query.where(none), known.where(none)),
     ):
-        assert sharpen(one, other, (0.0, 0.0, 0.0)) is None
-    assert sharpen(query, known, (1000.0, 0.0, 0.0)) is None
+        assert refine_by_keypoints(one, other, (0.0, 0.0, 0.0)) is None
+    assert refine_by_keypoints(query, known, (1000.0, 0.0, 0.0)) is None

@@ -9,8 +9,8 @@ import pytest
 
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.geometry.transforms import transform
-from coview_stream.localization.search.learned.recognizer import Learned
-from coview_stream.localization.search.request import Query
+from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
+from coview_stream.localization.search.request import SearchRequest
 
 HERE, THERE, SHIFT = (5.0, -7.0), (-15.0, 11.0), 7
 
@@ -29,12 +29,14 @@ def named(heights, peaks=5):
         distances=lambda view, suggested: np.tile(flat, (len(heights), 1)),
         sharpened=lambda hypotheses, view: hypotheses,
     )
-    source = Learned(SimpleNamespace(stations=stations, config=SimpleNamespace(block=2.0)), config, learned)
+    source = LearnedRecognizer(
+        SimpleNamespace(stations=stations, config=SimpleNamespace(block=2.0)), config, learned
+    )
     ground = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32) * (1, 1, 0)
     body = np.eye(4)
     body[2, 3] = 1.5
     none = np.empty((0, 3), np.float32)
-    source.vote(Query(0.0, body, none, none, none, surroundings=ground.astype(np.float32)))
+    source.vote(SearchRequest(0.0, body, none, none, none, surroundings=ground.astype(np.float32)))
     return source.hypotheses(), stations
 
 

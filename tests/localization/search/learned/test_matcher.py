@@ -15,7 +15,7 @@ from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import Features
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.learned.matcher import LearnedMap
+from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def stations():
 
 @pytest.fixture(scope="module")
 def known(planted, stations):
-    return LearnedMap(planted.features, stations, LearnedConfig())
+    return FeatureMatcher(planted.features, stations, LearnedConfig())
 
 
 PLACES = [((21.0, 33.0), 0), ((-41.0, 75.0), 7), ((61.0, -15.0), 30)]
@@ -73,9 +73,9 @@ def test_keyframes_votes_meet_at_the_newest(planted, known, stations):
 
 def test_large_maps_are_searched_around_what_looks_alike(planted, stations):
     config = LearnedConfig(dense_area=1000.0, shortlist=1)
-    known = LearnedMap(planted.features, stations, config)
+    known = FeatureMatcher(planted.features, stations, config)
     assert not known.dense
-    assert LearnedMap(planted.features, stations, LearnedConfig()).dense
+    assert FeatureMatcher(planted.features, stations, LearnedConfig()).dense
     distances = known.distances(planted.seen((-77.0, -43.0), 0.0, np.zeros(3)))
     searched = (distances != 1.0).any(axis=1)
     assert 0.05 < searched.mean() < 0.8
@@ -85,7 +85,7 @@ def test_large_maps_are_searched_around_what_looks_alike(planted, stations):
 
 
 def test_they_are_searched_around_suggestions_too(planted, stations):
-    known = LearnedMap(planted.features, stations, LearnedConfig(dense_area=1000.0, shortlist=1))
+    known = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0, shortlist=1))
     view = planted.seen((-77.0, -43.0), 0.0, np.zeros(3))
     near = np.hypot(*(stations[:, :2] - (50.0, 70.0)).T) < 10.0
     assert (known.distances(view)[near] == 1.0).all()
@@ -93,8 +93,8 @@ def test_they_are_searched_around_suggestions_too(planted, stations):
 
 
 def test_only_small_maps_are_prepared_to_be_searched_all_over(planted, stations):
-    large = LearnedMap(planted.features, stations, LearnedConfig(dense_area=1000.0))
-    small = LearnedMap(planted.features, stations, LearnedConfig())
+    large = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0))
+    small = FeatureMatcher(planted.features, stations, LearnedConfig())
     for known, prepared in ((large, {"coarse"}), (small, {"coarse", "_everywhere"})):
         known.prepare()
         assert {"coarse", "_everywhere"} & set(vars(known)) == prepared
@@ -148,7 +148,7 @@ def test_from_clouds_to_a_pose(map_points, monkeypatch, xy, degrees):
     axis = np.arange(-31.0, 32.0, 2.0)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     stations = np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32)
-    known = LearnedMap(FeatureMap(*feature_arrays(cloud)), stations, LearnedConfig())
+    known = FeatureMatcher(FeatureMap(*feature_arrays(cloud)), stations, LearnedConfig())
     known.network = pointwise
     centre = np.array([50.0, -8.0, 3.0])
     near = cloud[np.hypot(*(cloud[:, :2] - place[:2]).T) < 29.0]

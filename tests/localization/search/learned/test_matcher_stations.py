@@ -8,7 +8,7 @@ from planted_features import LOW, TILES, Planted
 
 from coview_stream.config import LearnedConfig
 from coview_stream.descriptors.feature_map import TILE
-from coview_stream.localization.search.learned.matcher import LearnedMap
+from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def test_a_station_has_the_best_score_of_its_block(planted, block, cell):
     count = int(TILES * TILE / block)
     xy = np.stack(np.meshgrid(*[(np.arange(count) + 0.5) * block + low * TILE for low in LOW]), -1)
     places = np.column_stack([xy.reshape(-1, 2), np.zeros(count**2)]).astype(np.float32)
-    known = LearnedMap(planted.features, places, LearnedConfig(cell=cell), block=block)
+    known = FeatureMatcher(planted.features, places, LearnedConfig(cell=cell), block=block)
     side = int(TILES * TILE / cell)
     scores = np.random.default_rng(0).normal(size=(3, side, side)).astype(np.float32)
     found = known._at_stations(scores)
@@ -41,7 +41,7 @@ def test_blocks_of_four_metres_find_a_place_anywhere_in_them(planted):
     axis = np.arange(2.0, TILES * TILE, 4.0)
     xy = np.stack(np.meshgrid(axis + LOW[0] * TILE, axis + LOW[1] * TILE), axis=-1).reshape(-1, 2)
     places = np.column_stack([xy, np.zeros(len(xy))]).astype(np.float32)
-    known = LearnedMap(planted.features, places, LearnedConfig(), block=4.0)
+    known = FeatureMatcher(planted.features, places, LearnedConfig(), block=4.0)
     for place in ((21.0, 33.0), (23.0, 33.0), (21.0, 35.0), (23.0, 35.0)):
         distances = known.distances(planted.seen(place, 0.0, np.zeros(3)))
         np.testing.assert_allclose(places[distances.min(axis=1).argmin(), :2], (22.0, 34.0))
@@ -53,7 +53,7 @@ def test_a_place_that_keypoints_have_moved_stands_on_its_own_storey(planted):
     xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     lower = np.column_stack([xy, 0.2 * xy[:, 0]])
     upper = lower[np.hypot(*xy.T) > 5.0] + (0.0, 0.0, 3.0)
-    known = LearnedMap(planted.features, np.vstack([lower, upper]).astype(np.float32), LearnedConfig())
+    known = FeatureMatcher(planted.features, np.vstack([lower, upper]).astype(np.float32), LearnedConfig())
 
     def ground(xy, before):
         return known._ground(np.array(xy), np.array(before))
