@@ -11,20 +11,19 @@ SPAN = launch.SPAN
 
 
 @ti.func
-def covisible(
+def describe_grid(
     at: ti.i32,
     rings: ti.i32,
     sectors: ti.i32,
     vertical: ti.i32,
     highest: ti.template(),
-    total: ti.template(),
     count: ti.template(),
     value: ti.template(),
 ):
     """Write the context of the grid that begins at ``at``.
 
-    vertical: 0 off, 1 greatest, 2 mean height. Slopes are h / (i + 1) with i from 0; they are compared by products
-    that are exact, see reference/.
+    vertical: 0 off, 1 greatest height. Slopes are h / (i + 1) with i from 0; they are compared by products that are
+    exact, see reference/.
     """
     size = rings * sectors
     points = ti.cast(0, ti.i64)
@@ -48,8 +47,6 @@ def covisible(
                     out = top
                 elif vertical != 0 and ti.cast(n, ti.i64) * size >= points:
                     out = top
-                    if vertical == 2:
-                        out = ti.cast(ti.cast(total[b], ti.f64) / n, ti.f32)
             value[b] = out
 
 
@@ -61,7 +58,6 @@ def coview(
     sectors: ti.i32,
     vertical: ti.i32,
     highest: Floats,
-    total: Floats,
     count: Integers,
     value: Floats,
 ):
@@ -72,4 +68,4 @@ def coview(
             step = (grids + chunks - 1) // chunks
             for m in range(ti.min(grids, c * step), ti.min(grids, (c + 1) * step)):
                 at = m * rings * sectors
-                covisible(at, rings, sectors, vertical, highest, total, count, value)
+                describe_grid(at, rings, sectors, vertical, highest, count, value)

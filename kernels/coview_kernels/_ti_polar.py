@@ -81,7 +81,6 @@ def add(
     params: ti.template(),
     edges: ti.template(),
     highest: ti.template(),
-    total: ti.template(),
     count: ti.template(),
 ):
     """Add ``n`` points, at most BLOCK, to the bins that begin at ``first``; see ``bins``."""
@@ -117,8 +116,7 @@ def add(
         b, h = at[j], height[j]
         top = highest[b]
         highest[b] = ti.select(top > h, top, h)
-        total[b] = total[b] + h  # += would be atomic: a locked instruction, 20 times as slow
-        count[b] = count[b] + 1
+        count[b] = count[b] + 1  # += would be atomic: a locked instruction, 20 times as slow
     if near > 0:
         for j in range(n):
             if at[j] == first + size + NEAR:
@@ -127,7 +125,6 @@ def add(
                 dy = ti.cast(ti.cast(points[i + 1], f64) - cy, f32)
                 b = first + exact_bin(dx, dy, rings, sectors, per_metre, edges)
                 highest[b] = ti.max(highest[b], height[j])
-                total[b] = total[b] + height[j]
                 count[b] = count[b] + 1
 
 
@@ -141,7 +138,6 @@ def bins(
     params: Doubles,
     edges: Doubles,
     highest: Floats,
-    total: Doubles,
     count: Integers,
 ):
     """Add ``rows`` points to the bins of their chunks.
@@ -160,7 +156,7 @@ def bins(
             for block in range((end - begin + BLOCK - 1) // BLOCK):
                 start = begin + block * BLOCK
                 n = ti.min(BLOCK, end - start)
-                add(start, n, first, points, rings, sectors, params, edges, highest, total, count)
+                add(start, n, first, points, rings, sectors, params, edges, highest, count)
 
 
 @ti.kernel
@@ -170,13 +166,11 @@ def station_bins(
     size: i32,
     top: Floats,
     points: Integers,
-    heights: Floats,
     base: Integers,
     ground: Floats,
     starts: Integers,
     offsets: Integers,
     highest: Floats,
-    total: Floats,
     count: Integers,
 ):
     """Bin b of a station gathers the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
@@ -193,13 +187,10 @@ def station_bins(
                 for b in range(size):
                     best = ti.cast(LOWEST, f32)
                     number = 0
-                    height = ti.cast(0.0, f64)
                     for k in range(starts[b], starts[b + 1]):
                         at = at_station + offsets[k]
                         best = ti.max(best, top[at])
                         number += points[at]
-                        height += ti.cast(heights[at], f64)
                     if number > 0:
                         highest[m * size + b] = ti.cast(ti.cast(best, f64) - floor, f32)
-                        total[m * size + b] = ti.cast(height - number * floor, f32)
                         count[m * size + b] = number

@@ -19,18 +19,16 @@ I64 = npt.NDArray[np.int64]
 C64 = npt.NDArray[np.complex64]
 Mask = npt.NDArray[np.bool_]
 
-Vertical = Literal["off", "max", "mean"]
+Vertical = Literal["off", "max"]
 VERTICALS: tuple[Vertical, ...] = get_args(Vertical)
 """In the order of the numbers that the kernels take for them."""
 
 
 class PolarGrid(NamedTuple):
-    """Heights and counts in rings x sectors around a centre; bins without points hold 0 in all three."""
+    """Heights and counts in rings x sectors around a centre; bins without points hold 0 in both."""
 
     max_height: F32
     """(..., R, S) greatest height above the centre, metres."""
-    sum_height: F32
-    """(..., R, S) sum of the heights above the centre, metres."""
     count: I32  # type: ignore[assignment]  # hides tuple.count, which is not needed here
     """(..., R, S) number of points; alone tells occupied bins from empty ones, since 0 is a valid height."""
 

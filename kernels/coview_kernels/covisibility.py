@@ -20,7 +20,6 @@ _MIN_BINS = 10_000  # for a kernel to be quicker: 8 grids of 20 x 60 (measured)
 
 def coview(
     max_height: npt.ArrayLike,
-    sum_height: npt.ArrayLike,
     count: npt.ArrayLike,
     vertical: Vertical = "max",
 ) -> F32:
@@ -32,15 +31,14 @@ def coview(
 
     Our reading of the paper: a bin is *vertically* visible (seen from above) if it is occupied and its density d_ij,
     the count, is at least the mean count over all R x S bins, empty ones included (eqs 3-4): dense bins hold vertical
-    structure, which both views share. A horizontally visible bin has its greatest height as value; a bin that is only
-    vertically visible has its greatest height (``vertical="max"``), its mean height (``"mean"``, the letter of eq. 4)
-    or nothing (``"off"``); others have 0.
+    structure, which both views share. A visible bin has its greatest height as value (the paper takes the mean height
+    of bins that are only vertically visible); others have 0. With ``vertical="off"`` so have bins that are only
+    vertically visible.
 
     Args:
         max_height: (..., R, S) float32, metres above the viewpoint (or the ground below it); ignored in empty bins.
-        sum_height: (..., R, S) float32, metres.
         count: (..., R, S) int32, of voxels: counts of raw points depend on the scan pattern.
-        vertical: value of bins that are visible from above only: ``max``, ``mean`` or ``off``.
+        vertical: value of bins that are visible from above only: ``max``, their greatest height, or ``off``, 0.
 
     Returns:
         (..., R, S) float32, metres.
@@ -49,22 +47,20 @@ def coview(
         ValueError: shapes disagree, there are fewer than two axes, or ``vertical`` is unknown.
     """
     height, points = _grids(max_height, count)
-    total = np.ascontiguousarray(sum_height, dtype=np.float32)
-    check_same_shape("sum_height", total, "max_height", height.shape)
     check_vertical(vertical)
     if points.size < _MIN_BINS:
-        return reference.coview(height, total, points, vertical)
-    return runtime.dispatch(_coview, reference.coview, height, total, points, vertical)
+        return reference.coview(height, points, vertical)
+    return runtime.dispatch(_coview, reference.coview, height, points, vertical)
 
 
-def _coview(max_height: F32, sum_height: F32, count: I32, vertical: Vertical) -> F32:
+def _coview(max_height: F32, count: I32, vertical: Vertical) -> F32:
     value = np.empty_like(max_height)
     rings, sectors = max_height.shape[-2:]
     grids = math.prod(max_height.shape[:-2])
     Launch(
         *("covisibility", "coview", grids, min(runtime.workers(), max(1, grids)), rings, sectors),
         VERTICALS.index(vertical),
-        *(a.reshape(-1) for a in (max_height, sum_height, count, value)),
+        *(a.reshape(-1) for a in (max_height, count, value)),
     )()
     return value
 

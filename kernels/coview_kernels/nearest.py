@@ -78,7 +78,7 @@ class PointGrid:
 def nearest(
     grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.ArrayLike | None = None
 ) -> tuple[F64, I64]:
-    """Nearest point of a cloud for each query, nearer than ``radius``; exact, and answered as cKDTree.query does.
+    """Find the nearest point of a cloud for each query, nearer than ``radius``; exact, with cKDTree.query's results.
 
     Args:
         grid: the cloud.

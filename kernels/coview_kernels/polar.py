@@ -1,4 +1,4 @@
-"""Polar binning: of the points around a sensor (VLS), and of a raster map around many stations (VRS)."""
+"""Polar binning of the points around a sensor (VLS), and of a raster map around many stations (VRS)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table
 from coview_kernels.sectors import ring_edges2, sector_edges
 
-_MAX_SIDE = 100_000  # rings or sectors that float32 tells apart
+_MAX_SIDE = 100_000  # rings or sectors that float32 resolves
 _MAX_BINS = 1 << 20
 _POINTS_PER_CHUNK = 8192  # fewer are done before another thread is awake
 _EXTRA = 3  # bins behind those of the grid: points outside, not finite, near an edge
@@ -35,7 +35,7 @@ _EMPTY: F32 = np.empty(0, dtype=np.float32)
 def polar_bin(
     points: npt.ArrayLike, centre: npt.ArrayLike, rings: int, sectors: int, r_max: float
 ) -> tuple[PolarGrid, int]:
-    """Greatest height, sum of heights and number of points in rings x sectors around ``centre``.
+    """Greatest height and number of points in rings x sectors around ``centre``.
 
     Height is z above ``centre``. Ring ``floor(r / (r_max / R))`` of the horizontal range r, points at or
     beyond ``r_max`` excluded; sector ``floor(theta / (2 pi / S))`` of theta = atan2(dy, dx) in [0, 2 pi),
@@ -59,12 +59,12 @@ def polar_bin(
     cloud = as_float32("points", points, None, 3)
     origin = as_finite64("centre", centre, 3)
     check_grid_size(rings, sectors, r_max)
-    native = _polar_bin if _tells_apart(rings, sectors) else reference.polar_bin
+    native = _polar_bin if _fits_kernel(rings, sectors) else reference.polar_bin
     return runtime.dispatch(native, reference.polar_bin, cloud, origin, rings, sectors, float(r_max))
 
 
-def _tells_apart(rings: int, sectors: int) -> bool:
-    """Whether the kernel can tell so many rings and sectors apart."""
+def _fits_kernel(rings: int, sectors: int) -> bool:
+    """Whether the kernel can bin into so many rings and sectors."""
     return max(rings, sectors) <= _MAX_SIDE and rings * sectors <= _MAX_BINS
 
 
@@ -80,7 +80,7 @@ def describe_points(
     r_max: float,
     vertical: Vertical = "max",
 ) -> tuple[PolarGrid, F32, int]:
-    """:func:`polar_bin` and :func:`coview` of its grid in one go, to the bit.
+    """Bin points as :func:`polar_bin` does and describe the grid as :func:`coview` does.
 
     Returns:
         The grid, (R, S) each; the co-view context (R, S) float32, metres; the number of rows dropped because
@@ -103,19 +103,18 @@ class _PolarBins:
         shape = self._chunks, self._size + _EXTRA
         edges = np.concatenate([ring_edges2(rings, r_max), sector_edges(sectors).ravel()])
         self._params = np.array([0.0, 0.0, 0.0, rings / r_max])
-        self._highest, self._total = np.empty(shape, dtype=np.float32), np.empty(shape)
+        self._highest = np.empty(shape, dtype=np.float32)
         self._count = np.empty(shape, dtype=np.int32)
-        self._sum = np.empty((rings, sectors))
+        self._shape = rings, sectors
         self._launch = Launch(
             *("polar", "bins", _EMPTY, 0, 1, rings, sectors, self._params, edges),
-            *(a.reshape(-1) for a in (self._highest, self._total, self._count)),
+            *(self._highest.reshape(-1), self._count.reshape(-1)),
         )
 
     def __call__(self, points: F32, centre: F64) -> tuple[PolarGrid, int]:
         """Return the grid of the points (N, 3) around ``centre`` (3,), and the number of rows not finite."""
         self._params[:3] = centre
         self._highest.fill(-np.inf)
-        self._total.fill(0.0)
         self._count.fill(0)
         chunks = min(self._chunks, 1 + len(points) // _POINTS_PER_CHUNK)
         for index, value in enumerate((points.reshape(-1), len(points), chunks)):
@@ -125,14 +124,11 @@ class _PolarBins:
         return self._merged()
 
     def _merged(self) -> tuple[PolarGrid, int]:
-        shape, size = self._sum.shape, self._size
+        shape, size = self._shape, self._size
         top = np.maximum.reduce(self._highest[:, :size].reshape(-1, *shape), axis=0)
         count = np.add.reduce(self._count[:, :size].reshape(-1, *shape), axis=0, dtype=np.int32)
         top[count == 0] = 0.0
-        with np.errstate(over="ignore", invalid="ignore"):  # of absurd heights
-            np.add.reduce(self._total[:, :size].reshape(-1, *shape), axis=0, out=self._sum)
-            height = self._sum.astype(np.float32)
-        return PolarGrid(top, height, count), int(self._count[:, size + 1].sum())
+        return PolarGrid(top, count), int(self._count[:, size + 1].sum())
 
 
 @lru_cache(maxsize=8)
@@ -143,7 +139,6 @@ def _bins(rings: int, sectors: int, r_max: float) -> _PolarBins:
 def station_bins(
     raster_max: npt.ArrayLike,
     raster_count: npt.ArrayLike,
-    raster_sum: npt.ArrayLike,
     cell: float,
     rows: npt.ArrayLike,
     cols: npt.ArrayLike,
@@ -162,7 +157,6 @@ def station_bins(
     Args:
         raster_max: (H, W) float32 greatest height of each cell, metres; ignored where the count is 0.
         raster_count: (H, W) int32 points (occupied voxels) of each cell; 0 marks an empty cell.
-        raster_sum: (H, W) float32 sum of the heights of each cell, metres.
         cell: edge of the raster cells, metres.
         rows: (M,) int32 row of each station.
         cols: (M,) int32 column of each station.
@@ -179,7 +173,6 @@ def station_bins(
     """
     top = as_float32("raster_max", raster_max, None, None)
     count = as_int32("raster_count", raster_count, *top.shape)
-    total = as_float32("raster_sum", raster_sum, *top.shape)
     row = as_int32("rows", rows, None)
     col = as_int32("cols", cols, len(row))
     base = as_float32("ground", ground, len(row))
@@ -191,14 +184,13 @@ def station_bins(
     return runtime.dispatch(
         _station_bins,
         reference.station_bins,
-        *(top, count, total, float(cell), row, col, base, rings, sectors, float(r_max)),
+        *(top, count, float(cell), row, col, base, rings, sectors, float(r_max)),
     )
 
 
 def _station_bins(
     raster_max: F32,
     raster_count: I32,
-    raster_sum: F32,
     cell: float,
     rows: I32,
     cols: I32,
@@ -215,16 +207,15 @@ def _station_bins(
     lowest = np.finfo(np.float32).min
     top = np.pad(np.where(empty, lowest, raster_max), reach, constant_values=lowest)
     points = np.pad(np.where(empty, 0, raster_count).astype(np.int32), reach)
-    heights = np.pad(np.where(empty, 0, raster_sum).astype(np.float32), reach)
     width = top.shape[1]
     base = (rows.astype(np.int64) + reach) * width + cols + reach
     size = rings * sectors
     shape = (len(rows), rings, sectors)
-    grid = PolarGrid(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.int32))
+    grid = PolarGrid(np.zeros(shape, np.float32), np.zeros(shape, np.int32))
     Launch(
         *("polar", "station_bins", len(rows), min(runtime.workers(), max(1, len(rows))), size),
-        *(top.ravel(), points.ravel(), heights.ravel(), base.astype(np.int32), ground),
+        *(top.ravel(), points.ravel(), base.astype(np.int32), ground),
         *(starts, (d_row * width + d_col).astype(np.int32)),
-        *(grid.max_height.reshape(-1), grid.sum_height.reshape(-1), grid.count.reshape(-1)),
+        *(grid.max_height.reshape(-1), grid.count.reshape(-1)),
     )()
     return grid

@@ -29,13 +29,11 @@ def _align() -> None:
 
 _CALLS: dict[str, Callable[[], object]] = {
     "align_planes": _align,
-    "coview": lambda: coview(*np.ones((3, 100, 20, 60))),
+    "coview": lambda: coview(*np.ones((2, 100, 20, 60))),
     "describe_points": lambda: describe_points(_CLOUD, _ORIGIN, 2, 4, 8.0),
     "nearest": lambda: nearest(PointGrid(_CLOUD), _CLOUD, 1.0),
     "polar_bin": lambda: polar_bin(_CLOUD, _ORIGIN, 2, 4, 8.0),
-    "station_bins": lambda: station_bins(
-        np.ones((1, 1)), np.ones((1, 1)), np.ones((1, 1)), 1.0, _ONE, _ONE, _ONE, 2, 4, 2.0
-    ),
+    "station_bins": lambda: station_bins(np.ones((1, 1)), np.ones((1, 1)), 1.0, _ONE, _ONE, _ONE, 2, 4, 2.0),
     "transform_unique": lambda: transform_unique(_CLOUD, _EYE, 1.0),
 }
 

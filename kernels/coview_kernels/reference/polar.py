@@ -22,13 +22,11 @@ def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) 
 
     size = rings * sectors
     count = np.bincount(bins, minlength=size).astype(np.int32)
-    with np.errstate(over="ignore"):  # a sum of absurd heights may be infinite
-        total = np.bincount(bins, weights=height, minlength=size).astype(np.float32)
     highest = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(highest, bins, height)
     highest[count == 0] = 0.0
     shape = (rings, sectors)
-    grid = PolarGrid(highest.reshape(shape), total.reshape(shape), count.reshape(shape))
+    grid = PolarGrid(highest.reshape(shape), count.reshape(shape))
     return grid, int(np.count_nonzero(~finite))
 
 
@@ -60,7 +58,6 @@ def cell_table(cell: float, rings: int, sectors: int, r_max: float) -> tuple[I64
 def station_bins(
     raster_max: F32,
     raster_count: I32,
-    raster_sum: F32,
     cell: float,
     rows: I32,
     cols: I32,
@@ -76,20 +73,17 @@ def station_bins(
     # a border as wide as the radius makes every neighbour a plain offset, without bounds checks
     empty = raster_count <= 0
     count_pad = np.pad(np.where(empty, 0, raster_count), reach).ravel()
-    sum_pad = np.pad(np.where(empty, 0, raster_sum).astype(np.float64), reach).ravel()
     max_pad = np.pad(np.where(empty, -np.inf, raster_max), reach, constant_values=-np.inf).ravel()
     width = raster_max.shape[1] + 2 * reach
     offsets = d_row * width + d_col
 
     size = (len(rows), rings * sectors)
-    highest, total = np.zeros(size, np.float32), np.zeros(size, np.float32)
-    count = np.zeros(size, np.int32)
+    highest, count = np.zeros(size, np.float32), np.zeros(size, np.int32)
     for m, (row, col, base) in enumerate(zip(rows, cols, ground.astype(np.float64), strict=True)):
         at = offsets + ((int(row) + reach) * width + int(col) + reach)
         n = np.add.reduceat(count_pad[at], starts)
         top = np.maximum.reduceat(max_pad[at], starts)
         highest[m, occupied_bins] = np.where(n > 0, top - base, 0.0)
-        total[m, occupied_bins] = np.add.reduceat(sum_pad[at], starts) - n * base
         count[m, occupied_bins] = n
     shape = (len(rows), rings, sectors)
-    return PolarGrid(highest.reshape(shape), total.reshape(shape), count.reshape(shape))
+    return PolarGrid(highest.reshape(shape), count.reshape(shape))
