@@ -15,7 +15,7 @@ from coview_stream.config.checks import counts
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.training.dataset import WorldViews, read_world, write_dataset
 from coview_stream.training.recipe import Recipe
-from coview_stream.training.training import TrainingConfig
+from coview_stream.training.training_config import TrainingConfig
 from coview_stream.version import __version__
 
 _EVERY = 20  # steps from one line to the next

@@ -1,25 +1,23 @@
 """Training: batches through both encoders until the budget is spent; nothing here depends on what is in the worlds."""
 
-# FOLDED coview_stream/training/training.py: """How the encoders are trained, in numbers."""
-
 from __future__ import annotations
 
 import math
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from coview_stream.config.checks import counts, positive
 from coview_stream.errors import InputError
 from coview_stream.training.batches import draw_batch
 from coview_stream.training.dataset import WorldViews
 from coview_stream.training.losses import Losses, losses
 from coview_stream.training.networks import VIEWS, PlaceNet
+from coview_stream.training.training_config import TrainingConfig
 
 _WARM_UP = 0.03  # share of the steps over which the learning rate rises
 
@@ -130,27 +128,3 @@ def _restore(
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     return int(state["step"])
-
-
-@dataclass(frozen=True)
-class TrainingConfig:
-    """How the encoders are trained.
-
-    ``steps`` batches of ``pieces`` maps (136 m) with ``each`` queries in every one; AdamW with a learning rate that
-    falls along a cosine from ``rate``. ``width`` is the encoder's channels at 1 m. ``wrong`` headings compete with each
-    query's true one.
-    """
-
-    steps: int = 600
-    pieces: int = 4
-    each: int = 5
-    rate: float = 3e-3
-    decay: float = 1e-4
-    width: int = 24
-    wrong: int = 4
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        counts(self, "steps", "pieces", "each", "width", "wrong")
-        counts(self, "seed", least=0)
-        positive(self, "rate", "decay")
