@@ -139,12 +139,13 @@ def _report(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path)
     import numpy as np
 
     from coview_stream.clouds.trajectory import read_tum
-    from coview_stream.localization.offline import draw, write
+    from coview_stream.localization.offline import write
     from coview_stream.report.evaluation import evaluate, frame_errors
     from coview_stream.report.plots import plot_errors, plot_map
+    from coview_stream.report.run_pictures import draw_run
 
-    write(located, base_map, out, pictures=False)
-    draw(located, base_map, out, truth[1][:, :3, 3])
+    write(located, base_map, out)
+    draw_run(located, base_map, out, truth[1][:, :3, 3])
     points = base_map.points.astype(np.float64) + base_map.origin
     plot_map(points, base_map.stations + base_map.origin, out / "map.png")
     estimate = read_tum(out / "trajectory.tum")  # what is judged is what was written

@@ -91,7 +91,11 @@ def run(args: argparse.Namespace) -> int:
                 bar.set_postfix_str(fix.state.value)
 
         located = locate(base_map, recorded, config, step)
-    write(located, base_map, args.output, pictures=not args.no_pictures)
+    write(located, base_map, args.output)
+    if not args.no_pictures:
+        from coview_stream.report.run_pictures import draw_run
+
+        draw_run(located, base_map, args.output)
     print(summary(located))
     return 0 if located.posed else 1
 

@@ -1,4 +1,4 @@
-"""Localize a recorded run offline and write down what came out: trajectory, evidence, timings, pictures."""
+"""Localization of a recorded run, offline; what came of it as files: trajectory, evidence, timings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ Progress = Callable[[int, int, Fix | None], None]
 """Called with (frames done, frames, newest fix)."""
 
 
-_PICTURES = ("trajectory.png", "descriptors.png")
+TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
+"""Pictures of a run; ``report.run_pictures`` draws them."""
 
 
 @dataclass
@@ -152,8 +153,8 @@ def from_stream(
     return located
 
 
-def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str], pictures: bool = True) -> None:
-    """Write ``trajectory.tum`` (posed frames only), ``result.json`` and, unless unwanted, pictures into ``out``.
+def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:
+    """Write ``trajectory.tum`` (posed frames only) and ``result.json`` into ``out``; remove an earlier run's pictures.
 
     Raises:
         InputError: the directory cannot be written.
@@ -161,7 +162,7 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str], pi
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in _PICTURES:  # of an earlier run: they would tell another story than the trajectory
+        for name in (TRAJECTORY_PNG, DESCRIPTORS_PNG):  # an earlier run's would contradict the new trajectory
             (folder / name).unlink(missing_ok=True)
         posed = located.posed
         poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
@@ -174,24 +175,6 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str], pi
         raise InputError(
             f"{folder}: cannot write the results ({error.strerror}); choose another place"
         ) from error
-    if pictures:
-        draw(located, base_map, folder)
-
-
-def draw(located: RunResult, base_map: BaseMap, folder: Path, truth: Any = None) -> None:
-    """Draw ``trajectory.png`` and, after a fix, ``descriptors.png``."""
-    from coview_stream.report.plots import plot_descriptor_pair, plot_trajectory
-
-    nowhere = np.full(3, np.nan)
-    positions = np.array([nowhere if f.T_map_body is None else f.T_map_body[:3, 3] for f in located.fixes])
-    base = base_map.points.astype(np.float64) + base_map.origin
-    plot_trajectory(base, positions, [f.state.value for f in located.fixes], folder / "trajectory.png", truth)
-    winner = located.winner
-    if winner is not None and winner.station is not None and winner.shift is not None and located.query:
-        name = next(iter(located.query))
-        station = base_map.descriptors(name)[winner.station].astype(np.float32)
-        titles = (f"keyframe ({name})", f"winning station {winner.station}")
-        plot_descriptor_pair(located.query[name], station, winner.shift, folder / "descriptors.png", titles)
 
 
 def _named(message: str, path: Path) -> str:
