@@ -18,6 +18,7 @@ import numpy.typing as npt
 from coview_stream.basemap import file_format, tiles
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
 from coview_stream.errors import ConfigError, CoViewError, MapError
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 
 if TYPE_CHECKING:
@@ -120,12 +121,12 @@ class BaseMap:
         return self.config.descriptor
 
     @cached_property
-    def stations(self) -> npt.NDArray[np.float32]:
+    def stations(self) -> Floats32:
         """(M, 3) ground positions, relative to :attr:`origin`."""
         return np.array(self._arrays["stations"])
 
     @property
-    def points(self) -> npt.NDArray[np.float32]:
+    def points(self) -> Floats32:
         """(N, 3) voxel cloud sorted by tile, relative to :attr:`origin`; memory-mapped when loaded."""
         return self._arrays["points"]
 
@@ -143,13 +144,13 @@ class BaseMap:
 
         return FeatureMap(self._arrays, parameters)
 
-    def crop(self, centre: npt.NDArray[np.float64], radius: float) -> tuple[Points, Points]:
+    def crop(self, centre: Floats, radius: float) -> tuple[Points, Points]:
         """Points and unit normals (K, 3) within ``radius`` metres of ``centre``, both relative to :attr:`origin`."""
         return tiles.crop(
             self.points, self._arrays["normals"], self._arrays["tile_index"], self.config.tile, centre, radius
         )
 
-    def surveyed(self, xy: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    def surveyed(self, xy: Reals) -> Bools:
         """Whether the map has points around each of (K, 2) positions, relative to :attr:`origin`."""
         grid, corner = self._arrays["surveyed"], self._arrays["surveyed_corner"]
         index = np.floor((xy - corner) / self.config.block).astype(np.int64)

@@ -22,6 +22,7 @@ from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 
 _MIN_POINTS = 1000
@@ -118,7 +119,7 @@ def _read(path: Path, done: int, total: int, step: Progress) -> Any:
     return cloud
 
 
-def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float64]]:
+def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
     """Block-sized cells (H, W) that hold points or neighbour on cells that do, and the lower left corner (2,).
 
     The neighbours bridge the shadows of buildings: a scan that shows nothing there has still been there.

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.errors import DependencyError
+from coview_stream.geometry.arrays import Bools, Floats32
 from coview_stream.geometry.transforms import Points
 
 _TILE = 256.0
@@ -46,7 +46,7 @@ def cloth_ground(
     slope_smooth: bool,
     iterations: int,
     threshold: float,
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """Which of (N, 3) points in metres the cloth, dropped on the upturned cloud, comes to lie on.
 
     Raises:
@@ -72,13 +72,13 @@ def cloth_ground(
     return ground
 
 
-def _between(values: npt.NDArray[np.float32], start: float, length: float) -> npt.NDArray[np.bool_]:
+def _between(values: Floats32, start: float, length: float) -> Bools:
     return np.asarray((values > start - _MARGIN) & (values < start + length + _MARGIN))
 
 
 def _one_cloth(
     points: Points, resolution: float, rigidness: int, slope_smooth: bool, iterations: int, threshold: float
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     csf = importlib.import_module("CSF")
     _one_thread()
     cloth = csf.CSF()

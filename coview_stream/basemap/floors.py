@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from coview_stream.basemap.ground import GroundConfig, ground_mask
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Bools, Ints
 from coview_stream.geometry.rasters import cells, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
@@ -46,7 +46,7 @@ class LevelConfig:
 def ground_levels(
     points: Points,
     cell: float = 2.0,
-    mask: npt.NDArray[np.bool_] | None = None,
+    mask: Bools | None = None,
     config: LevelConfig | None = None,
     ground_config: GroundConfig | None = None,
     floors: Points | None = None,
@@ -81,7 +81,7 @@ def ground_levels(
     return np.concatenate([base, _upper_squares(floors, base, cell)])
 
 
-def below_another(stations: Points, cell: float) -> npt.NDArray[np.bool_]:
+def below_another(stations: Points, cell: float) -> Bools:
     """Which of (M, 3) stations have another one above them in their ``cell``-sized square: a storey over a storey."""
     if not len(stations):
         return np.zeros(0, dtype=bool)
@@ -112,12 +112,12 @@ def indoor_floors(points: Points, config: LevelConfig) -> Points:
 
 
 def _flat_and_wide(
-    column: npt.NDArray[np.int64],
-    floor: npt.NDArray[np.int64],
-    ceiling: npt.NDArray[np.int64],
+    column: Ints,
+    floor: Ints,
+    ceiling: Ints,
     shape: tuple[int, int],
     config: LevelConfig,
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """Candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
     kept = np.zeros(len(column), dtype=bool)
     steps = max(1, round(config.flatness / _STEP))
@@ -136,13 +136,13 @@ def _flat_and_wide(
 
 
 def _one_slab(
-    column: npt.NDArray[np.int64],
-    floor: npt.NDArray[np.int64],
-    ceiling: npt.NDArray[np.int64],
+    column: Ints,
+    floor: Ints,
+    ceiling: Ints,
     shape: tuple[int, int],
     steps: int,
     area: float,
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     row, col = np.divmod(column, shape[1])
     # crop to where this slab has candidates; one cell of border keeps neighbours inside
     row, col = row - row.min() + 1, col - col.min() + 1

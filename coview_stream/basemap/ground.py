@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from coview_stream.basemap.cloth import cloth_available, cloth_ground, require_cloth
 from coview_stream.errors import ConfigError
-from coview_stream.geometry.rasters import Heights, cells, filled, lowest_per_cell
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
+from coview_stream.geometry.rasters import cells, filled, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
 _FEWEST = 50
@@ -94,7 +94,7 @@ def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal
     return "cloth" if hangs and cloth_available() else "morphological"
 
 
-def ground_mask(points: Points, config: GroundConfig | None = None) -> npt.NDArray[np.bool_]:
+def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
     """Which of the points lie on the ground.
 
     The lowest point of each cell goes through the filter; then all points are classified by their height
@@ -144,9 +144,7 @@ def ground_surface(points: Points, config: GroundConfig | None = None) -> Ground
     return GroundRaster(_refined(z, occupied, ground, config, cell), float(corner[0]), float(corner[1]), cell)
 
 
-def _cells_within(
-    points: Points, config: GroundConfig
-) -> tuple[npt.NDArray[np.float64], tuple[int, int], npt.NDArray[np.int64], float]:
+def _cells_within(points: Points, config: GroundConfig) -> tuple[Floats, tuple[int, int], Ints, float]:
     cell = config.cell
     while True:
         corner, shape, flat = cells(points, cell)
@@ -155,7 +153,7 @@ def _cells_within(
         cell *= 2
 
 
-def _stray_low(z: Heights) -> npt.NDArray[np.bool_]:
+def _stray_low(z: Floats32) -> Bools:
     """Cells more than 1 m below all but three of their 9 x 9 neighbours: echoes from below the ground."""
     high = np.where(np.isnan(z), np.float32(np.inf), z)
     fourth = ndimage.rank_filter(high, rank=3, size=9, mode="nearest")
@@ -164,12 +162,12 @@ def _stray_low(z: Heights) -> npt.NDArray[np.bool_]:
 
 def _filtered(
     lowest: Points,
-    z: Heights,
-    occupied: npt.NDArray[np.int64],
+    z: Floats32,
+    occupied: Ints,
     cell: float,
     config: GroundConfig,
     method: Literal["cloth", "morphological"],
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """Which of the lowest points are ground; all of them if they are too few to tell."""
     if len(lowest) < _FEWEST:
         return np.ones(len(lowest), dtype=bool)
@@ -190,12 +188,12 @@ def _filtered(
 
 
 def _refined(
-    z: Heights,
-    occupied: npt.NDArray[np.int64],
-    ground: npt.NDArray[np.bool_],
+    z: Floats32,
+    occupied: Ints,
+    ground: Bools,
     config: GroundConfig,
     cell: float,
-) -> Heights:
+) -> Floats32:
     """Raster of the ground cells; lowest points on its interpolation join, which mends steep slopes."""
     heights = z.flat[occupied]
     for _ in range(config.refinements + 1):
@@ -213,15 +211,15 @@ def _refined(
     return surface
 
 
-def _gradient(z: Heights, cell: float) -> Heights:
+def _gradient(z: Floats32, cell: float) -> Floats32:
     if min(z.shape) < 2:
         return np.zeros_like(z)
     dy, dx = np.gradient(z, cell)
-    slope: Heights = np.minimum(np.hypot(dx, dy), 2.0).astype(np.float32)
+    slope: Floats32 = np.minimum(np.hypot(dx, dy), 2.0).astype(np.float32)
     return slope
 
 
-def _slope(surface: GroundRaster) -> Heights:
+def _slope(surface: GroundRaster) -> Floats32:
     return _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
 
 
@@ -236,12 +234,12 @@ class GroundRaster:
         cell: edge length.
     """
 
-    z: Heights
+    z: Floats32
     x0: float
     y0: float
     cell: float
 
-    def height_at(self, xy: npt.NDArray[np.floating]) -> Heights:
+    def height_at(self, xy: Reals) -> Floats32:
         """Ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
 
         Bilinear between cell centres; unknown neighbours carry no weight.
@@ -274,7 +272,7 @@ _STEEPEST = 0.3
 _FIRST_THRESHOLD = 0.5
 
 
-def morphological_ground(z: Heights, cell: float) -> npt.NDArray[np.bool_]:
+def morphological_ground(z: Floats32, cell: float) -> Bools:
     """Which cells of a raster of lowest heights (H, W; NaN where empty; metres) are ground.
 
     Openings with growing windows remove what is narrower than the window and stands out of the opened surface

@@ -15,6 +15,7 @@ from coview_stream.basemap.floors import LevelConfig, below_another, ground_leve
 from coview_stream.basemap.ground import ground_mask
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.descriptors.coview import channel
+from coview_stream.geometry.arrays import Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 
 Described = dict[Channel, npt.NDArray[np.float16]]
@@ -36,7 +37,7 @@ _BELOW_FLOOR = 1.0  # metres of what lies below the floor that still belongs to 
 _CEILING = 6.0  # metres: as LevelConfig.cover
 
 
-def find_stations(points: Points, block: float, levels: bool = True) -> npt.NDArray[np.float32]:
+def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:
     """Stations (M, 3): one per ``block``-sized cell that has ground, at its centre and median ground height.
 
     With ``levels`` there is one more for every floor of a building above it. (The paper's centroids of 3-D voxels put
@@ -52,7 +53,7 @@ def find_stations(points: Points, block: float, levels: bool = True) -> npt.NDAr
 
 def describe_storeys(
     points: Points,
-    stations: npt.NDArray[np.float32],
+    stations: Floats32,
     block: float,
     config: DescriptorConfig,
     progress: Progress | None = None,
@@ -91,7 +92,7 @@ def describe_storeys(
 
 def describe_stations(
     raster: HeightRaster,
-    stations: npt.NDArray[np.float32],
+    stations: Floats32,
     config: DescriptorConfig,
     progress: Progress | None = None,
 ) -> Described:
@@ -131,9 +132,9 @@ class HeightRaster:
     ``corner + cell * (c + 1/2, r + 1/2)``. Metres in the map frame. Empty cells have count 0.
     """
 
-    top: npt.NDArray[np.float32]
+    top: Floats32
     count: npt.NDArray[np.int32]
-    corner: npt.NDArray[np.float64]
+    corner: Floats
     cell: float
 
     @property
@@ -141,13 +142,13 @@ class HeightRaster:
         """Rows and columns."""
         return self.top.shape[0], self.top.shape[1]
 
-    def cells_of(self, xy: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    def cells_of(self, xy: Reals) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         """Row and column (M,) of the cells that hold (M, 2) positions."""
         index = np.floor((np.asarray(xy, dtype=np.float64) - self.corner) / self.cell).astype(np.int32)
         return index[:, 1], index[:, 0]
 
 
-def aligned_corner(points: Points, block: float, cell: float) -> npt.NDArray[np.float64]:
+def aligned_corner(points: Points, block: float, cell: float) -> Floats:
     """Lower left corner (2,) of a raster in which the centres of ``block``-sized grid cells are cell centres.
 
     Stations stand at ``(k + 1/2) * block``; a half-cell shift lets one offset table serve them all. Needs
@@ -159,7 +160,7 @@ def aligned_corner(points: Points, block: float, cell: float) -> npt.NDArray[np.
 
 def rasterise(
     points: Points,
-    corner: npt.NDArray[np.float64],
+    corner: Floats,
     cell: float,
     voxel: float,
     margin: int = 0,

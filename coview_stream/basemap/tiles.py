@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 _NORMAL_SCALE = 127.0
 
 
-def sort_by_tile(
-    points: Points, normals: Points, tile: float
-) -> tuple[Points, npt.NDArray[np.int8], npt.NDArray[np.int64]]:
+def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, Int8s, Ints]:
     """Points (N, 3), normals (N, 3) as int8, and the index (T, 4) of their tiles.
 
     An index row is (column, row, begin, end): the tile covers ``[column, column + 1) * tile`` in x, likewise in y.
@@ -33,9 +32,9 @@ def sort_by_tile(
 def crop(
     points: npt.NDArray[Any],
     normals: npt.NDArray[Any],
-    index: npt.NDArray[np.int64],
+    index: Ints,
     tile: float,
-    centre: npt.NDArray[np.float64],
+    centre: Floats,
     radius: float,
 ) -> tuple[Points, Points]:
     """Points and unit normals (K, 3) float32 within ``radius`` metres (horizontal) of ``centre``."""

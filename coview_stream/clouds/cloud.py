@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import CloudError
+from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.transforms import Points
 
 LOCAL_LIMIT = 10_000.0
@@ -39,7 +40,7 @@ class Cloud:
     """
 
     points: Points
-    origin: npt.NDArray[np.float64]
+    origin: Floats
     crs: str | None = None
     classification: npt.NDArray[np.uint8] | None = None
     dropped: int = 0
@@ -47,7 +48,7 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def map_points(self) -> npt.NDArray[np.float64]:
+    def map_points(self) -> Floats:
         """(N, 3) float64 coordinates in the file's own frame, metres."""
         return self.points.astype(np.float64) + self.origin
 
@@ -57,14 +58,14 @@ class CloudBuilder:
     """Collects chunks of raw coordinates; the first usable chunk decides the origin."""
 
     crs: str | None = None
-    origin: npt.NDArray[np.float64] | None = None
+    origin: Floats | None = None
     dropped: int = 0
     _points: list[Points] = field(default_factory=list)
     _classes: list[npt.NDArray[np.uint8]] = field(default_factory=list)
 
     def add(
         self,
-        raw: npt.NDArray[np.floating],
+        raw: Reals,
         classification: npt.NDArray[np.uint8] | None = None,
         dropped: int = 0,
     ) -> None:
@@ -110,7 +111,7 @@ class CloudBuilder:
         return Cloud(points, self.origin, self.crs, classes, self.dropped)
 
 
-def choose_origin(raw: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+def choose_origin(raw: Reals) -> Floats:
     """(3,) float64 origin for (N, 3) coordinates in metres; zeros if they are all local.
 
     A sparse median rather than the bounding box: one stray point must not move the origin away.
@@ -150,6 +151,6 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
     )
 
 
-def _rebased(cloud: Cloud, origin: npt.NDArray[np.float64]) -> Points:
+def _rebased(cloud: Cloud, origin: Floats) -> Points:
     shift = cloud.origin - origin
     return (cloud.points + shift).astype(np.float32) if shift.any() else cloud.points

@@ -19,6 +19,7 @@ from coview_stream.clouds.npy_bin import read_bin, read_npy
 from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
 from coview_stream.errors import CloudError
+from coview_stream.geometry.arrays import Reals
 
 _READERS: dict[str, tuple[str, Callable[[Path], Cloud]]] = {
     ".las": ("LAS", read_las),
@@ -123,8 +124,6 @@ _LAS_SCALE = 0.001
 
 _FLOAT32_LIMIT = 10_000.0
 
-Rows = npt.NDArray[np.floating]
-
 
 @contextmanager
 def atomic(path: Path) -> Iterator[BinaryIO]:
@@ -142,9 +141,7 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
 
 
-def write_cloud(
-    path: str | os.PathLike[str], points: npt.NDArray[np.floating], origin: npt.ArrayLike | None = None
-) -> None:
+def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLike | None = None) -> None:
     """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), as the suffix says.
 
     PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 where ``origin`` moves the
@@ -172,7 +169,7 @@ def write_cloud(
         raise CloudError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
 
 
-def _pcd(stream: BinaryIO, rows: Rows, _: Path) -> None:
+def _pcd(stream: BinaryIO, rows: Reals, _: Path) -> None:
     size = rows.dtype.itemsize
     header = (
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\n"
@@ -183,7 +180,7 @@ def _pcd(stream: BinaryIO, rows: Rows, _: Path) -> None:
     stream.write(rows.tobytes())
 
 
-def _ply(stream: BinaryIO, rows: Rows, _: Path) -> None:
+def _ply(stream: BinaryIO, rows: Reals, _: Path) -> None:
     kind = "double" if rows.dtype.itemsize == 8 else "float"
     axes = "".join(f"property {kind} {axis}\n" for axis in "xyz")
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{axes}end_header\n"
@@ -191,11 +188,11 @@ def _ply(stream: BinaryIO, rows: Rows, _: Path) -> None:
     stream.write(rows.tobytes())
 
 
-def _npy(stream: BinaryIO, rows: Rows, _: Path) -> None:
+def _npy(stream: BinaryIO, rows: Reals, _: Path) -> None:
     np.save(stream, rows, allow_pickle=False)
 
 
-def _bin(stream: BinaryIO, rows: Rows, path: Path) -> None:
+def _bin(stream: BinaryIO, rows: Reals, path: Path) -> None:
     if rows.dtype.itemsize == 8:
         raise CloudError(f"{path}: float32 rows cannot hold coordinates beyond 10 km; write PCD, PLY or LAZ")
     padded = np.zeros((len(rows), 4), "<f4")
@@ -203,7 +200,7 @@ def _bin(stream: BinaryIO, rows: Rows, path: Path) -> None:
     stream.write(padded.tobytes())
 
 
-def _las(stream: BinaryIO, rows: Rows, path: Path) -> None:
+def _las(stream: BinaryIO, rows: Reals, path: Path) -> None:
     import laspy
 
     if not np.isfinite(rows).all():
@@ -216,7 +213,7 @@ def _las(stream: BinaryIO, rows: Rows, path: Path) -> None:
     las.write(stream, do_compress=path.suffix.lower() == ".laz")
 
 
-_WRITERS: dict[str, Callable[[BinaryIO, Rows, Path], None]] = {
+_WRITERS: dict[str, Callable[[BinaryIO, Reals, Path], None]] = {
     ".pcd": _pcd,
     ".ply": _ply,
     ".npy": _npy,

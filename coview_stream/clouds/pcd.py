@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.errors import CloudError
+from coview_stream.geometry.arrays import Reals
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -108,13 +109,13 @@ def _truncated(path: Path, header: _Header, found: int) -> CloudError:
     )
 
 
-def _stack(columns: list[npt.NDArray[np.generic]]) -> npt.NDArray[np.floating]:
+def _stack(columns: list[npt.NDArray[np.generic]]) -> Reals:
     """(N, 3) in float32 if that is what the file holds, in float64 otherwise."""
     dtype = np.float32 if all(column.dtype == np.float32 for column in columns) else np.float64
     return np.stack([column.astype(dtype, copy=False) for column in columns], axis=1)
 
 
-def _ascii(content: bytes, header: _Header, path: Path) -> npt.NDArray[np.floating]:
+def _ascii(content: bytes, header: _Header, path: Path) -> Reals:
     starts = np.concatenate([[0], np.cumsum(header.counts)])
     columns = [int(starts[header.fields.index(axis)]) for axis in _AXES]
     body = content[header.data_start :]
@@ -140,7 +141,7 @@ def _ascii(content: bytes, header: _Header, path: Path) -> npt.NDArray[np.floati
     return rows
 
 
-def _binary(content: bytes, header: _Header, path: Path) -> npt.NDArray[np.floating]:
+def _binary(content: bytes, header: _Header, path: Path) -> Reals:
     row = header.row
     stored = (len(content) - header.data_start) // row.itemsize
     if stored < header.points:
@@ -149,7 +150,7 @@ def _binary(content: bytes, header: _Header, path: Path) -> npt.NDArray[np.float
     return _stack([rows[f"f{header.fields.index(axis)}"][:, 0] for axis in _AXES])
 
 
-def _compressed(content: bytes, header: _Header, path: Path) -> npt.NDArray[np.floating]:
+def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
     """Unpack a body that is one LZF block with each field stored for all points before the next field."""
     start = header.data_start + 8
     if len(content) < start:

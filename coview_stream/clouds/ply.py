@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.errors import CloudError
+from coview_stream.geometry.arrays import Reals
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -111,9 +111,7 @@ def _truncated(path: Path, vertex: _Element, found: int) -> CloudError:
     )
 
 
-def _ascii(
-    content: bytes, start: int, _: str, before: list[_Element], vertex: _Element, path: Path
-) -> npt.NDArray[np.floating]:
+def _ascii(content: bytes, start: int, _: str, before: list[_Element], vertex: _Element, path: Path) -> Reals:
     stream = io.BytesIO(content[start:])
     for _row in range(sum(element.count for element in before)):
         if not stream.readline():
@@ -141,7 +139,7 @@ def _ascii(
 
 def _binary(
     content: bytes, start: int, order: str, before: list[_Element], vertex: _Element, path: Path
-) -> npt.NDArray[np.floating]:
+) -> Reals:
     for element in before:
         start = _skip(content, start, order, element)
     row = vertex.row(order)

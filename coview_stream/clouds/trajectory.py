@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from coview_stream.clouds.files import atomic
 from coview_stream.errors import InputError, RunError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import nearest_rotation, quat_to_matrix
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 
-Stamps = npt.NDArray[np.float64]
 Poses = npt.NDArray[np.float64]
 
 _TUM_COLUMNS = 8
@@ -23,7 +23,7 @@ _SHORTEST_QUATERNION = 1e-6
 _ROTATION_TOLERANCE = 1e-2
 
 
-def read_tum(path: str | os.PathLike[str]) -> tuple[Stamps, Poses]:
+def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
     """Stamps (N,) in seconds and poses (N, 4, 4) in metres of a TUM file.
 
     Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. A file
@@ -64,7 +64,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
     return _poses(parts[:, :, 3], nearest_rotation(R))
 
 
-def read_times(path: str | os.PathLike[str]) -> Stamps:
+def read_times(path: str | os.PathLike[str]) -> Floats:
     """Stamps (N,) in seconds, one a line, increasing.
 
     Raises:
@@ -77,7 +77,7 @@ def read_times(path: str | os.PathLike[str]) -> Stamps:
 
 
 def write_tum(
-    path: str | os.PathLike[str], stamps: Sequence[float] | Stamps, poses: Sequence[Pose] | Poses
+    path: str | os.PathLike[str], stamps: Sequence[float] | Floats, poses: Sequence[Pose] | Poses
 ) -> None:
     """Write stamps (N,) in seconds and poses (N, 4, 4) in metres; the file is complete or not there.
 
@@ -101,7 +101,7 @@ def write_tum(
         raise InputError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
 
 
-def check_stamps(stamps: Stamps, lines: Sequence[int], path: Path) -> None:
+def check_stamps(stamps: Floats, lines: Sequence[int], path: Path) -> None:
     """Raise RunError at the first stamp that does not come after the one before."""
     late = np.diff(stamps) <= 0
     if late.any():
@@ -134,7 +134,7 @@ def _words(path: Path) -> list[tuple[int, list[str]]]:
     return [(number, words) for number, words in numbered if words and not words[0].startswith("#")]
 
 
-def _read_rows(path: Path, columns: int, meaning: str) -> tuple[npt.NDArray[np.float64], list[int]]:
+def _read_rows(path: Path, columns: int, meaning: str) -> tuple[Floats, list[int]]:
     rows, lines = [], []
     for number, words in _words(path):
         if len(words) != columns:
@@ -153,7 +153,7 @@ def _read_rows(path: Path, columns: int, meaning: str) -> tuple[npt.NDArray[np.f
     return np.array(rows, dtype=np.float64).reshape(-1, columns), lines
 
 
-def _poses(translations: npt.NDArray[np.float64], rotations: npt.NDArray[np.float64] | None) -> Poses:
+def _poses(translations: Floats, rotations: Floats | None) -> Poses:
     poses = np.tile(np.eye(4), (len(translations), 1, 1))
     if rotations is not None:
         poses[:, :3, :3] = rotations

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Floats
 
 Gravity = Literal["ground", "level"] | tuple[float, float, float]
 """Where down is: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
@@ -64,7 +64,7 @@ class LidarOdometryConfig:
             down(self.gravity)
 
 
-def down(gravity: Gravity) -> npt.NDArray[np.float64]:
+def down(gravity: Gravity) -> Floats:
     """(3,) unit vector in the body frame that points down; not for ``"ground"``.
 
     Raises:

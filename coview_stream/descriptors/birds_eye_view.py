@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from coview_stream.geometry.arrays import Floats32, Ints, Reals
 from coview_stream.geometry.rasters import filled
 from coview_stream.geometry.transforms import Points
 
@@ -36,7 +37,7 @@ _UNDULATION = 8.0  # metres: relief is what differs from the mean of so far arou
 _RELIEF = 1.5  # metres of relief that fill the layer
 
 
-def birds_eye_view(points: Points, corner: npt.NDArray[np.floating], shape: tuple[int, int]) -> Image:
+def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Image:
     """Draw a gravity-aligned cloud from above.
 
     Args:
@@ -70,9 +71,7 @@ def birds_eye_view(points: Points, corner: npt.NDArray[np.floating], shape: tupl
     return image.astype(np.uint8).reshape(LAYERS, height, width)
 
 
-def _layers(
-    image: npt.NDArray[np.float32], cell: npt.NDArray[np.int64], above: npt.NDArray[np.floating]
-) -> None:
+def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
     """Fill all layers of a flat image but the last from points in ``cell`` (N,) at ``above`` (N,) metres."""
     size, levels = image.shape[1], int(SLABS[-1] / _LEVEL)
     standing = (above >= SLABS[0]) & (above < SLABS[-1])
@@ -89,9 +88,7 @@ def _layers(
     image[-2, cell[above < _SEEN]] = 255.0
 
 
-def _ground(
-    points: Points, index: npt.NDArray[np.int64], shape: tuple[int, int]
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
     """Height of the ground (h, w) by coarse cells, and its height above the mean around, 0 where it was not seen."""
     flat = index[:, 1] * shape[1] + index[:, 0]
     least = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
@@ -118,6 +115,6 @@ def _ground(
     return ground, np.where(level & (weight > 1e-2), ground - mean, 0.0).astype(np.float32)
 
 
-def _sampled(values: npt.NDArray[np.float32], at: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+def _sampled(values: Floats32, at: Reals) -> Floats32:
     """Bilinear values (N,) of an image (h, w) at (N, 2) columns and rows."""
     return np.asarray(ndimage.map_coordinates(values, at.T[::-1], order=1, mode="nearest", output=np.float32))

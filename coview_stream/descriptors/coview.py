@@ -10,6 +10,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_kernels import PolarGrid
 from coview_stream.config import Channel, DescriptorConfig
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points
 
 Descriptor = npt.NDArray[np.float32]
@@ -30,9 +31,7 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     return kernels.coview(*grid, vertical=_VERTICAL[name])
 
 
-def describe(
-    points: Points, centre: npt.NDArray[np.float64], config: DescriptorConfig
-) -> dict[Channel, Descriptor]:
+def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:
     """Descriptor channels, (R, S) each, of the virtual local scan around ``centre``.
 
     Args:
@@ -52,13 +51,13 @@ def describe(
     return {name: context if name == first else channel(name, grid) for name in config.channels}
 
 
-def ring_key(descriptor: Descriptor) -> npt.NDArray[np.float32]:
+def ring_key(descriptor: Descriptor) -> Floats32:
     """Return the paper's rotation-invariant key (..., R): share of occupied (non-zero) sectors of every ring."""
-    key: npt.NDArray[np.float32] = (descriptor != 0).mean(axis=-1, dtype=np.float32)
+    key: Floats32 = (descriptor != 0).mean(axis=-1, dtype=np.float32)
     return key
 
 
-def ground_below(points: Points, position: npt.NDArray[np.float64]) -> float:
+def ground_below(points: Points, position: Floats) -> float:
     """Height of the ground below ``position`` (3,), from the points around it, metres in their frame.
 
     The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and it needs no mast height.
@@ -77,6 +76,6 @@ def ground_below(points: Points, position: npt.NDArray[np.float64]) -> float:
     return float(np.median(near[order[first], 2]))
 
 
-def on_ground(points: Points, position: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def on_ground(points: Points, position: Floats) -> Floats:
     """Return ``position`` (3,), but at the height of the ground below it: see :func:`ground_below`."""
     return np.array([position[0], position[1], ground_below(points, position)])

@@ -16,6 +16,7 @@ from scipy import ndimage
 from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image, birds_eye_view
 from coview_stream.descriptors.feature_map import TILE, quantized, quantized_sigma, weights_sha256
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL, Features, network
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 WINDOW = 256
@@ -63,7 +64,7 @@ def feature_arrays(
     return arrays, {"weights": weights_sha256(directory), "cell": LOCAL_CELL}
 
 
-def _drawn(points: Points, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64], window: int) -> Windows:
+def _drawn(points: Points, low: Ints, high: Ints, window: int) -> Windows:
     """Bird views of the windows that have points, by column and row."""
     columns, rows = (-(-(high - low) // window)).tolist()
     views: Windows = {}
@@ -82,9 +83,7 @@ def _drawn(points: Points, low: npt.NDArray[np.int64], high: npt.NDArray[np.int6
     return views
 
 
-def _within(
-    values: npt.NDArray[np.float32], begin: np.int64, size: int, margin: int = 0
-) -> npt.NDArray[np.bool_]:
+def _within(values: Floats32, begin: np.int64, size: int, margin: int = 0) -> Bools:
     low, high = float(begin - margin), float(begin + size + margin)
     return np.asarray((values >= low) & (values < high))
 
@@ -113,7 +112,7 @@ def _clipped(begin: int, length: int, size: int) -> tuple[slice, slice]:
 
 
 def _stored(
-    features: Features, image: Image, corner: npt.NDArray[np.int64], shape: tuple[int, int]
+    features: Features, image: Image, corner: Ints, shape: tuple[int, int]
 ) -> dict[str, npt.NDArray[Any]]:
     """Features without their margin, as they are stored: those of the tiles that have points."""
     height, width = shape
@@ -134,7 +133,7 @@ def _stored(
     }
 
 
-def _known(image: Image) -> npt.NDArray[np.bool_]:
+def _known(image: Image) -> Bools:
     """Which 1 m cells (H, W) of an image are near points."""
     filled = image[:-1].any(axis=0)
     rows, columns = (n // _CELLS for n in filled.shape)
@@ -151,9 +150,7 @@ def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.asarray(blocks.swapaxes(1, 2).reshape(-1, TILE, TILE, *rest))
 
 
-def _places(
-    place: npt.NDArray[np.float32], known: npt.NDArray[np.bool_], shape: tuple[int, int]
-) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float64]]:
+def _places(place: Floats32, known: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
     """Global descriptors (K, P) of squares of 8 m, made as a query's is of its four middle cells, and their middles."""
     edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
     height, width = (n // side for n in shape)

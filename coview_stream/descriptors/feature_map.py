@@ -16,9 +16,7 @@ import numpy.typing as npt
 from coview_stream.descriptors.birds_eye_view import BIRD_VIEW_VERSION
 from coview_stream.descriptors.network import LOCAL_CELL, VIEW_NAMES, file_sha256, weights_file
 from coview_stream.errors import InputError, MapError
-
-Vectors = npt.NDArray[np.float32]
-"""(C, H, W): row along y."""
+from coview_stream.geometry.arrays import Floats, Floats32, Int8s, Ints, Reals
 
 _NAMES = ("local", "sigma", "tiles", "place", "place_at")
 
@@ -33,9 +31,9 @@ class Patch:
         corner: (2,) x and y of the lower corner of cell (0, 0), metres, map frame.
     """
 
-    local: Vectors
-    sigma: npt.NDArray[np.float32]
-    corner: npt.NDArray[np.float64]
+    local: Floats32
+    sigma: Floats32
+    corner: Floats
 
 
 class FeatureMap:
@@ -92,11 +90,11 @@ class FeatureMap:
         return self.index.columns * self.index.rows * (TILE * LOCAL_CELL) ** 2
 
     @property
-    def tile_centres(self) -> npt.NDArray[np.float64]:
+    def tile_centres(self) -> Floats:
         """(T, 2) middles of the tiles, metres, map frame."""
         return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)
 
-    def patch(self, centre: npt.NDArray[np.floating], reach: float) -> Patch:
+    def patch(self, centre: Reals, reach: float) -> Patch:
         """Return all within ``reach`` metres of ``centre`` (x and y, map frame), rounded outwards to whole cells."""
         low = np.floor((np.asarray(centre, dtype=np.float64)[:2] - reach) / LOCAL_CELL).astype(np.int64)
         high = np.ceil((np.asarray(centre, dtype=np.float64)[:2] + reach) / LOCAL_CELL).astype(np.int64)
@@ -108,7 +106,7 @@ class FeatureMap:
         vectors = np.ascontiguousarray(dequantized(local).transpose(2, 0, 1))
         return Patch(vectors, dequantized_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
 
-    def coarse(self, cell: float = 2.0) -> tuple[Vectors, npt.NDArray[np.float64]]:
+    def coarse(self, cell: float = 2.0) -> tuple[Floats32, Floats]:
         """Return means (C, H, W) over cells of ``cell`` metres, a divisor of 32, and their lower corner (2,), metres.
 
         What the map does not have counts as zero.
@@ -138,7 +136,7 @@ class FeatureMap:
             )
 
 
-def means(tile: npt.NDArray[np.int8], ratio: int) -> Vectors:
+def means(tile: Int8s, ratio: int) -> Floats32:
     """Means (C, h, w) of stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells."""
     height, width, channels = (tile.shape[0] // ratio, tile.shape[1] // ratio, tile.shape[2])
     blocks = tile.reshape(height, ratio, width, ratio, channels).astype(np.float32)
@@ -155,8 +153,6 @@ def weights_sha256(directory: Path | None = None) -> str:
     return hashlib.sha256("\n".join([*parts, str(BIRD_VIEW_VERSION)]).encode()).hexdigest()
 
 
-Bytes = npt.NDArray[np.int8]
-
 TILE = 32
 """Cells of 1 m along a tile's edge; tile (i, j) covers ``[32 i, 32 (i + 1))`` metres in x, likewise in y."""
 
@@ -167,23 +163,23 @@ _LEAST, _MOST = 0.02, 50.0  # sigmas that a byte can tell: steps of 3 %
 _STEPS = 255.0 / np.log(_MOST / _LEAST)
 
 
-def quantized(vectors: npt.NDArray[np.float32]) -> Bytes:
+def quantized(vectors: Floats32) -> Int8s:
     """Numbers of magnitude 1 at most (any shape) as bytes; off by 0.004 each."""
     return np.asarray(np.rint(vectors * np.float32(_SCALE)), dtype=np.int8)
 
 
-def dequantized(vectors: npt.NDArray[np.int8]) -> npt.NDArray[np.float32]:
+def dequantized(vectors: Int8s) -> Floats32:
     """Undo :func:`packed`."""
     return np.asarray(vectors * np.float32(1.0 / _SCALE), dtype=np.float32)
 
 
-def quantized_sigma(sigma: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+def quantized_sigma(sigma: Floats32) -> npt.NDArray[np.uint8]:
     """Positive sigmas (any shape) as bytes on a logarithmic scale; off by 1.5 % between 0.02 and 50."""
     steps = np.log(np.clip(sigma, _LEAST, _MOST) / _LEAST) * _STEPS
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
 
-def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> Floats32:
     """Undo :func:`packed_sigma`."""
     return np.asarray(_LEAST * np.exp(sigma / _STEPS), dtype=np.float32)
 
@@ -199,7 +195,7 @@ class TileIndex:
         self._number = np.full((self.rows, self.columns), -1, dtype=np.int64)
         self._number[tuple((self.tiles - self.low).T[::-1])] = np.arange(len(self.tiles))
 
-    def gather(self, values: npt.NDArray[Any], corner: npt.NDArray[np.int64], out: npt.NDArray[Any]) -> None:
+    def gather(self, values: npt.NDArray[Any], corner: Ints, out: npt.NDArray[Any]) -> None:
         """Copy into ``out`` (h, w, ...) what ``values`` (T, 32, 32, ...) have from cell ``corner`` (x, y) on."""
         height, width = out.shape[:2]
         first = np.floor_divide(corner, TILE) - self.low

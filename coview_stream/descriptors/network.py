@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_kernels.runtime import workers
 from coview_stream.descriptors.birds_eye_view import LAYERS, Image
 from coview_stream.errors import ConfigError, DependencyError, InputError, require_library
+from coview_stream.geometry.arrays import Floats32
 
 ViewName = Literal["aerial", "ground"]
 
@@ -48,9 +48,9 @@ class Features:
         place: (P, H / 8, W / 8) float32 of unit norm: global descriptor of what lies around each 4 m cell.
     """
 
-    local: npt.NDArray[np.float32]
-    sigma: npt.NDArray[np.float32]
-    place: npt.NDArray[np.float32]
+    local: Floats32
+    sigma: Floats32
+    place: Floats32
 
 
 class Network:

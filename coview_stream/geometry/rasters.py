@@ -6,26 +6,24 @@ SciPy's filters do the same; importing them takes a quarter of a second, which a
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Points
 
-Raster = npt.NDArray[np.float32]
 
-
-def min_filter(raster: Raster, size: int) -> Raster:
+def min_filter(raster: Floats32, size: int) -> Floats32:
     """Smallest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
     return _sliding(np.minimum, raster, size, np.float32(np.inf))
 
 
-def max_filter(raster: Raster, size: int) -> Raster:
+def max_filter(raster: Floats32, size: int) -> Floats32:
     """Greatest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
     return _sliding(np.maximum, raster, size, np.float32(-np.inf))
 
 
-def _sliding(pick: np.ufunc, raster: Raster, size: int, nothing: np.float32) -> Raster:
+def _sliding(pick: np.ufunc, raster: Floats32, size: int, nothing: np.float32) -> Floats32:
     """One axis after the other: the extreme of a square is that of its rows' extremes."""
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size must be odd, so that a window has a middle, got {size}")
@@ -42,15 +40,11 @@ def _sliding(pick: np.ufunc, raster: Raster, size: int, nothing: np.float32) -> 
     return out
 
 
-Heights = npt.NDArray[np.float32]
-
 _MAX_CELLS = 200_000_000
 """A raster above this many cells (0.8 GB) means stray coordinates, not a map."""
 
 
-def cells(
-    points: Points, cell: float
-) -> tuple[npt.NDArray[np.float64], tuple[int, int], npt.NDArray[np.int64]]:
+def cells(points: Points, cell: float) -> tuple[Floats, tuple[int, int], Ints]:
     """Lower corner (2,), shape (rows, columns) and the flat cell index (N,) of each point.
 
     Raises:
@@ -66,14 +60,14 @@ def cells(
     return corner, (height, width), index[1] * width + index[0]
 
 
-def lowest_per_cell(points: Points, flat: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+def lowest_per_cell(points: Points, flat: Ints) -> Indices:
     """Index of the lowest point of each occupied cell, in the order of the cells."""
     order = np.lexsort((points[:, 2], flat))
     ordered = flat[order]
     return np.asarray(order[np.append(True, ordered[1:] != ordered[:-1])])
 
 
-def filled(z: Heights) -> Heights:
+def filled(z: Floats32) -> Floats32:
     """``z`` (H, W) with every NaN filled from ever coarser averages of its surroundings (push-pull)."""
     unknown = np.isnan(z)
     if not unknown.any() or unknown.all():

@@ -9,18 +9,18 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from coview_stream.geometry.arrays import Floats, Reals
 
 _SMALL = 1e-8  # radians: below, the sine is the angle
 
 
-def nearest_rotation(R: npt.NDArray[np.floating]) -> Array:
+def nearest_rotation(R: Reals) -> Floats:
     """Rotations (..., 3, 3) nearest to matrices (..., 3, 3) that are nearly rotations."""
     U, _, Vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
     return np.asarray(U @ Vt)
 
 
-def exp_so3(rotvec: npt.ArrayLike) -> Array:
+def exp_so3(rotvec: npt.ArrayLike) -> Floats:
     """Rotations (..., 3, 3) about axes (..., 3) by their length, radians (Rodrigues' formula)."""
     v = np.asarray(rotvec, dtype=np.float64)
     angle = np.sqrt((v * v).sum(axis=-1))[..., None, None]
@@ -34,7 +34,7 @@ def exp_so3(rotvec: npt.ArrayLike) -> Array:
     return np.asarray(np.eye(3) + sine * K + cosine * (K @ K))
 
 
-def log_so3(R: npt.NDArray[np.floating]) -> Array:
+def log_so3(R: Reals) -> Floats:
     """Rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
     turn = matrix_to_quat(R)
     turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
@@ -45,7 +45,7 @@ def log_so3(R: npt.NDArray[np.floating]) -> Array:
     )
 
 
-def quat_to_matrix(quaternions: npt.ArrayLike) -> Array:
+def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
     q = np.asarray(quaternions, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
@@ -61,7 +61,7 @@ def quat_to_matrix(quaternions: npt.ArrayLike) -> Array:
     return R
 
 
-def matrix_to_quat(R: npt.NDArray[np.floating]) -> Array:
+def matrix_to_quat(R: Reals) -> Floats:
     """Return unit quaternions (..., 4) of rotation matrices (..., 3, 3); the largest component is positive."""
     M = np.asarray(R, dtype=np.float64)
     xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
@@ -82,7 +82,7 @@ def matrix_to_quat(R: npt.NDArray[np.floating]) -> Array:
     return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
 
 
-def slerp(start: npt.NDArray[np.floating], end: npt.NDArray[np.floating], share: npt.ArrayLike) -> Array:
+def slerp(start: Reals, end: Reals, share: npt.ArrayLike) -> Floats:
     """Rotations (..., 3, 3) a ``share`` (...) of the way from ``start`` to ``end`` (..., 3, 3), the short way round."""
     rotvec = log_so3(np.swapaxes(start, -1, -2) @ end)
     return np.asarray(start @ exp_so3(np.asarray(share, dtype=np.float64)[..., None] * rotvec))

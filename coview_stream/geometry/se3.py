@@ -16,38 +16,35 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import exp_so3, log_so3
 from coview_stream.geometry.transforms import Pose, is_pose, orthonormal
 
-Array = npt.NDArray[np.float64]
-Matrix6 = npt.NDArray[np.float64]
-Vector6 = npt.NDArray[np.float64]
 
-
-def along_body(covariance: Matrix6, T_map_body: Pose) -> Matrix6:
+def along_body(covariance: Floats, T_map_body: Pose) -> Floats:
     """Covariance (6, 6) in the body's tangent of one that is given along the map's axes."""
     return rotate_covariance(covariance, T_map_body[:3, :3].T)
 
 
-def along_map(covariance: Matrix6, T_map_body: Pose) -> Matrix6:
+def along_map(covariance: Floats, T_map_body: Pose) -> Floats:
     """Covariance (6, 6) along the map's axes of one that is given in the body's tangent."""
     return rotate_covariance(covariance, T_map_body[:3, :3])
 
 
-def rotate_covariance(covariance: Matrix6, R: Array) -> Matrix6:
+def rotate_covariance(covariance: Floats, R: Floats) -> Floats:
     """Both halves of a covariance (6, 6) along axes that ``R`` (3, 3) turns into: diag(R, R) C diag(R, R)^T."""
     blocks = covariance.reshape(2, 3, 2, 3).transpose(0, 2, 1, 3)
     moved = (R @ blocks @ R.T).transpose(0, 2, 1, 3).reshape(6, 6)
     return np.asarray(0.5 * (moved + moved.T))
 
 
-def boxminus(T_map_body: Pose, T_map_reference: Pose) -> Vector6:
+def boxminus(T_map_body: Pose, T_map_reference: Pose) -> Floats:
     """(6,) by which a pose differs from a reference, along the map's axes: see the module."""
     turn = log_so3(T_map_body[:3, :3] @ T_map_reference[:3, :3].T)
     return np.asarray(np.concatenate([turn, T_map_body[:3, 3] - T_map_reference[:3, 3]]))
 
 
-def boxplus(T_map_body: Pose, step: Vector6) -> Pose:
+def boxplus(T_map_body: Pose, step: Floats) -> Pose:
     """Return the pose that differs by ``step`` (6,) along the map's axes; undoes :func:`difference`."""
     moved: Pose = T_map_body.copy()
     moved[:3, :3] = exp_so3(step[:3]) @ T_map_body[:3, :3]
@@ -55,14 +52,14 @@ def boxplus(T_map_body: Pose, step: Vector6) -> Pose:
     return moved
 
 
-def cross(v: Array) -> Array:
+def cross(v: Floats) -> Floats:
     """Matrices (..., 3, 3) of the cross product with (..., 3)."""
     K = np.zeros((*v.shape[:-1], 3, 3))
     K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     return np.asarray(K - np.swapaxes(K, -1, -2))
 
 
-def adjoint(T: Pose) -> Matrix6:
+def adjoint(T: Pose) -> Floats:
     """Matrix (6, 6) with T exp(xi) = exp(Ad xi) T."""
     Ad = np.zeros((6, 6))
     Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
@@ -78,7 +75,7 @@ def checked_pose(name: str, T: npt.ArrayLike) -> Pose:
     return orthonormal(pose)
 
 
-def checked_covariance(name: str, covariance: npt.ArrayLike) -> Matrix6:
+def checked_covariance(name: str, covariance: npt.ArrayLike) -> Floats:
     """Return a covariance (6, 6) float64, symmetric to the last digit; InputError unless it is positive definite."""
     C = np.asarray(covariance, dtype=np.float64)
     if C.shape != (6, 6) or not np.isfinite(C).all():

@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.rotations import matrix_to_quat, nearest_rotation, quat_to_matrix
 
 _Real = TypeVar("_Real", np.float32, np.float64)
@@ -58,7 +59,7 @@ def norms(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) 
     return np.asarray(np.sqrt(x))
 
 
-def rot_z(yaw: float) -> npt.NDArray[np.float64]:
+def rot_z(yaw: float) -> Floats:
     """Rotation matrix (3, 3) about z by ``yaw`` radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -92,7 +93,7 @@ def orthonormal(T: Pose) -> Pose:
     return pose_from(nearest_rotation(T[:3, :3]), T[:3, 3])
 
 
-def is_pose(T: npt.NDArray[np.floating]) -> bool:
+def is_pose(T: Reals) -> bool:
     """Whether ``T`` is a finite 4x4 rigid transform (rotation orthonormal to 1e-3)."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
@@ -100,7 +101,7 @@ def is_pose(T: npt.NDArray[np.floating]) -> bool:
     return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0)
 
 
-def pose_to_tum(T: Pose) -> npt.NDArray[np.float64]:
+def pose_to_tum(T: Pose) -> Floats:
     """(7,) x y z qx qy qz qw of a pose."""
     return np.concatenate([T[:3, 3], matrix_to_quat(T[:3, :3])])
 
@@ -111,14 +112,12 @@ def pose_from_tum(row: npt.ArrayLike) -> Pose:
     return pose_from(quat_to_matrix(values[3:]), values[:3])
 
 
-def to_local(T_odom_body: Pose, anchor: npt.NDArray[np.float64]) -> Pose:
+def to_local(T_odom_body: Pose, anchor: Floats) -> Pose:
     """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
     return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
 
 
-def to_map_origin(
-    T_map_local: Pose, anchor: npt.NDArray[np.float64], origin: npt.NDArray[np.float64]
-) -> Pose:
+def to_map_origin(T_map_local: Pose, anchor: Floats, origin: Floats) -> Pose:
     """Return ``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
     shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
     return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)

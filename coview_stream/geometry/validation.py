@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, is_pose, orthonormal, pose_from
 
 _LEAST_POINTS = 10
@@ -47,7 +48,7 @@ def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float) -> Pose:
     return orthonormal(T)
 
 
-def validate_pose(T_map_body: npt.ArrayLike, origin: npt.NDArray[np.float64]) -> Pose:
+def validate_pose(T_map_body: npt.ArrayLike, origin: Floats) -> Pose:
     """Return a place (4, 4), given in the frame of the map's sources, about the map's ``origin`` (3,).
 
     RunError where it is not rigid or not on this planet.

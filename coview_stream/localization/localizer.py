@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_from, to_local, to_map_origin
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.registration.local_map import LocalMaps
@@ -67,7 +65,7 @@ class Localizer:
         self._buffer = KeyframeBuffer(self.config.keyframe)
         self._search.reset()
         self._tracker = Tracker(self.base_map, self.config, self._local_maps)
-        self._anchor: npt.NDArray[np.float64] | None = None
+        self._anchor: Floats | None = None
         self._evidence: KeyframeEvidence | None = None
         self._newest: _Frame | None = None
         self._suggestions = PoseHints()
@@ -127,7 +125,7 @@ class Localizer:
         cloud, T_odom_body = self._checked(cloud, T_odom_body, stamp)
         self._newest = _Frame(cloud, T_odom_body, stamp)
         if self.state is State.TRACKING:  # keyframes are for searching: a loss starts from nothing
-            self._tracker.observe(cloud, T_odom_body, self._buffer.thin(cloud, T_odom_body))
+            self._tracker.observe(cloud, T_odom_body, self._buffer.voxelize(cloud, T_odom_body))
             patience = _HURRIED if hurry else 1.0
             due = self._tracker.due(patience)
             still = stamp - self._registered >= patience * self.config.tracking.seconds
@@ -140,7 +138,7 @@ class Localizer:
         suggested = self._suggested(T_odom_body)
         keyframe = self._buffer.add(cloud, T_odom_body, stamp)
         self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
-        if self._continuity.broken(self._buffer.newest, T_odom_body[:3, 3]):
+        if self._continuity.contradicts(self._buffer.newest, T_odom_body[:3, 3]):
             self._break_off(stamp)
             return None
         if keyframe is None:

@@ -6,9 +6,7 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import RejectionReason
@@ -113,7 +111,7 @@ class Fix:
     state: State
     T_map_body: Pose | None = None
     T_map_odom: Pose | None = None
-    covariance: npt.NDArray[np.float64] | None = None
+    covariance: Floats | None = None
     confidence: float = 0.0
     evidence: KeyframeEvidence | None = field(default=None)
     drift: Drift | None = None

@@ -29,11 +29,10 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import MessageError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 from coview_stream.messages.types import CloudMessage
 from coview_stream.messages.validation import check_points
-
-Times = npt.NDArray[np.float64]
 
 Rings = npt.NDArray[np.uint16]
 
@@ -44,7 +43,7 @@ RING_NAMES = ("ring", "line", "channel")
 _LONGEST = 1.0  # seconds: no lidar frame lasts longer
 
 
-def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Times | None:
+def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floats | None:
     """(N,) seconds after ``stamp_ns``; 0 where a point is not finite. None if they make no sense."""
     measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])  # many times faster than all(axis=1)
     complete = bool(measured.all())
@@ -58,7 +57,7 @@ def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Times
     return None
 
 
-def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Times]:
+def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Floats]:
     """Seconds after the stamp in every sense that the type allows, likeliest first."""
     seconds = values.astype(np.float64)
     if values.dtype.kind in "ui":

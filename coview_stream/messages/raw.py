@@ -7,9 +7,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.errors import MessageError
+from coview_stream.geometry.arrays import Floats32
 from coview_stream.messages.point_fields import Table, read_table
 from coview_stream.messages.types import CloudMessage, Encoded, Sample
 from coview_stream.messages.validation import read_attachment
@@ -31,7 +31,7 @@ def _decode(sample: Sample, columns: int) -> CloudMessage:
     return read_table(table, stamp_ns)
 
 
-def _encode(message: CloudMessage, layout: str, rows: npt.NDArray[np.float32]) -> Encoded:
+def _encode(message: CloudMessage, layout: str, rows: Floats32) -> Encoded:
 
     stamp = int(message.stamp_ns).to_bytes(8, "little", signed=True)
     return Encoded(rows.astype("<f4", copy=False).tobytes(), _ENCODING + layout, stamp)

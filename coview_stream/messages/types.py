@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 
 
@@ -53,7 +54,7 @@ class CloudMessage:
 
     stamp_ns: int
     points: Points
-    times: npt.NDArray[np.float64] | None = None
+    times: Floats | None = None
     rings: npt.NDArray[np.uint16] | None = None
     sequence: int | None = None
 
@@ -86,7 +87,7 @@ class PoseMessage:
     robot: str
     state: str
     T_map_body: Pose
-    covariance: npt.NDArray[np.float64]
+    covariance: Floats
     confidence: float
     map_sha256: str
     age: float = 0.0

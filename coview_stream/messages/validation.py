@@ -7,9 +7,9 @@ import struct
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.errors import MessageError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages.types import PoseMessage
 
@@ -102,9 +102,7 @@ def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
     return None, None
 
 
-def bare_pose(
-    stamp_ns: int, T: Pose, frame_id: str, covariance: npt.NDArray[np.float64] | None = None
-) -> PoseMessage:
+def bare_pose(stamp_ns: int, T: Pose, frame_id: str, covariance: Floats | None = None) -> PoseMessage:
     """Pose message of a format that says little else: what it leaves out is NaN or empty, not a guess."""
     unknown = np.full((6, 6), np.nan) if covariance is None else covariance
     return PoseMessage(stamp_ns, "", "TRACKING", T, unknown, math.nan, "", math.nan, frame_id)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import slerp
 from coview_stream.geometry.transforms import Points, Pose, inverse
 from coview_stream.odometry.buffer import Segment
@@ -14,9 +14,7 @@ _STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 
 _INSTANT = 1e-4  # seconds
 
 
-def deskew(
-    points: Points, times: npt.NDArray[np.float64], segment: Segment, stamp_ns: int, T_odom_body: Pose
-) -> Points:
+def deskew(points: Points, times: Floats, segment: Segment, stamp_ns: int, T_odom_body: Pose) -> Points:
     """Return the points (N, 3) in the body frame at ``stamp_ns``.
 
     Args:

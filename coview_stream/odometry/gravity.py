@@ -16,11 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from coview_stream.config.odometry import MOST_TILT
-
-Array = npt.NDArray[np.float64]
+from coview_stream.config.odometry import MAX_TILT
+from coview_stream.geometry.arrays import Floats, Indices, Reals
 
 _REACH = 25.0  # metres around the sensor
 
@@ -55,14 +53,14 @@ class Ground:
         walls: patches of wall that agreed on ``up``, or corrected it.
     """
 
-    up: Array
+    up: Floats
     height: float
     share: float
     cells: int
     walls: int = 0
 
 
-def find_ground(points: npt.NDArray[np.floating]) -> Ground | str:
+def find_ground(points: Reals) -> Ground | str:
     """Find the ground in a cloud (N, 3), body frame with z about up, metres; or say in a clause why there is none."""
     lowest = _lowest(np.asarray(points, dtype=np.float64))
     if len(lowest) < _LEAST_CELLS:
@@ -71,7 +69,7 @@ def find_ground(points: npt.NDArray[np.floating]) -> Ground | str:
     if plane is None:
         return "no plane below the sensor fits three of the lowest points"
     up, height = plane
-    if up[2] < np.cos(MOST_TILT) or height < _LEAST_HEIGHT:  # it wandered there while it was refined
+    if up[2] < np.cos(MAX_TILT) or height < _LEAST_HEIGHT:  # it wandered there while it was refined
         return "the best plane does not lie below the sensor"
     above = lowest @ up + height
     inside = np.abs(above) < _BAND
@@ -89,14 +87,14 @@ def find_ground(points: npt.NDArray[np.floating]) -> Ground | str:
     return Ground(corrected, float(height), share, int(inside.sum()), walls)
 
 
-def aligned(up: Array) -> Array:
+def aligned(up: Floats) -> Floats:
     """Rotation (3, 3) that turns ``up`` (3,) to z and keeps x pointing forward: odometry <- body at the start."""
     x = np.array([1.0, 0.0, 0.0]) - up[0] * up
     x /= np.linalg.norm(x)  # up leans by 60 degrees at most, so x is never along it
     return np.stack([x, np.cross(up, x), up])
 
 
-def _lowest(points: Array) -> Array:
+def _lowest(points: Floats) -> Floats:
     """Return the lowest point of every cell around, (K, 3)."""
     near = points[(points[:, :2] ** 2).sum(axis=1) < _REACH**2]
     cell = np.floor(near[:, :2] / _CELL).astype(np.int64) @ np.array([1 << 20, 1])
@@ -105,7 +103,7 @@ def _lowest(points: Array) -> Array:
     return np.asarray(near[order][first])
 
 
-def _best_of_many(lowest: Array) -> tuple[Array, float] | None:
+def _best_of_many(lowest: Floats) -> tuple[Floats, float] | None:
     """Of planes through three points each, the one that most points lie in."""
     rng = np.random.default_rng(0)  # equal clouds have equal grounds
     a, b, c = np.moveaxis(lowest[rng.integers(len(lowest), size=(_TRIES, 3))], 1, 0)
@@ -114,7 +112,7 @@ def _best_of_many(lowest: Array) -> tuple[Array, float] | None:
     usable = lengths > 1.0  # square metres, twice the triangle's: slivers say nothing
     normals = normals[usable] / lengths[usable, None] * np.sign(normals[usable, 2:])
     heights = -(normals * a[usable]).sum(axis=1)
-    ground = (normals[:, 2] > np.cos(MOST_TILT)) & (heights > _LEAST_HEIGHT)
+    ground = (normals[:, 2] > np.cos(MAX_TILT)) & (heights > _LEAST_HEIGHT)
     if not ground.any():
         return None
     normals, heights = normals[ground], heights[ground]
@@ -123,7 +121,7 @@ def _best_of_many(lowest: Array) -> tuple[Array, float] | None:
     return normals[best], float(heights[best])
 
 
-def _refined(lowest: Array, plane: tuple[Array, float] | None) -> tuple[Array, float] | None:
+def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats, float] | None:
     """Least squares over what lies in the plane, a few times over."""
     for _ in range(_ROUNDS if plane else 0):
         assert plane is not None
@@ -158,9 +156,7 @@ _WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
 _WALL_ROUNDS = 10
 
 
-def gravity_from_walls(
-    points: npt.NDArray[np.floating], up: Array, sigma: float = SLOPE
-) -> tuple[Array, int]:
+def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple[Floats, int]:
     """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
 
     Where there are none, or all face one way, it stays as it is in the directions that they say nothing of.
@@ -178,7 +174,7 @@ def gravity_from_walls(
     return better, len(normals)
 
 
-def _patches(points: Array, up: Array) -> Array:
+def _patches(points: Floats, up: Floats) -> Floats:
     """Return normals (K, 3) of the flat, roughly upright pieces of surface around."""
     near = points[(points**2).sum(axis=1) < _WALL_REACH**2]
     cell = np.floor(near / _WALL_CELL).astype(np.int64) @ np.array([1 << 40, 1 << 20, 1])
@@ -192,6 +188,6 @@ def _patches(points: Array, up: Array) -> Array:
     return np.asarray(normals[flat & (np.abs(normals @ up) < _UPRIGHT)])
 
 
-def _sums(values: Array, which: npt.NDArray[np.intp], count: int) -> Array:
+def _sums(values: Floats, which: Indices, count: int) -> Floats:
     """Add up, (count, K), the rows of values (N, K) that go to each of ``count`` places."""
     return np.stack([np.bincount(which, column, minlength=count) for column in values.T], axis=1)

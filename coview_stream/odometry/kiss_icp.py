@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import require_library
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse
 
 _NO_TIMES = np.zeros(0)
@@ -23,7 +23,7 @@ _NO_TIMES = np.zeros(0)
 class Registration(Protocol):
     """Places frames in a local map that grows with them."""
 
-    def register(self, points: npt.NDArray[np.float64], guess: Pose) -> Pose:
+    def register(self, points: Floats, guess: Pose) -> Pose:
         """Return the pose (4, 4) of a deskewed frame (N, 3), local map <- body, from a guess near it; add the frame."""
         ...
 
@@ -39,7 +39,7 @@ class KissRegistration:
         self._kiss_icp, self._settings = _settings(config)
         self.clear()
 
-    def register(self, points: npt.NDArray[np.float64], guess: Pose) -> Pose:
+    def register(self, points: Floats, guess: Pose) -> Pose:
         """As of :class:`Registration`."""
         icp = self._icp
         # it predicts by the last motion, whatever the time between

@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config.odometry import LidarOdometryConfig, down
 from coview_stream.errors import CloudError, RunError
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.rotations import exp_so3, slerp
 from coview_stream.geometry.transforms import (
     Points,
@@ -75,7 +75,7 @@ class LidarOdometry:
         self._rest()
         self._registration.clear()
 
-    def step(self, points: Points, point_times: npt.NDArray[np.float64] | None, stamp: float) -> Pose:
+    def step(self, points: Points, point_times: Floats | None, stamp: float) -> Pose:
         """Take in one frame and say where it was taken.
 
         Args:
@@ -115,7 +115,7 @@ class LidarOdometry:
         if seconds >= _BRIEF:
             self._step, self._step_seconds = step, seconds
         self._pose = orthonormal(self._pose @ step)
-        if self.config.plumb:
+        if self.config.level_with_walls:
             self._plumb(finite)
         self._local, self._stamp, self.points = orthonormal(local), stamp, finite
         return np.array(self._pose)
@@ -154,7 +154,7 @@ class LidarOdometry:
         turn = slerp(np.eye(3), self._step[:3, :3], share)
         return pose_from(turn, share * self._step[:3, 3])
 
-    def _deskewed(self, points: Points, times: npt.NDArray[np.float64]) -> Points:
+    def _deskewed(self, points: Points, times: Floats) -> Points:
         ends = sweep_interval(times)
         if ends is None:
             return points
@@ -185,14 +185,14 @@ class LidarOdometry:
         self._step, self._step_seconds = np.eye(4), 1.0
 
 
-Times = npt.NDArray[np.float64]
-
 _INSTANT = 1e-4  # seconds: times that differ by less are one
 
 _LONGEST_SWEEP = 1.0  # seconds from the stamp: points farther away in time have another clock
 
 
-def validate(points: Points, times: Times | None, config: LidarOdometryConfig) -> tuple[Points, Times | None]:
+def validate(
+    points: Points, times: Floats | None, config: LidarOdometryConfig
+) -> tuple[Points, Floats | None]:
     """Finite points (N, 3) float32, and their times (N,).
 
     Raises:
@@ -210,21 +210,21 @@ def validate(points: Points, times: Times | None, config: LidarOdometryConfig) -
         raise CloudError(
             f"frame has {len(rows)} points and times of shape {at.shape}; give one time per point"
         )
-    finite: npt.NDArray[np.bool_] = np.all(np.isfinite(rows), axis=1)
+    finite: Bools = np.all(np.isfinite(rows), axis=1)
     if not finite.all():
         rows, at = rows[finite], None if at is None else at[finite]
     with np.errstate(over="ignore"):
         ranges = norms(rows)
     usable = int(((ranges > config.min_range) & (ranges < config.max_range)).sum())
-    if usable < config.least_points:
+    if usable < config.min_points:
         raise CloudError(
             f"frame has {usable} of {len(finite)} points between {config.min_range:g} and {config.max_range:g} m; "
-            f"lidar odometry needs {config.least_points}: is the sensor covered, or the cloud not in its frame?"
+            f"lidar odometry needs {config.min_points}: is the sensor covered, or the cloud not in its frame?"
         )
     return rows, at
 
 
-def sweep_interval(times: Times) -> tuple[float, float] | None:
+def sweep_interval(times: Floats) -> tuple[float, float] | None:
     """First and last of times (N,) in seconds around the stamp; None if they do not differ, or are no such times."""
     known = times[np.isfinite(times)]
     if not len(known) or np.abs(known).max() > _LONGEST_SWEEP or np.ptp(known) < _INSTANT:

@@ -14,17 +14,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.cloud import ABSURD, Cloud, CloudBuilder
 from coview_stream.clouds.trajectory import Poses, read_tum
 from coview_stream.errors import CloudError, MessageError, RunError
+from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.transforms import Points
 from coview_stream.messages import ros2
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.deskew import deskew
 from coview_stream.recordings.bag_reader import BagReader, explained, frame_id, header_stamp
-from coview_stream.recordings.odometry_track import SAME_NS, StampsNs, Track
+from coview_stream.recordings.odometry_track import SAME_NS, Track
 
 _NS = 1e-9
 
@@ -33,7 +33,7 @@ class BagClouds:
     """Clouds of a recording by index; in order, the recording is read once, and otherwise sought by arrival."""
 
     def __init__(
-        self, reader: BagReader, topic: str, stamps: StampsNs, arrivals: StampsNs, track: Track, poses: Poses
+        self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses
     ) -> None:
         self.reader, self.topic, self.track = reader, topic, track
         self.stamps, self.arrivals, self.poses = stamps, arrivals, poses
@@ -45,7 +45,7 @@ class BagClouds:
         """Frame ``index`` in the body frame at its stamp; CloudError if it is damaged or holds no usable point."""
         message = self.message(index)
         # false for NaN as well
-        usable: npt.NDArray[np.bool_] = np.all(np.abs(message.points) < ABSURD, axis=1)
+        usable: Bools = np.all(np.abs(message.points) < ABSURD, axis=1)
         builder = CloudBuilder(dropped=int((~usable).sum()))
         builder.add(self._deskewed(index, message, usable))
         return builder.finish(self._name(index))
@@ -77,7 +77,7 @@ class BagClouds:
             reads_on = False
         raise ValueError("it is not there any more")
 
-    def _deskewed(self, index: int, message: CloudMessage, usable: npt.NDArray[np.bool_]) -> Points:
+    def _deskewed(self, index: int, message: CloudMessage, usable: Bools) -> Points:
         points = message.points[usable]
         if message.times is None or not len(points):
             return points
@@ -106,7 +106,7 @@ FromClouds = Callable[[BagClouds], Track]
 class Opened:
     """What a run of a bag consists of: stamps (N,) in ns, poses (N, 4, 4) and who reads the clouds."""
 
-    stamps: StampsNs
+    stamps: Ints
     poses: Poses
     source: BagClouds
     notes: tuple[str, ...]
@@ -118,7 +118,7 @@ class _Survey:
 
     stamps: list[int] = field(default_factory=list)
     arrivals: list[int] = field(default_factory=list)
-    odometry: list[tuple[int, npt.NDArray[np.float64]]] = field(default_factory=list)
+    odometry: list[tuple[int, Floats]] = field(default_factory=list)
     damaged: int = 0
     lidar: str = ""
     body: str = ""
@@ -219,7 +219,7 @@ def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Tr
     return Track(stamps[kept], np.array([T for _, T in survey.odometry])[kept])
 
 
-def _steady(path: Path, stamps: StampsNs, what: str) -> npt.NDArray[np.bool_]:
+def _steady(path: Path, stamps: Ints, what: str) -> Bools:
     """(N,) whether each stamp comes after those before it; RunError if the clock started anew."""
     back = np.maximum.accumulate(stamps) - stamps
     strays = back > _LONGEST_WAY_BACK
@@ -236,10 +236,10 @@ def _steady(path: Path, stamps: StampsNs, what: str) -> npt.NDArray[np.bool_]:
 class _Order:
     """Clouds by stamp (K,), of those whose stamp is ``steady`` (N,); ``fresh`` (K,) if none before has the same one."""
 
-    stamps: StampsNs
-    arrivals: StampsNs
-    fresh: npt.NDArray[np.bool_]
-    steady: npt.NDArray[np.bool_]
+    stamps: Ints
+    arrivals: Ints
+    fresh: Bools
+    steady: Bools
 
 
 def _in_order(path: Path, survey: _Survey) -> _Order:
@@ -291,5 +291,5 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opene
     return Opened(source.stamps, source.poses, source, tuple(notes))
 
 
-def _span(stamps: StampsNs) -> str:
+def _span(stamps: Ints) -> str:
     return f"{_NS * stamps.min():.3f} to {_NS * stamps.max():.3f} s"

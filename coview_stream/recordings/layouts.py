@@ -8,15 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
-from coview_stream.clouds.trajectory import (
-    Poses,
-    Stamps,
-    columns_of,
-    read_kitti_poses,
-    read_times,
-    read_tum,
-)
+from coview_stream.clouds.trajectory import Poses, columns_of, read_kitti_poses, read_times, read_tum
 from coview_stream.errors import RunError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse
 
 _KITTI_COLUMNS = 12
@@ -108,7 +102,7 @@ def _frames(folder: Path) -> tuple[Path, ...]:
     return tuple(files)
 
 
-def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Stamps, Poses]:
+def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats, Poses]:
     """Stamps (N,) in seconds and poses (N, 4, 4), odometry <- body, one per frame.
 
     Raises:
@@ -124,7 +118,7 @@ def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Stamps,
     return stamps, poses
 
 
-def read_stamps(layout: Layout) -> Stamps | None:
+def read_stamps(layout: Layout) -> Floats | None:
     """Stamps (N,) in seconds, one per frame, of a run whose odometry is not asked for; None if it has none.
 
     Raises:
@@ -148,7 +142,7 @@ def _check_count(file: Path, count: int, what: str, layout: Layout) -> None:
         )
 
 
-def _kitti(layout: Layout, file: Path) -> tuple[Stamps, Poses]:
+def _kitti(layout: Layout, file: Path) -> tuple[Floats, Poses]:
     if layout.times is None:
         raise RunError(f"{layout.path / 'times.txt'}: no such file; KITTI poses need one stamp per frame")
     stamps = read_times(layout.times)

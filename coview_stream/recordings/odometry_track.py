@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.trajectory import Poses
 from coview_stream.config.node import NodeConfig
+from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.rotations import slerp
 from coview_stream.odometry.buffer import Segment
-
-StampsNs = npt.NDArray[np.int64]
 
 SAME_NS = 1000
 """Stamps this close are one moment: text files and float64 seconds are good to a microsecond."""
@@ -27,7 +25,7 @@ class Track:
         poses: (K, 4, 4) odometry <- body, metres.
     """
 
-    def __init__(self, stamps: StampsNs, poses: Poses, config: NodeConfig | None = None) -> None:
+    def __init__(self, stamps: Ints, poses: Poses, config: NodeConfig | None = None) -> None:
         """Sort the samples; of equal stamps the first counts. At least one sample."""
         config = config or NodeConfig()
         self.stamps, first = np.unique(stamps, return_index=True)
@@ -39,7 +37,7 @@ class Track:
         )
         self._part = np.concatenate([[0], np.cumsum(~steady)])
 
-    def at(self, stamps: StampsNs) -> tuple[Poses, npt.NDArray[np.bool_]]:
+    def at(self, stamps: Ints) -> tuple[Poses, Bools]:
         """Poses (N, 4, 4) at the stamps (N,), interpolated, and (N,) whether each is known."""
         last = len(self.stamps) - 1
         after = np.clip(np.searchsorted(self.stamps, stamps), 0, last)
@@ -65,7 +63,7 @@ class Track:
         return Segment(self.stamps[chosen], self.poses[chosen])
 
 
-def _between(a: Poses, b: Poses, share: npt.NDArray[np.float64]) -> Poses:
+def _between(a: Poses, b: Poses, share: Floats) -> Poses:
     poses = np.array(a)
     poses[:, :3, :3] = slerp(a[:, :3, :3], b[:, :3, :3], share)
     poses[:, :3, 3] += share[:, None] * (b[:, :3, 3] - a[:, :3, 3])

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.files import read_cloud
-from coview_stream.clouds.trajectory import Poses, Stamps
+from coview_stream.clouds.trajectory import Poses
 from coview_stream.errors import CloudError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.recordings.layouts import Layout
 
@@ -39,7 +39,7 @@ class Frame:
     stamp: float
     points: Points
     T_odom_body: Pose
-    origin: npt.NDArray[np.float64]
+    origin: Floats
     path: Path
     dropped: int = 0
 
@@ -67,7 +67,7 @@ class Run:
 
     path: Path
     frames_paths: tuple[Path, ...]
-    stamps: Stamps
+    stamps: Floats
     poses: Poses
     source: CloudSource | None = None
     notes: tuple[str, ...] = ()

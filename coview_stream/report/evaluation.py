@@ -9,10 +9,10 @@ import json
 from dataclasses import asdict, dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Bools, Floats, Indices
 from coview_stream.geometry.transforms import Pose
 
 MAX_ROTATION = float(np.radians(5.0))
@@ -27,7 +27,6 @@ MAX_STAMP_GAP = 0.051
 RIGHT_SHARE = 0.95
 """A run succeeds if its first pose is right and more than this share of all poses."""
 
-Floats = npt.NDArray[np.float64]
 Trajectory = tuple[Floats, Floats]
 """Stamps (N,) in seconds, increasing, and poses (N, 4, 4) in metres, as ``read_tum`` returns them."""
 
@@ -43,13 +42,13 @@ class FrameErrors:
         e_t: (K,) translation errors, metres (eq. 16).
     """
 
-    index: npt.NDArray[np.intp]
+    index: Indices
     distance: Floats
     e_r: Floats
     e_t: Floats
 
     @property
-    def right(self) -> npt.NDArray[np.bool_]:
+    def right(self) -> Bools:
         """(K,) whether each pose counts as a success (eq. 17)."""
         return (self.e_r < MAX_ROTATION) & (self.e_t < MAX_TRANSLATION)
 

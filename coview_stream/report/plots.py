@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Bools, Reals
 from coview_stream.report.evaluation import MAX_ROTATION, MAX_TRANSLATION
 from coview_stream.report.style import (
     ACCENT,
     STATE_COLOURS,
     TRUTH,
-    Floats,
     draw_base_map,
     figure,
     legend_above,
@@ -30,7 +30,7 @@ from coview_stream.report.style import (
 Path = str | os.PathLike[str]
 
 
-def plot_map(base: Floats, stations: Floats, path: Path, title: str = "Base map") -> None:
+def plot_map(base: Reals, stations: Reals, path: Path, title: str = "Base map") -> None:
     """Draw the base map (N, 3) in grey, shaded by height, and its stations (M, 3).
 
     Raises:
@@ -50,11 +50,11 @@ def plot_map(base: Floats, stations: Floats, path: Path, title: str = "Base map"
 
 
 def plot_trajectory(
-    base: Floats,
-    positions: Floats,
+    base: Reals,
+    positions: Reals,
     states: Sequence[str],
     path: Path,
-    truth: Floats | None = None,
+    truth: Reals | None = None,
     title: str = "Trajectory",
 ) -> None:
     """Draw a trajectory over the grey base map, coloured by state.
@@ -74,7 +74,7 @@ def plot_trajectory(
     if len(positions) != len(states):
         raise InputError(f"{path}: {len(states)} states for {len(positions)} positions; give as many of both")
     positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-    drawn: npt.NDArray[np.bool_] = np.asarray(np.isfinite(positions).all(axis=1))
+    drawn: Bools = np.asarray(np.isfinite(positions).all(axis=1))
     with figure(path, figsize=map_figure_size(base)) as (drawing, axes):
         shift = draw_base_map(axes, base)
         if truth is not None and len(truth):
@@ -89,9 +89,7 @@ def plot_trajectory(
         legend_below(drawing, axes)
 
 
-def _draw_states(
-    axes: Any, positions: Floats, drawn: npt.NDArray[np.bool_], states: npt.NDArray[np.object_]
-) -> None:
+def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[np.object_]) -> None:
     names = [*STATE_COLOURS, *sorted(set(states) - set(STATE_COLOURS))]
     for name in names:
         here = states == name
@@ -110,7 +108,7 @@ def _draw_states(
 
 
 def plot_errors(
-    distance: Floats, e_t: Floats, e_r: Floats, path: Path, title: str = "Errors over the distance driven"
+    distance: Reals, e_t: Reals, e_r: Reals, path: Path, title: str = "Errors over the distance driven"
 ) -> None:
     """Draw translation errors (N,) in metres and rotation errors (N,) in radians over (N,) metres driven.
 
@@ -140,7 +138,7 @@ def plot_errors(
         panels[1].set_xlabel("distance driven [m]")
 
 
-def _draw_false(axes: Any, distance: Floats, values: Floats, limit: float) -> None:
+def _draw_false(axes: Any, distance: Reals, values: Reals, limit: float) -> None:
     """Mark false poses and the limit they crossed; metres beside millimetres need a log axis."""
     if not len(values):
         axes.set_ylim(bottom=0.0)
@@ -153,8 +151,8 @@ def _draw_false(axes: Any, distance: Floats, values: Floats, limit: float) -> No
 
 
 def plot_descriptor_pair(
-    query: Floats,
-    winner: Floats,
+    query: Reals,
+    winner: Reals,
     shift: int,
     path: Path,
     titles: tuple[str, str] = ("keyframe", "winning station"),

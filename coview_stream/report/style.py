@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats, Reals
 
 STATE_COLOURS = {
     "SEARCHING": "#999999",
@@ -46,8 +46,6 @@ _STYLE = {
     "figure.constrained_layout.use": True,
 }
 
-Floats = npt.NDArray[np.floating]
-
 
 @contextmanager
 def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, Any]]:
@@ -76,7 +74,7 @@ def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, 
             ) from error
 
 
-def draw_base_map(axes: Any, points: Floats) -> npt.NDArray[np.float64]:
+def draw_base_map(axes: Any, points: Reals) -> Floats:
     """Draw (N, 3) base map points from above, darker the higher they stand over their surroundings.
 
     Returns what was subtracted from the coordinates: far from zero (UTM) they are shifted by a round number,
@@ -96,7 +94,7 @@ def draw_base_map(axes: Any, points: Floats) -> npt.NDArray[np.float64]:
     return shift
 
 
-def _shaded(points: npt.NDArray[np.float64]) -> tuple[Any, tuple[float, float, float, float]]:
+def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
     """Grey values [x, y] in 0..1, masked where empty, and the extent (left, right, bottom, top), metres."""
     from scipy.ndimage import grey_closing, minimum_filter
 
@@ -119,7 +117,7 @@ def _shaded(points: npt.NDArray[np.float64]) -> tuple[Any, tuple[float, float, f
     return np.where(known, grey, np.nan), (float(low[0]), float(top[0]), float(low[1]), float(top[1]))
 
 
-def map_figure_size(points: Floats) -> tuple[float, float]:
+def map_figure_size(points: Reals) -> tuple[float, float]:
     """Width and height of a map's figure, inches: a road corridor needs less height than a square."""
     if not len(points):
         return 8.0, 8.6
@@ -129,7 +127,7 @@ def map_figure_size(points: Floats) -> tuple[float, float]:
     return wide, min(wide * ratio, 10.5) + 0.9
 
 
-def base_shift(points: Floats) -> npt.NDArray[np.float64]:
+def base_shift(points: Reals) -> Floats:
     """(3,) round offset to subtract before drawing; zeros where coordinates are short enough to read."""
     if not len(points):
         return np.zeros(3)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coview_stream.sim.caster import Caster, Floats32
-from coview_stream.sim.mesh import Floats
+from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.sim.caster import Caster
 
 ALTITUDE = 250.0
 """Metres above the scene's zero."""

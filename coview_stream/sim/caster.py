@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.geometry.arrays import Bools, Floats32, Indices
 from coview_stream.sim.scenes import Epoch
-
-Floats32 = npt.NDArray[np.float32]
 
 BLOCK = 200_000
 """Rays cast at a time: bounds the memory to about 30 MB."""
@@ -68,7 +66,7 @@ class Caster:
     ) -> Hits:
         count = len(rays)
         distance, incidence = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
-        alive: npt.NDArray[np.intp] = np.arange(count, dtype=np.intp)
+        alive: Indices = np.arange(count, dtype=np.intp)
         start = np.zeros(count, np.float32)
         for layer in range(_MAX_LAYERS):
             from_here = origins[alive] + rays[alive] * start[alive, None]
@@ -85,7 +83,7 @@ class Caster:
                 break
         return Hits(distance, incidence)
 
-    def _query(self, origins: Floats32, rays: Floats32) -> tuple[Floats32, Floats32, npt.NDArray[np.bool_]]:
+    def _query(self, origins: Floats32, rays: Floats32) -> tuple[Floats32, Floats32, Bools]:
         packed = np.ascontiguousarray(np.concatenate([origins, rays], axis=1), dtype=np.float32)
         answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=self._threads)
         cosine = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), rays))

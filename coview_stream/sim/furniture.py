@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.sim.layout import Layout, Site, directions
-from coview_stream.sim.mesh import Floats, Mesh, box, cylinder, frustum, join, placed
+from coview_stream.sim.mesh import Mesh, box, cylinder, frustum, join, placed
 
 _LORRIES = 0.95  # from this kind on
 _LANE = 2.2  # metres from the middle of the robot's lane to the middle of a vehicle
@@ -35,7 +35,7 @@ def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: floa
     return np.asarray(rng.permutation(found[clear & _leaves_lane(found, layout.route)]))
 
 
-def _leaves_lane(rows: Floats, route: Floats) -> npt.NDArray[np.bool_]:
+def _leaves_lane(rows: Floats, route: Floats) -> Bools:
     """(N,) whether a vehicle parked there leaves the robot's lane free, its two ends included."""
     tree = cKDTree(route)
     reach = np.where(rows[:, 3] < _LORRIES, 2.7, 4.5)[:, None]

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
 from coview_stream.sim.mesh import Mesh, height_field
-
-Floats = npt.NDArray[np.float64]
 
 _LOOP_STEP = 0.25
 
@@ -223,13 +222,13 @@ class Site:
         c, s = np.cos(yaw), np.sin(yaw)
         return np.column_stack([x + c * U - s * V, y + s * U + c * V])
 
-    def _cells(self, x: Floats, y: Floats) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    def _cells(self, x: Floats, y: Floats) -> tuple[Indices, Indices]:
         last = len(self._taken) - 1
         i, j = (np.clip(((a + self.half) / _CELL).astype(np.intp), 0, last) for a in (x, y))
         return i, j
 
 
-def _rasters(layout: Layout, half: float) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float32]]:
+def _rasters(layout: Layout, half: float) -> tuple[Bools, Floats32]:
     """Taken cells (the streets, to begin with) and each cell's distance to a street's centre, metres."""
     n = int(2 * half / _CELL) + 1
     centre = np.ones((n, n), dtype=bool)

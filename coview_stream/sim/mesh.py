@@ -9,16 +9,15 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from coview_stream.geometry.arrays import Floats, Ints
 
 
 class Mesh(NamedTuple):
     """Vertices (V, 3) float64 metres and triangles (T, 3) int64."""
 
     vertices: Floats
-    triangles: npt.NDArray[np.int64]
+    triangles: Ints
 
 
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))

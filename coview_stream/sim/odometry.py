@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import rot_z
 from coview_stream.sim.layout import arc_lengths, directions
-from coview_stream.sim.mesh import Floats
 from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
 

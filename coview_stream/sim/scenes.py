@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.sim import furniture, vegetation
 from coview_stream.sim.kinds import KINDS, Kind, Plot
 from coview_stream.sim.layout import Site, directions, resample
-from coview_stream.sim.mesh import Floats, Mesh, join, placed
+from coview_stream.sim.mesh import Mesh, join, placed
 
 _MARGIN = 50.0  # metres of world beyond the map, for a robot near its edge still sees something
 _FOOTWAY = 1.8

@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.sim.caster import Caster
-from coview_stream.sim.mesh import Floats
 
 FRAME_PERIOD = 0.1
 """Seconds from frame to frame."""

@@ -23,11 +23,11 @@ import numpy as np
 from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.sim.airborne import airborne_scan
 from coview_stream.sim.caster import Caster
 from coview_stream.sim.config import SimulationConfig
-from coview_stream.sim.mesh import Floats
 from coview_stream.sim.odometry import drifting_odometry, drive
 from coview_stream.sim.scenes import Scene, build_scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.sim.layout import Site
-from coview_stream.sim.mesh import EMPTY, Floats, Mesh, copies, cylinder, ellipsoid, join, placed, prism
+from coview_stream.sim.mesh import EMPTY, Mesh, copies, cylinder, ellipsoid, join, placed, prism
 
 _TRUNK = cylinder(1.0, 1.0, 6, top=0.6)
 _CROWN = ellipsoid(5, 8)
@@ -146,7 +146,7 @@ def rocks(rng: np.random.Generator, site: Site, count: int, extent: float) -> Me
     return join(parts)
 
 
-def _noise(seed: Floats, k: int | npt.NDArray[np.int64]) -> Floats:
+def _noise(seed: Floats, k: int | Ints) -> Floats:
     """Repeatable numbers in [0, 1) from each tree's own seed, so that a tree keeps its shape."""
     value = np.sin(seed * 12.9898 + np.asarray(k) * 78.233) * 43758.5453
     return np.asarray(value - np.floor(value))

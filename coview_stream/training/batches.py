@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.descriptors.birds_eye_view import CELL, Image
+from coview_stream.geometry.arrays import Floats, Indices, Ints
 from coview_stream.training.augment import augmented
 from coview_stream.training.dataset import QUERY_CELLS, WorldViews
-
-Floats = npt.NDArray[np.float64]
 
 PIECE = 272
 """Cells of a piece of the map: 136 m."""
@@ -39,7 +37,7 @@ class Batch:
 
     pieces: Image
     queries: Image
-    piece_of: npt.NDArray[np.int64]
+    piece_of: Ints
     poses: Floats
 
 
@@ -71,11 +69,9 @@ def draw_batch(
     return Batch(np.stack(images), np.stack(queries), np.array(owners), np.array(poses))
 
 
-def _somewhere(
-    world: WorldViews, count: int, rng: np.random.Generator
-) -> tuple[Floats, npt.NDArray[np.intp]]:
+def _somewhere(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Floats, Indices]:
     """Middle (2,) of a piece and ``count`` queries near it; the same one twice where there are too few."""
-    best: tuple[Floats, npt.NDArray[np.intp]] | None = None
+    best: tuple[Floats, Indices] | None = None
     for _ in range(_TRIES):
         centre = world.poses[rng.integers(len(world.poses)), :2] + rng.uniform(-0.7, 0.7, 2) * _REACH
         near = np.flatnonzero(np.linalg.norm(world.poses[:, :2] - centre, axis=1) < _REACH)

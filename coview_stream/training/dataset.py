@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from coview_stream.descriptors.birds_eye_view import CELL, Image, birds_eye_view
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.worlds import base_scan, draw_world, submaps
 
@@ -45,12 +46,12 @@ class WorldViews:
     """
 
     aerial: Image
-    corner: npt.NDArray[np.float64]
+    corner: Floats
     queries: npt.NDArray[np.uint8]
-    poses: npt.NDArray[np.float64]
+    poses: Floats
     sensor: npt.NDArray[np.str_]
     kind: str
-    travelled: npt.NDArray[np.float64]
+    travelled: Floats
     recipe: dict[str, Any]
 
 

@@ -6,12 +6,9 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from coview_stream.sim.mesh import Floats, Mesh, copies, join
-
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+from coview_stream.geometry.arrays import Bools, Floats, Ints
+from coview_stream.sim.mesh import Mesh, copies, join
 
 
 class Part(NamedTuple):
@@ -28,7 +25,7 @@ class Part(NamedTuple):
     owner: Ints
 
 
-def standing(parts: Iterable[Part], there: Flags, shift: Floats | None = None) -> Mesh:
+def standing(parts: Iterable[Part], there: Bools, shift: Floats | None = None) -> Mesh:
     """One mesh of the parts of those owners (N,) that are ``there``, moved by their ``shift`` (N, 2), metres."""
     meshes = []
     for part in parts:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.sim.layout import Layout, arc_lengths, directions
-from coview_stream.sim.mesh import Floats
 
 CLEARANCE = 0.6
 """Metres between the robot's middle and a stem."""
@@ -43,7 +42,7 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
     return np.asarray(paths[best, :kept][::-1])
 
 
-def _clear(points: Floats, obstacles: Floats) -> npt.NDArray[np.bool_]:
+def _clear(points: Floats, obstacles: Floats) -> Bools:
     """Whether (..., 2) points are clear of all obstacles."""
     if not len(obstacles):
         return np.ones(points.shape[:-1], dtype=bool)

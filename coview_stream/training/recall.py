@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.descriptors.birds_eye_view import Image
 from coview_stream.descriptors.network import Features
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.localization.search.learned.correlation import correlate, downsample
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.training.dataset import WorldViews
@@ -23,7 +23,6 @@ _APART = 10.0  # metres between two places that are counted as two
 _RADIUS = 29.0
 
 Encoder = Callable[[Image], Features]
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -71,13 +70,13 @@ def seek(
     return sought
 
 
-def weights(sigma: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def weights(sigma: Floats32) -> Floats32:
     """Weight (h, h) of a query's cells from their uncertainty (h, h): 1 / sigma within 29 m of the middle."""
     at = np.arange(len(sigma)) + 0.5 - len(sigma) / 2
     return np.asarray((np.hypot(at[:, None], at[None]) < _RADIUS) / sigma, dtype=np.float32)
 
 
-def best_places(volume: npt.NDArray[np.float32], yaws: Floats, corner: Floats) -> tuple[Floats, Floats]:
+def best_places(volume: Floats32, yaws: Floats, corner: Floats) -> tuple[Floats, Floats]:
     """Places (5, 3) and scores (5,) of the highest peaks of (K, H, W), 10 m or more apart."""
     top = volume.max(axis=0)
     places, scores = [], []

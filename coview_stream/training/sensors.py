@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from coview_stream.sim.mesh import Floats
+from coview_stream.geometry.arrays import Floats
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Sensor
 
 INCLINATION = float(np.radians(45.0))

@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coview_stream.sim.mesh import Floats, Mesh, join
+from coview_stream.geometry.arrays import Bools, Floats, Ints
+from coview_stream.sim.mesh import Mesh, join
 from coview_stream.sim.scenes import Epoch
 from coview_stream.training import tree_meshes
-from coview_stream.training.mesh_copies import Flags, Ints, Part, standing
+from coview_stream.training.mesh_copies import Part, standing
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.terrain import Terrain
 from coview_stream.training.trees import PATTERNS, Trees, draw_species, draw_stems, draw_trees, opened
@@ -104,7 +105,7 @@ def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
 
 def _fates(
     rng: np.random.Generator, count: int, mortality: float
-) -> tuple[tuple[Flags, Flags], tuple[Flags, Flags]]:
+) -> tuple[tuple[Bools, Bools], tuple[Bools, Bools]]:
     """Which trees stand, and which of them have leaves, at each epoch; ``mortality`` is the share that differs."""
     fate = np.where(rng.random(count) < mortality, rng.integers(1, 4, count), 0)
     everyone = np.ones(count, dtype=bool)
@@ -132,8 +133,8 @@ def _epoch(
     woody: list[Part],
     leaves: list[Part],
     bushes: Part,
-    there: Flags,
-    leafed: Flags,
+    there: Bools,
+    leafed: Bools,
     shift: Floats | None,
 ) -> Epoch:
     grown = rng.random(len(bushes.owner)) < 0.85  # the understory changes most
@@ -141,7 +142,7 @@ def _epoch(
     return Epoch(join([*solid, standing(woody, there)]), join(foliage))
 
 
-def _obstacles(trees: Trees, there: Flags) -> Floats:
+def _obstacles(trees: Trees, there: Bools) -> Floats:
     # nobody drives through leaves that hang to the ground
     low = trees.base < 1.6
     radius = np.where(low & ~trees.dead, np.maximum(0.6 * trees.crown, trees.radius), trees.radius)

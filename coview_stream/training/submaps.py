@@ -6,14 +6,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from coview_stream.clouds.filters import voxel_grid
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, transform
 from coview_stream.sim.caster import Caster
 from coview_stream.sim.layout import directions
-from coview_stream.sim.mesh import Floats
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.sensors import FRAME_PERIOD
 from coview_stream.training.paths import STEP
@@ -109,9 +108,7 @@ def gathered(frames: Frames) -> Submap:
     return Submap(voxel_grid(cloud, VOXEL), np.array([x, y, yaw]), frames.travelled)
 
 
-def _moments(
-    rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _moments(rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str) -> tuple[Ints, Ints]:
     """Draw which points of the path (K,) have a frame, and the numbers of the sensor's frames (K,) there."""
     spacing = recipe.draw(rng, "frame_step") * _OFTEN.get(sensor, 1.0)
     last = len(path) - 1

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from coview_stream.sim.mesh import Floats, Mesh, height_field
+from coview_stream.geometry.arrays import Floats
+from coview_stream.sim.mesh import Mesh, height_field
 
 Field = Callable[[Floats, Floats], Floats]
 

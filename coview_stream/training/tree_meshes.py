@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.sim.mesh import Floats, Mesh, cylinder, ellipsoid
-from coview_stream.training.mesh_copies import Flags, Ints, Part, shaped
+from coview_stream.geometry.arrays import Bools, Floats, Ints
+from coview_stream.sim.mesh import Mesh, cylinder, ellipsoid
+from coview_stream.training.mesh_copies import Part, shaped
 from coview_stream.training.terrain import Terrain, waves
 from coview_stream.training.trees import FAMILIES, Trees
 
@@ -134,7 +135,7 @@ def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> Part:
     return shaped(rng, _BUSH, centre, semi, 0.2, np.arange(count))
 
 
-def leafy(trees: Trees, winter: bool) -> Flags:
+def leafy(trees: Trees, winter: bool) -> Bools:
     """Which trees (N,) have leaves."""
     return ~trees.dead & (trees.evergreen | (not winter))
 

@@ -7,11 +7,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from coview_stream.sim.mesh import Floats
-from coview_stream.training.mesh_copies import Flags, Ints
+from coview_stream.geometry.arrays import Bools, Floats, Indices, Ints
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.terrain import Terrain, waves
 
@@ -46,8 +44,8 @@ class Trees(NamedTuple):
     lean: Floats
     offset: Floats
     family: Ints
-    evergreen: Flags
-    dead: Flags
+    evergreen: Bools
+    dead: Bools
 
     def axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
         """Points (M, 3) of the stems' axes ``up`` (M,) metres over their feet; the crowns' weight bends them."""
@@ -112,7 +110,7 @@ def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Flo
     return np.minimum(np.clip(wide, low, high), room * rng.uniform(0.85, 1.15, len(height)))
 
 
-def _mixed(rng: np.random.Generator, xy: Floats, kinds: int) -> npt.NDArray[np.intp]:
+def _mixed(rng: np.random.Generator, xy: Floats, kinds: int) -> Indices:
     """Species (N,) by index: in patches, or one here one there."""
     scores = [
         waves(rng, rng.uniform(30, 100))(*xy.T) * rng.uniform(0, 2) + rng.gumbel(size=len(xy)) + rng.normal()
@@ -164,7 +162,7 @@ def _rows(rng: np.random.Generator, spacing: float, half: float) -> Floats:
     return np.asarray(xy[kept])
 
 
-def _thinned(rng: np.random.Generator, xy: Floats, apart: float) -> npt.NDArray[np.bool_]:
+def _thinned(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
     """Keep (N,) such that of each pair nearer than ``apart`` the one of lower rank goes."""
     keep = np.ones(len(xy), dtype=bool)
     pairs = cKDTree(xy).query_pairs(apart, output_type="ndarray")
@@ -173,7 +171,7 @@ def _thinned(rng: np.random.Generator, xy: Floats, apart: float) -> npt.NDArray[
     return keep
 
 
-def opened(rng: np.random.Generator, xy: Floats, half: float) -> npt.NDArray[np.bool_]:
+def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
     """Which stems (N,) remain where the stand has thin parts, gaps and perhaps a trail."""
     keep = np.ones(len(xy), dtype=bool)
     if rng.random() < 0.6:

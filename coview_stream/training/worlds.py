@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from coview_stream.clouds.filters import voxel_grid
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 from coview_stream.sim.airborne import Flight, airborne_scan
 from coview_stream.sim.caster import Caster
-from coview_stream.sim.mesh import Floats
 from coview_stream.sim.scenes import Epoch, build_scene
 from coview_stream.training.paths import along_streets, between_trees
 from coview_stream.training.recipe import Recipe

@@ -12,7 +12,8 @@ import numpy as np
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import InputError
-from coview_stream.geometry.se3 import Matrix6, Vector6, boxminus, boxplus, cross
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.se3 import boxminus, boxplus, cross
 from coview_stream.geometry.transforms import Pose
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
@@ -24,20 +25,20 @@ class Measured(NamedTuple):
 
     T_map_body: Pose
     """(4, 4)."""
-    information: Matrix6
+    information: Floats
     """(6, 6), positive semi-definite, before inflation."""
 
 
-def swap_rotation_translation(covariance: Matrix6) -> Matrix6:
+def swap_rotation_translation(covariance: Floats) -> Floats:
     """(6, 6) over (x, y, z, roll, pitch, yaw) as over (rx, ry, rz, x, y, z), or the other way round."""
     return np.asarray(covariance[np.ix_(_ANGLES_FIRST, _ANGLES_FIRST)])
 
 
 def remove_prior(
     T_map_body: Pose,
-    information: Matrix6,
+    information: Floats,
     T_map_prior: Pose,
-    prior_information: Matrix6,
+    prior_information: Floats,
     config: RegistrationConfig,
 ) -> Measured:
     """Take a prior out of a registration again, so that a graph that knows it already does not count it twice.
@@ -80,7 +81,7 @@ def remove_prior(
     return Measured(boxplus(T_map_body, step), np.asarray((back * share) @ back.T))
 
 
-def registration_covariance(information: Matrix6, config: RegistrationConfig) -> Matrix6:
+def registration_covariance(information: Floats, config: RegistrationConfig) -> Floats:
     """Covariance of a registration from its Hessian: inflated, widened where the map shows little, and floored.
 
     The inverse Hessian is optimistic, as points next to each other are not independent: its sigma is multiplied by
@@ -112,7 +113,7 @@ def registration_covariance(information: Matrix6, config: RegistrationConfig) ->
     return np.asarray((spread * variance) @ spread.T + np.diag(floor))
 
 
-def propagate(covariance: Matrix6, shift: Vector6) -> Matrix6:
+def propagate(covariance: Floats, shift: Floats) -> Floats:
     """Covariance (6, 6) after a known motion by ``shift`` (3,), metres along the map's axes.
 
     An error in the heading at its beginning is one in the place at its end: s' = s + r x shift.

@@ -35,7 +35,8 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.errors import require_library
-from coview_stream.geometry.se3 import Matrix6, Vector6, boxminus, boxplus, cross
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.se3 import boxminus, boxplus, cross
 from coview_stream.geometry.transforms import Points, Pose, orthonormal
 from coview_stream.localization.registration.result import MIN_PAIRS, Registration
 
@@ -96,7 +97,7 @@ def register_surfaces(
     grid: kernels.PointGrid,
     normals: Points,
     T_map_source: Pose,
-    pivot: npt.NDArray[np.float64],
+    pivot: Floats,
     scales: list[kernels.Scale],
     *,
     keep: float,
@@ -145,8 +146,8 @@ def register_surfaces(
 
 
 class _Pairs(NamedTuple):
-    information: Matrix6
-    gradient: Vector6
+    information: Floats
+    gradient: Floats
     kept: int
     rmse: float
 
@@ -157,7 +158,7 @@ def _pairs(
     grid: kernels.PointGrid,
     normals: Points,
     T: Pose,
-    pivot: npt.NDArray[np.float64],
+    pivot: Floats,
     radius: float,
     keep: float,
 ) -> _Pairs | None:
@@ -193,7 +194,7 @@ def _pairs(
 _TINY = 1e-6  # information: keeps what has none solvable
 
 
-def about_pivot(H: Matrix6, b: Vector6, T: Pose, pivot: npt.NDArray[np.float64]) -> tuple[Matrix6, Vector6]:
+def about_pivot(H: Floats, b: Floats, T: Pose, pivot: Floats) -> tuple[Floats, Floats]:
     """Hessian and gradient of small_gicp in our tangent.
 
     small_gicp perturbs on the right, T exp(d), d = (turn, shift) along the source's axes about its origin. We turn by r
@@ -209,12 +210,12 @@ def about_pivot(H: Matrix6, b: Vector6, T: Pose, pivot: npt.NDArray[np.float64])
 
 
 def fused_step(
-    information: Matrix6,
-    gradient: Vector6,
+    information: Floats,
+    gradient: Floats,
     T: Pose,
-    pivot: npt.NDArray[np.float64],
+    pivot: Floats,
     prior: kernels.Belief | None,
-) -> tuple[Vector6, Matrix6]:
+) -> tuple[Floats, Floats]:
     """Gauss-Newton's step (6,) to the most probable pose by pairs and prior, and the information of both (6, 6)."""
     if prior is not None:
         away = boxminus(_with_pivot(T, pivot), _with_pivot(prior.mean, pivot))
@@ -224,22 +225,20 @@ def fused_step(
     return np.asarray(step, dtype=np.float64), information
 
 
-def retract(T: Pose, step: Vector6, pivot: npt.NDArray[np.float64]) -> Pose:
+def retract(T: Pose, step: Floats, pivot: Floats) -> Pose:
     """Return the pose turned about its moved pivot and shifted, by ``step`` (6,) along the map's axes."""
     there = boxplus(_with_pivot(T, pivot), step)
     there[:3, 3] -= there[:3, :3] @ pivot
     return there
 
 
-def _with_pivot(T: npt.ArrayLike, pivot: npt.NDArray[np.float64]) -> Pose:
+def _with_pivot(T: npt.ArrayLike, pivot: Floats) -> Pose:
     there: Pose = np.array(T, dtype=np.float64)
     there[:3, 3] += there[:3, :3] @ pivot
     return there
 
 
-def point_to_point_system(
-    moved_points: npt.NDArray[np.float64], gap: npt.NDArray[np.float64], about: npt.NDArray[np.float64]
-) -> tuple[Matrix6, Vector6]:
+def point_to_point_system(moved_points: Floats, gap: Floats, about: Floats) -> tuple[Floats, Floats]:
     """Hessian and gradient of |gap|^2 / 2 of pairs: points (N, 3) in the map, gaps (N, 3), the moved pivot (3,)."""
     a = moved_points - about
     H, b = np.zeros((6, 6)), np.zeros(6)

@@ -14,10 +14,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationMethod
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 from coview_stream.localization.registration.result import MIN_PAIRS
@@ -44,10 +44,10 @@ _NOTHING = -1e6
 class RoofEdges:
     """Height of the edges (H, W) of a map crop, metres; row along x, column along y from ``corner`` (2,)."""
 
-    height: npt.NDArray[np.float32]
-    corner: npt.NDArray[np.float64]
+    height: Floats32
+    corner: Floats
 
-    def above(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+    def above(self, points: Reals) -> Bools:
         """Which of (N, 3) points stand below an edge of the map."""
         cells = np.floor((points[:, :2] - self.corner) / _CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.height.shape)).all(axis=1)
@@ -117,7 +117,7 @@ class LocalMaps:
         self._most = crops
         self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
 
-    def around(self, position: npt.NDArray[np.float64]) -> LocalMap | None:
+    def around(self, position: Floats) -> LocalMap | None:
         """Return the map within at least ``radius`` metres of ``position`` (3,); None if it is (nearly) empty there."""
         key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
         if key not in self._crops:
@@ -136,8 +136,8 @@ class RegistrationCloud:
     """Points (N, 3) float32 of a local scan, which of them stand above the ground, and how high (metres)."""
 
     points: Points
-    above: npt.NDArray[np.bool_]
-    height: npt.NDArray[np.float32]
+    above: Bools
+    height: Floats32
 
     def every(self, nth: int) -> RegistrationCloud:
         """Return a thinner scan: every ``nth`` point of each kind."""

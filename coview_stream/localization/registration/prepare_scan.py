@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig, RegistrationConfig
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, Pose, norms
 from coview_stream.localization.registration.local_map import RegistrationCloud
@@ -18,9 +18,7 @@ _CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, no
 _SEED = 20240
 
 
-def prepare_scan(
-    points: Points, position: npt.NDArray[np.float64], config: RegistrationConfig
-) -> RegistrationCloud:
+def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -> RegistrationCloud:
     """Thin a local scan to at most ``source_points`` points within ``source_range`` metres of ``position``.
 
     Args:
@@ -42,7 +40,7 @@ def prepare_scan(
     return RegistrationCloud(thin, height > _CLEAR, height)
 
 
-def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
+def height_above_lowest(points: Points) -> Floats32:
     """Height (N,) of each point above the lowest of its 2 m cell and the eight around it, metres.
 
     The neighbours matter where a sparse sensor sees only a facade in a cell and no ground.
@@ -57,7 +55,7 @@ def height_above_lowest(points: Points) -> npt.NDArray[np.float32]:
     lowest = np.full(rows * columns, np.inf, dtype=np.float32)
     np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
     around = min_filter(lowest.reshape(rows, columns), 3)
-    height: npt.NDArray[np.float32] = points[:, 2] - around.ravel()[cell]
+    height: Floats32 = points[:, 2] - around.ravel()[cell]
     return height
 
 

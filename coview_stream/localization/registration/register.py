@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.result import MIN_PAIRS, Prior, Registration
@@ -35,7 +35,7 @@ def register(
     config: RegistrationConfig,
     scales: tuple[float, ...],
     prior: Prior | None = None,
-    centre: npt.NDArray[np.float64] | None = None,
+    centre: Floats | None = None,
     iterations: int | None = None,
 ) -> Registration | None:
     """Trimmed ICP or GICP, as ``config.method`` says, from an initial pose.
@@ -88,7 +88,7 @@ def _by_gicp(
     config: RegistrationConfig,
     stages: list[kernels.Scale],
     belief: kernels.Belief | None,
-    pivot: npt.NDArray[np.float64],
+    pivot: Floats,
     iterations: int | None,
 ) -> Registration | None:
     from coview_stream.localization.registration.gicp import register_surfaces

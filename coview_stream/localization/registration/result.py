@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from coview_stream.geometry.se3 import Matrix6
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class Prior:
     """
 
     T_map_source: Pose
-    information: Matrix6
+    information: Floats
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Registration:
     """
 
     T_map_source: Pose
-    information: Matrix6
+    information: Floats
     rmse: float
     pairs: int
     iterations: int

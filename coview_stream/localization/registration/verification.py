@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_stream.geometry.arrays import Bools, Floats32, Ints, Reals
 from coview_stream.geometry.transforms import Points, Pose, inverse, norms, transform
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
@@ -69,7 +70,7 @@ def verify(
     seen: RangeImage,
     T_map_body: Pose,
     target: LocalMap,
-    surveyed: npt.NDArray[np.bool_],
+    surveyed: Bools,
 ) -> Evidence:
     """Evidence for a registered pose.
 
@@ -96,9 +97,7 @@ def verify(
     return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)
 
 
-def _on_surface(
-    points: npt.NDArray[np.floating], partner: npt.NDArray[np.integer], target: LocalMap
-) -> npt.NDArray[np.bool_]:
+def _on_surface(points: Reals, partner: npt.NDArray[np.integer], target: LocalMap) -> Bools:
     """Which of (N, 3) points lie on the plane of their partner (N,), the number of map points meaning none."""
     has = partner < len(target.points)
     near = partner[has]
@@ -140,9 +139,9 @@ class RangeImage:
         floor: height of the ground relative to the sensor, metres, not above it.
     """
 
-    nearest: npt.NDArray[np.float32]
-    farthest: npt.NDArray[np.float32]
-    hits: npt.NDArray[np.int64]
+    nearest: Floats32
+    farthest: Floats32
+    hits: Ints
     floor: float
 
     @classmethod
@@ -187,7 +186,7 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
     return int(met.sum()), int(passed.sum())
 
 
-def _beam_cells(points: npt.NDArray[np.floating], ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.int64]:
+def _beam_cells(points: Reals, ranges: Reals) -> Ints:
     azimuth = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
     elevation = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / _BEAM).astype(
         np.int64

@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from coview_kernels import Nearest
 from coview_stream.config import Channel, ConsensusConfig
+from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z
-from coview_stream.localization.search.retrieval import Volume
 
 _SAMPLE = 100_000  # numbers are enough for a median
 
@@ -50,8 +50,8 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class _Vote:
-    centre: npt.NDArray[np.float64]  # (3,) odometry frame, z on the ground
-    votes: Values  # standardised distances (S, ...), spread over the grid
+    centre: Floats  # (3,) odometry frame, z on the ground
+    votes: Floats32  # standardised distances (S, ...), spread over the grid
     smallest: float  # smallest raw distance of any channel, for the paper's single-minimum rule
     where: tuple[int, int]  # its station and shift
     sectors: int
@@ -60,7 +60,7 @@ class _Vote:
 class Consensus:
     """The newest keyframes' votes and the hypotheses they agree on."""
 
-    def __init__(self, stations: npt.NDArray[np.float32], block: float, config: ConsensusConfig) -> None:
+    def __init__(self, stations: Floats32, block: float, config: ConsensusConfig) -> None:
         self.config = config
         self.stations = stations
         self.grid = StationGrid(stations, block)
@@ -74,9 +74,7 @@ class Consensus:
         """Forget all votes."""
         self._ballots.clear()
 
-    def vote(
-        self, centre: npt.NDArray[np.float64], distances: Mapping[Channel, Volume] | Mapping[str, Volume]
-    ) -> None:
+    def vote(self, centre: Floats, distances: Mapping[Channel, Floats32] | Mapping[str, Floats32]) -> None:
         """Add one keyframe's distances (M, S) per channel; ``centre`` (3,) is its descriptor's zero, odometry frame.
 
         Channels are standardised (median and MAD over all hypotheses) before they are averaged: how far a
@@ -92,9 +90,7 @@ class Consensus:
         ballot = _Vote(centre, spread, float(best.min()), (int(station), int(shift)), best.shape[1])
         self._ballots.append(ballot)
 
-    def vote_nearest(
-        self, centre: npt.NDArray[np.float64], nearest: dict[Channel, Nearest], sectors: int
-    ) -> None:
+    def vote_nearest(self, centre: Floats, nearest: dict[Channel, Nearest], sectors: int) -> None:
         """Add what ``single`` makes of one keyframe: the nearest station of each channel, out of ``sectors`` shifts."""
         best = min(nearest.values(), key=lambda found: float(found.distance[0]))
         where = int(best.station[0]), int(best.shift[0])
@@ -109,7 +105,7 @@ class Consensus:
             return [self._hypothesis(*ballot.where, ballot.smallest, ballot.centre)]
         return self._peaks(self.scores(), self._ballots[-1].centre)
 
-    def scores(self) -> Volume:
+    def scores(self) -> Floats32:
         """Sum the votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
         newest = self._ballots[-1]
         total = newest.votes.copy()
@@ -121,10 +117,10 @@ class Consensus:
             for n, cell in enumerate(cells):
                 self.grid.add(total[n], ballot.votes[n], cell, float(step[2]))
         total *= np.float32(1.0 / np.sqrt(len(self._ballots)))
-        scores: Volume = self.grid.gathered(total).T
+        scores: Floats32 = self.grid.gathered(total).T
         return scores
 
-    def _peaks(self, scores: Volume, centre: npt.NDArray[np.float64]) -> list[Hypothesis]:
+    def _peaks(self, scores: Floats32, centre: Floats) -> list[Hypothesis]:
         stations, sectors = scores.shape
         flat = np.ascontiguousarray(scores.T).ravel()
         shortlist = argsmallest(flat, _SHORTLIST)
@@ -141,34 +137,32 @@ class Consensus:
             free &= ~(near & (turn < self.config.distinct_yaw))
         return found
 
-    def _hypothesis(
-        self, station: int, shift: int, score: float, centre: npt.NDArray[np.float64]
-    ) -> Hypothesis:
+    def _hypothesis(self, station: int, shift: int, score: float, centre: Floats) -> Hypothesis:
         """Eq. 12, mended: the turn is about the keyframe's centre, not about the odometry frame's origin."""
         turn = rot_z(float(yaw_of_shift(shift, self._ballots[-1].sectors)))
         T = pose_from(turn, self.stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
         return Hypothesis(T, station, shift, score)
 
 
-def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> npt.NDArray[np.float64]:
+def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> Floats:
     """Eq. 9: heading of the odometry frame's x axis in the map for shift n (any shape), radians."""
     return np.asarray(shift, dtype=np.float64) * (-2.0 * np.pi / sectors)
 
 
-def robust_zscore(volume: Volume) -> Volume:
+def robust_zscore(volume: Floats32) -> Floats32:
     """How many robust standard deviations each distance lies from the median of all, negative is better."""
     sample = _sample(volume)
     if not len(sample):
         return np.zeros_like(volume)
     median = np.median(sample)
     spread = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
-    votes: Volume = (volume - median) * np.float32(1.0 / spread)
+    votes: Floats32 = (volume - median) * np.float32(1.0 / spread)
     if median > 1.0:  # then what nothing is known of would count in favour
         np.maximum(votes, np.float32(0.0), out=votes, where=volume == 1.0)
     return votes
 
 
-def _sample(volume: Volume) -> npt.NDArray[np.float32]:
+def _sample(volume: Floats32) -> Floats32:
     """Distances (K,) at every shift of stations spread over the map, those left out that were not scored."""
     every = max(1, volume.size // _SAMPLE)
     for rows in (volume[::every], volume):  # the paper's mode leaves most stations at 1, unscored
@@ -178,7 +172,7 @@ def _sample(volume: Volume) -> npt.NDArray[np.float32]:
     return np.asarray(scored.ravel())
 
 
-def argsmallest(values: npt.NDArray[np.float32], count: int) -> npt.NDArray[np.int64]:
+def argsmallest(values: Floats32, count: int) -> Ints:
     """Return the indices of the ``count`` smallest of (N,) values, smallest first; equal ones by index."""
     if count >= len(values):
         return np.asarray(np.argsort(values, kind="stable"))
@@ -194,8 +188,6 @@ def argsmallest(values: npt.NDArray[np.float32], count: int) -> npt.NDArray[np.i
     found = found[near <= bound]
     return np.asarray(found[np.argsort(values[found], kind="stable")[:count]])
 
-
-Values = npt.NDArray[np.float32]
 
 _MARGIN = 100  # cells around the stations that are looked up; steps of more find nothing there
 
@@ -216,7 +208,7 @@ class StationGrid:
         laid_out: whether the first layout is used.
     """
 
-    def __init__(self, stations: npt.NDArray[np.float32], block: float) -> None:
+    def __init__(self, stations: Floats32, block: float) -> None:
         self.stations = stations
         self.block = block
         cells = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
@@ -230,7 +222,7 @@ class StationGrid:
         self._flat = (cells[:, 0] + _MARGIN) * self._width + cells[:, 1] + _MARGIN
 
     @cached_property
-    def _grid(self) -> npt.NDArray[np.intp]:
+    def _grid(self) -> Indices:
         """Station (L, cells) of each level and cell with its margin, lowest level first, -1 for none."""
         order = np.lexsort((self.stations[:, 2], self._flat))
         unique, first, count = np.unique(self._flat[order], return_index=True, return_counts=True)
@@ -241,7 +233,7 @@ class StationGrid:
             grid[level, unique[has]] = order[first[has] + level]
         return grid
 
-    def moved(self, step: npt.NDArray[np.int64], rise: float) -> npt.NDArray[np.intp]:
+    def moved(self, step: Ints, rise: float) -> Indices:
         """Index (M,) of the station that lies ``step`` (2,) cells from each station, -1 where there is none.
 
         ``rise`` (metres) is the height gained on the way; it picks the storey.
@@ -258,7 +250,7 @@ class StationGrid:
         columns = np.arange(len(self.stations))
         return np.where(gap[best, columns] < _LEVEL_GAP, levels[best, columns], -1)
 
-    def spread(self, values: Values) -> Values:
+    def spread(self, values: Floats32) -> Floats32:
         """Lay out values (S, M) of the stations for :meth:`add`; a cell without a station has zero."""
         if not self.laid_out:
             return np.concatenate([values, np.zeros((len(values), 1), dtype=np.float32)], axis=1)
@@ -266,13 +258,13 @@ class StationGrid:
         cells[:, self._cell] = values
         return cells.reshape(len(values), *self._shape)
 
-    def gathered(self, spread: Values) -> Values:
+    def gathered(self, spread: Floats32) -> Floats32:
         """Values (S, M) of the stations out of their layout; undoes :meth:`spread`."""
         if not self.laid_out:
             return spread[:, :-1]
         return np.asarray(spread.reshape(len(spread), -1)[:, self._cell])
 
-    def add(self, total: Values, values: Values, step: npt.NDArray[np.int64], rise: float) -> None:
+    def add(self, total: Floats32, values: Floats32, step: Ints, rise: float) -> None:
         """Add to each station's ``total`` what ``values`` has ``step`` cells farther on; both one row of a layout."""
         if not self.laid_out:
             total[:-1] += values.take(self.moved(step, rise))  # -1, no station there, finds the zero

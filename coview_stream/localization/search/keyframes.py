@@ -1,13 +1,4 @@
-"""Keyframes and the virtual local scans made of them: a ring buffer of fixed size (paper, section 3.3)."""
-
-# FOLDED coview_stream/localization/search/keyframes.py: """Whether frames go on fitting together where odometry puts them, while no map can tell yet.
-#
-# Keyframes are worth something together only if odometry is right between them. Where it is not (the robot was lifted and
-# put down, its odometry jumped) the old ones spoil the search for as long as they are in the buffer. So each frame is
-# compared with one that is two metres old at most: the share of its points in a cubic metre that the other has points in.
-# In simulated towns and forests that was 0.31 to 0.9 where odometry is right, 0.30 at most two metres off, 0.19 four
-# metres off (seen once while this was made, on worlds 5101, 5103 and 5108; no command prints it).
-# """
+"""Keyframes, the virtual local scans made of them, and a check of the odometry between them (paper, section 3.3)."""
 
 from __future__ import annotations
 
@@ -15,13 +6,24 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose
 
-_PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points
+_PENDING_POINTS = (
+    200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
+)
+
+# OdometryCheck
+_VOXEL = 1.0  # metres; set by hand
+_STRIDE = 2.0  # metres between the frames that others are compared with; set by hand
+_POINTS = 2000  # of a frame, compared; set by hand
+_MIN_POINTS = 300  # of a frame that is judged; set by hand
+_MIN_SHARE = 0.22  # set by hand, from the shares in the class docstring, which no command prints
+_PATIENCE = 3  # frames in a row: one may be dust; set by hand
+_BITS = 21  # of a coordinate in a voxel's key
 
 
 @dataclass(frozen=True)
@@ -39,13 +41,13 @@ class Keyframe:
     points: Points
 
     @property
-    def position(self) -> npt.NDArray[np.float64]:
+    def position(self) -> Floats:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
 
 
 class KeyframeBuffer:
-    """Turns frames into keyframes and keeps the newest ``capacity`` of them.
+    """Ring buffer of the newest ``capacity`` keyframes, made from the frames that are added.
 
     All coordinates are in the odometry frame, which must be gravity aligned and near its own origin.
 
@@ -63,14 +65,14 @@ class KeyframeBuffer:
         self._pending: list[Points] = []
         self._filter = kernels.VoxelFilter(config.voxel, config.range_min)
 
-    def thin(self, cloud: Points, T_odom_body: Pose) -> Points:
-        """Thin one frame (N, 3) in the body frame to :attr:`newest`, for who needs no keyframes."""
+    def voxelize(self, cloud: Points, T_odom_body: Pose) -> Points:
+        """Reduce one frame (N, 3), body frame, to :attr:`newest`, without adding it to a keyframe."""
         self.newest = self._filter(cloud, T_odom_body)[0].copy()  # which the next frame overwrites
         return self.newest
 
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
-        """Take in one frame (N, 3) in the body frame; return the keyframe it completes, if it does."""
-        self.thin(cloud, T_odom_body)
+        """Add one frame (N, 3), body frame; return the keyframe that it completes, if any."""
+        self.voxelize(cloud, T_odom_body)
         self._pending.append(self.newest)
         if sum(map(len, self._pending)) > _PENDING_POINTS:
             self._pending = [self._unique(np.concatenate(self._pending))]
@@ -89,14 +91,14 @@ class KeyframeBuffer:
         parts = [k.points for k in list(self.keyframes)[-count:]] + self._pending
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
-    def virtual_scan(self, centre: npt.NDArray[np.float64], radius: float, voxel: float) -> Points:
-        """Virtual local scan: everything so far within ``radius`` metres of ``centre``, one point per voxel."""
+    def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
+        """Virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel."""
         points = np.concatenate([k.points for k in self.keyframes])
         near = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) < radius
         return self._unique(points[near], voxel)
 
     def clear(self) -> None:
-        """Forget all keyframes: their odometry no longer fits the next frame's."""
+        """Forget all keyframes, for odometry does not connect them with the next frame."""
         self.keyframes.clear()
         self._pending = []
 
@@ -104,64 +106,57 @@ class KeyframeBuffer:
         return kernels.transform_unique(points, np.eye(4), voxel or self.config.voxel)[0]
 
 
-_VOXEL = 1.0  # metres
-
-_STRIDE = 2.0  # metres between the frames that others are compared with
-
-_POINTS = 2000  # of a frame, compared
-
-_LEAST_POINTS = 300
-
-_LEAST_SHARE = 0.22
-
-_PATIENCE = 3  # frames in a row: one may be dust
-
-_BITS = 21  # of a coordinate in a voxel's key
-
-
 class OdometryCheck:
-    """Remembers one frame and compares the next ones with it."""
+    """Check that consecutive frames overlap where odometry puts them, while there is no map pose to check against.
+
+    Keyframes may be combined only if odometry is right between them. Where it is not (the robot was lifted and put
+    down, its odometry jumped) the old ones spoil the search for as long as they are in the buffer. So each frame is
+    compared with one that is two metres old at most: the share of its points in a cubic metre in which the other has
+    points. In simulated towns and forests (worlds 5101, 5103 and 5108) that share was 0.31 to 0.9 where odometry is
+    right, at most 0.30 two metres off and at most 0.19 four metres off.
+    """
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew at the next frame."""
-        self._voxels: npt.NDArray[np.int64] | None = None
+        """Forget the reference frame: the next frame becomes it."""
+        self._voxels: Ints | None = None
         self._position = np.zeros(3)
-        self._strange = 0
+        self._mismatches = 0
 
-    def broken(self, points: Points, position: npt.NDArray[np.float64]) -> bool:
-        """Take in a frame; whether it is the third in a row that does not fit the ones before.
+    def contradicts(self, points: Points, position: Floats) -> bool:
+        """Compare a frame; True if it is the third in a row that does not overlap the reference frame.
 
         Args:
             points: (N, 3) of the frame, one per voxel, odometry frame, metres.
             position: (3,) the sensor's, same frame.
         """
-        if len(points) < _LEAST_POINTS:
+        if len(points) < _MIN_POINTS:
             return False
         if self._voxels is None:
-            self._remember(points, position)
+            self._set_reference(points, position)
             return False
-        some = _voxel_keys(points[:: max(1, len(points) // _POINTS)])
-        near = np.minimum(np.searchsorted(self._voxels, some), len(self._voxels) - 1)
-        if float((self._voxels[near] == some).mean()) < _LEAST_SHARE:
-            self._strange += 1
-            if self._strange < _PATIENCE:
+        keys = _voxel_keys(points[:: max(1, len(points) // _POINTS)])
+        near = np.minimum(np.searchsorted(self._voxels, keys), len(self._voxels) - 1)
+        if float((self._voxels[near] == keys).mean()) < _MIN_SHARE:
+            self._mismatches += 1
+            if self._mismatches < _PATIENCE:
                 return False
             self.clear()
-            self._remember(points, position)
+            self._set_reference(points, position)
             return True
-        self._strange = 0
+        self._mismatches = 0
         if float(np.linalg.norm(position - self._position)) > _STRIDE:
-            self._remember(points, position)
+            self._set_reference(points, position)
         return False
 
-    def _remember(self, points: Points, position: npt.NDArray[np.float64]) -> None:
+    def _set_reference(self, points: Points, position: Floats) -> None:
         self._voxels = np.unique(_voxel_keys(points))
         self._position = position.copy()
 
 
-def _voxel_keys(points: Points) -> npt.NDArray[np.int64]:
+def _voxel_keys(points: Points) -> Ints:
+    """One integer (N,) for the cubic metre that each point lies in."""
     cell = np.floor(points / np.float32(_VOXEL)).astype(np.int64) + (1 << (_BITS - 1))
     return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])

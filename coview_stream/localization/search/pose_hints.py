@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis
 
@@ -36,11 +36,11 @@ class PoseHints:
         """Suggest that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
         self._awaited = T_map_body
 
-    def frames_were(self, T_map_odom: Pose, anchor: npt.NDArray[np.float64]) -> None:
+    def frames_were(self, T_map_odom: Pose, anchor: Floats) -> None:
         """Suggest, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
         self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
 
-    def about(self, anchor: npt.NDArray[np.float64], T_odom_body: Pose) -> tuple[Pose, ...]:
+    def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""
         if self._awaited is not None:
             T_map_body, self._awaited = self._awaited, None
@@ -79,6 +79,6 @@ class HintSchedule:
             self._wait = _PAUSE
 
 
-def robot_position(T_map_odom: Pose, T_odom_body: Pose) -> npt.NDArray[np.float64]:
+def robot_position(T_map_odom: Pose, T_odom_body: Pose) -> Floats:
     """Return where (1, 2) in the map a suggestion puts the robot."""
     return transform(T_map_odom, T_odom_body[None, :3, 3])[:, :2]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
 from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import register
@@ -91,7 +91,7 @@ class Refinement:
         found = register(
             moving, start, target, self.config.registration, scales, upright, query.position, iterations
         )
-        if found is None or tilt_of(found.T_map_source) > self.config.acceptance.most_tilt:
+        if found is None or tilt_of(found.T_map_source) > self.config.acceptance.max_tilt:
             return None
         T = found.T_map_source
         surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
@@ -99,6 +99,6 @@ class Refinement:
         return Candidate(hypothesis, found, evidence)
 
 
-def gravity_information(sigma: float) -> npt.NDArray[np.float64]:
+def gravity_information(sigma: float) -> Floats:
     """Information (6, 6) over (rx, ry, rz, x, y, z) of "both frames are level to ``sigma`` radians"."""
     return np.diag([sigma**-2, sigma**-2, 0.0, 0.0, 0.0, 0.0])

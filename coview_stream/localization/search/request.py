@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config import DescriptorConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle
 from coview_stream.localization.registration.verification import RangeImage
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
@@ -58,7 +58,7 @@ class SearchRequest:
     surroundings: Points = field(default_factory=_nothing)
 
     @property
-    def position(self) -> npt.NDArray[np.float64]:
+    def position(self) -> Floats:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
 

@@ -11,11 +11,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import Descriptor, ring_key
-
-Volume = npt.NDArray[np.float32]
-"""(M, S) float32: one number for each station and shift."""
-
-Spectra = npt.NDArray[np.complex64]
+from coview_stream.geometry.arrays import Complexes, Floats32
 
 _CACHE_BYTES = 400_000_000  # spectra of all stations are kept if they fit, else made anew block by block
 _BLOCK = 8192
@@ -44,11 +40,11 @@ class Retrieval:
     def __init__(self, stations: Stations, config: RetrievalConfig) -> None:
         self.stations = stations
         self.config = config
-        self._spectra: dict[Channel, Spectra] = {}
-        self._keys: dict[Channel, npt.NDArray[np.float32]] = {}
+        self._spectra: dict[Channel, Complexes] = {}
+        self._keys: dict[Channel, Floats32] = {}
         self._indices: dict[Channel, kernels.MatchIndex] = {}
 
-    def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, Volume]:
+    def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, Floats32]:
         """Eqs 7-9 for each channel: (M, S) distances in [0, 2]; shift n means yaw -2 pi n / S.
 
         In ``ring_key`` mode stations that are not among the candidates have distance 1 at every shift.
@@ -74,7 +70,7 @@ class Retrieval:
         size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
         return size <= _CACHE_BYTES
 
-    def _channel(self, name: Channel, query: Descriptor) -> Volume:
+    def _channel(self, name: Channel, query: Descriptor) -> Floats32:
         if self.config.mode == "ring_key":
             return self._by_ring_key(name, query)
         sectors = query.shape[-1]
@@ -92,7 +88,7 @@ class Retrieval:
             self._indices[name] = kernels.MatchIndex(self.stations.descriptors(name))
         return self._indices[name].top_k(query, k, spectra=self._spectra.get(name))
 
-    def _blocks(self, name: Channel) -> Iterator[Spectra]:
+    def _blocks(self, name: Channel) -> Iterator[Complexes]:
         descriptors = self.stations.descriptors(name)
         if not self._kept():
             for start in range(0, len(descriptors), _BLOCK):
@@ -102,7 +98,7 @@ class Retrieval:
             self._spectra[name] = kernels.column_spectra(descriptors.astype(np.float32))
         yield self._spectra[name]
 
-    def _by_ring_key(self, name: Channel, query: Descriptor) -> Volume:
+    def _by_ring_key(self, name: Channel, query: Descriptor) -> Floats32:
         if name not in self._keys:
             self._keys[name] = ring_key(self.stations.descriptors(name).astype(np.float32))
         gap = np.linalg.norm(self._keys[name] - ring_key(query), axis=1)

@@ -11,9 +11,9 @@ only asks for a registration now.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 
@@ -41,7 +41,7 @@ class DisplacementCheck:
         """Forget what was usual."""
         self.usual = None
 
-    def learn(self, points: Points, position: npt.NDArray[np.float64], T: Pose, target: LocalMap) -> None:
+    def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:
         """Take note of a frame whose registration was believed; not of others: a slow error would become usual.
 
         Args:
@@ -54,7 +54,7 @@ class DisplacementCheck:
         if share is not None:
             self.usual = share if self.usual is None else self.usual + _HABIT * (share - self.usual)
 
-    def alarming(self, points: Points, position: npt.NDArray[np.float64], T: Pose, target: LocalMap) -> bool:
+    def alarming(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> bool:
         """Whether a frame lies on the map much less than usual; not if there is too little to tell by.
 
         Arguments are those of :meth:`learn`, ``T`` as predicted.
@@ -67,7 +67,7 @@ class DisplacementCheck:
 
 def share_on_map(
     points: Points,
-    position: npt.NDArray[np.float64],
+    position: Floats,
     T: Pose,
     target: LocalMap,
 ) -> float | None:

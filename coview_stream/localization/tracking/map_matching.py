@@ -10,7 +10,7 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
-from coview_stream.geometry.se3 import Matrix6
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, tilt_of, transform
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
@@ -48,7 +48,7 @@ class MapMatch:
 
     judgement: MatchVerdict
     T_map_body: Pose
-    covariance: Matrix6
+    covariance: Floats
     innovation: float
 
 
@@ -98,7 +98,7 @@ class MapMatcher:
             if cause is RejectionReason.VERIFIED:
                 return _unheld(belief, "too few points have a partner in the map", evidence)
             return MapMatch(MatchVerdict(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
-        if tilt_of(T) > acceptance.most_tilt:
+        if tilt_of(T) > acceptance.max_tilt:
             cause, reason = (
                 RejectionReason.TILT,
                 f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity",
@@ -120,7 +120,7 @@ def _unheld(belief: Estimate, reason: str, evidence: Evidence | None = None) -> 
     return MapMatch(judgement, belief.T_map_body, belief.covariance, 0.0)
 
 
-def _inverted(covariance: Matrix6) -> Matrix6 | None:
+def _inverted(covariance: Floats) -> Floats | None:
     try:
         inverted = np.asarray(np.linalg.inv(covariance))
     except np.linalg.LinAlgError:

@@ -8,10 +8,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config import TrackingConfig
-from coview_stream.geometry.se3 import Matrix6, boxminus
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.se3 import boxminus
 from coview_stream.geometry.transforms import Points, Pose, inverse, yaw_of
 from coview_stream.localization.tracking.odometry_noise import Drift, DriftEstimator, worth_learning
 
@@ -32,7 +32,7 @@ class _Registered:
     """A registration that was believed: the pose (4, 4) as the map alone has it, its variances (6,), and when."""
 
     T_map_body: Pose
-    variances: npt.NDArray[np.float64]
+    variances: Floats
     mark: _Mark
 
 
@@ -81,7 +81,7 @@ class OdometryTracker:
         """How fast odometry seems to drift."""
         return self._rates.drift
 
-    def learn(self, T_map_body: Pose, covariance: Matrix6) -> None:
+    def learn(self, T_map_body: Pose, covariance: Floats) -> None:
         """Take note of where a registration at the newest keyframe was believed to be, by the map alone."""
         before, now = self._registered, self._keyframe
         variances = np.diag(covariance)

@@ -13,7 +13,7 @@ from math import exp
 import numpy as np
 
 from coview_stream.config import TrackingConfig
-from coview_stream.geometry.se3 import Matrix6, Vector6
+from coview_stream.geometry.arrays import Floats
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
@@ -50,18 +50,18 @@ class Drift:
             config.position_drift, config.height_drift, config.tilt_drift, config.yaw_drift, config.turn_drift
         )
 
-    def variances(self, driven: float, turned: float) -> Vector6:
+    def variances(self, driven: float, turned: float) -> Floats:
         """Variances (6,) over (rx, ry, rz, x, y, z) that gather in metres driven and radians turned."""
         rates = np.array([self.tilt, self.tilt, self.yaw, self.position, self.position, self.height])
-        gathered: Vector6 = rates**2 * max(driven, _LEAST_DRIVEN)
+        gathered: Floats = rates**2 * max(driven, _LEAST_DRIVEN)
         gathered[2] += (self.turn * turned) ** 2
         return gathered
 
-    def covariance(self, driven: float, turned: float) -> Matrix6:
+    def covariance(self, driven: float, turned: float) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) of the body's motion; positive definite even standing still."""
         return np.diag(self.variances(driven, turned))
 
-    def reported(self, driven: float, turned: float) -> Matrix6:
+    def reported(self, driven: float, turned: float) -> Floats:
         """Return the same covariance over (x, y, z, roll, pitch, yaw)."""
         return swap_rotation_translation(self.covariance(driven, turned))
 
@@ -72,7 +72,7 @@ class DriftEstimator:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         self._nominal = Drift.of(config)
-        self._metres = np.full(len(_GROUPS), config.drift_trust)
+        self._metres = np.full(len(_GROUPS), config.drift_prior)
         self._sums = self._metres.copy()
 
     @property
@@ -85,7 +85,7 @@ class DriftEstimator:
             position * known.position, height * known.height, tilt * known.tilt, yaw * known.yaw, yaw * known.turn
         )  # fmt: skip
 
-    def add(self, gap: Vector6, noise: Vector6, driven: float, turned: float) -> None:
+    def add(self, gap: Floats, noise: Floats, driven: float, turned: float) -> None:
         """Take note of the motion between two registrations; see :func:`worth_learning`.
 
         Args:

@@ -24,12 +24,11 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config import GraphConfig
 from coview_stream.errors import require_library
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.se3 import (
-    Matrix6,
     adjoint,
     along_body,
     along_map,
@@ -48,7 +47,7 @@ class Estimate(NamedTuple):
 
     T_map_body: Pose
     """(4, 4) float64."""
-    covariance: Matrix6
+    covariance: Floats
     """(6, 6) over (rx, ry, rz, x, y, z): a turn about the body, then a shift, along the map's axes."""
 
 
@@ -56,7 +55,7 @@ class _Gaussian(NamedTuple):
     """A pose and its covariance (6, 6) in the tangent of its own body."""
 
     T: Pose
-    covariance: Matrix6
+    covariance: Floats
 
 
 @dataclass
@@ -110,7 +109,7 @@ class PoseGraph:
         self._factors: Any = None  # not handed over to iSAM2 yet, nor are the values
         self._values: Any = None
 
-    def start(self, T_map_body: Pose, covariance: Matrix6) -> None:
+    def start(self, T_map_body: Pose, covariance: Floats) -> None:
         """Begin a new chain: all that is known is that the body is here.
 
         After a (re-)localization, too: nothing of an older chain is carried over.
@@ -125,7 +124,7 @@ class PoseGraph:
         self._keyframes.append(_Keyframe(T))
         self._build(prior)
 
-    def move(self, T_between: Pose, covariance: Matrix6) -> None:
+    def move(self, T_between: Pose, covariance: Floats) -> None:
         """Add a keyframe: odometry has moved on.
 
         Args:
@@ -147,7 +146,7 @@ class PoseGraph:
         if len(self) > self.config.restart:
             self._restart()
 
-    def correct(self, T_map_body: Pose, covariance: Matrix6) -> None:
+    def correct(self, T_map_body: Pose, covariance: Floats) -> None:
         """Tell where a registration found the newest keyframe, under Huber's kernel.
 
         Args:
@@ -168,7 +167,7 @@ class PoseGraph:
         belief = self._belief()
         return Estimate(belief.T.copy(), along_map(belief.covariance, belief.T))
 
-    def innovation(self, T_map_body: Pose, covariance: Matrix6) -> float:
+    def innovation(self, T_map_body: Pose, covariance: Floats) -> float:
         """Squared Mahalanobis distance of a measurement from the present estimate; ask before ``correct``.
 
         If both covariances are right it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty,
@@ -181,7 +180,7 @@ class PoseGraph:
         T = checked_pose("T_map_body", T_map_body)
         spread = checked_covariance("covariance", covariance)
         expected = self.estimate
-        gap: npt.NDArray[np.float64] = boxminus(T, expected.T_map_body)
+        gap: Floats = boxminus(T, expected.T_map_body)
         return float(gap @ np.linalg.solve(expected.covariance + spread, gap))
 
     def _newest(self) -> _Keyframe:

@@ -9,11 +9,10 @@ the sum over clusters of the outer products of their gradients.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry.se3 import Matrix6
+from coview_stream.geometry.arrays import Bools, Floats, Ints, Reals
 from coview_stream.geometry.transforms import Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
@@ -28,15 +27,13 @@ class SharedErrorModel:
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
-        self._clustered: Matrix6 | None = None
+        self._clustered: Floats | None = None
 
     def clear(self) -> None:
         """Forget what was seen: the place is another."""
         self._clustered = None
 
-    def learn(
-        self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: npt.NDArray[np.float64]
-    ) -> None:
+    def learn(self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats) -> None:
         """Take note of a registration; arguments are those of :func:`clustered_covariance`."""
         now = clustered_covariance(source, T_map_source, target, pivot, self._config)
         if now is not None:
@@ -44,7 +41,7 @@ class SharedErrorModel:
             self._clustered = now if before is None else before + _HABIT * (now - before)
 
     @property
-    def covariance(self) -> Matrix6:
+    def covariance(self) -> Floats:
         """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the sigma of late, and what the pairs do not show.
 
         That is how odometry's roll and pitch tremble from frame to frame, above all.
@@ -65,9 +62,9 @@ def clustered_covariance(
     source: RegistrationCloud,
     T_map_source: Pose,
     target: LocalMap,
-    pivot: npt.NDArray[np.float64],
+    pivot: Floats,
     config: RegistrationConfig,
-) -> Matrix6 | None:
+) -> Floats | None:
     """Covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, along the map's axes; None if too little was seen.
 
     Args:
@@ -100,7 +97,7 @@ def clustered_covariance(
     return np.asarray(back @ (pulls.T @ pulls) @ back * count / (count - 6))
 
 
-def _evened(found: npt.NDArray[np.bool_], above: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+def _evened(found: Bools, above: Bools) -> Floats:
     """Weights (N,) of points: 0 for those without a partner, and equal sums for both kinds."""
     weights = np.zeros(len(found))
     for kind in (above, ~above):
@@ -109,7 +106,7 @@ def _evened(found: npt.NDArray[np.bool_], above: npt.NDArray[np.bool_]) -> npt.N
     return weights
 
 
-def _clusters(points: npt.NDArray[np.floating], above: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+def _clusters(points: Reals, above: Bools) -> Ints:
     """Return the number (M,) of the cluster of each point: its cell of the ground plan, structure apart from ground."""
     cell = np.floor(points[:, :2] / _CELL).astype(np.int64)
     key = (cell[:, 0] * 100_003 + cell[:, 1]) * 2 + above

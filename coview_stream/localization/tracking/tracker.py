@@ -6,7 +6,8 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.se3 import Matrix6, boxminus
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.se3 import boxminus
 from coview_stream.geometry.transforms import Points, Pose, inverse, transform
 from coview_stream.localization.registration.covariance import (
     propagate,
@@ -90,10 +91,10 @@ class Tracker:
         settings = self.config.tracking
         if driven >= patience * settings.distance or turned >= patience * settings.turn:
             return True
-        if driven < patience * settings.least_distance:
+        if driven < patience * settings.min_distance:
             return False
         grown = self.drift.variances(driven, turned)
-        yaw, position = patience * settings.unsure_yaw, patience * settings.unsure_position
+        yaw, position = patience * settings.max_yaw_sigma, patience * settings.max_position_sigma
         return bool(grown[2] > yaw**2 or grown[3] > position**2)
 
     def alarmed(self, T_odom_body: Pose) -> bool:
@@ -145,7 +146,7 @@ class Tracker:
         scan = ScanInput(source, cloud, T_odom_body)
         belief = graph.estimate
         tried = self._attempt(scan, belief, target, self.config.registration.track)
-        limit = self.config.acceptance.keep_innovation
+        limit = self.config.acceptance.max_innovation
         if alone or not tried.judgement.verified or tried.innovation > limit:
             doubted = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             again = self._attempt(scan, doubted, target, self.config.registration.search[1:])
@@ -161,7 +162,7 @@ class Tracker:
         self._glance.learn(newest, T_odom_body[:3, 3], self.T_map_odom, target)
         return tried.judgement
 
-    def predicted_covariance(self) -> Matrix6:
+    def predicted_covariance(self) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
         last = self._odometer.pose
         if not len(self._graph) or last is None:
@@ -171,7 +172,7 @@ class Tracker:
         carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
         return np.asarray(carried + self.drift.covariance(*self._odometer.since_keyframe()))
 
-    def reported_covariance(self) -> Matrix6:
+    def reported_covariance(self) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
         return swap_rotation_translation(self.predicted_covariance() + self._shared.covariance)
 
@@ -185,7 +186,7 @@ class Tracker:
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
 
-    def _restart(self, T_map_body: Pose, covariance: Matrix6, T_odom_body: Pose) -> None:
+    def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
         self._graph.start(T_map_body, covariance)
         self._odometer.unlearn()

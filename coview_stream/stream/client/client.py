@@ -15,10 +15,10 @@ from time import monotonic
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import ConfigError, MessageError, TransportError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import PoseMessage, Sample
@@ -125,9 +125,7 @@ class RobotClient:
         """How many poses and statuses could not be decoded."""
         return self._malformed
 
-    def send_cloud(
-        self, points: npt.ArrayLike, stamp: float, times: npt.NDArray[np.float64] | None = None
-    ) -> None:
+    def send_cloud(self, points: npt.ArrayLike, stamp: float, times: Floats | None = None) -> None:
         """Publish one lidar frame; it is dropped if the link is busy with the one before, or nobody listens.
 
         Args:

@@ -7,17 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import slerp
 from coview_stream.geometry.transforms import Pose, pose_from
 from coview_stream.recordings.run import Run
 
 _LONE_PERIOD = 0.1  # seconds between repetitions of a run of one frame, which has no rate of its own
-
-
-Times = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -86,11 +83,11 @@ def beats(run: Run, config: ReplayConfig) -> Iterator[Beat]:
         lap += 1
 
 
-def frame_times(run: Run, config: ReplayConfig) -> Times:
+def frame_times(run: Run, config: ReplayConfig) -> Floats:
     """(N,) seconds after the start at which each frame is due."""
     if config.rate is not None:
         return np.arange(len(run)) / config.rate
-    times: Times = (run.stamps - run.stamps[0]) / config.speed
+    times: Floats = (run.stamps - run.stamps[0]) / config.speed
     return times
 
 
@@ -102,11 +99,11 @@ def odometry_spacing(run: Run, config: ReplayConfig) -> float:
     return max(real, _period(run.stamps, 0.0)) / parts
 
 
-def _period(times: Times, lone: float) -> float:
+def _period(times: Floats, lone: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else lone
 
 
-def _lap(run: Run, dues: Times, odometry_rate: float | None) -> Iterator[Beat]:
+def _lap(run: Run, dues: Floats, odometry_rate: float | None) -> Iterator[Beat]:
     for k in range(len(run)):
         yield Beat(float(dues[k]), float(run.stamps[k]), run.poses[k], k)
         # nothing after the last frame: the way back to the start was never driven
@@ -114,7 +111,7 @@ def _lap(run: Run, dues: Times, odometry_rate: float | None) -> Iterator[Beat]:
             yield from _between(run, dues, k, odometry_rate)
 
 
-def _between(run: Run, dues: Times, k: int, rate: float) -> Iterator[Beat]:
+def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[Beat]:
     count = round((dues[k + 1] - dues[k]) * rate)
     if count < 2:
         return

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.errors import CloudError, ConfigError, InputError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, is_pose
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage
 from coview_stream.stream.transport.key_expressions import check_expression
@@ -62,9 +63,7 @@ class Sender:
         self._cloud = _publisher(transport, self.cloud_key, "bulk", keys.rmw)
         self._odometry = _publisher(transport, self.odometry_key, "data", keys.rmw)
 
-    def cloud(
-        self, points: npt.ArrayLike, stamp_ns: int, times: npt.NDArray[np.float64] | None = None
-    ) -> Encoded:
+    def cloud(self, points: npt.ArrayLike, stamp_ns: int, times: Floats | None = None) -> Encoded:
         """Encode (N, 3) body-frame points, metres; further columns are not sent. ``times`` as in CloudMessage.
 
         Raises:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import numpy as np
-import numpy.typing as npt
-
 from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.acceptance import SearchResult
@@ -39,7 +37,7 @@ class FrameJob:
     stamp_ns: int
     points: Points
     T_odom_body: Pose
-    times: npt.NDArray[np.float64] | None = None
+    times: Floats | None = None
     segment: Segment | None = None
     suspect: bool = False
     verdict: SearchResult | None = None
@@ -82,7 +80,7 @@ class OdometryJob:
     generation: int
     stamp_ns: int
     points: Points
-    times: npt.NDArray[np.float64] | None
+    times: Floats | None
     config: LidarOdometryConfig
 
 

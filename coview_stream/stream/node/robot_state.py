@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence, State
@@ -189,7 +187,7 @@ class OdomCorrection:
 
     T_map_odom: Pose
     T_map_body: Pose
-    covariance: npt.NDArray[np.float64]
+    covariance: Floats
     confidence: float
     verified_ns: int
     travelled: float

@@ -13,15 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config.search import LearnedMatchConfig
-
-F32 = npt.NDArray[np.float32]
-
-Mask = npt.NDArray[np.bool_]
-
-Indices = npt.NDArray[np.int64]
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 
 _OUTER, _INNER, _TRIES = 40, 25, 12
 
@@ -36,7 +30,7 @@ _LONGEST = 1e6  # step of a climb: beyond, only the slope's direction matters
 class Clique:
     """``members`` in ascending order; ``exact``: it is proved that there is no larger one."""
 
-    members: Indices
+    members: Ints
     exact: bool
 
     def __len__(self) -> int:
@@ -44,12 +38,12 @@ class Clique:
         return len(self.members)
 
 
-def maximum_clique(weights: F32, nodes: int) -> Clique:
+def maximum_clique(weights: Floats32, nodes: int) -> Clique:
     """Relax, then search: see :func:`relaxed` and :func:`largest`."""
     return largest(weights > 0, relaxed(weights), nodes)
 
 
-def relaxed(weights: F32) -> Indices:
+def relaxed(weights: Floats32) -> Ints:
     """Find a heavy clique of a weighted graph (N, N), symmetric, 0 for no edge; usually the largest or nearly.
 
     Maximises ``u^T (W + I - d B) u`` over unit vectors u >= 0 by projected gradients, where B marks the pairs
@@ -80,7 +74,7 @@ def relaxed(weights: F32) -> Indices:
     return _agreeing(weights > 0, np.argsort(-u, kind="stable"))
 
 
-def _climb(matrix: F32, u: F32) -> F32:
+def _climb(matrix: Floats32, u: Floats32) -> Floats32:
     """Projected gradient ascent of ``u^T matrix u`` over unit vectors u >= 0 (N,)."""
     slope = matrix @ u
     value, step = float(u @ slope), 1.0
@@ -104,7 +98,7 @@ def _climb(matrix: F32, u: F32) -> F32:
     return u
 
 
-def _agreeing(adjacent: Mask, order: Indices) -> Indices:
+def _agreeing(adjacent: Bools, order: Ints) -> Ints:
     """Take nodes in ``order`` (N,), each that is adjacent to all before it: a clique that nothing can be added to."""
     free = np.ones(len(adjacent), dtype=bool)
     members = []
@@ -116,7 +110,7 @@ def _agreeing(adjacent: Mask, order: Indices) -> Indices:
     return np.array(sorted(members), dtype=np.int64)
 
 
-def largest(adjacent: Mask, start: Indices, nodes: int) -> Clique:
+def largest(adjacent: Bools, start: Ints, nodes: int) -> Clique:
     """Search for the maximum clique of a graph.
 
     Args:
@@ -143,7 +137,7 @@ def largest(adjacent: Mask, start: Indices, nodes: int) -> Clique:
     return Clique(np.sort(members), exact)
 
 
-def _core(edges: Mask, size: int) -> Indices:
+def _core(edges: Bools, size: int) -> Ints:
     """Nodes with at least ``size`` neighbours among themselves: a clique of more than ``size`` is made of these."""
     kept = np.arange(len(edges))
     while len(kept):
@@ -205,10 +199,7 @@ def _coloured(candidates: int, neighbours: list[int], spare: int) -> tuple[list[
     return order, colours
 
 
-F64 = npt.NDArray[np.float64]
-
-
-def consistency_graph(query: F64, known: F64, config: LearnedMatchConfig) -> F32:
+def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) -> Floats32:
     """Weigh how well every two pairs of points agree: a turn about the vertical and a shift keep distances.
 
     Args:
@@ -227,7 +218,7 @@ def consistency_graph(query: F64, known: F64, config: LearnedMatchConfig) -> F32
     if query.shape != known.shape or query.shape[1:] != (2,):
         raise ValueError(f"pairs of points {query.shape} and {known.shape}: both have to be (N, 2)")
     here, there = _distances(query), _distances(known)
-    apart = np.minimum(here, there) >= config.least_apart
+    apart = np.minimum(here, there) >= config.min_separation
     here -= there
     fits = apart & (np.abs(here) < config.tolerance)
     np.fill_diagonal(fits, False)
@@ -236,7 +227,7 @@ def consistency_graph(query: F64, known: F64, config: LearnedMatchConfig) -> F32
     return np.where(fits, np.exp(here), np.float32(0.0))
 
 
-def _distances(xy: F64) -> F32:
+def _distances(xy: Floats) -> Floats32:
     """Distances (N, N) between points; they are subtracted before single precision takes over."""
     step = [(xy[:, None, k] - xy[None, :, k]).astype(np.float32) for k in (0, 1)]
     return np.asarray(np.hypot(*step))

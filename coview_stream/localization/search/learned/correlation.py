@@ -10,13 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
+from coview_stream.geometry.arrays import Complexes, Floats, Floats32, Ints, Reals
 from coview_stream.localization.search.learned.feature_index import FeatureIndex, transformed
-
-F32 = npt.NDArray[np.float32]
-
-C64 = npt.NDArray[np.complex64]
-
-Indices = npt.NDArray[np.int64]
 
 COVERED = 0.6
 """Share of a query's weight that has to lie on surveyed cells."""
@@ -27,13 +22,13 @@ _LEAST = 1e-6  # weight of nothing
 
 
 def correlate(
-    query: F32,
-    weight: F32,
+    query: Floats32,
+    weight: Floats32,
     coarse_map: FeatureIndex,
     yaws: npt.ArrayLike,
-    blocks: Indices | None = None,
+    blocks: Ints | None = None,
     covered: float | None = COVERED,
-) -> F32:
+) -> Floats32:
     """Mean inner product of a query's cells with the map's, for its middle at every cell's centre, at every heading.
 
     A query that reaches beyond the map has less to be compared with. Its sum over all weights would count what nobody
@@ -75,12 +70,12 @@ def correlate(
 class _Wave:
     """Spectra (bins, K, C + 1) to multiply a map's with, and the row and column at which its margin's end is found."""
 
-    spectra: C64
+    spectra: Complexes
     first: int
 
 
 def _waves(
-    query: F32, weight: F32, coarse_map: FeatureIndex, yaws: npt.NDArray[np.float64]
+    query: Floats32, weight: Floats32, coarse_map: FeatureIndex, yaws: Floats
 ) -> tuple[_Wave] | tuple[_Wave, _Wave]:
     """Spectra of a turned query, the weight's last, over the sum of the weights."""
     half, size = len(weight) // 2, len(yaws) // 2
@@ -98,7 +93,7 @@ def _waves(
     return (before, _Wave(spectra, coarse_map.margin + half)) if twice else (before,)
 
 
-def _check(query: F32, weight: F32, coarse_map: FeatureIndex, yaws: npt.NDArray[np.float64]) -> None:
+def _check(query: Floats32, weight: Floats32, coarse_map: FeatureIndex, yaws: Floats) -> None:
     if query.ndim != 3 or weight.shape != query.shape[1:] or yaws.ndim != 1 or not len(yaws):
         raise ValueError(
             f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit"
@@ -111,7 +106,9 @@ def _check(query: F32, weight: F32, coarse_map: FeatureIndex, yaws: npt.NDArray[
         )
 
 
-def _score(scores: F32, group: Indices, coarse_map: FeatureIndex, wave: _Wave, covered: float | None) -> None:
+def _score(
+    scores: Floats32, group: Ints, coarse_map: FeatureIndex, wave: _Wave, covered: float | None
+) -> None:
     """Fill in the places (H, W, K) that some blocks answer for."""
     spectra = wave.spectra
     mean = _back(np.matmul(coarse_map.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), coarse_map, wave)
@@ -129,7 +126,7 @@ def _score(scores: F32, group: Indices, coarse_map: FeatureIndex, wave: _Wave, c
         scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
 
 
-def _back(product: C64, coarse_map: FeatureIndex, wave: _Wave) -> F32:
+def _back(product: Complexes, coarse_map: FeatureIndex, wave: _Wave) -> Floats32:
     """Correlations (places, places, blocks, K) from products of spectra (bins, blocks, K)."""
     size, last = coarse_map.block, wave.first + coarse_map.places
     grid = product.reshape(size, -1, *product.shape[1:])
@@ -137,10 +134,7 @@ def _back(product: C64, coarse_map: FeatureIndex, wave: _Wave) -> F32:
     return np.asarray(fft.irfft(rows, size, axis=1, workers=coarse_map.workers)[:, wave.first : last])
 
 
-F64 = npt.NDArray[np.float64]
-
-
-def downsample(local: npt.NDArray[np.floating], weight: F32 | None = None, ratio: int = 2) -> tuple[F32, F32]:
+def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:
     """Mean of ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and of the weights.
 
     Returns:
@@ -161,7 +155,7 @@ def downsample(local: npt.NDArray[np.floating], weight: F32 | None = None, ratio
     return np.asarray(weighted), np.asarray(weight.reshape(parts).mean(axis=(1, 3), dtype=np.float32))
 
 
-def rotate_images(images: F32, yaws: F64) -> F32:
+def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
     """Sample images on a grid of odd size about their middle, turned by each heading.
 
     Args:

@@ -8,9 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-F32 = npt.NDArray[np.float32]
-C64 = npt.NDArray[np.complex64]
-Indices = npt.NDArray[np.int64]
+from coview_stream.geometry.arrays import Bools, Complexes, Floats32, Ints, Reals
 
 BLOCK = 96
 """Edge of a block in cells: fast to transform, and two thirds of it are answers."""
@@ -31,11 +29,11 @@ class FeatureIndex:
 
     def __init__(
         self,
-        features: npt.NDArray[np.floating],
+        features: Reals,
         corner: npt.ArrayLike,
         cell: float = 2.0,
         *,
-        surveyed: npt.NDArray[np.bool_] | None = None,
+        surveyed: Bools | None = None,
         block: int = BLOCK,
         margin: int = MARGIN,
         most_bytes: int = KEPT_BYTES,
@@ -88,7 +86,7 @@ class FeatureIndex:
         """Bytes of the kept spectra."""
         return 0 if self._spectra is None else int(self._spectra.nbytes)
 
-    def spectra(self, blocks: Indices) -> C64:
+    def spectra(self, blocks: Ints) -> Complexes:
         """Return half spectra (bins, len(blocks), C); bins are rows of the block times half its columns."""
         if self._spectra is None:
             return self._transformed(blocks)
@@ -96,12 +94,12 @@ class FeatureIndex:
             return self._spectra
         return self._spectra[:, blocks]
 
-    def surveyed_spectra(self, blocks: Indices) -> C64:
+    def surveyed_spectra(self, blocks: Ints) -> Complexes:
         """Return half spectra (bins, len(blocks), 1) of the mask of surveyed cells."""
         cut = np.stack([self._cut(self.surveyed, k) for k in blocks], axis=-1).astype(np.float32)
         return transformed(cut, self.block, self.workers)[..., None]
 
-    def whole(self, blocks: Indices) -> npt.NDArray[np.bool_]:
+    def whole(self, blocks: Ints) -> Bools:
         """Which blocks have been surveyed without a gap, margin included."""
         return self._whole[blocks]
 
@@ -113,7 +111,7 @@ class FeatureIndex:
             left, min(left + self.places, self.width)
         )
 
-    def blocks_near(self, xy: npt.ArrayLike, radius: float) -> Indices:
+    def blocks_near(self, xy: npt.ArrayLike, radius: float) -> Ints:
         """Blocks that answer for a cell centre within ``radius`` metres of any of some places (N, 2)."""
         cells = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.corner) / self.cell - 0.5
         found = []
@@ -125,14 +123,14 @@ class FeatureIndex:
                 found.append(block)
         return np.array(found, dtype=np.int64)
 
-    def _transformed(self, blocks: Indices) -> C64:
+    def _transformed(self, blocks: Ints) -> Complexes:
         out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.channels), dtype=np.complex64)
         for k, block in enumerate(blocks):  # one by one: what is in between stays small
             cut = np.ascontiguousarray(self._cut(self._features, block).transpose(1, 2, 0))
             out[:, k] = transformed(cut, self.block, self.workers)
         return out
 
-    def _cut(self, image: npt.NDArray[np.generic], block: int | np.integer) -> npt.NDArray[np.float32]:
+    def _cut(self, image: npt.NDArray[np.generic], block: int | np.integer) -> Floats32:
         """Cells (..., block, block) of a block of an image (..., H, W), 0 beyond the map."""
         rows, cols = self.place_of(block)
         top, left = rows.start - self.margin, cols.start - self.margin
@@ -145,7 +143,7 @@ class FeatureIndex:
         return out
 
 
-def transformed(images: F32, size: int, workers: int) -> C64:
+def transformed(images: Floats32, size: int, workers: int) -> Complexes:
     """Half spectra (size * (size // 2 + 1), ...) of images (h, w, ...), zeros appended up to ``size``."""
     half = fft.rfft(images, size, axis=1, workers=workers)
     whole = fft.fft(half, size, axis=0, overwrite_x=True, workers=workers)

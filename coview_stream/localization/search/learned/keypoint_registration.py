@@ -8,12 +8,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.config.search import LearnedMatchConfig
+from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.transforms import wrap_angle
 from coview_stream.localization.search.learned.consistent_pairs import consistency_graph, maximum_clique
-from coview_stream.localization.search.learned.keypoints import Keypoints, Pairs, nearest_pairs
+from coview_stream.localization.search.learned.keypoints import Keypoints, nearest_pairs
 
 Start = tuple[float, float, float]
 """x and y (metres) and heading (radians) of the query's frame in the map."""
@@ -50,15 +50,15 @@ def refine_by_keypoints(
         None where too few pairs agree, or agree on something too far from ``start``.
     """
     config = config or LearnedMatchConfig()
-    near = known.around(start[:2], config.reach + config.most_shift)
+    near = known.around(start[:2], config.reach + config.max_shift)
     possible = _meeting(query, near, start, config)
     pairs, _ = nearest_pairs(query.descriptors, near.descriptors, most=config.pairs, possible=possible)
-    if len(pairs) < config.least_inliers:
+    if len(pairs) < config.min_inliers:
         return None
     left, right = query.where(pairs[:, 0]), near.where(pairs[:, 1])
     clique = maximum_clique(consistency_graph(left.xy, right.xy, config), config.nodes)
     members = pairs[clique.members]
-    while len(members) >= config.least_inliers:
+    while len(members) >= config.min_inliers:
         found = _aligned(query, near, members)
         fits = found.residuals < config.tolerance
         if fits.all():
@@ -68,18 +68,16 @@ def refine_by_keypoints(
     return None
 
 
-def _meeting(
-    query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig
-) -> npt.NDArray[np.bool_]:
+def _meeting(query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig) -> Bools:
     """Mask (N, M) of the pairs that lie on each other in some pose that would be accepted."""
     c, s = math.cos(start[2]), math.sin(start[2])
     there = query.xy @ np.array([[c, s], [-s, c]]) + start[:2]
     gap = np.hypot(there[:, None, 0] - known.xy[None, :, 0], there[:, None, 1] - known.xy[None, :, 1])
-    swing = 2.0 * math.sin(0.5 * min(config.most_turn, math.pi)) * np.hypot(query.xy[:, 0], query.xy[:, 1])
-    return np.asarray(gap <= config.most_shift + config.tolerance + swing[:, None])
+    swing = 2.0 * math.sin(0.5 * min(config.max_turn, math.pi)) * np.hypot(query.xy[:, 0], query.xy[:, 1])
+    return np.asarray(gap <= config.max_shift + config.tolerance + swing[:, None])
 
 
-def _aligned(query: Keypoints, known: Keypoints, members: Pairs) -> RigidFit2D:
+def _aligned(query: Keypoints, known: Keypoints, members: Ints) -> RigidFit2D:
     """Lay the members (P, 2) on each other, the certain ones more firmly."""
     left, right = query.where(members[:, 0]), known.where(members[:, 1])
     weights = 1.0 / (left.sigma.astype(np.float64) ** 2 + right.sigma.astype(np.float64) ** 2)
@@ -88,14 +86,11 @@ def _aligned(query: Keypoints, known: Keypoints, members: Pairs) -> RigidFit2D:
 
 def _close(found: RigidFit2D, start: Start, config: LearnedMatchConfig) -> bool:
     shift = math.hypot(found.x - start[0], found.y - start[1])
-    return shift <= config.most_shift and abs(wrap_angle(found.yaw - start[2])) <= config.most_turn
+    return shift <= config.max_shift and abs(wrap_angle(found.yaw - start[2])) <= config.max_turn
 
 
 def _match(found: RigidFit2D, inliers: int, exact: bool) -> KeypointMatch:
     return KeypointMatch(found.x, found.y, found.yaw, inliers, exact, found.rms)
-
-
-F64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -106,7 +101,7 @@ class RigidFit2D:
     y: float
     yaw: float
     """Radians in (-pi, pi]."""
-    residuals: F64
+    residuals: Floats
     """(N,) metres, in the plane."""
 
     @property
@@ -115,7 +110,7 @@ class RigidFit2D:
         return float(np.sqrt(np.mean(self.residuals**2)))
 
 
-def fit_rigid_2d(query: F64, known: F64, weights: F64 | None = None) -> RigidFit2D:
+def fit_rigid_2d(query: Floats, known: Floats, weights: Floats | None = None) -> RigidFit2D:
     """Weighted least squares in the plane.
 
     Args:

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-F32 = npt.NDArray[np.float32]
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
 
 
 @dataclass(frozen=True)
 class Keypoints:
     """``xy`` (N, 2) metres, ``descriptors`` (N, C), ``sigma`` (N,)."""
 
-    xy: npt.NDArray[np.float64]
-    descriptors: F32
-    sigma: F32
+    xy: Floats
+    descriptors: Floats32
+    sigma: Floats32
 
     def __post_init__(self) -> None:
         count = len(self.xy)
@@ -30,7 +30,7 @@ class Keypoints:
         """Return how many there are."""
         return len(self.xy)
 
-    def where(self, chosen: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Keypoints:
+    def where(self, chosen: Bools | Ints) -> Keypoints:
         """Return those chosen by a mask (N,) or by indices."""
         return Keypoints(self.xy[chosen], self.descriptors[chosen], self.sigma[chosen])
 
@@ -41,11 +41,11 @@ class Keypoints:
 
 
 def keypoints(
-    local: npt.NDArray[np.floating],
-    sigma: F32,
+    local: Reals,
+    sigma: Floats32,
     corner: npt.ArrayLike,
     *,
-    mask: npt.NDArray[np.bool_] | None = None,
+    mask: Bools | None = None,
     count: int | None = 200,
     cell: float = 1.0,
 ) -> Keypoints:
@@ -72,7 +72,7 @@ def keypoints(
     return Keypoints(xy, np.ascontiguousarray(local[:, row, col].T, dtype=np.float32), sigma[row, col])
 
 
-def local_minima(values: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+def local_minima(values: Reals) -> Bools:
     """Mask (H, W) of finite values that no neighbour of eight undercuts; of equal ones the first counts."""
     height, width = values.shape
     padded = np.pad(values, 1, constant_values=np.inf)
@@ -87,17 +87,13 @@ def local_minima(values: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     return np.asarray(lowest)
 
 
-Pairs = npt.NDArray[np.int64]
-"""(P, 2) indices: the query's keypoint, the map's."""
-
-
 def nearest_pairs(
-    query: F32,
-    known: F32,
+    query: Floats32,
+    known: Floats32,
     *,
     most: int = 300,
-    possible: npt.NDArray[np.bool_] | None = None,
-) -> tuple[Pairs, F32]:
+    possible: Bools | None = None,
+) -> tuple[Ints, Floats32]:
     """Pair descriptors each of which is the most similar to the other, by inner product.
 
     Args:

@@ -15,13 +15,13 @@ from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import LOCAL_CELL, Features, Network, network
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.learned.correlation import correlate, downsample
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.localization.search.learned.keypoint_registration import refine_by_keypoints
 from coview_stream.localization.search.learned.keypoints import Keypoints, keypoints
-from coview_stream.localization.search.retrieval import Volume
 
 _SIZE = 64.0
 """Metres along the edge of a query's image."""
@@ -44,16 +44,16 @@ class QueryFeatures:
     """
 
     features: Features
-    weight: npt.NDArray[np.float32]
-    centre: npt.NDArray[np.float64]
+    weight: Floats32
+    centre: Floats
 
     @property
-    def corner(self) -> npt.NDArray[np.float64]:
+    def corner(self) -> Floats:
         """(2,) lower corner of the image, metres from the centre."""
         return np.full(2, -0.5 * _SIZE)
 
     @property
-    def place(self) -> npt.NDArray[np.float32]:
+    def place(self) -> Floats32:
         """(P,) global descriptor of unit norm: the mean of the four cells in the middle."""
         middle = self.features.place.shape[1] // 2
         mean = self.features.place[:, middle - 1 : middle + 1, middle - 1 : middle + 1].mean(axis=(1, 2))
@@ -69,7 +69,7 @@ class FeatureMatcher:
     def __init__(
         self,
         features: FeatureMap,
-        stations: npt.NDArray[np.float32],
+        stations: Floats32,
         config: LearnedConfig,
         directory: Path | None = None,
         *,
@@ -106,7 +106,7 @@ class FeatureMatcher:
         )
 
     @cached_property
-    def _everywhere(self) -> npt.NDArray[np.int64]:
+    def _everywhere(self) -> Ints:
         """Blocks of the coarse map that have features at all."""
         return self.coarse.blocks_near(self.features.tile_centres, _TILE_RADIUS)
 
@@ -123,7 +123,7 @@ class FeatureMatcher:
         """
         _ = self.network, self._everywhere if self.dense else self.coarse
 
-    def view(self, points: Points, centre: npt.NDArray[np.float64]) -> QueryFeatures:
+    def view(self, points: Points, centre: Floats) -> QueryFeatures:
         """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot.
 
         Raises:
@@ -136,7 +136,7 @@ class FeatureMatcher:
         weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
         return QueryFeatures(features, weight, centre)
 
-    def distances(self, view: QueryFeatures, suggested: npt.ArrayLike = ()) -> Volume:
+    def distances(self, view: QueryFeatures, suggested: npt.ArrayLike = ()) -> Floats32:
         """(M, S) of all stations and headings, lower is more alike; shift n means yaw -2 pi n / S.
 
         Where the map is too large to be searched all over, it is searched around ``suggested`` (N, 2) as well, metres.
@@ -151,11 +151,11 @@ class FeatureMatcher:
         sample = read[:: max(1, read.size // _SAMPLE)]
         sample = sample[np.isfinite(sample)]
         usual = np.median(sample) if len(sample) else np.float32(0.0)
-        found: Volume = np.float32(1.0 + usual) - read
+        found: Floats32 = np.float32(1.0 + usual) - read
         found[~compared] = 1.0
         return found
 
-    def _at_stations(self, scores: npt.NDArray[np.float32]) -> Volume:
+    def _at_stations(self, scores: Floats32) -> Floats32:
         """Best (M, K) of the scores (K, H, W) whose cells have their middle in a station's block, -inf off the map.
 
         A block smaller than a cell has the score of the cell around its station.
@@ -180,12 +180,10 @@ class FeatureMatcher:
         ours = keypoints(local, sigma, view.corner, mask=view.weight > 0, count=self.match.keypoints)
         return [self._sharpened(each, ours, view.centre) for each in hypotheses]
 
-    def _sharpened(
-        self, hypothesis: Hypothesis, ours: Keypoints, centre: npt.NDArray[np.float64]
-    ) -> Hypothesis:
+    def _sharpened(self, hypothesis: Hypothesis, ours: Keypoints, centre: Floats) -> Hypothesis:
         T = hypothesis.T_map_odom
         x, y, z = transform(T, centre[None])[0].tolist()
-        patch = self.features.patch(np.array([x, y]), self.match.reach + self.match.most_shift)
+        patch = self.features.patch(np.array([x, y]), self.match.reach + self.match.max_shift)
         known = (patch.local != 0).any(axis=0)
         theirs = keypoints(patch.local, patch.sigma, patch.corner, mask=known, count=None)
         found = refine_by_keypoints(ours, theirs, (x, y, yaw_of(T)), self.match)
@@ -195,7 +193,7 @@ class FeatureMatcher:
         there = pose_from(rot_z(found.yaw), np.array([found.x, found.y, z]))
         return replace(hypothesis, T_map_odom=there @ pose_from(np.eye(3), -centre), exact=True)
 
-    def _ground(self, xy: npt.NDArray[np.float64], before: npt.NDArray[np.float64]) -> float:
+    def _ground(self, xy: Floats, before: Floats) -> float:
         """Height at ``xy`` (2,) of the storey that was at ``before`` (3,), metres; unchanged where it has none."""
         away = np.hypot(*(self.stations[:, :2] - xy).T)
         rise = np.abs(self.stations[:, 2] - before[2])
@@ -206,7 +204,7 @@ class FeatureMatcher:
         nearest = same[np.lexsort((rise[same], np.round(away[same], 2)))[0]]
         return float(self.stations[nearest, 2])
 
-    def _alike(self, view: QueryFeatures, suggested: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    def _alike(self, view: QueryFeatures, suggested: npt.ArrayLike) -> Ints:
         """Blocks of the coarse map around suggestions, and around the tiles that look most like the view."""
         likeness = self.features.place.astype(np.float32) @ view.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
