@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import MapError
 
 FORMAT = "coview-map"
@@ -41,20 +40,11 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = _digest(text, contiguous)
     metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
-    temporary: str | None = None
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        with os.fdopen(handle, "wb") as file:
+        with atomic_file(path, sync=True) as file:
             _write(file, contiguous, metadata)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
     except OSError as error:
         raise MapError(f"{path}: cannot write the map ({error.strerror}); choose a writable place") from error
-    finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
     return digest
 
 

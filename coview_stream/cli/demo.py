@@ -159,10 +159,10 @@ def _write_report(
 ) -> None:
     import json
 
-    from coview_stream.clouds.files import atomic
+    from coview_stream.clouds.atomic_file import atomic_file
 
     facts = json.loads(verdict.to_json()) | {"world": config.to_dict(), "seconds": seconds}
-    with atomic(out / "report.json") as stream:
+    with atomic_file(out / "report.json") as stream:
         stream.write((json.dumps(facts, indent=1) + "\n").encode())
 
 

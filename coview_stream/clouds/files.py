@@ -5,14 +5,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.las import read_las
 from coview_stream.clouds.npy_bin import read_bin, read_npy
@@ -125,22 +125,6 @@ _LAS_SCALE = 0.001
 _FLOAT32_LIMIT = 10_000.0
 
 
-@contextmanager
-def atomic(path: Path) -> Iterator[BinaryIO]:
-    """Open a binary stream that becomes ``path`` only if the block ends without an error.
-
-    Raises:
-        OSError: the directory does not exist or cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as stream:
-            yield stream
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLike | None = None) -> None:
     """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), as the suffix says.
 
@@ -162,7 +146,7 @@ def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLi
     far = bool(len(rows)) and float(np.nanmax(np.abs(rows), initial=0.0)) > _FLOAT32_LIMIT
     rows = rows.astype("<f8" if far and rows.dtype == np.float64 else "<f4", copy=False)
     try:
-        with atomic(path) as stream:
+        with atomic_file(path) as stream:
             writer(stream, np.ascontiguousarray(rows), path)
     except OSError as error:
         reason = error.strerror or error

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.clouds.files import atomic
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import InputError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import nearest_rotation, quat_to_matrix
@@ -94,7 +94,7 @@ def write_tum(
         x, y, z, qx, qy, qz, qw = pose_to_tum(np.asarray(T, dtype=np.float64))
         lines.append(f"{stamp:.6f} {x:.6f} {y:.6f} {z:.6f} {qx:.9f} {qy:.9f} {qz:.9f} {qw:.9f}\n")
     try:
-        with atomic(path) as stream:
+        with atomic_file(path) as stream:
             stream.write("".join(lines).encode("ascii"))
     except OSError as error:
         reason = error.strerror or error

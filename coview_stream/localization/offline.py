@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
@@ -168,9 +169,8 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
         poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
         write_tum(folder / "trajectory.tum", np.array([fix.stamp for fix in posed]), poses)
         text = json.dumps(located.to_json(base_map), indent=1) + "\n"
-        temporary = folder / ".result.json.part"
-        temporary.write_text(text)
-        temporary.replace(folder / "result.json")
+        with atomic_file(folder / "result.json") as stream:
+            stream.write(text.encode())
     except OSError as error:
         raise InputError(
             f"{folder}: cannot write the results ({error.strerror}); choose another place"

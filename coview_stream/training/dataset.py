@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.descriptors.birds_eye_view import CELL, Image, birds_eye_view
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
@@ -87,11 +88,9 @@ def write_world(path: str | os.PathLike[str], seed: int, recipe: Recipe) -> None
     """
     path, views = Path(path), world_views(seed, recipe)
     fields = {name: getattr(views, name) for name in _KEYS} | {"recipe": json.dumps(views.recipe)}
-    part = path.with_name(path.name + ".part")
     try:
-        with part.open("wb") as file:
+        with atomic_file(path) as file:
             np.savez_compressed(file, **fields)
-        part.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another directory") from error
 

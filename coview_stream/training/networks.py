@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.descriptors.birds_eye_view import LAYERS, Image
 from coview_stream.descriptors.network import CARD, OUTPUTS, Features, file_sha256, weights_name
 
@@ -152,15 +152,14 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
     for view, name in enumerate(VIEWS):
         single = OneView(net, view).eval()
         path = directory / weights_name(name)
-        partial = path.with_suffix(f".{os.getpid()}.part")
         image = torch.zeros(1, LAYERS, _SAMPLE, _SAMPLE)
         sizes = {"image": {2: "height", 3: "width"}}
         sizes |= {output: {2: f"{output}_height", 3: f"{output}_width"} for output in OUTPUTS}
-        torch.onnx.export(
-            single, (image,), str(partial), input_names=["image"], output_names=list(OUTPUTS),
-            dynamic_axes=sizes, opset_version=_OPSET, dynamo=False,
-        )  # fmt: skip
-        partial.replace(path)
+        with atomic_path(path) as part:
+            torch.onnx.export(
+                single, (image,), str(part), input_names=["image"], output_names=list(OUTPUTS),
+                dynamic_axes=sizes, opset_version=_OPSET, dynamo=False,
+            )  # fmt: skip
         written.append(path)
     card = card | {"sha256": {path.name: file_sha256(path) for path in written}}
     text = json.dumps(card, indent=1, sort_keys=True) + "\n"

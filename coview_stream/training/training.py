@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import InputError
 from coview_stream.training.batches import draw_batch
 from coview_stream.training.dataset import WorldViews
@@ -100,15 +101,14 @@ def _schedule(step: int, steps: int) -> float:
 def _keep(
     path: Path, net: PlaceNet, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig
 ) -> None:
-    partial = path.with_suffix(".part")
     state = {
         "net": net.state_dict(),
         "optimiser": optimiser.state_dict(),
         "step": step,
         "config": asdict(config),
     }
-    torch.save(state, partial)
-    partial.replace(path)
+    with atomic_path(path) as part:
+        torch.save(state, part)
 
 
 def _restore(

@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import Pose, is_pose
 
@@ -64,12 +65,9 @@ def save(folder: Path, last: LastPose) -> Path:
         "T_map_body": np.asarray(last.T_map_body, dtype=np.float64).tolist(),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".part")  # always the same one: a power cut leaves one behind at most
-    with temporary.open("w", encoding="utf-8") as file:
-        json.dump(document, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())  # else a power cut, the usual end of a robot's day, leaves an empty file
-    temporary.replace(path)
+    # a robot's day usually ends with a power cut: synced, and one name for all, so that at most one is left behind
+    with atomic_file(path, sync=True, temporary=path.with_suffix(".part")) as file:
+        file.write(json.dumps(document, indent=1).encode())
     return path
 
 
