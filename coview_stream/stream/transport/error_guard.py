@@ -5,13 +5,22 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 
 def is_panic(error: BaseException) -> bool:
     """Whether a Rust library panicked: pyo3's PanicException is no Exception, and nothing exports it to import."""
     return type(error).__name__ == "PanicException"
+
+
+@dataclass
+class Caught:
+    """What a block of :meth:`RateLimitedErrors.catch` raised; None if it ended well."""
+
+    error: Exception | None = None
 
 
 class RateLimitedErrors:
@@ -33,19 +42,26 @@ class RateLimitedErrors:
         self._last: dict[str, float] = {}
         self._silent: dict[str, int] = {}
 
-    def run(self, place: str, action: Callable[[], Any]) -> Exception | None:
-        """Call ``action``; return what it raised, after logging it as having happened at ``place``."""
+    @contextmanager
+    def catch(self, place: str) -> Iterator[Caught]:
+        """Log what the block raises as having happened at ``place``, and go on after it."""
+        caught = Caught()
         try:
-            action()
-        except Exception as error:  # whatever it is, the next message deserves its chance
+            yield caught
+        except Exception as error:  # of any kind: the next message deserves its chance
             self.report(place, error)
-            return error
+            caught.error = error
         except BaseException as error:
             if not is_panic(error):
                 raise
             self.report(place, error)
-            return RuntimeError(str(error))
-        return None
+            caught.error = RuntimeError(str(error))
+
+    def run(self, place: str, action: Callable[[], Any]) -> Exception | None:
+        """Call ``action``; return what it raised, after logging it as having happened at ``place``."""
+        with self.catch(place) as caught:
+            action()
+        return caught.error
 
     def report(self, place: str, error: BaseException, kind: str = "") -> None:
         """Log ``error`` unless a line about ``place``, and of this ``kind``, was logged less than the interval ago."""
