@@ -50,10 +50,10 @@ def test_how_long_a_doubt_lasts_and_what_ends_it():
     rule, words = AcceptanceConfig(), {2: "two", 3: "three", 10.0: "ten"}
     rows = re.findall(r"^\|.*AMBIGUOUS.*\|$", section("How the node behaves"), re.MULTILINE)
     rejected, blind, long = rows[:3]
-    assert f"{words[rule.patience]} rejected a metre apart" in rejected
-    assert f"{words[rule.patience_seconds]} seconds of doubt" in rejected
-    assert f"goes on for {rule.patience_blind:.0f} s without a pose" in blind
-    assert f"lasted {words[rule.patience_seconds]} seconds" in long
+    assert f"{words[rule.max_rejections]} rejected a metre apart" in rejected
+    assert f"{words[rule.max_doubt_s]} seconds of doubt" in rejected
+    assert f"goes on for {rule.max_blind_s:.0f} s without a pose" in blind
+    assert f"lasted {words[rule.max_doubt_s]} seconds" in long
     assert f"{words[rule.confirmations]} registrations" in long
 
 
@@ -72,7 +72,7 @@ def test_every_field_of_the_evidence():
         for name in re.findall(r"`(\w+)`", row)
     ]
     assert sorted(named) == sorted(KeyframeEvidence(0.0, State.LOST, "").to_json())
-    assert f"above {AcceptanceConfig().keep_innovation:.0f} it is rejected" in table
+    assert f"above {AcceptanceConfig().max_innovation:.0f} it is rejected" in table
     assert "(method.md#fields-of-the-evidence)" in TEXT
 
 

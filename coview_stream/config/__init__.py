@@ -6,6 +6,7 @@ the map and read back from it, so that the two can never drift apart; the rest b
 
 from __future__ import annotations
 
+from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.localizer import LocalizerConfig
 from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, map_preset
 from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
@@ -16,7 +17,7 @@ from coview_stream.config.search import (
     Reloc,
     RetrievalConfig,
 )
-from coview_stream.config.tracking import AcceptanceConfig, GraphConfig, TrackingConfig
+from coview_stream.config.tracking import GraphConfig, TrackingConfig
 
 __all__ = [
     "AcceptanceConfig",

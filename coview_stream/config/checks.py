@@ -1,8 +1,10 @@
-"""Ranges of a configuration's fields, checked when it is made: what is wrong, where, and what is allowed."""
+"""Range checks of configuration fields, made when a configuration is; the message names field, value and range."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import fields
+from typing import Any
 
 from coview_stream.errors import ConfigError
 
@@ -21,11 +23,16 @@ def positive(config: object, *names: str) -> None:
         require(math.isfinite(value) and value > 0, config, name, "a positive, finite number")
 
 
-def counts(config: object, *names: str, least: int = 1) -> None:
-    """Refuse fields that are not whole numbers of at least ``least``."""
+def all_positive(config: Any, *but: str) -> None:
+    """Refuse a configuration with a field, other than those named, that is not positive and finite."""
+    positive(config, *(f.name for f in fields(config) if f.name not in but))
+
+
+def counts(config: object, *names: str, minimum: int = 1) -> None:
+    """Refuse fields that are not whole numbers of at least ``minimum``."""
     for name in names:
         value = getattr(config, name)
-        require(isinstance(value, int) and value >= least, config, name, f"a whole number >= {least}")
+        require(isinstance(value, int) and value >= minimum, config, name, f"a whole number >= {minimum}")
 
 
 def fraction(config: object, *names: str) -> None:

@@ -1,10 +1,11 @@
-"""All of the localizer's settings in one."""
+"""All of the localizer's settings together."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import get_args
 
+from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.checks import require
 from coview_stream.config.registration import RegistrationConfig
 from coview_stream.config.search import (
@@ -14,16 +15,25 @@ from coview_stream.config.search import (
     Reloc,
     RetrievalConfig,
 )
-from coview_stream.config.tracking import AcceptanceConfig, GraphConfig, TrackingConfig
+from coview_stream.config.tracking import GraphConfig, TrackingConfig
 
 
 @dataclass(frozen=True)
 class LocalizerConfig:
     """Everything that the localizer decides by; the defaults need no change.
 
-    ``reloc`` says who names places to look at: the co-view descriptors (``coview``), the learned features
-    (``learned``), or both where map and installation have the latter (``auto``). ``stationary`` is the paper's path for
-    terrestrial scans: one frame may be enough for a fix.
+    Attributes:
+        keyframe: when frames become keyframes.
+        retrieval: which stations a keyframe is compared with.
+        consensus: how keyframes vote.
+        registration: how scans are registered to the map, and its covariance.
+        acceptance: what makes, keeps and loses a fix.
+        tracking: when to register while tracking.
+        graph: how poses are smoothed.
+        learned: how learned features are looked up.
+        reloc: which place recognition names places, see :data:`coview_stream.config.Reloc`; ``auto`` goes without
+            learned features where map or installation lack them.
+        stationary: the paper's path for terrestrial scans: one frame may be enough for a fix.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

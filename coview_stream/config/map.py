@@ -1,4 +1,4 @@
-"""How a base map and its descriptors are made, and the paper's two settings for it."""
+"""Settings of a base map and its descriptors, and the paper's two presets."""
 
 from __future__ import annotations
 
@@ -16,10 +16,20 @@ Preset = Literal["slam", "tls"]
 class DescriptorConfig:
     """How a virtual scan becomes a polar descriptor (paper, section 3.2, eqs 1-4).
 
-    ``channels`` names the descriptors that vote together: ``scan_context`` is the maximum height of every bin,
-    ``coview`` keeps what both views can see (eqs 1-3: horizontally visible, or dense), ``coview_strict`` only
-    what is horizontally visible. Measured: unlike views (airborne map) favour co-visibility, like views favour Scan
-    Context, the two together are right on both.
+    Stored in the map and read back from it, so that map and robot cannot drift apart.
+
+    Attributes:
+        radius: metres that a descriptor reaches; the paper's.
+        rings: bins along it.
+        sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
+        channels: descriptors that vote together. ``scan_context`` is the maximum height of every bin, ``coview`` keeps
+            what both views can see (eqs 1-3: horizontally visible, or dense), ``coview_strict`` only what is
+            horizontally visible. Seen once, no command prints it: unlike views (an airborne map) favour co-visibility,
+            like views Scan Context, and the two together are right on both. ``python -m bench ablation`` compares them
+            on simulated worlds.
+        voxel: metres; one point is kept in each cube of this size first.
+        ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are; otherwise from
+            the sensor. ``python -m bench ablation`` compares the two.
     """
 
     radius: float = 50.0
@@ -32,7 +42,7 @@ class DescriptorConfig:
     def __post_init__(self) -> None:
         positive(self, "radius", "voxel")
         require(self.radius <= 1000, self, "radius", "at most 1000 m")
-        counts(self, "rings", "sectors", least=4)
+        counts(self, "rings", "sectors", minimum=4)
         known = get_args(Channel)
         require(
             bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}"
@@ -42,7 +52,20 @@ class DescriptorConfig:
 
 @dataclass(frozen=True)
 class MapConfig:
-    """How a base map is built (paper, section 3.1); ``learned`` maps also hold what learned re-localization needs."""
+    """How a base map is built (paper, section 3.1); set by hand where the paper gives no value.
+
+    Attributes:
+        descriptor: of the stations.
+        block: metres between stations, a multiple of 0.5.
+        voxel: metres; one point is stored for each cube of this size.
+        tile: metres, size of the tiles by which points are sorted.
+        outlier_neighbours: of each point, for the statistical outlier filter; 0 switches it off.
+        outlier_std_ratio: standard deviations of their mean distance beyond which a point is removed.
+        normal_radius: metres within which a point's neighbours make its normal,
+        normal_neighbours: and how many of them at most.
+        levels: a station for every floor of a building above the ground, too.
+        learned: also store the features that learned re-localization needs.
+    """
 
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
     block: float = 2.0
@@ -57,8 +80,8 @@ class MapConfig:
 
     def __post_init__(self) -> None:
         positive(self, "block", "voxel", "tile", "outlier_std_ratio", "normal_radius")
-        counts(self, "outlier_neighbours", least=0)
-        counts(self, "normal_neighbours", least=3)
+        counts(self, "outlier_neighbours", minimum=0)
+        counts(self, "normal_neighbours", minimum=3)
         halves = self.block / 0.5  # stations must stand at the centres of the raster's cells
         require(abs(halves - round(halves)) < 1e-6, self, "block", "a multiple of 0.5 m")
         require(self.voxel <= self.block, self, "voxel", f"no larger than block ({self.block} m)")

@@ -1,29 +1,30 @@
-"""How the node behaves; every default is usable as it is."""
+"""Settings of the node; every default is usable as it is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from coview_stream.errors import ConfigError
+from coview_stream.config.checks import all_positive, require
 
 
 @dataclass(frozen=True)
 class NodeConfig:
-    """Limits and rates of the node, in seconds, metres, Hz and bytes.
+    """Limits and rates of the node, in seconds, metres, Hz and bytes; set by hand.
 
     Attributes:
         pose_rate: of the poses, while TRACKING.
         status_rate: of the statuses, besides one at every change of state.
         odometry_timeout: without odometry for this long (local time) there is no pose: LOST.
-        coast: without a usable frame for this long poses go on by odometry alone, then LOST.
+        dead_reckoning_timeout: without a usable frame for this long poses go on by odometry alone, then LOST
+            (``serve --coast``).
         pairing_wait: a frame waits this long (local time) for the odometry around its stamp.
-        horizon: odometry is remembered for this long (sensor time); an older frame is late.
+        odometry_history: odometry is remembered for this long (sensor time); an older frame is late.
         max_gap: odometry is interpolated between samples no farther apart than this.
         max_outage: a longer pause of odometry (sensor time) is a new beginning: the robot may have been carried.
-        max_network_outage: the same where nobody was connected to the node meanwhile, which explains the pause.
+        max_network_outage: the same where nothing was connected to the node meanwhile, which explains the pause.
         max_speed: faster motion between two odometry samples is a jump; see :mod:`coview_stream.odometry.buffer`.
         max_turn_rate: likewise for headings, radians per second, and 20 degrees.
-        max_payload: a larger message is counted as oversized and not looked at.
+        max_payload: a larger message is counted as oversized and not decoded.
         max_points: of a larger frame only every n-th point is used, so that no robot holds up the others.
         restart_after: stamps that run on steadily, but not from where they were, are a restarted clock after this.
         deskew: move points to the frame's stamp where the sender gives each point's time.
@@ -32,9 +33,9 @@ class NodeConfig:
     pose_rate: float = 10.0
     status_rate: float = 1.0
     odometry_timeout: float = 0.5
-    coast: float = 5.0
+    dead_reckoning_timeout: float = 5.0
     pairing_wait: float = 0.3
-    horizon: float = 5.0
+    odometry_history: float = 5.0
     max_gap: float = 0.5
     max_outage: float = 2.0
     max_network_outage: float = 10.0
@@ -46,9 +47,5 @@ class NodeConfig:
     deskew: bool = True
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self) if f.name != "deskew"):
-            value = getattr(self, name)
-            if not (value > 0 and value < float("inf")):
-                raise ConfigError(f"NodeConfig.{name} is {value}; it must be positive and finite")
-        if self.pose_rate > 200:
-            raise ConfigError(f"NodeConfig.pose_rate is {self.pose_rate}; 200 Hz is the most")
+        all_positive(self, "deskew")
+        require(self.pose_rate <= 200, self, "pose_rate", "at most 200 Hz")

@@ -1,40 +1,41 @@
-"""How odometry is made of lidar frames, and where down is said to be."""
+"""Settings of lidar odometry, and the direction of gravity."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from coview_stream.config.checks import all_positive, require
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
 
 Gravity = Literal["ground", "level"] | tuple[float, float, float]
 """Where down is: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
 
-MOST_TILT = math.radians(60.0)
-"""A body frame has z up (x forward): one that leans more was not meant."""
+MAX_TILT = math.radians(60.0)
+"""Radians from upright; a body frame has z up (x forward), so one that leans more is a mistake. Set by hand."""
 
 
 @dataclass(frozen=True)
 class LidarOdometryConfig:
-    """Lidar odometry.
+    """Lidar odometry; set by hand.
 
     Attributes:
         gravity: see :data:`Gravity`. An accelerometer at rest points up, a gravity vector points down.
         min_range: metres; nearer points are the robot itself, or what covers the sensor.
         max_range: metres; farther points are left out.
         voxel: of the local map, metres.
-        least_points: between the two ranges; a frame with fewer cannot be placed.
+        min_points: between the two ranges; a frame with fewer cannot be placed.
         max_gap: seconds without a usable frame after which the local map is begun anew, where the last frame was:
             how far the robot went meanwhile is not known.
         max_speed: metres per second; what says more is refused, and the local map begun anew.
         max_turn_rate: radians per second, likewise.
-        plumb: keep roll and pitch from drifting by the walls in each frame.
+        level_with_walls: keep roll and pitch from drifting by the walls in each frame.
         threads: of kiss-icp.
-        convergence: its registration ends at a smaller step than this, metres and radians.
+        convergence: its registration ends at a smaller step than this, metres and radians,
         iterations: or after so many.
     """
 
@@ -42,24 +43,18 @@ class LidarOdometryConfig:
     min_range: float = 1.0
     max_range: float = 100.0
     voxel: float = 1.0
-    least_points: int = 100
+    min_points: int = 100
     max_gap: float = 1.5
     max_speed: float = 50.0
     max_turn_rate: float = 10.0
-    plumb: bool = True
+    level_with_walls: bool = True
     threads: int = 1
     convergence: float = 1e-3
     iterations: int = 60
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self) if f.name not in ("gravity", "plumb")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"LidarOdometryConfig.{name} is {value}; it must be positive and finite")
-        if self.max_range <= self.min_range:
-            raise ConfigError(
-                f"LidarOdometryConfig.max_range is {self.max_range}, not beyond min_range {self.min_range}"
-            )
+        all_positive(self, "gravity", "level_with_walls")
+        require(self.max_range > self.min_range, self, "max_range", f"beyond min_range ({self.min_range} m)")
         if self.gravity not in ("ground", "level"):
             down(self.gravity)
 
@@ -79,7 +74,7 @@ def down(gravity: Gravity) -> Floats:
     if g.shape != (3,) or not (math.isfinite(length) and length > 0):
         raise ConfigError(f"gravity is {gravity!r}; give ground, level, or three numbers X Y Z, not all zero")
     g /= length
-    if -g[2] < math.cos(MOST_TILT):
+    if -g[2] < math.cos(MAX_TILT):
         raise ConfigError(
             f"gravity {gravity!r} does not point down in the body frame (x forward, z up), where a level sensor has "
             "0 0 -1; an accelerometer at rest shows the opposite: turn the signs"

@@ -1,4 +1,4 @@
-"""Where exactly, and how sure: registration and its covariance."""
+"""Settings of registration and of its covariance."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from coview_stream.config.checks import counts, fraction, positive, require
+from coview_stream.config.checks import all_positive, counts, fraction, require
 
 RegistrationMethod = Literal["trimmed-icp", "gicp"]
 
@@ -15,19 +15,39 @@ RegistrationMethod = Literal["trimmed-icp", "gicp"]
 class RegistrationConfig:
     """Trimmed ICP (eq. 13): point-to-plane, coarse to fine; or GICP, with the same schedule and settings.
 
-    ``method`` is ``trimmed-icp`` or ``gicp``; the latter needs the extra of that name and is for tracking only, the
-    search's hypotheses go through trimmed ICP (see :mod:`coview_stream.localization.registration.gicp`). ``residual_scale`` is trimmed
-    ICP's alone. ``keep`` is the overlap; the paper keeps 60 %, 70 % converges faster here and as well. ``search`` and
-    ``track`` list the largest correspondence distances of the successive scales. Points above the ground and points
-    on it are trimmed apart, else the ground, which fits anywhere, pushes out the facades that fix the position (KITTI
-    04: 0.25 m median error against 0.05 m). ``inflation`` scales the inverse Hessian's sigma, which is optimistic
-    (points are not independent). A direction in which that leaves more than ``weak_from`` metres (an angle counts as
-    what it moves at ``weak_lever`` metres) is one that the map hardly shows: its sigma is widened further, up to
-    ``weak_sigma`` metres (see :func:`coview_stream.localization.registration.covariance.registration_covariance`). The ``shared`` sigmas are
-    of the error that neighbouring registrations have in common (see
-    :class:`coview_stream.localization.tracking.shared_error.SharedErrorModel`): a scanned map's points lie off its surfaces. Inflation,
-    floors and shared sigmas are calibrated on simulated drives, seeds 5101 to 5110 of ``bench.tracking``; a real map's
-    own error, against the ground truth that matters to you, comes on top.
+    Points above the ground and points on it are trimmed apart, else the ground, which fits anywhere, pushes out the
+    facades that fix the position (seen once on KITTI 04, no command prints it: 0.25 m median error against 0.05 m).
+
+    ``inflation``, the floors and the ``shared`` sigmas are calibrated on the simulated drives of
+    ``python -m bench tracking --seeds 5100``, which prints how often the truth lies within 1, 2 and 3 sigma; a real
+    map's own error, against the ground truth that matters to you, comes on top. The rest is set by hand.
+
+    Attributes:
+        method: ``trimmed-icp``, or ``gicp``, which needs the extra of that name and is for tracking only: the search
+            registers its hypotheses by trimmed ICP (see :mod:`coview_stream.localization.registration.gicp`).
+        keep: overlap, the share of the pairs that is kept; the paper keeps 0.6, 0.7 converges faster and as well.
+        search: largest correspondence distances of the successive scales of a search, metres, coarse to fine.
+        track: likewise while tracking.
+        iterations: at most, on each scale.
+        source_voxel: metres; one point of the scan is kept in each cube of this size.
+        source_points: at most so many of them, chosen at random.
+        source_range: metres from the sensor within which the scan's points are used.
+        residual_scale: width of the Cauchy weights on the last scale, metres; of trimmed ICP alone.
+        inflation: times the inverse Hessian's sigma, which is optimistic: neighbouring points are not independent.
+        sigma_floor: metres, added to what registration claims of each position.
+        sigma_floor_angle: radians, likewise of each angle.
+        shared: times the clustered sigma of the error that neighbouring registrations have in common, as a scanned
+            map's points lie off its surfaces
+            (:class:`coview_stream.localization.tracking.shared_error.SharedErrorModel`).
+        shared_position: metres of x and of y of that error which the pairs do not show.
+        shared_height: metres of z, likewise.
+        shared_tilt: radians of roll and of pitch, likewise.
+        shared_yaw: radians of the heading, likewise.
+        gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
+        weak_lever: metres; an angle is compared with a shift by what it moves at this distance.
+        weak_from: metres; a direction that is known less well is one that the map hardly shows, and its sigma is
+            widened (:func:`coview_stream.localization.registration.covariance.registration_covariance`).
+        weak_sigma: metres, the largest sigma that this gives.
     """
 
     method: RegistrationMethod = "trimmed-icp"
@@ -57,13 +77,10 @@ class RegistrationConfig:
         require(self.method in methods, self, "method", f"one of {', '.join(methods)}")
         fraction(self, "keep")
         counts(self, "iterations", "source_points")
-        positive(self, "weak_lever", "weak_from", "weak_sigma")
-        positive(self, "source_voxel", "source_range", "residual_scale", "inflation", "gravity_sigma")
-        positive(self, "sigma_floor", "sigma_floor_angle")
-        positive(self, "shared", "shared_position", "shared_height", "shared_tilt", "shared_yaw")
+        all_positive(self, "method", "search", "track")
         for name in ("search", "track"):
-            steps = getattr(self, name)
-            falling = bool(steps) and all(
-                a >= b > 0 for a, b in zip(steps, (*steps[1:], steps[-1]), strict=True)
+            scales = getattr(self, name)
+            falling = bool(scales) and all(
+                a >= b > 0 for a, b in zip(scales, (*scales[1:], scales[-1]), strict=True)
             )
             require(falling, self, name, "one or more positive distances, coarse to fine")

@@ -1,7 +1,4 @@
-"""Where am I, roughly: keyframes, the stations they are compared with, and how they vote."""
-
-# FOLDED coview_stream/config/search.py: """Learned re-localization: whether it is used, and how a scan is compared with a map's features."""
-# FOLDED coview_stream/config/search.py: """How keypoints of a scan and of the map are matched."""
+"""Settings of the search: keyframes, the stations they are compared with, their votes, and learned features."""
 
 from __future__ import annotations
 
@@ -14,10 +11,14 @@ from coview_stream.config.checks import counts, positive, require
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """When the robot's frames become a virtual local scan (paper, section 3.3).
+    """When the robot's frames become a virtual local scan, VLS (paper, section 3.3).
 
-    ``distance`` is the paper's sigma_d. The ring buffer holds ``capacity`` keyframes, so memory is fixed;
-    ``min_points`` after voxel de-duplication is what a VLS needs before it may vote.
+    Attributes:
+        distance: metres driven from keyframe to keyframe, the paper's sigma_d.
+        capacity: keyframes held, so memory is fixed; set by hand.
+        voxel: metres; one point of a frame is kept in each cube of this size.
+        range_min: metres; nearer points are the robot itself.
+        min_points: points, after that, which a VLS needs before it may vote; set by hand.
     """
 
     distance: float = 2.0
@@ -34,10 +35,12 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class RetrievalConfig:
-    """Which stations are scored (paper, section 3.4).
+    """Which stations are scored (paper, section 3.4); ``python -m bench ablation`` compares the two modes.
 
-    ``exhaustive`` scores all stations at all shifts. ``ring_key`` is the paper's way, kept for comparison: only
-    the ``candidates`` stations nearest in ring key are scored, all others count as worst.
+    Attributes:
+        mode: ``exhaustive`` scores all stations at all shifts. ``ring_key`` is the paper's way, kept for comparison:
+            only the stations nearest in ring key are scored, all others count as worst.
+        candidates: how many those are.
     """
 
     mode: Literal["exhaustive", "ring_key"] = "exhaustive"
@@ -52,9 +55,13 @@ class RetrievalConfig:
 class ConsensusConfig:
     """How keyframes vote for one ``T_map_odom``.
 
-    ``window`` newest keyframes vote; ``peaks`` best hypotheses that differ by more than ``distinct_distance`` or
-    ``distinct_yaw`` from every better one go on to registration. ``single`` is the paper's rule instead: the one
-    smallest distance of all keyframes.
+    Attributes:
+        mode: ``consensus``; or ``single``, the paper's rule: the one smallest distance of all keyframes.
+            ``python -m bench ablation`` compares them.
+        window: newest keyframes that vote; set by hand.
+        peaks: best hypotheses that go on to registration; set by hand.
+        distinct_distance: metres; a hypothesis is one of its own where it lies farther than this from every better one,
+        distinct_yaw: or is turned by more than this, radians; both set by hand.
     """
 
     mode: Literal["consensus", "single"] = "consensus"
@@ -70,18 +77,23 @@ class ConsensusConfig:
 
 
 Reloc = Literal["auto", "coview", "learned"]
-"""Who says where to look: the descriptors of the paper, the learned features, or both where a map has features."""
+"""What names places: the descriptors of the paper, learned features, or (auto) both where map and installation can."""
 
 
 @dataclass(frozen=True)
 class LearnedConfig:
-    """How a scan's learned features are looked up in the map's (see :mod:`coview_stream.localization.search.learned`).
+    """How a scan's learned features are looked up in the map's (:mod:`coview_stream.localization.search.learned`).
 
-    ``reach`` is how far around the robot's newest position (metres, horizontally) its keyframes' points are used. Their
-    features are compared with the map's at every ``cell`` metres and at ``yaws`` headings; with all of a map of up to
-    ``dense_area`` square metres, with the surroundings of the ``shortlist`` tiles that look most alike where it is
-    larger. ``peaks`` best places go on to registration, and while both sources vote as many of the other source's.
-    Keypoints that match make each of them exact first.
+    Set by hand; ``python -m bench forest`` prints what comes of it, ``bench learned_match`` what it costs.
+
+    Attributes:
+        reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.
+        cell: metres from place to place at which their features are compared with the map's.
+        yaws: headings at each.
+        dense_area: square metres up to which a map is searched all over.
+        shortlist: tiles of a larger one, those that look most alike, around which it is searched.
+        peaks: best places that go on to registration, made exact by keypoints that match first; and as many of the
+            descriptors' while both vote.
     """
 
     reach: float = 30.0
@@ -95,40 +107,46 @@ class LearnedConfig:
         positive(self, "dense_area")
         require(5.0 <= self.reach <= 32.0, self, "reach", "5 to 32 m, half a query's image")
         require(self.cell in (1.0, 2.0, 4.0), self, "cell", "1, 2 or 4 m")
-        counts(self, "yaws", least=4)
+        counts(self, "yaws", minimum=4)
         require(self.yaws <= 360, self, "yaws", "360 at most: memory and time grow with it")
         counts(self, "shortlist", "peaks")
 
 
 @dataclass(frozen=True)
 class LearnedMatchConfig:
-    """Keypoints, pairs, their consistency, and what a match has to be.
+    """Keypoints, pairs, their consistency, and what a match has to be; set by hand.
 
-    ``keypoints`` of least uncertainty describe a query; a pair is kept where each is the other's nearest among those
-    that can meet, the ``pairs`` most similar of them. Two pairs agree where the distance between their points differs
-    by less than ``tolerance`` between the views (weight: a bell of width ``spread``); pairs less than ``least_apart``
-    away from each other say nothing about the heading and do not count. The search for the largest consistent set
-    gives up being exact after ``nodes`` branches. A match has at least ``least_inliers`` and lies within ``most_shift``
-    (metres) and ``most_turn`` (radians) of where it was sought; the query reaches ``reach`` metres around its middle.
-    Pairing only points that can meet within these bounds finds many more right pairs, but chance agreement too lies
-    near the start. Of 200 keypoints without any partner, mutual nearest ones agree in sets of up to 7 by chance:
-    ``least_inliers`` has to be more.
+    A pair is kept where each keypoint is the other's nearest among those that can meet. Pairing only those finds many
+    more right pairs, but then chance agreement lies near the start, too.
+
+    Attributes:
+        keypoints: of least uncertainty, which describe a query.
+        pairs: kept, the most similar ones.
+        tolerance: metres; two pairs agree where the distance between their points differs by less between the views.
+        spread: metres, standard deviation of the bell by which that difference is weighed.
+        min_separation: metres; pairs nearer to each other say nothing about the heading and do not count.
+        nodes: branches after which the search for the largest consistent set gives up being exact.
+        min_inliers: pairs in that set. Of 200 keypoints without any partner, mutual nearest ones agree in sets of up
+            to 7 by chance.
+        max_shift: metres from where it was sought within which a match lies.
+        max_turn: radians, likewise.
+        reach: metres around its middle that the query covers.
     """
 
     keypoints: int = 200
     pairs: int = 300
     tolerance: float = 1.0
     spread: float = 0.4
-    least_apart: float = 2.0
+    min_separation: float = 2.0
     nodes: int = 2000
-    least_inliers: int = 8
-    most_shift: float = 6.0
-    most_turn: float = math.radians(15.0)
+    min_inliers: int = 8
+    max_shift: float = 6.0
+    max_turn: float = math.radians(15.0)
     reach: float = 30.0
 
     def __post_init__(self) -> None:
         counts(self, "keypoints", "nodes")
-        counts(self, "least_inliers", least=2)
-        counts(self, "pairs", least=2)
+        counts(self, "min_inliers", minimum=2)
+        counts(self, "pairs", minimum=2)
         require(self.pairs <= 400, self, "pairs", "400 at most: the time grows with their square")
-        positive(self, "tolerance", "spread", "least_apart", "most_shift", "most_turn", "reach")
+        positive(self, "tolerance", "spread", "min_separation", "max_shift", "max_turn", "reach")

@@ -42,7 +42,7 @@ def clock_finding(clouds: list[Seen], odometry: list[Seen], robot: str) -> Findi
     ahead = _offset(odometry) - _offset(clouds)
     size = abs(ahead)
     found = f"odometry stamps are {_seconds(size)} {'ahead of' if ahead > 0 else 'behind'} the clouds'"
-    horizon, wait = NodeConfig().horizon, NodeConfig().pairing_wait
+    horizon, wait = NodeConfig().odometry_history, NodeConfig().pairing_wait
     if -wait <= ahead <= _LAG:
         return Finding("ok", "one clock", found, robot=robot)
     if 0 < ahead < horizon:
@@ -68,7 +68,7 @@ def _seconds(value: float) -> str:
 
 def pairing_finding(clouds: list[Seen], odometry: list[Seen], ended: float, robot: str) -> Finding:
     """Play the messages to the node's own pairing, in order of arrival, and see what becomes of the clouds."""
-    config, counters = NodeConfig(horizon=60.0), Counters()
+    config, counters = NodeConfig(odometry_history=60.0), Counters()
     buffer = OdometryBuffer(config)
     pairing = FrameSync(config, buffer, counters)
     # what was under way when listening began or ended says nothing

@@ -100,7 +100,7 @@ class OdometryBuffer:
         self._samples.append(_Entry(sample, self.travelled, self.turned))
         self._strange.clear()
         self._strange_since = float("inf")
-        oldest = sample.stamp_ns - round(self.config.horizon * _NS)
+        oldest = sample.stamp_ns - round(self.config.odometry_history * _NS)
         while self._samples[0].stamp_ns < oldest:
             self._samples.popleft()
         return verdict
@@ -113,7 +113,7 @@ class OdometryBuffer:
             return SampleKind.DUPLICATE
         seconds = (sample.stamp_ns - last.stamp_ns) / _NS
         # a single stray stamp must not shut out all that follow, so one far ahead has to be confirmed as well
-        ahead = seconds > self.config.horizon + 2.0 * (now - self.arrived)
+        ahead = seconds > self.config.odometry_history + 2.0 * (now - self.arrived)
         if seconds < 0 or ahead:
             if not self._runs_on(sample.stamp_ns, now):
                 return SampleKind.OUT_OF_ORDER

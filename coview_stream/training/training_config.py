@@ -27,5 +27,5 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         counts(self, "steps", "pieces", "each", "width", "wrong")
-        counts(self, "seed", least=0)
+        counts(self, "seed", minimum=0)
         positive(self, "rate", "decay")

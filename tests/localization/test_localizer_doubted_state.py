@@ -49,7 +49,7 @@ def test_while_the_newest_registration_is_doubtful_there_is_no_pose(found, world
     assert doubtful.covariance is None
     assert doubtful.drift is None
     assert doubtful.confidence == 0.0
-    assert doubtful.evidence.score < RULE.keep_score
+    assert doubtful.evidence.score < RULE.tracking_min_score
     assert doubtful.evidence.cause in (
         RejectionReason.GROUND,
         RejectionReason.FITNESS,
@@ -75,7 +75,7 @@ def test_what_a_registration_says_is_told(found, world_drive):
     fix = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 2.5)
     assert fix.evidence.cause is RejectionReason.VERIFIED
     assert fix.evidence.reason == "verified"
-    assert 0.0 < fix.evidence.innovation < RULE.keep_innovation
+    assert 0.0 < fix.evidence.innovation < RULE.max_innovation
     assert fix.evidence.stamp == 2.5
     assert fix.drift is not None
     doubtful = found.step(garbage(), world_drive.T_odom_body[6], 3.0)
@@ -94,13 +94,13 @@ def test_a_search_has_no_cause_and_no_innovation(world_fixes):
 def test_after_a_loss_the_search_starts_from_nothing(found, world_drive):
     """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
     anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
-    lost = follow(found, anew, range(RULE.patience), 2.5)
-    assert [fix.T_map_body for fix in lost] == [None] * RULE.patience
+    lost = follow(found, anew, range(RULE.max_rejections), 2.5)
+    assert [fix.T_map_body for fix in lost] == [None] * RULE.max_rejections
     assert lost[-1].state is State.LOST
-    again = follow(found, anew, range(RULE.patience, RULE.patience + RULE.confirmations), 2.5)
+    again = follow(found, anew, range(RULE.max_rejections, RULE.max_rejections + RULE.confirmations), 2.5)
     assert [fix.state for fix in again] == [State.LOST] * (RULE.confirmations - 1) + [State.TRACKING]
     assert min(fix.evidence.score for fix in again) > 0.9
-    assert right(again[-1], anew.T_map_body[RULE.patience + RULE.confirmations - 1])
+    assert right(again[-1], anew.T_map_body[RULE.max_rejections + RULE.confirmations - 1])
 
 
 def found_frame(drive):
@@ -115,7 +115,7 @@ def test_odometry_that_starts_anew_far_away_is_lost_and_found(found, world_drive
     assert all(fix.T_map_body is None for fix in fixes)
     assert fixes[0].evidence.cause is RejectionReason.OFF_MAP
     states = [fix.state for fix in fixes]
-    assert states.index(State.LOST) == round(RULE.patience_seconds)
+    assert states.index(State.LOST) == round(RULE.max_doubt_s)
     again = follow(found, anew, range(1, 5), 15.0)
     assert again[-1].state is State.TRACKING
     assert right(again[-1], anew.T_map_body[4])
@@ -136,7 +136,7 @@ def test_carried_between_two_frames_there_is_no_wrong_pose_at_all(world_map, wor
         assert fix.T_map_body is None or right(fix, truth)
     lost = [fix for fix in fixes if fix.state is State.LOST]
     assert lost
-    assert f"{RULE.patience} registrations rejected" in lost[0].evidence.reason
+    assert f"{RULE.max_rejections} registrations rejected" in lost[0].evidence.reason
     assert lost[0].evidence.cause in (
         RejectionReason.FITNESS,
         RejectionReason.FREE_SPACE,
@@ -190,11 +190,11 @@ def covered(seed):
 
 def test_a_covered_sensor_costs_the_pose_and_in_the_end_the_place_which_is_found_again(found, world_drive):
     """As soon as any place could be: the first keyframe that sees anything counts already."""
-    seconds = np.arange(2.5, 2.5 + RULE.patience_blind + 2.0, 1.0)
+    seconds = np.arange(2.5, 2.5 + RULE.max_blind_s + 2.0, 1.0)
     fixes = [found.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
     assert all(fix.T_map_body is None for fix in fixes)
     assert fixes[0].evidence.cause is RejectionReason.BLIND
-    blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.patience_blind]
+    blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.max_blind_s]
     assert {fix.state for fix in blind} == {State.AMBIGUOUS}
     assert fixes[-1].state is State.LOST
     again = follow(found, world_drive, range(6, 10), 100.0)
@@ -207,7 +207,7 @@ def test_a_covered_sensor_costs_the_pose_and_in_the_end_the_place_which_is_found
 def test_after_a_short_cover_the_pose_is_back_at_once_and_after_a_long_one_with_proof(world_map, world_drive):
     """Meanwhile it may have been carried: one frame could fit by chance."""
     waits = []
-    for seconds in (0.5 * RULE.patience_seconds, 2.0 * RULE.patience_seconds):
+    for seconds in (0.5 * RULE.max_doubt_s, 2.0 * RULE.max_doubt_s):
         localizer = Localizer(world_map)
         follow(localizer, world_drive, range(5))
         for t in np.arange(2.5, 2.5 + seconds, 0.5):

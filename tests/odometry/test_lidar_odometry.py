@@ -14,7 +14,7 @@ from coview_stream.errors import CloudError, DependencyError, RunError
 from coview_stream.geometry.transforms import inverse, is_pose, pose_from, rot_z, tilt_of
 from coview_stream.odometry.lidar_odometry import LidarOdometry
 
-LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
+LEVEL = LidarOdometryConfig(gravity="level", level_with_walls=False)
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +195,7 @@ def test_walls_undo_a_tilt_that_drifts(cloud):
     lean = [np.linalg.matrix_power(tilt, k) for k in range(25)]  # the robot stands, and registration tilts it
     ends = {}
     for plumb in (True, False):
-        odometry = LidarOdometry(LidarOdometryConfig(gravity="level", plumb=plumb), Told(*lean))
+        odometry = LidarOdometry(LidarOdometryConfig(gravity="level", level_with_walls=plumb), Told(*lean))
         for k in range(25):
             T = odometry.step(cloud, None, 0.1 * k)
         ends[plumb] = np.degrees(tilt_of(T))

@@ -229,7 +229,7 @@ def test_stamps_that_run_backwards_for_ever_are_no_restart():
 
 
 def test_only_the_horizon_is_remembered():
-    odometry = buffer(horizon=2.0)
+    odometry = buffer(odometry_history=2.0)
     steady(odometry, 0.0, 10.0)
     assert odometry.covers(ns(7.99)) == -1
     assert odometry.covers(ns(8.0)) == 0
@@ -293,8 +293,8 @@ def test_whatever_stamps_come_the_buffer_stays_in_order(samples):
     "wrong",
     [
         {"pose_rate": 0.0},
-        {"coast": -1.0},
-        {"horizon": float("nan")},
+        {"dead_reckoning_timeout": -1.0},
+        {"odometry_history": float("nan")},
         {"max_gap": float("inf")},
         {"pose_rate": 201.0},
     ],

@@ -33,7 +33,7 @@ class Steady:
 
 
 def lidar():
-    return LidarOdometry(LidarOdometryConfig(gravity="level", plumb=False), Steady())
+    return LidarOdometry(LidarOdometryConfig(gravity="level", level_with_walls=False), Steady())
 
 
 def sweep(k):

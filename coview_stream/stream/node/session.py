@@ -158,8 +158,8 @@ class Session:
             newest_ns = self.odometry.newest.stamp_ns if self.odometry.newest else 0
             if silent > self.config.odometry_timeout:
                 self.whereabouts.stop(self._silence(now), newest_ns)
-            elif unseen > self.config.coast:
-                self.whereabouts.stop(f"no usable frame for {self.config.coast:g} s", newest_ns)
+            elif unseen > self.config.dead_reckoning_timeout:
+                self.whereabouts.stop(f"no usable frame for {self.config.dead_reckoning_timeout:g} s", newest_ns)
             self._look()
 
     def _silence(self, now: float) -> str:

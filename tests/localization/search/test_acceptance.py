@@ -52,7 +52,7 @@ def test_a_place_that_features_favour_needs_less_proof_but_all_confirmations() -
 
 def test_what_lies_off_the_map_proves_nothing() -> None:
     """At the map's edge a few points may fit anywhere: the fewer lie on it, the more keyframes are needed."""
-    shares = [RULE.inside_fully, 0.75 * RULE.inside_fully, RULE.inside]
+    shares = [RULE.full_overlap, 0.75 * RULE.full_overlap, RULE.min_overlap]
     needed = [keyframes_needed(candidate(0.45, inside=share)) for share in shares]
     assert None not in needed
     assert needed == sorted(set(needed))
@@ -75,16 +75,16 @@ def test_votes_for_this_place_count_whoever_named_it_first() -> None:
 
 
 def test_votes_never_make_a_place_true_that_does_not_fit() -> None:
-    assert keyframes_needed(candidate(RULE.favoured_score - 0.02, lead=100.0)) is None
+    assert keyframes_needed(candidate(RULE.learned_score - 0.02, lead=100.0)) is None
     assert keyframes_needed(candidate(WEAK, lead=100.0), candidate(WEAK - 0.05, ELSEWHERE)) is None
-    assert keyframes_needed(candidate(WEAK, lead=100.0, inside=RULE.inside - 0.02)) is None
+    assert keyframes_needed(candidate(WEAK, lead=100.0, inside=RULE.min_overlap - 0.02)) is None
 
 
 def test_a_lower_score_is_enough_only_where_features_favour_the_place_clearly() -> None:
     low = RULE.score - 0.03
     assert keyframes_needed(candidate(low)) is None
-    assert keyframes_needed(candidate(low, lead=0.9 * RULE.favoured_lead)) is None
-    needed = keyframes_needed(candidate(low, lead=RULE.favoured_lead))
+    assert keyframes_needed(candidate(low, lead=0.9 * RULE.learned_lead)) is None
+    needed = keyframes_needed(candidate(low, lead=RULE.learned_lead))
     assert needed is not None
     assert needed > RULE.confirmations
 

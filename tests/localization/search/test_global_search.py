@@ -100,7 +100,7 @@ def test_a_place_that_stands_alone_is_believed_after_enough_keyframes(search):
 
 REFUSED = {
     "low score": ([candidate(RULE.score - 0.02)], State.SEARCHING),
-    "off the survey": ([candidate(0.95, inside=RULE.inside - 0.05)], State.SEARCHING),
+    "off the survey": ([candidate(0.95, inside=RULE.min_overlap - 0.05)], State.SEARCHING),
     "no ground": ([candidate(0.5, ground=RULE.ground - 0.05)], State.AMBIGUOUS),
     "equal rival": ([candidate(0.7), candidate(0.7, moved(20))], State.AMBIGUOUS),
     "close rival": ([candidate(0.7), candidate(0.7 - RULE.lead / 2, moved(20))], State.AMBIGUOUS),
@@ -123,7 +123,7 @@ def test_refused_however_often_it_is_seen(search, case):
 ACCEPTED = {
     "just good enough": [candidate(RULE.score + 0.02)],
     "just enough ground": [candidate(0.65, ground=RULE.ground + 0.05)],
-    "just inside": [candidate(0.95, inside=RULE.inside + 0.05)],
+    "just inside": [candidate(0.95, inside=RULE.min_overlap + 0.05)],
     "rival far enough below": [candidate(0.7), candidate(0.7 - 1.5 * RULE.lead, moved(20))],
     "the same place twice is no rival": [candidate(0.7), candidate(0.69, moved(0.5, 1.0))],
 }
@@ -132,7 +132,7 @@ ACCEPTED = {
 @pytest.mark.parametrize("case", ACCEPTED)
 def test_accepted(search, case):
     best = ACCEPTED[case][0]
-    proof = int(np.ceil(RULE.proof / (best.evidence.score - RULE.proof_floor)))
+    proof = int(np.ceil(RULE.evidence_sum / (best.evidence.score - RULE.evidence_floor)))
     accepted = [v.accepted for v in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))]
     assert accepted[-1] is best
     # no sooner either: weak evidence needs more driving
@@ -210,7 +210,7 @@ def test_one_scan_alone_must_lead_by_more(stationary):
         assert verdict.accepted is None
         assert verdict.evidence.state is State.AMBIGUOUS
     assert judged(stationary, [candidate(RULE.single_score - 0.01)])[0].accepted is None
-    assert judged(stationary, [candidate(0.9, inside=RULE.inside - 0.05)])[0].accepted is None
+    assert judged(stationary, [candidate(0.9, inside=RULE.min_overlap - 0.05)])[0].accepted is None
 
 
 # ---- on the small world
@@ -273,15 +273,15 @@ def test_what_was_bad_is_not_tried_again(search, world_drive, monkeypatch):
     assert search.update(next(frames)).evidence.score == 0.0
 
 
-def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, most_tilt):
+def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, max_tilt):
     """First search keyframe; the odometry leans against gravity by TILT, the hypothesis is right but upright."""
     config = LocalizerConfig(
         registration=RegistrationConfig(gravity_sigma=gravity_sigma),
         acceptance=AcceptanceConfig(
-            most_tilt=most_tilt,
+            max_tilt=max_tilt,
             confirmations=1,
-            proof=0.01,
-            proof_floor=0.0,
+            evidence_sum=0.01,
+            evidence_floor=0.0,
             score=0.01,
             lead=0.01,
             ground=0.01,

@@ -7,7 +7,7 @@ import pytest
 from coview_stream.config import AcceptanceConfig, TrackingConfig
 from coview_stream.localization.tracking.monitor import LossMonitor, MatchVerdict, RejectionReason
 
-RULE = AcceptanceConfig(patience=3, patience_seconds=10.0, patience_blind=60.0, confirmations=3)
+RULE = AcceptanceConfig(max_rejections=3, max_doubt_s=10.0, max_blind_s=60.0, confirmations=3)
 GOOD = MatchVerdict(RejectionReason.VERIFIED, "verified")
 BAD = MatchVerdict(RejectionReason.FITNESS, "nothing fits")
 AGAINST = [

@@ -84,7 +84,7 @@ def test_innovation_is_the_distance_from_what_the_graph_predicts(world_map, worl
     gap = boxminus(far.T_map_body, away)
     expected = gap @ np.linalg.solve(TIGHT + far.covariance, gap)
     assert far.innovation == pytest.approx(expected, rel=1e-6)
-    assert far.innovation > CONFIG.acceptance.keep_innovation
+    assert far.innovation > CONFIG.acceptance.max_innovation
     assert far.judgement.innovation == far.innovation
     # the place fits: what to think of odometry is another question
     assert far.judgement.cause is RejectionReason.VERIFIED

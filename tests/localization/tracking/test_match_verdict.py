@@ -10,7 +10,7 @@ from coview_stream.config import AcceptanceConfig
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 
-RULE = AcceptanceConfig(keep_score=0.22, keep_share=0.5, keep_ground=0.5, inside=0.3)
+RULE = AcceptanceConfig(tracking_min_score=0.22, tracking_min_share=0.5, tracking_min_ground=0.5, min_overlap=0.3)
 GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
 
 
@@ -55,11 +55,11 @@ def test_off_the_map_says_more_than_that_nothing_fits():
 def test_what_would_do_elsewhere_does_not_where_places_fit_better(used):
     """A score of 0.3: right in a street where half of everything is hidden, wrong where 0.8 is usual."""
     poor = Evidence(near=0.3, covered=0.45, ground=0.85, free_space=0.8, inside=1.0)
-    assert RULE.keep_score < poor.score < RULE.keep_share * used.usual.score
+    assert RULE.tracking_min_score < poor.score < RULE.tracking_min_share * used.usual.score
     assert EvidenceBaseline().judge(poor, RULE)[0] is RejectionReason.VERIFIED
     cause, reason = used.judge(poor, RULE)
     assert cause is RejectionReason.FITNESS
-    assert f"score {poor.score:.2f}, {RULE.keep_share * GOOD.score:.2f} needed" in reason
+    assert f"score {poor.score:.2f}, {RULE.tracking_min_share * GOOD.score:.2f} needed" in reason
     assert "80% usual here" in reason
     poor_habit = EvidenceBaseline()
     poor_habit.learn(poor)
@@ -68,12 +68,12 @@ def test_what_would_do_elsewhere_does_not_where_places_fit_better(used):
 
 def test_a_poor_habit_does_not_lower_what_is_asked_in_any_case():
     bad = replace(GOOD, near=0.05, covered=0.5)
-    assert bad.score < RULE.keep_score
+    assert bad.score < RULE.tracking_min_score
     habit = EvidenceBaseline()
     habit.learn(bad)
     cause, reason = habit.judge(bad, RULE)
     assert cause is not RejectionReason.VERIFIED
-    assert f"{RULE.keep_score:.2f} needed" in reason
+    assert f"{RULE.tracking_min_score:.2f} needed" in reason
 
 
 def test_the_cause_is_what_has_fallen_furthest_below_what_is_usual():
@@ -83,7 +83,7 @@ def test_the_cause_is_what_has_fallen_furthest_below_what_is_usual():
         Evidence(near=0.45, covered=0.6, ground=0.9, free_space=0.9, inside=1.0),
     )
     habit.learn(usual)
-    tight = replace(RULE, keep_share=0.9)
+    tight = replace(RULE, tracking_min_share=0.9)
     assert habit.judge(replace(usual, free_space=0.5, near=0.4), tight)[0] is RejectionReason.FREE_SPACE
     assert habit.judge(replace(usual, ground=0.6, near=0.42), tight)[0] is RejectionReason.GROUND
     assert habit.judge(replace(usual, free_space=0.8, near=0.2), tight)[0] is RejectionReason.FITNESS

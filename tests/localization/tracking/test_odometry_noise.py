@@ -15,7 +15,7 @@ CONFIG = TrackingConfig(
     tilt_drift=np.radians(0.05),
     yaw_drift=np.radians(0.15),
     turn_drift=0.02,
-    drift_trust=10.0,
+    drift_prior=10.0,
     drift_memory=40.0,
 )
 NOISE = np.square([3e-4, 3e-4, 2e-4, 0.004, 0.004, 0.002])

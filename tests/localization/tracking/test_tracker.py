@@ -33,7 +33,7 @@ def test_a_good_registration_is_believed(world_map, world_drive):
     assert judgement.verified
     assert judgement.reason == "verified"
     assert judgement.score == judgement.evidence.score > 0.8
-    assert 0.0 < judgement.innovation < RULE.keep_innovation
+    assert 0.0 < judgement.innovation < RULE.max_innovation
     metres, degrees = ride.error(truth)
     assert metres < 0.05
     assert degrees < 0.2
@@ -86,7 +86,7 @@ def test_the_map_is_cropped_before_it_is_needed(world_map, world_drive, monkeypa
 
 @pytest.mark.parametrize(
     ("rule", "cause"),
-    [("keep_score", None), ("inside", RejectionReason.OFF_MAP), ("keep_ground", RejectionReason.GROUND)],
+    [("tracking_min_score", None), ("min_overlap", RejectionReason.OFF_MAP), ("tracking_min_ground", RejectionReason.GROUND)],
 )
 def test_the_same_registration_held_to_a_higher_standard(world_map, world_drive, rule, cause):
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
@@ -100,7 +100,7 @@ def test_garbage_is_not_believed(world_map, world_drive):
     ride = ride_of(world_map, world_drive)
     judgement = refused(ride, garbage(), world_drive.T_map_body[4], alone=True)
     assert judgement.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
-    assert judgement.score < RULE.keep_score
+    assert judgement.score < RULE.tracking_min_score
 
 
 def test_another_world_does_not_fit_by_what_stands_there(world_map, world_drive, elsewhere):
@@ -115,7 +115,7 @@ def test_rays_that_pass_through_what_the_map_shows_are_named(world_map, world_dr
     """The nearest buildings have been torn down; what is left stands where it stood."""
     truth = world_drive.T_map_body[4]
     near = sorted(scene, key=lambda box: np.hypot(*(box.centre - truth[:2, 3])))
-    ride = ride_of(world_map, world_drive, ruled(keep_share=0.95))
+    ride = ride_of(world_map, world_drive, ruled(tracking_min_share=0.95))
     assert ride.update(world_drive.clouds[4], truth).verified
     judgement = refused(ride, scan(near[4:], truth), truth, alone=True)
     assert judgement.cause is RejectionReason.FREE_SPACE
@@ -150,7 +150,7 @@ def test_a_pose_that_leans_more_than_the_limit_is_not_believed(world_map, world_
     tilt, truth = np.radians(3.0), world_drive.T_map_body[4]
     leaning = exp_se3(np.array([0.0, tilt, 0.0, 0.0, 0.0, 0.0]))
     robot = pose_from(np.eye(3), truth[:3, 3])
-    config = ruled(most_tilt=limit * tilt, keep_score=0.01, inside=0.01, keep_ground=0.01)
+    config = ruled(max_tilt=limit * tilt, tracking_min_score=0.01, min_overlap=0.01, tracking_min_ground=0.01)
     ride = Ride.begin(
         world_map,
         config,

@@ -63,15 +63,15 @@ def test_turning_makes_it_due_and_to_and_fro_adds_up(world_map):
 @pytest.mark.parametrize(
     ("bad", "metres"),
     [
-        ({"position_drift": 0.04, "unsure_position": 0.03}, 0.75**2),
-        ({"yaw_drift": 0.004, "unsure_yaw": 0.003}, 0.75**2),
-        ({"position_drift": 0.4, "unsure_position": 0.03, "least_distance": 0.25}, 0.25),
-        ({"yaw_drift": 0.4, "unsure_yaw": 0.003, "least_distance": 0.25}, 0.25),
-        ({"position_drift": 0.01, "unsure_position": 0.03}, 1.0),
+        ({"position_drift": 0.04, "max_position_sigma": 0.03}, 0.75**2),
+        ({"yaw_drift": 0.004, "max_yaw_sigma": 0.003}, 0.75**2),
+        ({"position_drift": 0.4, "max_position_sigma": 0.03, "min_distance": 0.25}, 0.25),
+        ({"yaw_drift": 0.4, "max_yaw_sigma": 0.003, "min_distance": 0.25}, 0.25),
+        ({"position_drift": 0.01, "max_position_sigma": 0.03}, 1.0),
     ],
 )
 def test_where_odometry_is_bad_it_is_due_earlier_but_not_at_once(world_map, bad, metres):
-    settings = {"distance": 1.0, "least_distance": 0.2, **bad}
+    settings = {"distance": 1.0, "min_distance": 0.2, **bad}
     found = steps_until_due(world_map, straight(0.01), **settings)
     assert 0.01 * found == pytest.approx(metres, abs=0.0101)
     late = steps_until_due(world_map, straight(0.05), 3.0, **settings)

@@ -38,7 +38,7 @@ def test_a_slip_is_found_and_the_next_frame_is_right(world_map, slow_drive, slip
     judgement = ride.update(clouds[k], truth[k])
     assert judgement.cause is RejectionReason.ODOMETRY
     assert not judgement.verified
-    assert judgement.innovation > RULE.keep_innovation
+    assert judgement.innovation > RULE.max_innovation
     told = [float(word) for word in judgement.reason.split() if word[0].isdigit()]
     # by the new way's end a wrong heading is a wrong place, too
     assert told[0] == pytest.approx(metres, abs=0.03 + 0.2 * np.radians(degrees))
@@ -68,7 +68,7 @@ def test_what_may_be_odometrys_drift_is_no_slip(world_map, slow_drive):
     causes = []
     for trusted in (0.002, 0.1):
         config = LocalizerConfig(
-            tracking=replace(TrackingConfig(), position_drift=trusted, drift_trust=1000.0)
+            tracking=replace(TrackingConfig(), position_drift=trusted, drift_prior=1000.0)
         )
         ride = on_the_way(world_map, slow_drive, config)
         ride.slips(small, slow_drive.T_map_body[7])
@@ -119,7 +119,7 @@ def test_standing_still_only_what_was_seen_since_counts(world_map, slow_drive):
         ride.see(garbage(k), slow_drive.T_map_body[4])
     judgement = ride.update(garbage(3), slow_drive.T_map_body[4], idle=True)
     assert not judgement.verified
-    assert judgement.score < RULE.keep_score
+    assert judgement.score < RULE.tracking_min_score
     moving = on_the_way(world_map, slow_drive, wide, 4)
     for k in (1, 2):
         moving.see(garbage(k), slow_drive.T_map_body[4])

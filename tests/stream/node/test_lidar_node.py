@@ -23,7 +23,7 @@ from coview_stream.stream.node.lidar_session import LidarSession
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.transport.memory_transport import FakeTransport
 
-LEVEL = LidarOdometryConfig(gravity="level", plumb=False)
+LEVEL = LidarOdometryConfig(gravity="level", level_with_walls=False)
 CLOUD = np.random.default_rng(0).uniform(-30, 30, (500, 3)).astype(np.float32)
 FATAL = np.concatenate([CLOUD, CLOUD])
 
@@ -85,7 +85,7 @@ def placing(job):
 @pytest.fixture
 def quiet():
     net = FakeTransport()
-    session = LidarSession(KEYS, SHA, NodeConfig(odometry_timeout=30.0, coast=30.0))
+    session = LidarSession(KEYS, SHA, NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0))
     track, lane = Lane(tracking), Lane(placing)
     made = Node([session], net, track, track, session.config, odometry=lane)
     made.declare()
@@ -166,7 +166,7 @@ def test_an_engine_that_aborts_is_started_again(stand_in):
 
 def test_a_node_survives_its_odometry_engine(stand_in):
     net = FakeTransport()
-    config = NodeConfig(odometry_timeout=30.0, coast=30.0, max_outage=30.0, pose_rate=50.0)
+    config = NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0, max_outage=30.0, pose_rate=50.0)
     session = LidarSession(KEYS, SHA, config, lidar=LEVEL)
     track, lane = Lane(tracking), EngineProcess("odometry", "unused", "")
     node = Node([session], net, track, track, config, odometry=lane)

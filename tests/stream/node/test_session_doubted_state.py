@@ -96,7 +96,7 @@ def test_silence_during_a_doubt_loses_the_place(covered):
 
 @pytest.mark.parametrize("answer", [tracking, doubted])
 def test_without_frames_a_place_that_waits_to_be_verified_is_lost_but_the_first_frame_may_do_it(answer):
-    robot = Robot(NodeConfig(coast=2.0)).localized(0.0)
+    robot = Robot(NodeConfig(dead_reckoning_timeout=2.0)).localized(0.0)
     robot.frame(0.1, answer)
     robot.moved(0.8, x=0.3)  # after a pause
     for k in range(17, 80):

@@ -167,7 +167,7 @@ def test_duplicates_keep_nobody_alive(robot):
 
 
 def test_without_frames_odometry_carries_on_for_a_while_only():
-    robot = Robot(NodeConfig(coast=2.0)).localized(0.0)
+    robot = Robot(NodeConfig(dead_reckoning_timeout=2.0)).localized(0.0)
     for k in range(1, 39):
         robot.moved(0.05 * k)
         robot.session.tick(robot.now)
@@ -182,7 +182,7 @@ def test_without_frames_odometry_carries_on_for_a_while_only():
 
 
 def test_frames_that_are_rejected_do_not_count_as_seen():
-    robot = Robot(NodeConfig(coast=1.0)).localized(0.0)
+    robot = Robot(NodeConfig(dead_reckoning_timeout=1.0)).localized(0.0)
     for k in range(1, 30):
         robot.moved(0.05 * k)
         robot.saw(0.05 * k - 0.01)

@@ -130,7 +130,7 @@ def test_a_pose_too_far_from_the_start_is_none(off):
     pose = (10.0, 20.0, 0.5)
     query, known = views(np.random.default_rng(1), pose)
     start = tuple(np.add(pose, off))
-    config = LearnedMatchConfig(least_inliers=10)
+    config = LearnedMatchConfig(min_inliers=10)
     assert refine_by_keypoints(query, known, start, config) is None
 
 
@@ -139,7 +139,7 @@ def test_a_mirror_image_is_no_match():
     query, known = views(np.random.default_rng(2), pose, own=0)
     assert refine_by_keypoints(query, known, pose) is not None
     mirrored = Keypoints(known.xy * (1.0, -1.0), known.descriptors, known.sigma)
-    config = LearnedMatchConfig(least_inliers=12, most_shift=50.0, most_turn=4.0)
+    config = LearnedMatchConfig(min_inliers=12, max_shift=50.0, max_turn=4.0)
     assert refine_by_keypoints(query, known, pose, config) is not None
     assert refine_by_keypoints(query, mirrored, pose, config) is None
 

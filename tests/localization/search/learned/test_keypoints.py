@@ -113,7 +113,7 @@ def test_nothing_pairs_with_nothing():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"keypoints": 0}, {"pairs": 401}, {"least_inliers": 1}, {"tolerance": 0.0}, {"most_turn": -1.0}]
+    "wrong", [{"keypoints": 0}, {"pairs": 401}, {"min_inliers": 1}, {"tolerance": 0.0}, {"max_turn": -1.0}]
 )
 def test_a_configuration_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
