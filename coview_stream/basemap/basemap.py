@@ -1,6 +1,4 @@
-"""The base map: stations with descriptors to search in, and a tiled cloud with normals to register to."""
-
-# FOLDED coview_stream/basemap/basemap.py: """Whether a map's learned features can be used here; apart from the sources, for a node's parent imports it."""
+"""Base map: stations with descriptors to search in, and a tiled cloud with normals to register to."""
 
 from __future__ import annotations
 
@@ -24,15 +22,14 @@ from coview_stream.geometry.transforms import Points
 if TYPE_CHECKING:
     from coview_stream.descriptors.feature_map import FeatureMap
 
-
 _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
 
 _FIXED = {"visibility": "paper", "eye": 1.5}
-"""Descriptor options of earlier versions, in the files of those: the value that is all there is now."""
+"""Descriptor options that only earlier versions had, which their files name, and the value that is built in now."""
 
 
 class BaseMap:
-    """A base map, built from clouds or loaded from a ``.coview`` file.
+    """Base map, built from clouds or loaded from a ``.coview`` file.
 
     All coordinates inside are float32 metres relative to :attr:`origin`, (3,) float64 in the frame of the source.
 
@@ -158,39 +155,37 @@ class BaseMap:
         index[~inside] = 0
         return np.asarray(inside & (grid[index[:, 1], index[:, 0]] > 0))
 
+    def require_features(self, reloc: Reloc, load: bool = True) -> str | None:
+        """Check what the first learned query needs: the map's features, the weights and onnxruntime.
 
-def check_reloc(base_map: BaseMap, reloc: Reloc, load: bool = True) -> str | None:
-    """Try what the first query would stumble on: features, weights and onnxruntime.
+        Args:
+            reloc: how the map is to be searched.
+            load: also load the network, which takes 0.3 s and 60 MB; only searching needs it.
 
-    Args:
-        base_map: the map.
-        reloc: what is asked for.
-        load: also load the network, which takes 0.3 s and 60 MB; whoever does not search need not.
+        Returns:
+            Why ``auto`` goes without the features that the map has, with the remedy; None if it does not have to.
 
-    Returns:
-        Why ``auto`` goes without the features that the map has, with the remedy; None if it does not have to.
+        Raises:
+            MapError: ``learned`` is asked for, and the map has no features, damaged ones, or some of other weights.
+            InputError: likewise, and there are no weights, or some that cannot be loaded.
+            DependencyError: likewise, and there is no onnxruntime, or one that cannot be loaded.
+        """
+        if reloc == "coview":
+            return None
+        try:
+            if self.learned is not None:
+                self.learned.check()
+                if load:
+                    from coview_stream.descriptors.network import network
 
-    Raises:
-        MapError: ``learned`` is asked for, and the map has no features, damaged ones, or some of other weights.
-        InputError: likewise, and there are no weights, or some that cannot be loaded.
-        DependencyError: likewise, and there is no onnxruntime, or one that cannot be loaded.
-    """
-    if reloc == "coview":
+                    network("ground", None, 1)
+            elif reloc == "learned":
+                raise MapError(
+                    "the map has no learned features; build it again without --no-learned, or go without "
+                    "them (--reloc coview)"
+                )
+        except CoViewError as error:
+            if reloc == "learned":
+                raise
+            return f"going without learned features: {error}"
         return None
-    try:
-        if base_map.learned is not None:
-            base_map.learned.check()
-            if load:
-                from coview_stream.descriptors.network import network
-
-                network("ground", None, 1)
-        elif reloc == "learned":
-            raise MapError(
-                "the map has no learned features; build it again without --no-learned, or go without "
-                "them (--reloc coview)"
-            )
-    except CoViewError as error:
-        if reloc == "learned":
-            raise
-        return f"going without learned features: {error}"
-    return None

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.basemap.basemap import check_reloc
 from coview_stream.doctor.finding import Finding, from_error
 from coview_stream.doctor.machine_checks import GB, LEAST_MEMORY
 from coview_stream.errors import MapError
@@ -55,7 +54,7 @@ def site_findings(base_map: BaseMap, size: int, available: int | None) -> Iterat
 
 
 def _features_finding(base_map: BaseMap) -> Finding:
-    missing = check_reloc(base_map, "auto")
+    missing = base_map.require_features("auto")
     if missing is not None:
         return replace(from_error("map features", missing), verdict="warn")
     if base_map.learned is None:
@@ -81,7 +80,7 @@ def _learned_memory(base_map: BaseMap) -> float:
 
     Coarse features and a query's scores fill the rectangle around the map, however little of it has points.
     """
-    if check_reloc(base_map, "auto") is not None or base_map.learned is None:
+    if base_map.require_features("auto") is not None or base_map.learned is None:
         return 0.0
     from coview_stream.config import LearnedConfig
     from coview_stream.localization.search.learned.feature_index import KEPT_BYTES

@@ -11,7 +11,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from coview_stream.basemap.basemap import BaseMap, check_reloc
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors import network
 from coview_stream.descriptors.feature_map import weights_sha256
@@ -85,12 +85,12 @@ SPOILT = [
 
 def judged(base_map, text):
     """Every way to hear of features that cannot be used."""
-    said = check_reloc(base_map, "auto")
+    said = base_map.require_features("auto")
     assert said.startswith("going without learned features: ")
     assert text in said
-    assert check_reloc(base_map, "coview") is None
+    assert base_map.require_features("coview") is None
     with pytest.raises(CoViewError) as caught:
-        check_reloc(base_map, "learned")
+        base_map.require_features("learned")
     assert text in str(caught.value)
     with pytest.raises(type(caught.value)):
         Localizer(base_map, LocalizerConfig(reloc="learned"))
@@ -124,7 +124,7 @@ def test_all_is_well(learned_map, world_map, weights):
         assert SearchIndex.of(learned_map, LocalizerConfig(reloc="coview")).learned is None
         assert SearchIndex.of(world_map, LocalizerConfig()).learned is None
     for base_map, text in ((learned_map, "of the installed networks"), (world_map, "none")):
-        assert check_reloc(base_map, "auto") is None
+        assert base_map.require_features("auto") is None
         (finding,) = [f for f in site_findings(base_map, int(1e6), None) if f.what == "map features"]
         assert finding.verdict == "ok"
         assert text in finding.found

@@ -2,11 +2,9 @@
 
 Each (keyframe, station, shift) is a hypothesis of the same unknown transform. Odometry says where the other
 keyframes stood relative to the newest one, so a hypothesis of the newest keyframe predicts a station and a shift
-for each of the others: their distances are looked up there and added. All M x S hypotheses are summed, none is cut
-by a top-k before it could be confirmed.
+for each of the others: :class:`StationGrid` looks their distances up there, and they are added. All M x S hypotheses
+are summed, none is cut by a top-k before it could be confirmed.
 """
-
-# FOLDED coview_stream/localization/search/consensus.py: """The stations as the square grid they stand on: whatever has a value for each, looked up a step farther on."""
 
 from __future__ import annotations
 
@@ -22,21 +20,29 @@ from coview_kernels import Nearest
 from coview_stream.config import Channel, ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z
+from coview_stream.localization.search.retrieval import ScoreVolume
 
-_SAMPLE = 100_000  # numbers are enough for a median
-
+_SAMPLE = 100_000  # distances that a median is taken of; set by hand
+_SHORTLIST = 4000  # hypotheses among which distinct peaks are sought; set by hand
+_MARGIN = 100  # cells around the stations that are looked up; steps of more find nothing there; set by hand
+_LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys; set by hand
+_FILLED = 0.25  # share of the cells that must have a station for a raster of the values; set by hand
 _NO_VOTES = np.empty(0, dtype=np.float32)
-
-_SHORTLIST = 4000  # hypotheses among which distinct peaks are sought
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A coarse ``T_map_odom`` (4 x 4), with its station, shift and summed score (lower is better).
+    """A coarse ``T_map_odom`` to register from.
 
-    Station and shift are None where no vote stands behind it: somebody suggested it. ``learned`` says that the votes
-    are those of learned features, and ``lead`` by how much the mean keyframe's votes favour it over the next place, in
-    robust standard deviations; 0 where it is not the first. ``exact`` says that keypoints have agreed on it.
+    Attributes:
+        T_map_odom: (4, 4).
+        station: index of its station; None for a pose hint, which has no votes.
+        shift: its number of sectors; None for a pose hint.
+        score: sum of its votes, lower is better.
+        learned: whether the votes are those of learned features.
+        lead: how much the mean keyframe's votes prefer it to the next place, in robust standard deviations; 0 where it
+            is not the first.
+        exact: whether matched keypoints have refined it.
     """
 
     T_map_odom: Pose
@@ -50,31 +56,35 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class _Vote:
+    """What one keyframe says."""
+
     centre: Floats  # (3,) odometry frame, z on the ground
-    votes: Floats32  # standardised distances (S, ...), spread over the grid
+    scores: Floats32  # z-scores (S, ...) of the distances, in the grid's layout
     smallest: float  # smallest raw distance of any channel, for the paper's single-minimum rule
     where: tuple[int, int]  # its station and shift
     sectors: int
 
 
 class Consensus:
-    """The newest keyframes' votes and the hypotheses they agree on."""
+    """The votes of the newest keyframes, and the hypotheses that they agree on."""
 
     def __init__(self, stations: Floats32, block: float, config: ConsensusConfig) -> None:
         self.config = config
         self.stations = stations
         self.grid = StationGrid(stations, block)
-        self._ballots: deque[_Vote] = deque(maxlen=config.window)
+        self._votes: deque[_Vote] = deque(maxlen=config.window)
 
     def __len__(self) -> int:
         """Return how many keyframes have voted."""
-        return len(self._ballots)
+        return len(self._votes)
 
     def clear(self) -> None:
         """Forget all votes."""
-        self._ballots.clear()
+        self._votes.clear()
 
-    def vote(self, centre: Floats, distances: Mapping[Channel, Floats32] | Mapping[str, Floats32]) -> None:
+    def vote(
+        self, centre: Floats, distances: Mapping[Channel, ScoreVolume] | Mapping[str, ScoreVolume]
+    ) -> None:
         """Add one keyframe's distances (M, S) per channel; ``centre`` (3,) is its descriptor's zero, odometry frame.
 
         Channels are standardised (median and MAD over all hypotheses) before they are averaged: how far a
@@ -82,45 +92,44 @@ class Consensus:
         """
         best = min(distances.values(), key=lambda volume: float(volume.min()))
         station, shift = np.unravel_index(int(best.argmin()), best.shape)
-        votes = np.zeros_like(best)
+        mean = np.zeros_like(best)
         for volume in distances.values():
-            votes += robust_zscore(volume)
-        votes *= np.float32(1.0 / len(distances))
-        spread = self.grid.spread(np.ascontiguousarray(votes.T))
-        ballot = _Vote(centre, spread, float(best.min()), (int(station), int(shift)), best.shape[1])
-        self._ballots.append(ballot)
+            mean += robust_zscore(volume)
+        mean *= np.float32(1.0 / len(distances))
+        scores = self.grid.to_grid(np.ascontiguousarray(mean.T))
+        where = int(station), int(shift)
+        self._votes.append(_Vote(centre, scores, float(best.min()), where, best.shape[1]))
 
     def vote_nearest(self, centre: Floats, nearest: dict[Channel, Nearest], sectors: int) -> None:
-        """Add what ``single`` makes of one keyframe: the nearest station of each channel, out of ``sectors`` shifts."""
+        """Add one keyframe for mode ``single``: the nearest station of each channel, out of ``sectors`` shifts."""
         best = min(nearest.values(), key=lambda found: float(found.distance[0]))
         where = int(best.station[0]), int(best.shift[0])
-        self._ballots.append(_Vote(centre, _NO_VOTES, float(best.distance[0]), where, sectors))
+        self._votes.append(_Vote(centre, _NO_VOTES, float(best.distance[0]), where, sectors))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""
-        if not self._ballots:
+        if not self._votes:
             return []
         if self.config.mode == "single":
-            ballot = min(self._ballots, key=lambda b: b.smallest)
-            return [self._hypothesis(*ballot.where, ballot.smallest, ballot.centre)]
-        return self._peaks(self.scores(), self._ballots[-1].centre)
+            vote = min(self._votes, key=lambda vote: vote.smallest)
+            return [self._hypothesis(*vote.where, vote.smallest, vote.centre)]
+        return self._peaks(self.scores(), self._votes[-1].centre)
 
-    def scores(self) -> Floats32:
+    def scores(self) -> ScoreVolume:
         """Sum the votes (M, S) for the newest keyframe to stand at station m with shift n, per sqrt(keyframe)."""
-        newest = self._ballots[-1]
-        total = newest.votes.copy()
+        newest = self._votes[-1]
+        total = newest.scores.copy()
         yaw = yaw_of_shift(np.arange(len(total)), len(total))
-        turned = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        for ballot in list(self._ballots)[:-1]:
-            step = ballot.centre - newest.centre
-            cells = np.rint(np.tensordot(step[:2], turned, (0, 1)).T / self.grid.block).astype(np.int64)
+        turns = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        for vote in list(self._votes)[:-1]:
+            step = vote.centre - newest.centre
+            cells = np.rint(np.tensordot(step[:2], turns, (0, 1)).T / self.grid.block).astype(np.int64)
             for n, cell in enumerate(cells):
-                self.grid.add(total[n], ballot.votes[n], cell, float(step[2]))
-        total *= np.float32(1.0 / np.sqrt(len(self._ballots)))
-        scores: Floats32 = self.grid.gathered(total).T
-        return scores
+                self.grid.add(total[n], vote.scores[n], cell, float(step[2]))
+        total *= np.float32(1.0 / np.sqrt(len(self._votes)))
+        return np.asarray(self.grid.from_grid(total).T)
 
-    def _peaks(self, scores: Floats32, centre: Floats) -> list[Hypothesis]:
+    def _peaks(self, scores: ScoreVolume, centre: Floats) -> list[Hypothesis]:
         stations, sectors = scores.shape
         flat = np.ascontiguousarray(scores.T).ravel()
         shortlist = argsmallest(flat, _SHORTLIST)
@@ -138,8 +147,8 @@ class Consensus:
         return found
 
     def _hypothesis(self, station: int, shift: int, score: float, centre: Floats) -> Hypothesis:
-        """Eq. 12, mended: the turn is about the keyframe's centre, not about the odometry frame's origin."""
-        turn = rot_z(float(yaw_of_shift(shift, self._ballots[-1].sectors)))
+        """Eq. 12, corrected: the rotation is about the keyframe's centre, not about the odometry frame's origin."""
+        turn = rot_z(float(yaw_of_shift(shift, self._votes[-1].sectors)))
         T = pose_from(turn, self.stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
         return Hypothesis(T, station, shift, score)
 
@@ -149,21 +158,21 @@ def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> Floats:
     return np.asarray(shift, dtype=np.float64) * (-2.0 * np.pi / sectors)
 
 
-def robust_zscore(volume: Floats32) -> Floats32:
-    """How many robust standard deviations each distance lies from the median of all, negative is better."""
+def robust_zscore(volume: ScoreVolume) -> ScoreVolume:
+    """Robust standard deviations (M, S) by which each distance lies above the median of all: negative is better."""
     sample = _sample(volume)
     if not len(sample):
         return np.zeros_like(volume)
     median = np.median(sample)
-    spread = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
-    votes: Floats32 = (volume - median) * np.float32(1.0 / spread)
-    if median > 1.0:  # then what nothing is known of would count in favour
-        np.maximum(votes, np.float32(0.0), out=votes, where=volume == 1.0)
-    return votes
+    deviation = np.float32(1.4826 * np.median(np.abs(sample - median)) + 1e-6)
+    scores: ScoreVolume = (volume - median) * np.float32(1.0 / deviation)
+    if median > 1.0:  # unscored entries (1.0) must not get a negative z-score
+        np.maximum(scores, np.float32(0.0), out=scores, where=volume == 1.0)
+    return scores
 
 
-def _sample(volume: Floats32) -> Floats32:
-    """Distances (K,) at every shift of stations spread over the map, those left out that were not scored."""
+def _sample(volume: ScoreVolume) -> Floats32:
+    """Distances (K,) at every shift of every so many stations, without stations that were not scored."""
     every = max(1, volume.size // _SAMPLE)
     for rows in (volume[::every], volume):  # the paper's mode leaves most stations at 1, unscored
         scored = rows[(rows != 1.0).any(axis=1)]
@@ -176,7 +185,7 @@ def argsmallest(values: Floats32, count: int) -> Ints:
     """Return the indices of the ``count`` smallest of (N,) values, smallest first; equal ones by index."""
     if count >= len(values):
         return np.asarray(np.argsort(values, kind="stable"))
-    # most are ruled out by a bound from a sample, which is too small now and then: then all are looked at
+    # a bound from a sample rules most out; where it leaves fewer than ``count``, all are sorted
     every = max(1, len(values) // _SAMPLE)
     sample = values[::every]
     rank = min(2 * count // every, len(sample) - 1)
@@ -189,23 +198,16 @@ def argsmallest(values: Floats32, count: int) -> Ints:
     return np.asarray(found[np.argsort(values[found], kind="stable")[:count]])
 
 
-_MARGIN = 100  # cells around the stations that are looked up; steps of more find nothing there
-
-_LEVEL_GAP = 2.5  # metres: stations farther apart in height are on different storeys
-
-_FILLED = 0.25  # share of the cells that must have a station, or the values are not laid out on them
-
-
 class StationGrid:
-    """Finds the station at a position: stations stand at the centres of a square grid, one per level.
+    """The square grid at whose cells' centres the stations stand, one per level: values are added a step apart on it.
 
-    The values of stations, ``(S, M)``, are added up a step apart in either of two layouts, which agree for steps of
-    less than 100 cells. Where most cells have one station they are laid out on the cells, ``(S, H, W)``, and a step is
-    a shifted slice; otherwise (a lone road, or storeys) each is looked up, ``(S, M + 1)``, where the last column means
-    no station.
+    The values of stations, ``(S, M)``, take either of two layouts, which agree for steps of less than 100 cells. Where
+    at least a quarter of the cells has a station, and none has two, the values form a raster, ``(S, H, W)``, and a step
+    is a shifted slice; otherwise (a lone road, or storeys) each is looked up, ``(S, M + 1)``, where the last column
+    means no station.
 
     Attributes:
-        laid_out: whether the first layout is used.
+        is_raster: whether the first layout is used.
     """
 
     def __init__(self, stations: Floats32, block: float) -> None:
@@ -217,7 +219,7 @@ class StationGrid:
         self._shape = rows, columns
         self._cell = cells[:, 0] * columns + cells[:, 1]
         single = len(np.unique(self._cell)) == len(stations)
-        self.laid_out = bool(single and len(stations) >= _FILLED * rows * columns)
+        self.is_raster = bool(single and len(stations) >= _FILLED * rows * columns)
         self._width = columns + 2 * _MARGIN
         self._flat = (cells[:, 0] + _MARGIN) * self._width + cells[:, 1] + _MARGIN
 
@@ -233,10 +235,10 @@ class StationGrid:
             grid[level, unique[has]] = order[first[has] + level]
         return grid
 
-    def moved(self, step: Ints, rise: float) -> Indices:
-        """Index (M,) of the station that lies ``step`` (2,) cells from each station, -1 where there is none.
+    def shifted_index(self, step: Ints, rise: float) -> Indices:
+        """Index (M,) of the station ``step`` (2,) cells away from each station, -1 where there is none.
 
-        ``rise`` (metres) is the height gained on the way; it picks the storey.
+        ``rise`` is the height gained on the way, metres; it picks the storey.
         """
         if np.abs(step).max() >= _MARGIN:
             return np.full(len(self.stations), -1, dtype=np.intp)
@@ -250,24 +252,24 @@ class StationGrid:
         columns = np.arange(len(self.stations))
         return np.where(gap[best, columns] < _LEVEL_GAP, levels[best, columns], -1)
 
-    def spread(self, values: Floats32) -> Floats32:
-        """Lay out values (S, M) of the stations for :meth:`add`; a cell without a station has zero."""
-        if not self.laid_out:
+    def to_grid(self, values: Floats32) -> Floats32:
+        """Return values (S, M) of the stations in the layout for :meth:`add`; a cell without a station has zero."""
+        if not self.is_raster:
             return np.concatenate([values, np.zeros((len(values), 1), dtype=np.float32)], axis=1)
         cells = np.zeros((len(values), self._shape[0] * self._shape[1]), dtype=np.float32)
         cells[:, self._cell] = values
         return cells.reshape(len(values), *self._shape)
 
-    def gathered(self, spread: Floats32) -> Floats32:
-        """Values (S, M) of the stations out of their layout; undoes :meth:`spread`."""
-        if not self.laid_out:
-            return spread[:, :-1]
-        return np.asarray(spread.reshape(len(spread), -1)[:, self._cell])
+    def from_grid(self, layout: Floats32) -> Floats32:
+        """Return values (S, M) of the stations from their layout; undoes :meth:`to_grid`."""
+        if not self.is_raster:
+            return layout[:, :-1]
+        return np.asarray(layout.reshape(len(layout), -1)[:, self._cell])
 
     def add(self, total: Floats32, values: Floats32, step: Ints, rise: float) -> None:
-        """Add to each station's ``total`` what ``values`` has ``step`` cells farther on; both one row of a layout."""
-        if not self.laid_out:
-            total[:-1] += values.take(self.moved(step, rise))  # -1, no station there, finds the zero
+        """Add to each station's ``total`` the one of ``values`` ``step`` cells away; both are one row of a layout."""
+        if not self.is_raster:
+            total[:-1] += values.take(self.shifted_index(step, rise))  # -1, no station there, finds the zero
             return
         (rows, columns), (down, across) = self._shape, step.tolist()
         if abs(down) < rows and abs(across) < columns:

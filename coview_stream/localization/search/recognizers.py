@@ -1,4 +1,4 @@
-"""Where a search's hypotheses come from: each source lets keyframes vote for places, in its own way."""
+"""Place recognizers: keyframes vote for places of the map, and the best places are the search's hypotheses."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
-from coview_stream.basemap.basemap import BaseMap, check_reloc
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, describe, on_ground
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval
 
-if TYPE_CHECKING:  # it brings half of SciPy along
+if TYPE_CHECKING:  # it imports SciPy, which takes a while
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
 class PlaceRecognizer(Protocol):
-    """Takes in keyframes and names the places they speak for."""
+    """What a global search needs of a way to recognise places."""
 
-    def vote(self, query: SearchRequest) -> None:
-        """Take in one keyframe; one with too few points says nothing."""
+    def vote(self, request: SearchRequest) -> None:
+        """Add the votes of one keyframe; one with too few points has none."""
         ...
 
     def hypotheses(self) -> list[Hypothesis]:
@@ -39,7 +39,7 @@ class PlaceRecognizer(Protocol):
 
 @dataclass(frozen=True)
 class SearchIndex:
-    """What all searches of one map share; None for what is not used.
+    """The part of the recognizers that all searches of one map share; None for what is not used.
 
     Attributes:
         retrieval: the stations' co-view descriptors.
@@ -51,15 +51,15 @@ class SearchIndex:
 
     @classmethod
     def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> SearchIndex:
-        """Choose by ``config.reloc``; the network is loaded if ``load``, the map's spectra are not made yet.
+        """Return the index that ``config.reloc`` asks for; the network is loaded if ``load``, spectra are not made yet.
 
         ``auto`` warns if the map has learned features that cannot be used, and goes without them.
 
         Raises:
-            MapError, InputError, DependencyError: as :func:`~coview_stream.basemap.basemap.check_reloc`.
+            MapError, InputError, DependencyError: as :meth:`BaseMap.require_features`.
         """
         retrieval = None if config.reloc == "learned" else Retrieval(base_map, config.retrieval)
-        missing = check_reloc(base_map, config.reloc, load)
+        missing = base_map.require_features(config.reloc, load)
         if missing is not None:
             warnings.warn(missing, stacklevel=2)
         if missing is not None or config.reloc == "coview" or base_map.learned is None:
@@ -72,7 +72,7 @@ class SearchIndex:
         )
 
     def prepare(self) -> None:
-        """Make now what would make the first query slow; raises :class:`CoViewError` if something is missing."""
+        """Load and compute what the first query would; raises :class:`CoViewError` if something is missing."""
         if self.retrieval is not None:
             self.retrieval.prepare()
         if self.learned is not None:
@@ -80,7 +80,7 @@ class SearchIndex:
 
 
 class CoViewRecognizer:
-    """Votes by the paper's descriptors (eqs 1-12).
+    """Recognizer by the paper's descriptors (eqs 1-12).
 
     Attributes:
         last_query: descriptors (R, S) of the newest keyframe that voted, by channel.
@@ -95,13 +95,13 @@ class CoViewRecognizer:
         )
         self.last_query: dict[Channel, Descriptor] = {}
 
-    def vote(self, query: SearchRequest) -> None:
+    def vote(self, request: SearchRequest) -> None:
         """Compare the virtual local scan with every station's."""
         descriptor = self.base_map.descriptor_config
-        if len(query.scan) < self.config.keyframe.min_points:
+        if len(request.scan) < self.config.keyframe.min_points:
             return
-        centre = on_ground(query.scan, query.position) if descriptor.ground_zero else query.position
-        self.last_query = describe(query.scan, centre, descriptor)
+        centre = on_ground(request.scan, request.position) if descriptor.ground_zero else request.position
+        self.last_query = describe(request.scan, centre, descriptor)
         if self.config.consensus.mode == "single":
             self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
         else:

@@ -13,12 +13,17 @@ from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import Descriptor, ring_key
 from coview_stream.geometry.arrays import Complexes, Floats32
 
-_CACHE_BYTES = 400_000_000  # spectra of all stations are kept if they fit, else made anew block by block
-_BLOCK = 8192
+ScoreVolume = Floats32
+"""(M, S): one number for each station and shift."""
+
+_CACHE_BYTES = (
+    400_000_000  # spectra of all stations are kept if they fit, else made anew block by block; set by hand
+)
+_BLOCK = 8192  # stations whose spectra are made at a time; set by hand
 
 
 class Stations(Protocol):
-    """What retrieval needs to know of a base map."""
+    """The part of a base map that retrieval uses: its stations' descriptors."""
 
     @property
     def descriptor_config(self) -> DescriptorConfig:
@@ -35,7 +40,7 @@ class Stations(Protocol):
 
 
 class Retrieval:
-    """Scores one query against all stations of a map, exactly (``exhaustive``), or by the paper's ``ring_key``."""
+    """Distances of a query to all stations of a map: exact (mode ``exhaustive``), or by the paper's ``ring_key``."""
 
     def __init__(self, stations: Stations, config: RetrievalConfig) -> None:
         self.stations = stations
@@ -44,7 +49,7 @@ class Retrieval:
         self._keys: dict[Channel, Floats32] = {}
         self._indices: dict[Channel, kernels.MatchIndex] = {}
 
-    def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, Floats32]:
+    def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, ScoreVolume]:
         """Eqs 7-9 for each channel: (M, S) distances in [0, 2]; shift n means yaw -2 pi n / S.
 
         In ``ring_key`` mode stations that are not among the candidates have distance 1 at every shift.
@@ -54,23 +59,24 @@ class Retrieval:
     def best(self, query: dict[Channel, Descriptor], k: int) -> dict[Channel, kernels.Nearest]:
         """Eqs 7-9 for each channel: the ``k`` nearest stations, each at its best shift, nearest first.
 
-        The same stations as :meth:`distances` would give, at a fraction of its time and memory: most of the
-        stations are ruled out by bounds. An index of 1.3 kB per station is made at the first query.
+        The same stations as :meth:`distances` would give, at a fraction of its time and memory: bounds rule most of
+        the stations out. An index of 1.3 kB per station is made at the first query.
         """
         return {name: self._nearest(name, descriptor, k) for name, descriptor in query.items()}
 
     def prepare(self) -> None:
-        """Make now the spectra that are kept, rather than at the first query."""
-        if self.config.mode == "exhaustive" and self._kept():
+        """Make the spectra that are kept, or the first query makes them."""
+        if self.config.mode == "exhaustive" and self._cached():
             for name in self.stations.descriptor_config.channels:
                 next(self._blocks(name))
 
-    def _kept(self) -> bool:
+    def _cached(self) -> bool:
+        """Whether the spectra of all stations fit in memory."""
         config = self.stations.descriptor_config
         size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
         return size <= _CACHE_BYTES
 
-    def _channel(self, name: Channel, query: Descriptor) -> Floats32:
+    def _channel(self, name: Channel, query: Descriptor) -> ScoreVolume:
         if self.config.mode == "ring_key":
             return self._by_ring_key(name, query)
         sectors = query.shape[-1]
@@ -79,7 +85,7 @@ class Retrieval:
 
     def _nearest(self, name: Channel, query: Descriptor, k: int) -> kernels.Nearest:
         bounded = self.config.mode == "exhaustive" and query.shape[-1] <= kernels.MatchIndex.MAX_SECTORS
-        if not bounded or kernels.backend() == "numpy":  # bounds are for the kernel's integers
+        if not bounded or kernels.backend() == "numpy":  # the compiled kernel only has the bounds
             volume = self._channel(name, query)
             nearest = volume.min(axis=1)
             station = np.argsort(nearest, kind="stable")[:k]
@@ -90,7 +96,7 @@ class Retrieval:
 
     def _blocks(self, name: Channel) -> Iterator[Complexes]:
         descriptors = self.stations.descriptors(name)
-        if not self._kept():
+        if not self._cached():
             for start in range(0, len(descriptors), _BLOCK):
                 yield kernels.column_spectra(descriptors[start : start + _BLOCK].astype(np.float32))
             return
@@ -98,7 +104,7 @@ class Retrieval:
             self._spectra[name] = kernels.column_spectra(descriptors.astype(np.float32))
         yield self._spectra[name]
 
-    def _by_ring_key(self, name: Channel, query: Descriptor) -> Floats32:
+    def _by_ring_key(self, name: Channel, query: Descriptor) -> ScoreVolume:
         if name not in self._keys:
             self._keys[name] = ring_key(self.stations.descriptors(name).astype(np.float32))
         gap = np.linalg.norm(self._keys[name] - ring_key(query), axis=1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.basemap.basemap import BaseMap, check_reloc
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
@@ -79,7 +79,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     names = [k.robot for k in options.keys]
     begin = time.monotonic()
     base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
-    missing = check_reloc(base_map, options.reloc)
+    missing = base_map.require_features(options.reloc)
     if missing is not None:
         log.warning("%s: %s", options.map_path, missing)
     path, method = str(options.map_path), options.registration

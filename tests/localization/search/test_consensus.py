@@ -137,7 +137,7 @@ def test_the_map_does_not_wrap_around_its_edges():
     stations = grid_stations()
     grid = StationGrid(stations, BLOCK)
     for step in ([3, 0], [0, 3], [-4, 0], [0, -5], [2, -1], [-50, 0], [0, 1000], [0, 0]):
-        found = grid.moved(np.array(step), 0.0)
+        found = grid.shifted_index(np.array(step), 0.0)
         goal = stations[:, :2] + BLOCK * np.array(step)
         for m in range(len(stations)):
             there = np.flatnonzero(np.abs(stations[:, :2] - goal[m]).max(axis=1) < 0.1)
@@ -149,29 +149,29 @@ def test_values_are_added_a_step_farther_on_in_either_layout():
     rng = np.random.default_rng(5)
     stations = grid_stations(9)[rng.permutation(81)[:60]]
     cells, each = StationGrid(stations, BLOCK), StationGrid(stations, BLOCK)
-    assert cells.laid_out
-    each.laid_out = False
+    assert cells.is_raster
+    each.is_raster = False
     values = rng.normal(size=(3, 60)).astype(np.float32)
-    np.testing.assert_array_equal(cells.gathered(cells.spread(values)), values)
+    np.testing.assert_array_equal(cells.from_grid(cells.to_grid(values)), values)
     for step in ([0, 0], [2, -3], [-8, 1], [8, 8], [9, 0], [0, -9], [500, 0], [-150, 150]):
         sums = []
         for grid in (cells, each):
-            total = grid.spread(values[:1])
-            grid.add(total[0], grid.spread(values[1:2])[0], np.array(step), 0.0)
-            sums.append(grid.gathered(total)[0])
-        there = cells.moved(np.array(step), 0.0)
+            total = grid.to_grid(values[:1])
+            grid.add(total[0], grid.to_grid(values[1:2])[0], np.array(step), 0.0)
+            sums.append(grid.from_grid(total)[0])
+        there = cells.shifted_index(np.array(step), 0.0)
         np.testing.assert_array_equal(sums[0], values[0] + np.where(there < 0, 0, values[1][there]))
         np.testing.assert_array_equal(sums[0], sums[1])
 
 
 @pytest.mark.parametrize("kind", ["one road", "two storeys"])
-def test_few_stations_on_a_wide_grid_are_not_laid_out(kind):
+def test_few_stations_on_a_wide_grid_are_no_raster(kind):
     road = (
         grid_stations(40)[::41]
         if kind == "one road"
         else np.concatenate([grid_stations(4), grid_stations(4, z=4.0)])
     )
-    assert not StationGrid(road, BLOCK).laid_out
+    assert not StationGrid(road, BLOCK).is_raster
 
 
 @pytest.mark.parametrize("count", [1, 7, 4000, 9999, 10_000, 20_000])
@@ -192,12 +192,12 @@ def test_storeys_are_told_apart_by_the_height_gained():
     low, high = grid_stations(4), grid_stations(4, z=4.0)
     stations = np.concatenate([low, high[:8]])
     grid = StationGrid(stations, BLOCK)
-    same = grid.moved(np.zeros(2, np.int64), 0.0)
+    same = grid.shifted_index(np.zeros(2, np.int64), 0.0)
     np.testing.assert_array_equal(same, np.arange(24))
-    up = grid.moved(np.zeros(2, np.int64), 4.0)
+    up = grid.shifted_index(np.zeros(2, np.int64), 4.0)
     np.testing.assert_array_equal(up[:8], np.arange(16, 24))
     assert (up[8:] == -1).all()  # no upper storey there, and above it nothing
-    down = grid.moved(np.zeros(2, np.int64), -4.0)
+    down = grid.shifted_index(np.zeros(2, np.int64), -4.0)
     np.testing.assert_array_equal(down[16:], np.arange(8))
     assert (down[:16] == -1).all()
 

@@ -164,7 +164,7 @@ def test_what_is_remembered_is_not_registered_twice(world_map, world_drive, monk
 def test_the_judge_wants_rivals_before_it_believes_a_suggestion(world_map, votes):
     search = GlobalSearch(world_map, LocalizerConfig(), LocalMaps(world_map, 50.0))
     for _ in range(votes):
-        search.coview.consensus._ballots.append(None)
+        search.coview.consensus._votes.append(None)
     best = candidate(0.7)
     alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
     assert same_place(HERE, HERE, KEYFRAME)

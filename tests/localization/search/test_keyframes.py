@@ -110,10 +110,10 @@ def test_what_was_taken_in_stays_as_it_was():
     np.testing.assert_array_equal(first, before)
 
 
-def test_a_frame_can_be_thinned_without_becoming_part_of_a_keyframe():
+def test_a_frame_can_be_voxelized_without_becoming_part_of_a_keyframe():
     buffer = KeyframeBuffer(CONFIG)
     np.testing.assert_array_equal(
-        buffer.thin(cloud(0), at(0.0)), prepare_scan.voxelized(cloud(0), at(0.0), CONFIG)
+        buffer.voxelize(cloud(0), at(0.0)), prepare_scan.voxelized(cloud(0), at(0.0), CONFIG)
     )
     assert buffer.newest is not None
     assert len(buffer.recent(1)) == 0

@@ -1,4 +1,4 @@
-"""Continuity: frames that go on from each other, and a robot that is elsewhere at once."""
+"""Odometry check: frames that continue each other, and a robot that is suddenly elsewhere."""
 
 from __future__ import annotations
 
@@ -25,52 +25,52 @@ def frames(slow_drive):
 
 
 def test_a_drive_goes_on(frames, world_drive):
-    continuity = OdometryCheck()
-    assert not any(continuity.broken(*frame) for frame in frames)
+    check = OdometryCheck()
+    assert not any(check.contradicts(*frame) for frame in frames)
     wide = OdometryCheck()
-    assert not any(wide.broken(*frame) for frame in frames_of(world_drive))
+    assert not any(wide.contradicts(*frame) for frame in frames_of(world_drive))
 
 
 def test_another_place_is_noticed_after_a_few_frames_and_once(frames, elsewhere):
-    continuity = OdometryCheck()
+    check = OdometryCheck()
     for frame in frames[:10]:
-        continuity.broken(*frame)
+        check.contradicts(*frame)
     other, _ = list(frames_of(elsewhere))[2]
     here = frames[9][1]
     # it feels no motion: the other place's points lie around where it was
     moved = (other - other.mean(axis=0) + frames[9][0].mean(axis=0) + [25.0, 9.0, 3.0]).astype(np.float32)
-    told = [continuity.broken(moved, here) for _ in range(6)]
+    told = [check.contradicts(moved, here) for _ in range(6)]
     assert told == [k == _PATIENCE - 1 for k in range(6)]
 
 
 def test_one_strange_frame_is_dust(frames):
-    continuity = OdometryCheck()
+    check = OdometryCheck()
     rng = np.random.default_rng(0)
     dust = rng.uniform(-3.0, 3.0, (4000, 3)).astype(np.float32) + np.float32([0.0, 0.0, 20.0])
     for k, frame in enumerate(frames):
-        assert not continuity.broken(*frame)
+        assert not check.contradicts(*frame)
         if k % 3 == 0:
-            assert not continuity.broken(dust, frame[1])
+            assert not check.contradicts(dust, frame[1])
 
 
 def test_a_handful_of_points_says_nothing(frames):
-    continuity = OdometryCheck()
-    assert not continuity.broken(frames[0][0][:5], frames[0][1])
+    check = OdometryCheck()
+    assert not check.contradicts(frames[0][0][:5], frames[0][1])
     for frame in frames[:3]:
-        continuity.broken(*frame)
+        check.contradicts(*frame)
     far = frames[0][0][:100] + np.float32(500.0)
-    assert not any(continuity.broken(far, frames[2][1]) for _ in range(9))
+    assert not any(check.contradicts(far, frames[2][1]) for _ in range(9))
 
 
 def test_a_jump_of_odometry_is_noticed_and_can_be_forgotten(frames):
     jump = np.float32([40.0, 0.0, 0.0])
     jumped = [(points + jump, place + jump) for points, place in frames]
-    continuity = OdometryCheck()
+    check = OdometryCheck()
     for frame in frames[:10]:
-        continuity.broken(*frame)
-    assert [continuity.broken(*frame) for frame in jumped[10:16]].count(True) == 1
+        check.contradicts(*frame)
+    assert [check.contradicts(*frame) for frame in jumped[10:16]].count(True) == 1
     cleared = OdometryCheck()
     for frame in frames[:10]:
-        cleared.broken(*frame)
+        cleared.contradicts(*frame)
     cleared.clear()
-    assert not any(cleared.broken(*frame) for frame in jumped[10:16])
+    assert not any(cleared.contradicts(*frame) for frame in jumped[10:16])
