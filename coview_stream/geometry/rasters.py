@@ -1,37 +1,39 @@
-"""Greatest or smallest value in a square window around each cell of a raster.
+"""Rasters: points by cell, window minima and maxima, and filled gaps.
 
-SciPy's filters do the same; importing them takes a quarter of a second, which a node that starts does not have.
+SciPy has such filters too; importing it takes a quarter of a second, which a node that starts does not have. So only
+:func:`filled`, which builds maps, imports it, and does so when called.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Points
 
+_MAX_CELLS = 200_000_000  # set by hand: a raster above that (0.8 GB) means stray coordinates, not a map
+
 
 def min_filter(raster: Floats32, size: int) -> Floats32:
-    """Smallest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
+    """Find the smallest value around each cell of (H, W), in a square of ``size`` cells, an odd number."""
     return _sliding(np.minimum, raster, size, np.float32(np.inf))
 
 
 def max_filter(raster: Floats32, size: int) -> Floats32:
-    """Greatest value of each cell of (H, W) and those around it, in a square of ``size`` cells, an odd number."""
+    """Find the greatest value around each cell of (H, W), in a square of ``size`` cells, an odd number."""
     return _sliding(np.maximum, raster, size, np.float32(-np.inf))
 
 
-def _sliding(pick: np.ufunc, raster: Floats32, size: int, nothing: np.float32) -> Floats32:
-    """One axis after the other: the extreme of a square is that of its rows' extremes."""
+def _sliding(pick: np.ufunc, raster: Floats32, size: int, outside: np.float32) -> Floats32:
+    """Filter along one axis after the other: the extreme of a square is that of its rows' extremes."""
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size must be odd, so that a window has a middle, got {size}")
     out = raster.astype(np.float32, copy=False)
     for axis in range(2):
         reach = [(0, 0), (0, 0)]
         reach[axis] = (size // 2, size // 2)
-        padded = np.pad(out, reach, constant_values=nothing)
+        padded = np.pad(out, reach, constant_values=outside)
         length = raster.shape[axis]
         views = [padded[k : k + length] if axis == 0 else padded[:, k : k + length] for k in range(size)]
         out = views[0].copy()
@@ -40,12 +42,11 @@ def _sliding(pick: np.ufunc, raster: Floats32, size: int, nothing: np.float32) -
     return out
 
 
-_MAX_CELLS = 200_000_000
-"""A raster above this many cells (0.8 GB) means stray coordinates, not a map."""
-
-
 def cells(points: Points, cell: float) -> tuple[Floats, tuple[int, int], Ints]:
-    """Lower corner (2,), shape (rows, columns) and the flat cell index (N,) of each point.
+    """Assign points to square cells of ``cell`` metres.
+
+    Returns:
+        The lower corner (2,) in metres, the shape (rows, columns), and the flat cell index (N,) of each point.
 
     Raises:
         ConfigError: the raster would be absurdly large for a map.
@@ -61,14 +62,14 @@ def cells(points: Points, cell: float) -> tuple[Floats, tuple[int, int], Ints]:
 
 
 def lowest_per_cell(points: Points, flat: Ints) -> Indices:
-    """Index of the lowest point of each occupied cell, in the order of the cells."""
+    """Find the index of the lowest point of each occupied cell, in the order of the cells."""
     order = np.lexsort((points[:, 2], flat))
     ordered = flat[order]
     return np.asarray(order[np.append(True, ordered[1:] != ordered[:-1])])
 
 
 def filled(z: Floats32) -> Floats32:
-    """``z`` (H, W) with every NaN filled from ever coarser averages of its surroundings (push-pull)."""
+    """Return ``z`` (H, W) with every NaN filled from ever coarser averages of its surroundings (push-pull)."""
     unknown = np.isnan(z)
     if not unknown.any() or unknown.all():
         return z
@@ -78,6 +79,8 @@ def filled(z: Floats32) -> Floats32:
     count = np.isfinite(blocks).sum(axis=(1, 3))
     coarse = np.full(count.shape, np.nan, dtype=np.float32)
     np.divide(np.nansum(blocks, axis=(1, 3)), count, out=coarse, where=count > 0)
+    from scipy import ndimage
+
     coarse = filled(coarse)
     rows = (np.arange(height) + 0.5) / 2 - 0.5
     columns = (np.arange(width) + 0.5) / 2 - 0.5

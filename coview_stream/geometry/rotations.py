@@ -1,4 +1,4 @@
-"""Rotations as matrices and quaternions: the few conversions that the robot's side needs.
+"""Rotations as matrices, quaternions and rotation vectors.
 
 SciPy has them too, but importing it takes half a second of the two in which a node should be ready; the tests compare.
 All take single rotations or stacks. Quaternions are x, y, z, w.
@@ -20,6 +20,13 @@ def nearest_rotation(R: Reals) -> Floats:
     return np.asarray(U @ Vt)
 
 
+def skew(v: Floats) -> Floats:
+    """Matrices (..., 3, 3) of the cross product with (..., 3)."""
+    K = np.zeros((*v.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return np.asarray(K - np.swapaxes(K, -1, -2))
+
+
 def exp_so3(rotvec: npt.ArrayLike) -> Floats:
     """Rotations (..., 3, 3) about axes (..., 3) by their length, radians (Rodrigues' formula)."""
     v = np.asarray(rotvec, dtype=np.float64)
@@ -28,9 +35,7 @@ def exp_so3(rotvec: npt.ArrayLike) -> Floats:
     safe = np.where(small, 1.0, angle)
     sine = np.where(small, 1.0, np.sin(safe) / safe)
     cosine = np.where(small, 0.5, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
-    K = np.zeros((*v.shape, 3))
-    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    K -= np.swapaxes(K, -1, -2)
+    K = skew(v)
     return np.asarray(np.eye(3) + sine * K + cosine * (K @ K))
 
 

@@ -4,8 +4,6 @@
 ``p_target = T_target_source @ p_source``. Metres and radians throughout.
 """
 
-# FOLDED coview_stream/geometry/transforms.py: """The anchor: where the localizer moves the origin of the odometry frame to, so that float32 stays exact."""
-
 from __future__ import annotations
 
 from typing import TypeVar
@@ -14,12 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.arrays import Floats, Reals
-from coview_stream.geometry.rotations import matrix_to_quat, nearest_rotation, quat_to_matrix
+from coview_stream.geometry.rotations import matrix_to_quat, nearest_rotation, quat_to_matrix, slerp
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
 Pose = npt.NDArray[np.float64]
 """A 4x4 float64 rigid transform."""
+
+Poses = npt.NDArray[np.float64]
+"""(N, 4, 4) float64 rigid transforms."""
 
 Points = npt.NDArray[np.float32]
 """(N, 3) float32 coordinates near the origin of their frame, metres."""
@@ -101,6 +102,19 @@ def is_pose(T: Reals) -> bool:
     return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0)
 
 
+def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:
+    """Poses (..., 4, 4) a ``share`` (...) of the way from one to another, both (..., 4, 4).
+
+    The rotation turns at a constant rate the short way round, the position moves along a straight line. Shares outside
+    [0, 1] extrapolate.
+    """
+    part = np.asarray(share, dtype=np.float64)
+    poses = np.array(T_start, dtype=np.float64)
+    poses[..., :3, :3] = slerp(T_start[..., :3, :3], T_end[..., :3, :3], part)
+    poses[..., :3, 3] += part[..., None] * (T_end[..., :3, 3] - T_start[..., :3, 3])
+    return poses
+
+
 def pose_to_tum(T: Pose) -> Floats:
     """(7,) x y z qx qy qz qw of a pose."""
     return np.concatenate([T[:3, 3], matrix_to_quat(T[:3, :3])])
@@ -113,7 +127,7 @@ def pose_from_tum(row: npt.ArrayLike) -> Pose:
 
 
 def to_local(T_odom_body: Pose, anchor: Floats) -> Pose:
-    """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,)."""
+    """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,), where float32 stays exact."""
     return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
 
 

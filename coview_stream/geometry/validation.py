@@ -1,51 +1,89 @@
-"""What callers hand the localizer: checked, and copied where they may write into it again."""
+"""Checks of what callers hand over: clouds, poses, stamps and covariances.
+
+Arrays are copied where the caller may write into them again.
+"""
 
 from __future__ import annotations
+
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.errors import CloudError, RunError
-from coview_stream.geometry.arrays import Floats
+from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points, Pose, is_pose, orthonormal, pose_from
 
-_LEAST_POINTS = 10
-_LOOKED_AT = 2000  # of a frame's points, to see how far they lie
-_FARTHEST = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
-_OTHER_WORLD = 1e7  # metres from the map's origin: no place on this planet
+_Real = TypeVar("_Real", np.float32, np.float64)
+
+# set by hand, all of them
+_MIN_POINTS = 10
+_SAMPLED_POINTS = 2000  # of a frame, to see how far they lie
+_MAX_DISTANCE = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
+_MAX_COORDINATE = 1e7  # metres from the map's origin: no place on this planet
+_MIN_EIGENVALUE = 1e-12  # of a correlation matrix
+
+
+def to_array(
+    values: npt.ArrayLike, dtype: type[_Real], name: str, error: type[InputError] = CloudError
+) -> npt.NDArray[_Real]:
+    """Return ``values`` as an array of ``dtype``, copied only if they are not; ``error`` if they are no numbers."""
+    try:
+        with np.errstate(over="ignore"):
+            return np.asarray(values).astype(dtype, copy=False)
+    except (TypeError, ValueError) as reason:
+        raise error(f"{name} is not an array of numbers ({reason})") from reason
+
+
+def cloud_rows(cloud: npt.ArrayLike, columns: tuple[int, ...] = (3,)) -> Points:
+    """Return a cloud's rows (N, 3) float32, or (N, one of ``columns``), without a copy; CloudError for other shapes."""
+    rows = to_array(cloud, np.float32, "cloud")
+    if rows.ndim != 2 or rows.shape[1] not in columns:
+        expected = " or ".join(f"(N, {count})" for count in columns)
+        raise CloudError(f"cloud has shape {rows.shape}; expected {expected}")
+    return rows
+
+
+def finite_rows(rows: Points) -> tuple[Points, Bools | None]:
+    """Return a copy of the finite rows (K, 3) of (N, 3), and which (N,) they are: None if all are."""
+    if np.isfinite(rows).all():
+        return rows.copy(order="C"), None
+    finite: Bools = np.isfinite(rows).all(axis=1)
+    return rows.compress(finite, axis=0), finite
 
 
 def validate_cloud(cloud: npt.ArrayLike) -> Points:
     """Return a frame's finite points, a copy (N, 3) float32 in rows; CloudError where it is no cloud."""
-    try:
-        with np.errstate(over="ignore"):
-            rows = np.asarray(cloud).astype(np.float32, copy=False)
-    except (TypeError, ValueError) as error:
-        raise CloudError(f"cloud is not an array of numbers ({error}); expected (N, 3) float32") from error
-    if rows.ndim != 2 or rows.shape[1] != 3:
-        raise CloudError(f"cloud has shape {rows.shape}; expected (N, 3)")
-    whole = np.isfinite(rows).all()
-    # a copy even so: the caller may write the next frame into the same array
-    finite = rows.copy(order="C") if whole else rows.compress(np.isfinite(rows).all(axis=1), axis=0)
-    if len(finite) < _LEAST_POINTS:
-        raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_LEAST_POINTS} or more")
-    if np.median(np.abs(finite[:: 1 + len(finite) // _LOOKED_AT])) > _FARTHEST:
+    finite, _ = finite_rows(cloud_rows(cloud))
+    if len(finite) < _MIN_POINTS:
+        raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_MIN_POINTS} or more")
+    if np.median(np.abs(finite[:: 1 + len(finite) // _SAMPLED_POINTS])) > _MAX_DISTANCE:
         raise CloudError("cloud lies kilometres from its origin; give it relative to the sensor")
     return finite
 
 
+def check_stamp(stamp: float) -> None:
+    """Refuse a stamp that is no finite number of seconds (RunError)."""
+    try:
+        finite = bool(np.isfinite(stamp))
+    except TypeError as reason:
+        raise RunError(f"stamp is not numeric ({reason})") from reason
+    if not finite:
+        raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
+
+
+def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputError) -> Pose:
+    """Return a rigid pose (4, 4) float64, orthonormal to the last digit; ``error`` for anything else."""
+    pose = to_array(T, np.float64, name, error)
+    if not is_pose(pose):
+        raise error(f"{name} is not a finite rigid 4x4 transform; check where it comes from")
+    return orthonormal(pose)
+
+
 def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float) -> Pose:
     """Return a frame's pose (4, 4), exactly rigid; RunError where it is not, or its stamp (seconds) not finite."""
-    try:
-        T = np.asarray(T_odom_body, dtype=np.float64)
-        known = bool(np.isfinite(stamp))
-    except (TypeError, ValueError) as error:
-        raise RunError(f"T_odom_body or stamp is not numeric ({error})") from error
-    if not known:
-        raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
-    if not is_pose(T):
-        raise RunError("T_odom_body is not a finite rigid 4x4 transform; check the odometry")
-    return orthonormal(T)
+    check_stamp(stamp)
+    return check_rigid(T_odom_body, "T_odom_body", RunError)
 
 
 def validate_pose(T_map_body: npt.ArrayLike, origin: Floats) -> Pose:
@@ -53,13 +91,20 @@ def validate_pose(T_map_body: npt.ArrayLike, origin: Floats) -> Pose:
 
     RunError where it is not rigid or not on this planet.
     """
-    try:
-        T = np.asarray(T_map_body, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RunError(f"T_map_body is not numeric ({error})") from error
-    if not is_pose(T):
-        raise RunError("T_map_body is not a finite rigid 4x4 transform")
-    local = orthonormal(pose_from(T[:3, :3], T[:3, 3] - origin))
-    if np.abs(local[:3, 3]).max() > _OTHER_WORLD:
+    T = check_rigid(T_map_body, "T_map_body", RunError)
+    local = pose_from(T[:3, :3], T[:3, 3] - origin)
+    if np.abs(local[:3, 3]).max() > _MAX_COORDINATE:
         raise RunError("T_map_body lies 10,000 km off the map; is it in the frame of the map's sources?")
     return local
+
+
+def check_covariance(covariance: npt.ArrayLike, name: str) -> Floats:
+    """Return a covariance (6, 6) float64, symmetric to the last digit; InputError unless it is positive definite."""
+    C = np.asarray(covariance, dtype=np.float64)
+    if C.shape != (6, 6) or not np.isfinite(C).all():
+        raise InputError(f"{name} has shape {C.shape} or is not finite; expected a covariance (6, 6)")
+    C = np.asarray(0.5 * (C + C.T))
+    sigma = np.sqrt(np.clip(np.diag(C), 1e-300, None))
+    if (np.diag(C) <= 0).any() or np.linalg.eigvalsh(C / np.outer(sigma, sigma))[0] < _MIN_EIGENVALUE:
+        raise InputError(f"{name} is not positive definite; give every direction a variance")
+    return C

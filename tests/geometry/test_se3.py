@@ -14,10 +14,9 @@ from coview_stream.geometry.se3 import (
     along_map,
     boxminus,
     boxplus,
-    checked_covariance,
-    checked_pose,
 )
 from coview_stream.geometry.transforms import pose_from
+from coview_stream.geometry.validation import check_covariance, check_rigid
 
 T = pose_from(exp_so3([0.4, -0.7, 1.9]), [300.0, -200.0, 12.0])
 
@@ -80,7 +79,7 @@ def test_the_adjoint_moves_an_increment_to_the_other_side():
 @pytest.mark.parametrize("bad", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1])])
 def test_what_is_no_pose_is_refused_by_name(bad):
     with pytest.raises(InputError, match="T_here"):
-        checked_pose("T_here", bad)
+        check_rigid(bad, "T_here")
 
 
 @pytest.mark.parametrize(
@@ -89,8 +88,8 @@ def test_what_is_no_pose_is_refused_by_name(bad):
 )
 def test_what_is_no_covariance_is_refused_by_name(bad):
     with pytest.raises(InputError, match="spread"):
-        checked_covariance("spread", bad)
+        check_covariance(bad, "spread")
 
 
 def test_sigmas_of_very_different_size_are_a_covariance():
-    checked_covariance("spread", np.diag([1e-12, 1e-12, 1e-12, 1e4, 1e4, 1e4]))
+    check_covariance(np.diag([1e-12, 1e-12, 1e-12, 1e4, 1e4, 1e4]), "spread")

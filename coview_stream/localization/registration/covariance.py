@@ -13,7 +13,8 @@ import numpy as np
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.se3 import boxminus, boxplus, cross
+from coview_stream.geometry.rotations import skew
+from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import Pose
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
@@ -119,5 +120,5 @@ def propagate(covariance: Floats, shift: Floats) -> Floats:
     An error in the heading at its beginning is one in the place at its end: s' = s + r x shift.
     """
     J = np.eye(6)
-    J[3:, :3] = -cross(shift)
+    J[3:, :3] = -skew(shift)
     return np.asarray(J @ covariance @ J.T)

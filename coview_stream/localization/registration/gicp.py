@@ -36,7 +36,8 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.se3 import boxminus, boxplus, cross
+from coview_stream.geometry.rotations import skew
+from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import Points, Pose, orthonormal
 from coview_stream.localization.registration.result import MIN_PAIRS, Registration
 
@@ -204,7 +205,7 @@ def about_pivot(H: Floats, b: Floats, T: Pose, pivot: Floats) -> tuple[Floats, F
     R = T[:3, :3]
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = R.T
-    J[3:, :3] = cross(np.asarray(pivot, dtype=np.float64)) @ R.T
+    J[3:, :3] = skew(np.asarray(pivot, dtype=np.float64)) @ R.T
     turned = J.T @ H @ J
     return np.asarray(0.5 * (turned + turned.T)), np.asarray(J.T @ b)
 
@@ -243,7 +244,7 @@ def point_to_point_system(moved_points: Floats, gap: Floats, about: Floats) -> t
     a = moved_points - about
     H, b = np.zeros((6, 6)), np.zeros(6)
     H[:3, :3] = np.einsum("ij,ij->", a, a) * np.eye(3) - a.T @ a
-    H[:3, 3:] = cross(a.sum(axis=0))
+    H[:3, 3:] = skew(a.sum(axis=0))
     H[3:, :3] = -H[:3, 3:]
     H[3:, 3:] = len(a) * np.eye(3)
     b[:3], b[3:] = np.cross(a, gap).sum(axis=0), gap.sum(axis=0)

@@ -33,10 +33,9 @@ from coview_stream.geometry.se3 import (
     along_body,
     along_map,
     boxminus,
-    checked_covariance,
-    checked_pose,
 )
 from coview_stream.geometry.transforms import Pose, inverse, orthonormal
+from coview_stream.geometry.validation import check_covariance, check_rigid
 
 _RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are weighed again
 _MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
@@ -118,8 +117,8 @@ class PoseGraph:
             T_map_body: (4, 4) of the first keyframe.
             covariance: of the prior.
         """
-        T = checked_pose("T_map_body", T_map_body)
-        prior = _Gaussian(T, along_body(checked_covariance("covariance", covariance), T))
+        T = check_rigid(T_map_body, "T_map_body")
+        prior = _Gaussian(T, along_body(check_covariance(covariance, "covariance"), T))
         self.clear()
         self._keyframes.append(_Keyframe(T))
         self._build(prior)
@@ -132,8 +131,8 @@ class PoseGraph:
             covariance: of the new pose if the last one were known, along the map's axes as the estimate has them now
                 (see :func:`coview_stream.localization.tracking.odometry_noise.Drift.covariance`).
         """
-        step = checked_pose("T_between", T_between)
-        spread = checked_covariance("covariance", covariance)
+        step = check_rigid(T_between, "T_between")
+        spread = check_covariance(covariance, "covariance")
         before = self._belief()
         T = orthonormal(before.T @ step)
         moved = _Gaussian(step, along_body(spread, T))
@@ -154,8 +153,8 @@ class PoseGraph:
                 twice (see :func:`coview_stream.localization.registration.covariance.remove_prior`).
             covariance: of that measurement alone (see :func:`coview_stream.localization.registration.covariance.registration_covariance`).
         """
-        T = checked_pose("T_map_body", T_map_body)
-        spread = checked_covariance("covariance", covariance)
+        T = check_rigid(T_map_body, "T_map_body")
+        spread = check_covariance(covariance, "covariance")
         measured = _Gaussian(T, along_body(spread, T))
         self._newest().corrections.append(measured)
         self._newest_belief = None
@@ -177,8 +176,8 @@ class PoseGraph:
             T_map_body: (4, 4) measured pose of the newest keyframe.
             covariance: of that measurement alone.
         """
-        T = checked_pose("T_map_body", T_map_body)
-        spread = checked_covariance("covariance", covariance)
+        T = check_rigid(T_map_body, "T_map_body")
+        spread = check_covariance(covariance, "covariance")
         expected = self.estimate
         gap: Floats = boxminus(T, expected.T_map_body)
         return float(gap @ np.linalg.solve(expected.covariance + spread, gap))

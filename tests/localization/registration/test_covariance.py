@@ -8,8 +8,9 @@ from courtyard import courtyard, local_map, source_of
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.geometry.se3 import boxminus, boxplus, checked_covariance
+from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.registration.covariance import (
     propagate,
     registration_covariance,
@@ -109,7 +110,7 @@ def test_no_information_is_the_widest_sigma(weakest):
     information = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
     information[4, 4] = weakest
     found = registration_covariance(information, CONFIG)
-    checked_covariance("found", found)
+    check_covariance(found, "found")
     assert np.sqrt(found[4, 4]) == pytest.approx(CONFIG.weak_sigma, rel=1e-3)
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.se3 import boxminus, boxplus, checked_covariance
+from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
@@ -70,7 +71,7 @@ def test_the_map_alone_speaks_whatever_was_believed(world_map, world_drive, scan
 def test_its_covariance_is_the_maps_and_not_the_beliefs(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
     loose, tight = (attempted(world_map, scan, Estimate(truth, C)).covariance for C in (LOOSE, TIGHT))
-    checked_covariance("loose", loose)
+    check_covariance(loose, "loose")
     np.testing.assert_allclose(np.sqrt(np.diag(tight)), np.sqrt(np.diag(loose)), rtol=0.2)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.config import TrackingConfig
-from coview_stream.geometry.se3 import checked_covariance
+from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.tracking.odometry_noise import Drift, DriftEstimator
 
 CONFIG = TrackingConfig(
@@ -31,7 +31,7 @@ def test_a_random_walk_with_metres_and_radians():
 
 
 def test_standing_still_is_a_covariance_too():
-    checked_covariance("still", Drift.of(CONFIG).covariance(0.0, 0.0))
+    check_covariance(Drift.of(CONFIG).covariance(0.0, 0.0), "still")
 
 
 def driven(true: Drift, metres=100.0, step=1.0, turned=0.0, seed=0, config=CONFIG, noise=NOISE):
