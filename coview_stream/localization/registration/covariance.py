@@ -1,4 +1,4 @@
-"""How sure a registration is: by its Hessian, less what it was told; and how sure a pose is on its way from one.
+"""Covariance of a registration: from its Hessian, without the prior, inflated; and carried along by a known motion.
 
 Covariances and informations are (6, 6), radians and metres, along the map's axes, about the body. Their order is
 (rx, ry, rz, x, y, z) unless a function says that it is the report's, (x, y, z, roll, pitch, yaw).
@@ -18,11 +18,12 @@ from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import Pose
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
-_LEAST_SHARE = 0.01  # of what is known of a direction: where the pairs have less, their minimum is guesswork
+_MIN_SHARE = 0.01
+"""Share of what is known of a direction; where the pairs have less, their minimum is noise. Set by hand."""
 
 
 class Measured(NamedTuple):
-    """What the map alone says of the pose."""
+    """A registration without its prior: what the map alone says of the pose."""
 
     T_map_body: Pose
     """(4, 4)."""
@@ -64,8 +65,8 @@ def remove_prior(
     Raises:
         InputError: ``information`` is not finite, or leaves a direction open in spite of the prior.
     """
-    told = np.asarray(prior_information) * config.inflation**2
-    alone = information - told
+    prior_part = np.asarray(prior_information) * config.inflation**2
+    pairs_part = information - prior_part
     if not np.isfinite(information).all():
         raise InputError("the registration's information is not finite")
     try:
@@ -74,26 +75,26 @@ def remove_prior(
     except np.linalg.LinAlgError as error:
         raise InputError("the registration's information is not positive definite") from error
     # in units of what is known with the prior, what the pairs know of a direction is a share in [0, 1]
-    share, directions = np.linalg.eigh(half @ (0.5 * (alone + alone.T)) @ half.T)
+    share, directions = np.linalg.eigh(half @ (0.5 * (pairs_part + pairs_part.T)) @ half.T)
     share = np.clip(share, 0.0, 1.0)
     back, spread = L @ directions, half.T @ directions
-    pull = told @ boxminus(T_map_body, T_map_prior)
-    step = spread @ (share / (share**2 + _LEAST_SHARE**2) * (spread.T @ pull))
+    pull = prior_part @ boxminus(T_map_body, T_map_prior)
+    step = spread @ (share / (share**2 + _MIN_SHARE**2) * (spread.T @ pull))
     return Measured(boxplus(T_map_body, step), np.asarray((back * share) @ back.T))
 
 
 def registration_covariance(information: Floats, config: RegistrationConfig) -> Floats:
-    """Covariance of a registration from its Hessian: inflated, widened where the map shows little, and floored.
+    """Return a registration's covariance from its Hessian: inflated, widened where the map shows little, and floored.
 
     The inverse Hessian is optimistic, as points next to each other are not independent: its sigma is multiplied by
     ``inflation``. Where the map hardly shows a direction (along a tunnel, on a bare field) what there is of a Hessian
     comes from noise in the normals, so that its sigma means little. In units that compare, metres and metres at a lever
     arm of ``weak_lever``, a direction's sigma s becomes s sqrt(1 + (s / w)^2), w = ``weak_from``: well below w nothing
-    happens, far above it the sigma grows with its square, up to ``weak_sigma``, which also stands for none at all. At
-    last ``sigma_floor`` and ``sigma_floor_angle`` are added.
+    happens, far above it the sigma grows with its square, up to ``weak_sigma``, which also stands for no information
+    at all. At last ``sigma_floor`` and ``sigma_floor_angle`` are added.
 
     Args:
-        information: (6, 6) of the pairs alone: no prior in it (see :func:`without_prior`), before inflation.
+        information: (6, 6) of the pairs alone: no prior in it (see :func:`remove_prior`), before inflation.
         config: inflation, floors, and what counts as weak.
 
     Raises:
@@ -115,9 +116,9 @@ def registration_covariance(information: Floats, config: RegistrationConfig) -> 
 
 
 def propagate(covariance: Floats, shift: Floats) -> Floats:
-    """Covariance (6, 6) after a known motion by ``shift`` (3,), metres along the map's axes.
+    """Return a covariance (6, 6) after a known motion by ``shift`` (3,), metres along the map's axes.
 
-    An error in the heading at its beginning is one in the place at its end: s' = s + r x shift.
+    An error r in the heading at its beginning is one in the place s at its end: s' = s + r x shift.
     """
     J = np.eye(6)
     J[3:, :3] = -skew(shift)

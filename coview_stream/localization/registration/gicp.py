@@ -1,29 +1,25 @@
-"""GICP (Segal et al., RSS 2009) beside trimmed ICP: small_gicp's residuals, our Gauss-Newton, trimming and prior.
+"""GICP (Segal et al., RSS 2009): small_gicp's residuals in our Gauss-Newton, with our trimming and prior.
 
 The one place that imports small_gicp (MIT; Koide, JOSS 2024). A pair costs r^T (C_map + R C_scan R^T)^-1 r / 2, with
 r = T p - q and covariances that are flat along the surface around each point. small_gicp has no prior, does not trim
 and does not tell ground from structure, so it only does what is slow: its ``align`` with one iteration is asked for
 the Hessian and the gradient at the pose it is given, of either kind of point by itself. The rest is as for trimmed ICP
-(see :func:`coview_kernels.align_planes`): of either kind the ``keep`` nearest pairs, both kinds weighing the same, and
-the prior in every step, so that a direction that the map does not show is the prior's from the first step on.
+(:func:`coview_kernels.align_planes`): of either kind the ``keep`` nearest pairs, both kinds weighing the same, and the
+prior in every step, so that a direction that the map does not show is the prior's from the first step on. Steps turn
+about a pivot, a point of the source that moves with it (usually the sensor), along the map's axes.
 
 A covariance's variance along its surface is one square metre by definition, so the weight of a pair is at least 1/2 in
-every direction: a thousand pairs in a corridor claim to know where along it they are to 0.15 m, and mean that they do
-not like to move. That half is taken out again, from Hessian and gradient, which leaves a weight that is positive
-semi-definite and says nothing where surfaces say nothing.
+every direction: a thousand pairs in a corridor claim to know where along it they are to 0.15 m, of which the surfaces
+say nothing. That half is taken out again, from Hessian and gradient, which leaves a weight that is positive
+semi-definite and zero along surfaces.
 
 small_gicp holds the interpreter's lock while it works and aborts the interpreter on empty clouds and NaN. Nothing of
 that kind is passed to it. What else would run in this process waits meanwhile: some 10 ms a call, and a quarter of a
 second for the covariances of a new crop of the map (160,000 points), of which there is one every 16 m. That is why
-the global search, which looks at many places, keeps to trimmed ICP whatever the method. ``serve`` registers in its
-lanes' processes only (:mod:`coview_stream.stream.node.engine_process`), whichever the method, so the pose clock's process never
-imports small_gicp.
+the global search, which looks at many places, keeps to trimmed ICP with either method. ``serve`` registers only in the
+processes of its engines (:mod:`coview_stream.stream.node.engine_process`), so that the process that publishes poses
+never imports small_gicp.
 """
-
-# FOLDED coview_stream/localization/registration/gicp.py: """Gauss-Newton about a pivot: turns about a moved point of the source, usually the sensor, along the map's axes.
-#
-# What a registration needs beside its pairs: another library's Hessian in our tangent, a prior's pull, the step.
-# """
 
 from __future__ import annotations
 
@@ -41,29 +37,27 @@ from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import Points, Pose, orthonormal
 from coview_stream.localization.registration.result import MIN_PAIRS, Registration
 
+# set by hand
 _NEIGHBOURS = 10  # that a point's covariance is made of; small_gicp's own choice
-
-_LEAST_KIND = 20  # points: fewer of a kind have no surfaces
-
-_MOST_SHARE = 5.0  # as trimmed ICP: a handful of points must not outweigh thousands
-
-_INFORMATION = 4.0
-"""Times small_gicp's Hessian, so that the configuration's ``inflation`` suits both methods.
-
-Measured once, by no command of this repository, on simulated drives against the truth (worlds 5101 to 5109 of
-``bench.tracking``, 30 places each, starts off by 0.12 m and 0.3 degrees, no prior, no floors) and restated for the
-inflation of 3: the mean squared Mahalanobis error per
-degree of freedom of trimmed ICP is 1.0 to 1.2 in towns and on a campus, 2.5 in a sparse forest, 2.8 in a town that has
-changed; GICP's, with this factor, 0.4 to 0.6, 1.6 to 2.4 and 0.6. So in no kind of world is GICP less honest than
-trimmed ICP. What is missing where it exceeds 1 is the error that neighbouring registrations share, which
-:mod:`coview_stream.localization.tracking.shared_error` adds. The residual would be no better guide: 0.05 of what small_gicp expects, in all of
-them.
-"""
+_MIN_POINTS = 20  # fewer of a kind have no surfaces
+_MAX_SHARE = 5.0  # as trimmed ICP: a handful of points must not outweigh thousands
+_ROUNDING = 1e-3  # metres: the farthest pair that is kept must not be lost to float32
+_TINY = 1e-6  # information: keeps what has none solvable
 
 _ALONG = 0.5
 """Times the identity, what every pair's weight holds in all directions, per square metre: see the module."""
 
-_ROUNDING = 1e-3  # metres: the farthest pair that is kept must not be lost to float32
+_INFORMATION = 4.0
+"""Times small_gicp's Hessian, so that the configuration's ``inflation`` suits both methods.
+
+Measured once, by no command of this repository, on simulated drives against the truth (nine worlds of
+``python -m bench tracking --seeds 5100``, 30 places each, starts off by 0.12 m and 0.3 degrees, no prior, no floors)
+and restated for the inflation of 3: the mean squared Mahalanobis error per degree of freedom of trimmed ICP is 1.0 to
+1.2 in towns and on a campus, 2.5 in a sparse forest, 2.8 in a town that has changed; GICP's, with this factor, 0.4 to
+0.6, 1.6 to 2.4 and 0.6. So in no kind of world is GICP less honest than trimmed ICP. What is missing where it exceeds
+1 is the error that neighbouring registrations share, which :mod:`coview_stream.localization.tracking.shared_error`
+adds. The residual would be no better guide: 0.05 of what small_gicp expects, in all of them.
+"""
 
 
 class Surfaces(NamedTuple):
@@ -84,7 +78,7 @@ def surfaces(points: Points) -> Surfaces | None:
     gicp = library()
     whole = np.isfinite(points).all(axis=1)
     rows = np.ascontiguousarray(points if whole.all() else points.compress(whole, axis=0))
-    if len(rows) < _LEAST_KIND:
+    if len(rows) < _MIN_POINTS:
         return None
     cloud = gicp.PointCloud(rows.astype(np.float64))
     tree = gicp.KdTree(cloud, num_threads=1)
@@ -105,13 +99,13 @@ def register_surfaces(
     iterations: int,
     prior: kernels.Belief | None = None,
 ) -> Registration | None:
-    """Register the kinds of points of a scan.
+    """Register the points of a scan, those above the ground and those on it.
 
     Args:
-        kinds: the scan's points, those above the ground and those on it, what there is of them.
+        kinds: either kind of point that the scan has enough of.
         target: the map.
         grid: the same points, to be searched.
-        normals: (K, 3) of theirs.
+        normals: (K, 3) of these points.
         T_map_source: (4, 4) initial guess.
         pivot: (3,) source-frame point that rotations are about.
         scales: coarse to fine.
@@ -120,10 +114,11 @@ def register_surfaces(
         prior: belief to fuse, about the same pivot.
 
     Returns:
-        What was found, or None where fewer than 50 points find a partner.
+        The result, or None where fewer than 50 points find a partner.
 
     Raises:
-        ValueError: the initial guess or the prior is not finite. DependencyError: there is no small_gicp.
+        ValueError: the initial guess or the prior is not finite.
+        DependencyError: there is no small_gicp.
     """
     if not all(np.isfinite(a).all() for a in (T_map_source, pivot, *(prior or ()))):
         raise ValueError("T_map_source, its pivot or the prior is not finite")
@@ -147,6 +142,8 @@ def register_surfaces(
 
 
 class _Pairs(NamedTuple):
+    """System of all kept pairs at one pose: information (6, 6), gradient (6,), their number and residual, metres."""
+
     information: Floats
     gradient: Floats
     kept: int
@@ -163,7 +160,7 @@ def _pairs(
     radius: float,
     keep: float,
 ) -> _Pairs | None:
-    """Ask what the pairs say at a pose, both kinds weighing the same; None where too few points find a partner."""
+    """Find pairs at a pose and sum up what they say, both kinds weighing the same; None where they are too few."""
     gicp, about = library(), T[:3, :3] @ pivot + T[:3, 3]
     H, b, kept, squares, weights = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     points = sum(len(kind.points) for kind in clouds)
@@ -182,7 +179,7 @@ def _pairs(
         there = kind.points[near] @ T[:3, :3].T + T[:3, 3]
         gap = there - grid.points[partner[near]]
         off = np.einsum("ij,ij->i", gap, normals[partner[near]])
-        share = min(0.5 * points / len(near), _MOST_SHARE)
+        share = min(0.5 * points / len(near), _MAX_SHARE)
         turned, slope = about_pivot(answer.H, answer.b, T, pivot)
         pull, drag = point_to_point_system(there, gap, about)
         H = H + share * _INFORMATION * (turned - _ALONG * pull)
@@ -190,9 +187,6 @@ def _pairs(
         kept += len(near)
         squares, weights = squares + share * float(off @ off), weights + share * len(near)
     return _Pairs(H, b, kept, float(np.sqrt(squares / weights))) if kept >= MIN_PAIRS else None
-
-
-_TINY = 1e-6  # information: keeps what has none solvable
 
 
 def about_pivot(H: Floats, b: Floats, T: Pose, pivot: Floats) -> tuple[Floats, Floats]:

@@ -1,9 +1,9 @@
-"""Where the map, seen from above, must have a wall: below the edges of what stands high.
+"""The map around a place, and the scan that is compared with it, each with what registration makes of them.
 
-An airborne scan shows roofs and few of the facades that a robot sees. But a facade stands under the edge of a roof, so
-a point there is explained by the map though no map point is near it. Seen by hand on one simulated campus (no command
-prints it) in whose map most facades are missing: at the right place 27-55 % of the structure has a map point within
-0.5 m, and 99-100 % has one or stands below an edge; at the best wrong places 6-22 % and 25-44 %.
+Roof edges: an airborne scan shows roofs and few of the facades that a robot sees. But a facade stands under the edge of
+a roof, so a point there is explained by the map though no map point is near it. Seen by hand on one simulated campus
+(no command prints it) in whose map most facades are missing: at the right place 27-55 % of the structure has a map
+point within 0.5 m, and 99-100 % has one or stands below an edge; at the best wrong places 6-22 % and 25-44 %.
 """
 
 from __future__ import annotations
@@ -26,55 +26,25 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.localization.registration.gicp import Surfaces
 
-
-_CELL = 0.5  # metres
-
+# set by hand
+_MAX_CROPS = 12  # cached
+_CROP_STEP = 16.0  # metres between the centres of cached crops
+_CELL = 0.5  # metres, of the raster of roof edges
 _DROP = 2.0  # metres: what falls less is no wall
-
 _REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
-
 _OVERHANG = 3  # cells, odd: a wall stands this close to the edge
-
 _SLACK = 0.5  # metres that a point may rise above the edge
-
 _NOTHING = -1e6
 
 
 @dataclass(frozen=True)
-class RoofEdges:
-    """Height of the edges (H, W) of a map crop, metres; row along x, column along y from ``corner`` (2,)."""
-
-    height: Floats32
-    corner: Floats
-
-    def above(self, points: Reals) -> Bools:
-        """Which of (N, 3) points stand below an edge of the map."""
-        cells = np.floor((points[:, :2] - self.corner) / _CELL).astype(np.int64)
-        inside = ((cells >= 0) & (cells < self.height.shape)).all(axis=1)
-        cells[~inside] = 0
-        return np.asarray(inside & (self.height[cells[:, 0], cells[:, 1]] > points[:, 2] - _SLACK))
-
-
-def roof_edges(points: Points) -> RoofEdges:
-    """Edges of (K, 3) map points. Cells without points count as low: below a roof's edge there often are none."""
-    corner = np.array([points[:, d].min() for d in range(2)], dtype=np.float64) - 2 * _CELL
-    i, j = (np.floor((points[:, d] - corner[d]) / _CELL).astype(np.int64) for d in range(2))
-    rows, columns = int(i.max()) + 3, int(j.max()) + 3
-    flat = np.full(rows * columns, _NOTHING, dtype=np.float32)
-    np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
-    top = flat.reshape(rows, columns)
-    edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
-    return RoofEdges(max_filter(edge, _OVERHANG), corner)
-
-
-_CACHED_CROPS = 12
-
-_CROP_STEP = 16.0  # metres between the centres of cached crops
-
-
-@dataclass(frozen=True)
 class LocalMap:
-    """A crop of the base map: points and unit normals (K, 3), map frame, metres; the rest is made when asked for."""
+    """A crop of the base map; what registration and verification make of it is made when first asked for.
+
+    Attributes:
+        points: (K, 3) map frame, metres.
+        normals: (K, 3) unit normals.
+    """
 
     points: Points
     normals: Points
@@ -85,7 +55,7 @@ class LocalMap:
         return kernels.PointGrid(self.points)
 
     def prepare(self, method: RegistrationMethod = "trimmed-icp") -> None:
-        """Make now what a registration by ``method`` would make when it asks for it."""
+        """Make now what registration by ``method`` and verification would make when they ask for it."""
         _ = self.edges, self._sorted
         if method == "gicp":
             _ = self.surfaces
@@ -109,12 +79,12 @@ class LocalMap:
 
 
 class LocalMaps:
-    """Crops of a base map by place, the recently used ones kept."""
+    """Crops of a base map by place, of which the recently used ones are kept."""
 
-    def __init__(self, base_map: BaseMap, radius: float, crops: int = _CACHED_CROPS) -> None:
+    def __init__(self, base_map: BaseMap, radius: float, crops: int = _MAX_CROPS) -> None:
         self._map = base_map
         self._radius = radius
-        self._most = crops
+        self._max_crops = crops
         self._crops: OrderedDict[tuple[int, int], LocalMap | None] = OrderedDict()
 
     def around(self, position: Floats) -> LocalMap | None:
@@ -125,15 +95,56 @@ class LocalMaps:
             points, normals = self._map.crop(centre, self._radius + 0.75 * _CROP_STEP)
             enough = len(points) >= MIN_PAIRS
             self._crops[key] = LocalMap(points, normals) if enough else None
-            if len(self._crops) > self._most:
+            if len(self._crops) > self._max_crops:
                 self._crops.popitem(last=False)
         self._crops.move_to_end(key)
         return self._crops[key]
 
 
 @dataclass(frozen=True)
+class RoofEdges:
+    """Where a map crop, seen from above, must have walls: below the edges of what stands high.
+
+    Attributes:
+        height: (H, W) of the edges, metres; far below everything where there is none. Rows along x, columns along y.
+        corner: (2,) x and y of the first cell's corner, map frame, metres.
+    """
+
+    height: Floats32
+    corner: Floats
+
+    def covers(self, points: Reals) -> Bools:
+        """Which of (N, 3) points stand below an edge of the map."""
+        cells = np.floor((points[:, :2] - self.corner) / _CELL).astype(np.int64)
+        inside = ((cells >= 0) & (cells < self.height.shape)).all(axis=1)
+        cells[~inside] = 0
+        return np.asarray(inside & (self.height[cells[:, 0], cells[:, 1]] > points[:, 2] - _SLACK))
+
+
+def roof_edges(points: Points) -> RoofEdges:
+    """Find the edges of (K, 3) map points.
+
+    Cells without points count as low: below a roof's edge there often are none.
+    """
+    corner = np.array([points[:, d].min() for d in range(2)], dtype=np.float64) - 2 * _CELL
+    i, j = (np.floor((points[:, d] - corner[d]) / _CELL).astype(np.int64) for d in range(2))
+    rows, columns = int(i.max()) + 3, int(j.max()) + 3
+    flat = np.full(rows * columns, _NOTHING, dtype=np.float32)
+    np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
+    top = flat.reshape(rows, columns)
+    edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
+    return RoofEdges(max_filter(edge, _OVERHANG), corner)
+
+
+@dataclass(frozen=True)
 class RegistrationCloud:
-    """Points (N, 3) float32 of a local scan, which of them stand above the ground, and how high (metres)."""
+    """A local scan that is registered and verified.
+
+    Attributes:
+        points: (N, 3) float32, gravity-aligned frame, metres.
+        above: (N,) which of them stand above the ground; the others lie on it.
+        height: (N,) metres above the lowest ground nearby.
+    """
 
     points: Points
     above: Bools

@@ -1,4 +1,4 @@
-"""What of the robot's recent points goes into registration and verification."""
+"""The part of the robot's recent points that is registered and verified."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, Pose, norms
 from coview_stream.localization.registration.local_map import RegistrationCloud
 
+# set by hand
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
-
 _CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, not part of it
-
-_SEED = 20240
+_SEED = 20240  # of the choice among too many points
 
 
 def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -> RegistrationCloud:
@@ -60,5 +59,5 @@ def height_above_lowest(points: Points) -> Floats32:
 
 
 def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Points:
-    """Points (K, 3) of a frame (N, 3) in the odometry frame, one per voxel, without those near the sensor."""
+    """Return points (K, 3) of a frame (N, 3) in the odometry frame, one per voxel, without those near the sensor."""
     return kernels.transform_unique(cloud, T_odom_body, config.voxel, config.range_min)[0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 import coview_kernels as kernels
@@ -13,18 +11,11 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.result import MIN_PAIRS, Prior, Registration
 
-if TYPE_CHECKING:
-    pass
-
-
+# set by hand
 _STOP_SHIFT = 2e-3  # metres; below the map's own noise, and the next step would be a third of it
-
 _STOP_TURN = 1e-4  # radians
-
 _COARSE_SHIFT = 0.06  # of a scale that another one follows; a finer stop there changes no error
-
 _COARSE_TURN = 3e-3  # radians per metre of such a scale
-
 _WIDTH_SHARE = 0.33  # of a scale, width of its weights: narrow ones from the start hold a wrong pose fast
 
 
@@ -38,7 +29,7 @@ def register(
     centre: Floats | None = None,
     iterations: int | None = None,
 ) -> Registration | None:
-    """Trimmed ICP or GICP, as ``config.method`` says, from an initial pose.
+    """Register a scan by trimmed ICP (eq. 13) or GICP, as ``config.method`` says, from an initial pose.
 
     Args:
         source: the local scan.
@@ -57,13 +48,12 @@ def register(
         DependencyError: the method is GICP and small_gicp is missing.
     """
     pivot = source.points.mean(axis=0, dtype=np.float64) if centre is None else centre
-    # the pairs count correlated points; weigh the prior alike
     belief = None
-    if prior is not None:
+    if prior is not None:  # the pairs are believed too much by inflation^2, so the prior is, too
         belief = kernels.Belief(prior.T_map_source, prior.information * config.inflation**2)
     if config.method == "gicp":
-        return _by_gicp(
-            source, T_map_source, target, config, _stages(scales, config), belief, pivot, iterations
+        return _register_by_gicp(
+            source, T_map_source, target, config, _kernel_scales(scales, config), belief, pivot, iterations
         )
     found = kernels.align_planes(
         target.grid,
@@ -72,7 +62,7 @@ def register(
         source.above,
         T_map_source,
         pivot,
-        _stages(scales, config),
+        _kernel_scales(scales, config),
         keep=config.keep,
         iterations=iterations or config.iterations,
         min_pairs=MIN_PAIRS,
@@ -81,12 +71,12 @@ def register(
     return None if found is None else Registration(*found)
 
 
-def _by_gicp(
+def _register_by_gicp(
     source: RegistrationCloud,
     T_map_source: Pose,
     target: LocalMap,
     config: RegistrationConfig,
-    stages: list[kernels.Scale],
+    scales: list[kernels.Scale],
     belief: kernels.Belief | None,
     pivot: Floats,
     iterations: int | None,
@@ -102,14 +92,14 @@ def _by_gicp(
         target.normals,
         T_map_source,
         pivot,
-        stages,
+        scales,
         keep=config.keep,
         iterations=iterations or config.iterations,
         prior=belief,
     )
 
 
-def _stages(scales: tuple[float, ...], config: RegistrationConfig) -> list[kernels.Scale]:
+def _kernel_scales(scales: tuple[float, ...], config: RegistrationConfig) -> list[kernels.Scale]:
     """Return the scales as the kernel takes them; all but the last end early, as the next one goes on from there."""
     last = len(scales) - 1
     return [

@@ -1,43 +1,57 @@
-"""Independent evidence that a pose is right. The residual of an ICP is not: it falls at wrong places too.
+"""Evidence that a pose is right, independent of the residual of its registration, which falls at wrong places too.
 
-Four shares in [0, 1], each of which a wrong place fails in its own way:
+A pose is judged by four shares in [0, 1], which a wrong place fails in different ways:
 
-* near: points well above the ground that have map points near them;
-* covered: points well above the ground that have map points near them or stand below an edge of the map;
-* ground: points on the ground that have map points near them;
-* free space: map points that the robot's rays met, rather than passed through.
+* near: of the robot's points that stand well above the ground, those that have a map point next to them. At a wrong
+  place walls, poles and trunks stand where the map has none.
+* covered: of the same points, those that have a map point next to them or stand below an edge of the map. An airborne
+  map shows roofs and few of the facades below them, so that near is low even at the right place, where covered is high.
+* ground: of the robot's points on the ground, those that lie on the map's ground. A place on another storey, a slope
+  or inside a block of houses fails it.
+* free space: of the map's points in view of the robot, those that its rays met rather than passed through. The first
+  three ask whether the map has what the robot sees; this one asks whether the robot sees what the map has.
 
-The score is the square root of their product. It separates, but not by itself: seen by hand on a few runs, right places
-score 0.3-0.75 in simulated towns and campuses, and wrong ones mostly below 0.2 but 0.3-0.57 at times when the robot is
-outside the map; on the road corridor ``riverside`` right places reach 0.8-0.95 and wrong ones on the same road 0.6-0.7.
-Hence the lead over the best rival, the ground share and the repeated proof that ``AcceptanceConfig`` asks for as well.
+The score is sqrt(near * covered * ground * free space): structure, which tells places apart, weighs as much as ground
+and free space together. A fifth share, inside, is not in it: how many of the points lie where the map has been surveyed
+at all; the others leave out the points that do not.
+
+The score separates right from wrong, but not by itself. Seen by hand on a few runs, no command prints it: right places
+score 0.3 to 0.75 in simulated towns and campuses, and wrong ones mostly below 0.2 but 0.3 to 0.57 at times when the
+robot is outside the map; on the road corridor ``riverside`` right places reach 0.8 to 0.95 and wrong ones on the same
+road 0.6 to 0.7. Hence the lead over the best rival, the ground share and the evidence of several keyframes that
+:class:`coview_stream.config.AcceptanceConfig` asks for as well. The constants below are set by hand.
 """
-
-# FOLDED coview_stream/localization/registration/verification.py: """Free space: a lidar ray that passed through a map point says that the point is not there, or the pose is wrong."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Bools, Floats32, Ints, Reals
 from coview_stream.geometry.transforms import Points, Pose, inverse, norms, transform
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
+# structure and ground
 _STRUCTURE_HEIGHT = 1.0  # metres above the ground
-
 _STRUCTURE_REACH = 0.5  # metres: two voxels of the map
-
 _GROUND_SEARCH = 1.0  # metres to the next map point of the ground, which a sparse map shows every half metre
-
 _GROUND_REACH = 0.15  # metres off its plane
+_MIN_STRUCTURE = 60  # points; fewer cannot tell places apart
+_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
 
-_LEAST_STRUCTURE = 60  # fewer points cannot tell places apart
-
-_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points proves little
+# free space
+_FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
+_FREE_EVERY = 3  # of the map's points: a share needs no more
+_FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
+_BEAM = np.radians(2.0)  # cell of the range image
+_COLUMNS = int(np.ceil(2 * np.pi / _BEAM)) + 1
+_CELLS = _COLUMNS * (int(np.ceil(np.pi / _BEAM)) + 1)
+_BEAM_HITS = 2  # returns in a cell: fewer say nothing
+_MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
+_SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
+_SLACK_SLOPE = 0.03
 
 
 @dataclass(frozen=True)
@@ -45,11 +59,12 @@ class Evidence:
     """How well a pose explains what the robot sees; all are shares in [0, 1].
 
     Attributes:
-        near: points > 1 m above the ground within 0.5 m of a map point.
-        covered: the same, or below an edge of the map (see :mod:`coview_stream.localization.registration.local_map`).
-        ground: points on the ground within 0.15 m of the plane of a map point less than 1 m away.
-        free_space: map points met by rays among those met or passed through.
-        inside: points that lie where the map has been surveyed.
+        near: of the points > 1 m above the ground, those within 0.5 m of a map point; 0 if there are fewer than 60.
+        covered: of the same points, those that are near, or below an edge of the map (see
+            :class:`coview_stream.localization.registration.local_map.RoofEdges`).
+        ground: of the points on the ground, those within 0.15 m of the plane of a map point less than 1 m away.
+        free_space: of the map points that rays met or passed through, those that they met.
+        inside: of all points, those that lie where the map has been surveyed.
     """
 
     near: float
@@ -60,7 +75,7 @@ class Evidence:
 
     @property
     def score(self) -> float:
-        """Square root of the product of the shares that can contradict a pose."""
+        """Square root of the product of the four shares that can contradict a pose, in [0, 1]."""
         return float(np.sqrt(self.near * self.covered * self.ground * self.free_space))
 
 
@@ -72,60 +87,29 @@ def verify(
     target: LocalMap,
     surveyed: Bools,
 ) -> Evidence:
-    """Evidence for a registered pose.
+    """Return the evidence for a registered pose.
 
     Args:
-        source: local scan that was registered; points that the map does not cover are left out.
+        source: local scan that was registered.
         T_map_source: (4, 4) its pose.
         seen: the newest frame: the rays whose way was free.
         T_map_body: (4, 4) pose of that frame.
         target: the map around it.
-        surveyed: (M,) which points of ``source`` lie where the map has been surveyed.
+        surveyed: (M,) which points of ``source`` lie where the map has been surveyed; the others are left out.
     """
     moved = transform(T_map_source, source.points)
     distance, partner = kernels.nearest(target.grid, moved, _GROUND_SEARCH)
     high = surveyed & (source.height > _STRUCTURE_HEIGHT)
     low = surveyed & ~source.above
-    few = int(high.sum()) < _LEAST_STRUCTURE
+    few = int(high.sum()) < _MIN_STRUCTURE
     found = distance[high] < _STRUCTURE_REACH
     near = 0.0 if few else float(found.mean())
-    covered = 0.0 if few else float((found | target.edges.above(moved[high])).mean())
+    covered = 0.0 if few else float((found | target.edges.covers(moved[high])).mean())
     grounded = float(_on_surface(moved[low], partner[low], target).sum())
     ground = (grounded + 0.5 * _PSEUDO) / (float(low.sum()) + _PSEUDO)
     met, passed = free_space(seen, T_map_body, target.points)
     free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
     return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)
-
-
-def _on_surface(points: Reals, partner: npt.NDArray[np.integer], target: LocalMap) -> Bools:
-    """Which of (N, 3) points lie on the plane of their partner (N,), the number of map points meaning none."""
-    has = partner < len(target.points)
-    near = partner[has]
-    off = np.abs(np.einsum("ij,ij->i", points[has] - target.points[near], target.normals[near]))
-    on = np.zeros(len(points), dtype=bool)
-    on[has] = off < _GROUND_REACH
-    return on
-
-
-_FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
-
-_FREE_EVERY = 3  # of the map's points: a share needs no more
-
-_FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
-
-_BEAM = np.radians(2.0)  # cell of the range image
-
-_COLUMNS = int(np.ceil(2 * np.pi / _BEAM)) + 1
-
-_CELLS = _COLUMNS * (int(np.ceil(np.pi / _BEAM)) + 1)
-
-_BEAM_HITS = 2
-
-_MOST_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
-
-_SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
-
-_SLACK_SLOPE = 0.03
 
 
 @dataclass(frozen=True)
@@ -147,7 +131,7 @@ class RangeImage:
     @classmethod
     def of(cls, cloud: Points) -> RangeImage:
         """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
-        cloud = cloud[:: max(1, -(-len(cloud) // _MOST_RAYS))]
+        cloud = cloud[:: max(1, -(-len(cloud) // _MAX_RAYS))]
         ranges = norms(cloud)
         usable = ranges > 1.0
         ranges = ranges[usable]
@@ -160,7 +144,7 @@ class RangeImage:
 
 
 def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int, int]:
-    """How many map points the frame's rays met, and how many they passed through.
+    """Count the map points that the frame's rays met, and those that they passed through.
 
     A map point is passed through where every return in its 2-degree cell of the frame's range image lies clearly
     behind it; points behind the returns are hidden and do not count.
@@ -186,7 +170,18 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
     return int(met.sum()), int(passed.sum())
 
 
+def _on_surface(points: Reals, partner: Ints, target: LocalMap) -> Bools:
+    """Which of (N, 3) points lie on the plane of their partner: (N,) indices of the K map points, K for none."""
+    has = partner < len(target.points)
+    near = partner[has]
+    off = np.abs(np.einsum("ij,ij->i", points[has] - target.points[near], target.normals[near]))
+    on = np.zeros(len(points), dtype=bool)
+    on[has] = off < _GROUND_REACH
+    return on
+
+
 def _beam_cells(points: Reals, ranges: Reals) -> Ints:
+    """Cell (N,) of the range image that each of (N, 3) points at ``ranges`` (N,) lies in."""
     azimuth = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
     elevation = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / _BEAM).astype(
         np.int64

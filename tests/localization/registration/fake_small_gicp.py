@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from coview_stream.geometry.se3 import cross
+from coview_stream.geometry.rotations import skew
 
 _FLAT = 2e-3  # variance along the normal of two clouds' covariances
 
@@ -48,9 +48,9 @@ def align(
     p, q, n = source.points[found], target.points[partner[found]], target.normals[partner[found]]
     residual = np.einsum("ij,ij->i", moved[found] - q, n)
     along = n @ T[:3, :3]
-    off = np.concatenate([-np.einsum("ni,nij->nj", along, cross(p)), along], axis=1)
+    off = np.concatenate([-np.einsum("ni,nij->nj", along, skew(p)), along], axis=1)
     # along the surfaces two variances of 1 add up as well
-    whole = np.concatenate([-T[:3, :3] @ cross(p), np.tile(T[:3, :3], (len(p), 1, 1))], axis=2)
+    whole = np.concatenate([-T[:3, :3] @ skew(p), np.tile(T[:3, :3], (len(p), 1, 1))], axis=2)
     sharp = 1 / _FLAT - 0.5
     H = sharp * off.T @ off + 0.5 * np.einsum("nki,nkj->ij", whole, whole)
     b = sharp * off.T @ residual + 0.5 * np.einsum("nki,nk->i", whole, moved[found] - q)

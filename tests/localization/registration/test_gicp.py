@@ -26,8 +26,8 @@ from coview_stream.localization.registration.covariance import registration_cova
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
-from coview_stream.localization.result import State
 from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.state import State
 from coview_stream.stream.node.engines import open_engine
 
 TRIMMED = RegistrationConfig()

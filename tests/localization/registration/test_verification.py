@@ -152,7 +152,7 @@ def test_points_off_the_survey_do_not_count(seen):
 def test_a_dense_frame_is_judged_by_a_part_of_it(monkeypatch):
     cloud = np.repeat(fan(10.2), 9, axis=0)
     whole = free_space(RangeImage.of(cloud), BODY, WALL)
-    monkeypatch.setattr(rays, "_MOST_RAYS", len(fan(10.2)) * 3)
+    monkeypatch.setattr(rays, "_MAX_RAYS", len(fan(10.2)) * 3)
     part = RangeImage.of(cloud)
     assert 0.2 * len(cloud) < part.hits.sum() < 0.4 * len(cloud)
     assert free_space(part, BODY, WALL) == whole
