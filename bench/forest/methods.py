@@ -12,17 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.forest.canopy import Canopy, seen_from
-from bench.forest.chains import APART, Chain, distinct, of_places, of_volume
-from bench.forest.query import errors, local, query_of
+from bench.forest.query import APART, Chain, distinct, errors, local, of_places, of_volume, query_of
 from bench.forest.worlds import Drive
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry import Points, Pose, transform
-from coview_stream.place.consensus import Consensus, Hypothesis, standardised
-from coview_stream.place.descriptor import describe, ground_below
-from coview_stream.place.learned.votes import View
-from coview_stream.query import Query
-from coview_stream.sources import Knowledge
+from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.geometry.transforms import Points, Pose, transform
+from coview_stream.localization.search.consensus import Consensus, Hypothesis, robust_zscore
+from coview_stream.localization.search.learned.matcher import QueryFeatures
+from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.localization.search.request import SearchRequest
 
 Floats = npt.NDArray[np.float64]
 
@@ -47,8 +46,8 @@ class Methods:
         usual = LocalizerConfig(reloc="auto")
         self.config = usual
         self.base_map = base_map
-        known = Knowledge.of(base_map, replace(usual, reloc="learned"))
-        retrieval = Knowledge.of(base_map, replace(usual, reloc="coview")).retrieval
+        known = SearchIndex.of(base_map, replace(usual, reloc="learned"))
+        retrieval = SearchIndex.of(base_map, replace(usual, reloc="coview")).retrieval
         if known.learned is None or retrieval is None:
             raise ValueError("the map has no learned features")
         self._learned, self._retrieval = known.learned, retrieval
@@ -79,15 +78,15 @@ class Methods:
         answer["chains"] = {name: self._chain.ask(named[name], moving, truth, query) for name in BASELINES}
         return answer | metric | {"ms": {name: round(1e3 * s, 1) for name, s in clock.seconds.items()}}
 
-    def _by_descriptors(self, query: Query, clock: _Clock) -> Named:
+    def _by_descriptors(self, query: SearchRequest, clock: _Clock) -> Named:
         with clock("descriptors"):
             centre = _on_ground(query.scan, query)
             volumes = self._retrieval.distances(describe(query.scan, centre, self.base_map.descriptor_config))
-            both = standardised(volumes["scan_context"]) + standardised(volumes["coview"])
+            both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
         named = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
         return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in named.items()}
 
-    def _by_canopy(self, query: Query, clock: _Clock) -> list[Hypothesis]:
+    def _by_canopy(self, query: SearchRequest, clock: _Clock) -> list[Hypothesis]:
         with clock("canopy"):
             xy, top = seen_from(query.surroundings, query.position)
             score, heading = self._canopy.search(xy, top)
@@ -95,11 +94,11 @@ class Methods:
         return of_places(self._canopy.places, score.ravel(), heading.ravel(), self.base_map.stations, centre)
 
     def _by_features(
-        self, query: Query, truth: Pose, clock: _Clock
+        self, query: SearchRequest, truth: Pose, clock: _Clock
     ) -> tuple[dict[str, Floats], dict[str, Any]]:
         centre = _on_ground(query.surroundings, query)
         with clock("network"):
-            view = self._learned.view(query.surroundings, centre)
+            view = self._learned.encode(query.surroundings, centre)
         with clock("correlation"):
             volume = self._learned.distances(view)
             consensus = Consensus(
@@ -110,7 +109,7 @@ class Methods:
             consensus.vote(centre, {"learned": volume})
             voted = [replace(each, learned=True) for each in consensus.hypotheses()]
         with clock("keypoints"):
-            sharpened = self._learned.sharpened(voted, view)
+            sharpened = self._learned.refine(voted, view)
         with clock("registration"):
             candidates = self._chain.register(sharpened, self._chain.source(query), query)
         verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in candidates]
@@ -124,19 +123,19 @@ class Methods:
         metric: dict[str, Any] = {"dense": errors(voted[0].T_map_odom, truth, query)[:2], "moved": moved}
         return places, {**metric, **self._chain.metric(sharpened, candidates, truth, query)}
 
-    def _by_global_descriptor(self, view: View) -> Floats:
+    def _by_global_descriptor(self, view: QueryFeatures) -> Floats:
         features = self._learned.features
         likeness = features.place.astype(np.float32) @ view.place
         return distinct(features.place_at, likeness)
 
 
-def _on_ground(points: Points, query: Query) -> Floats:
+def _on_ground(points: Points, query: SearchRequest) -> Floats:
     """Return the robot's position (3,), but on the ground that the points (N, 3) show below it; odometry frame."""
     x, y, _ = query.position
     return np.array([x, y, ground_below(points, query.position)])
 
 
-def _in_turn(hypotheses: list[Hypothesis], query: Query) -> Floats:
+def _in_turn(hypotheses: list[Hypothesis], query: SearchRequest) -> Floats:
     """Places (K, 2) of hypotheses in their order, those left out that are near a better one."""
     at = [transform(each.T_map_odom, query.position[None])[0, :2] for each in hypotheses]
     return distinct(np.array(at).reshape(-1, 2), -np.arange(len(at), dtype=np.float64))

@@ -13,6 +13,7 @@ It must find as many. BLAS has the threads of OPENBLAS_NUM_THREADS, the transfor
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -64,21 +65,21 @@ def convolved(features: F32, query: F32, weight: F32, yaws: npt.NDArray[np.float
 
 def _turned(query: F32, weight: F32, yaws: npt.NDArray[np.float64]) -> F32:
     """Turn a query (K, C, h + 1, h + 1), over the sum of its weights."""
-    from coview_stream.place.learned.turning import turned
+    from coview_stream.localization.search.learned.correlation import rotate_images
 
-    images = turned(np.concatenate([query, weight[None]]), yaws).transpose(2, 3, 0, 1)
+    images = rotate_images(np.concatenate([query, weight[None]]), yaws).transpose(2, 3, 0, 1)
     return np.ascontiguousarray(images[:, :-1] / images[:, -1:].sum(axis=(2, 3), keepdims=True))
 
 
-def rows(quick: bool = False) -> Iterator[Row]:
+def rows(asked: Namespace) -> Iterator[Row]:
     """Rows of the suite."""
-    yield from _dense(quick)
-    yield from _cliques(5 if quick else 15)
+    yield from _dense(asked.quick)
+    yield from _cliques(5 if asked.quick else 15)
 
 
 def _dense(quick: bool) -> Iterator[Row]:
-    from coview_stream.place.learned.coarse_map import CoarseMap
-    from coview_stream.place.learned.correlation import correlate
+    from coview_stream.localization.search.learned.correlation import correlate
+    from coview_stream.localization.search.learned.feature_index import FeatureIndex
 
     rng = np.random.default_rng(0)
     query, weight = _unit(rng, QUERY, QUERY), np.ones((QUERY, QUERY), dtype=np.float32)
@@ -87,9 +88,9 @@ def _dense(quick: bool) -> Iterator[Row]:
         if quick and side > 200:
             continue
         features = _unit(rng, side, side)
-        known, one = CoarseMap(features, (0.0, 0.0)), OneFft(features)
-        near = known.blocks_near([known.centre_of(side // 2, side // 2)], 50.0)
-        plain = partial(correlate, query, weight, known, yaws, covered=None)
+        known, one = FeatureIndex(features, (0.0, 0.0)), OneFft(features)
+        near = known.blocks_near([known.corner + (side // 2 + 0.5) * known.cell], 50.0)
+        plain = partial(correlate, query, weight, known, yaws, min_coverage=None)
         _same(plain(), one(query, weight, yaws))
         _same(plain()[:1], convolved(features, query, weight, yaws[:1]))
         repeat = 3 if quick or side > 200 else 7
@@ -112,23 +113,27 @@ def _dense(quick: bool) -> Iterator[Row]:
 
 
 def _cliques(repeat: int) -> Iterator[Row]:
-    from coview_stream.place.learned.clique import largest, maximum_clique, relaxed
-    from coview_stream.place.learned.consistency import consistency
-    from coview_stream.place.learned.match_config import LearnedMatchConfig
+    from coview_stream.config.search import LearnedMatchConfig
+    from coview_stream.localization.search.learned.consistent_pairs import (
+        consistency_graph,
+        largest_clique,
+        maximum_clique,
+        relaxed_clique,
+    )
 
     config = LearnedMatchConfig()
     for label, share in (("1 in 10 right", 0.1), ("none right", 0.0)):
         here, there = _pairs(np.random.default_rng(1), share)
-        weights = consistency(here, there, config)
+        weights = consistency_graph(here, there, config)
         found, most = maximum_clique(weights, config.nodes), enumerated(weights > 0)
         if found.exact and len(found) != most:
             raise RuntimeError(f"a clique of {len(found)}, there is one of {most}")
         nothing = np.empty(0, dtype=np.int64)
         graph, relaxing, ours, search, listing = medians(
-            partial(consistency, here, there, config),
-            partial(relaxed, weights),
+            partial(consistency_graph, here, there, config),
+            partial(relaxed_clique, weights),
             partial(maximum_clique, weights, config.nodes),
-            partial(largest, weights > 0, nothing, config.nodes),
+            partial(largest_clique, weights > 0, nothing, config.nodes),
             partial(enumerated, weights > 0),
             repeat=repeat,
         )

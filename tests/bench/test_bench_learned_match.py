@@ -16,7 +16,7 @@ def test_both_dense_baselines_equal_ours_on_a_map_that_is_not_square():
     features = rng.normal(size=(3, 40, 71)).astype(np.float32)
     query, weight = rng.normal(size=(3, 32, 32)).astype(np.float32), np.ones((32, 32), np.float32)
     yaws = np.array([0.2, 1.9])
-    ours = correlate(query, weight, FeatureIndex(features, (0, 0)), yaws, covered=None)
+    ours = correlate(query, weight, FeatureIndex(features, (0, 0)), yaws, min_coverage=None)
     np.testing.assert_allclose(ours, learned_match.OneFft(features)(query, weight, yaws), atol=1e-5)
     np.testing.assert_allclose(ours, learned_match.convolved(features, query, weight, yaws), atol=1e-5)
     with pytest.raises(RuntimeError, match="differ"):

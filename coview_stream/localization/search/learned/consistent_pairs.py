@@ -1,12 +1,11 @@
-"""The largest set of pairs that all agree: a maximum clique of the consistency graph.
+"""Consistent pairs of keypoints: the largest set in which all pairs agree, a maximum clique of the consistency graph.
 
-:func:`relaxed` climbs a weighted relaxation whose penalty for contradicting pairs grows until none is left together
-(the idea of Lusk et al., "CLIPPER: A Graph-Theoretic Framework for Robust Data Association", ICRA 2021);
-:func:`largest` starts from its clique and proves, by branch and bound with greedy colours, that there is no larger
-one, or finds it. Both are deterministic.
+Gravity is known, so two right pairs have the same horizontal distance in both views (:func:`consistency_graph`).
+:func:`relaxed_clique` climbs a weighted relaxation whose penalty for contradicting pairs grows until none is left
+together (the idea of Lusk et al., "CLIPPER: A Graph-Theoretic Framework for Robust Data Association", ICRA 2021);
+:func:`largest_clique` starts from its clique and proves, by branch and bound with greedy colours, that there is no
+larger one, or finds it. Both are deterministic.
 """
-
-# FOLDED coview_stream/localization/search/learned/consistent_pairs.py: """Which pairs of keypoints can all be true at once: gravity is known, so distances from above must agree."""
 
 from __future__ import annotations
 
@@ -17,18 +16,21 @@ import numpy as np
 from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 
-_OUTER, _INNER, _TRIES = 40, 25, 12
-
-_STILL = 1e-4  # change of the unit vector below which a climb has ended
-
-_FASTER, _SLOWER = 3.0, 0.25
-
-_LONGEST = 1e6  # step of a climb: beyond, only the slope's direction matters
+# of the relaxation's climb; set by hand
+_OUTER, _INNER, _TRIES = 40, 25, 12  # penalties, steps for each, step sizes for each
+_MIN_CHANGE = 1e-4  # of the unit vector: with less, a climb has ended
+_GROW, _SHRINK = 3.0, 0.25  # factors on the step size
+_MAX_STEP = 1e6  # beyond it only the gradient's direction matters
 
 
 @dataclass(frozen=True)
 class Clique:
-    """``members`` in ascending order; ``exact``: it is proved that there is no larger one."""
+    """A set of nodes that are all adjacent.
+
+    Attributes:
+        members: (K,) in ascending order.
+        exact: whether it is proved that there is no larger one.
+    """
 
     members: Ints
     exact: bool
@@ -39,15 +41,15 @@ class Clique:
 
 
 def maximum_clique(weights: Floats32, nodes: int) -> Clique:
-    """Relax, then search: see :func:`relaxed` and :func:`largest`."""
-    return largest(weights > 0, relaxed(weights), nodes)
+    """Return the maximum clique of a weighted graph (N, N): relaxed, then searched in up to ``nodes`` branches."""
+    return largest_clique(weights > 0, relaxed_clique(weights), nodes)
 
 
-def relaxed(weights: Floats32) -> Ints:
+def relaxed_clique(weights: Floats32) -> Ints:
     """Find a heavy clique of a weighted graph (N, N), symmetric, 0 for no edge; usually the largest or nearly.
 
     Maximises ``u^T (W + I - d B) u`` over unit vectors u >= 0 by projected gradients, where B marks the pairs
-    without an edge and d grows. Whatever u comes out, its heaviest entries are taken in order as long as they agree.
+    without an edge and d grows. Of the u that results, the heaviest entries are taken in order as long as they agree.
 
     Returns:
         Members of the clique, ascending; none for a graph without nodes.
@@ -66,40 +68,40 @@ def relaxed(weights: Floats32) -> Ints:
     penalty = 0.0
     for _ in range(_OUTER):
         conflict = apart @ u
-        torn = (u > 1e-6) & (conflict > 1e-6)
-        if not torn.any():
+        conflicting = (u > 1e-6) & (conflict > 1e-6)
+        if not conflicting.any():
             break
-        penalty += float(np.mean((own @ u)[torn] / conflict[torn])) if penalty == 0 else penalty
+        penalty += float(np.mean((own @ u)[conflicting] / conflict[conflicting])) if penalty == 0 else penalty
         u = _climb(own - np.float32(penalty) * apart, u)
-    return _agreeing(weights > 0, np.argsort(-u, kind="stable"))
+    return _greedy_clique(weights > 0, np.argsort(-u, kind="stable"))
 
 
 def _climb(matrix: Floats32, u: Floats32) -> Floats32:
     """Projected gradient ascent of ``u^T matrix u`` over unit vectors u >= 0 (N,)."""
-    slope = matrix @ u
-    value, step = float(u @ slope), 1.0
+    gradient = matrix @ u
+    value, step = float(u @ gradient), 1.0
     for _ in range(_INNER):
-        step = min(step * _FASTER, _LONGEST)
+        step = min(step * _GROW, _MAX_STEP)
         for _ in range(_TRIES):
-            tried = np.maximum(u + np.float32(step) * slope, np.float32(0.0))
-            norm = float(np.linalg.norm(tried))
+            trial = np.maximum(u + np.float32(step) * gradient, np.float32(0.0))
+            norm = float(np.linalg.norm(trial))
             if norm > 0:
-                tried /= np.float32(norm)
-                steep = matrix @ tried
-                if (reached := float(tried @ steep)) >= value:
+                trial /= np.float32(norm)
+                trial_gradient = matrix @ trial
+                if (trial_value := float(trial @ trial_gradient)) >= value:
                     break
-            step *= _SLOWER
+            step *= _SHRINK
         else:
             break
-        moved = float(np.linalg.norm(tried - u))
-        u, slope, value = tried, steep, reached
-        if moved < _STILL:
+        moved = float(np.linalg.norm(trial - u))
+        u, gradient, value = trial, trial_gradient, trial_value
+        if moved < _MIN_CHANGE:
             break
     return u
 
 
-def _agreeing(adjacent: Bools, order: Ints) -> Ints:
-    """Take nodes in ``order`` (N,), each that is adjacent to all before it: a clique that nothing can be added to."""
+def _greedy_clique(adjacent: Bools, order: Ints) -> Ints:
+    """Take nodes in ``order`` (N,), each that is adjacent to all taken before it: a maximal clique."""
     free = np.ones(len(adjacent), dtype=bool)
     members = []
     for node in order:
@@ -110,13 +112,13 @@ def _agreeing(adjacent: Bools, order: Ints) -> Ints:
     return np.array(sorted(members), dtype=np.int64)
 
 
-def largest(adjacent: Bools, start: Ints, nodes: int) -> Clique:
-    """Search for the maximum clique of a graph.
+def largest_clique(adjacent: Bools, start: Ints, nodes: int) -> Clique:
+    """Find the maximum clique of a graph by branch and bound.
 
     Args:
         adjacent: (N, N) symmetric; the diagonal does not matter.
-        start: members of a clique that is known, possibly none.
-        nodes: branches after which the search ends with the best that it has found.
+        start: members of a known clique, possibly none.
+        nodes: branches after which the search ends with the best clique so far.
 
     Raises:
         ValueError: ``start`` is no clique.
@@ -149,7 +151,7 @@ def _core(edges: Bools, size: int) -> Ints:
 
 
 def _search(neighbours: list[int], size: int, nodes: int) -> tuple[list[int], bool]:
-    """Find a largest clique of more than ``size`` (empty: there is none) in bit sets, and say if that is proved."""
+    """Find a largest clique of more than ``size`` (empty: there is none) in bit sets, and whether that is proved."""
     best: list[int] = []
     path: list[int] = []
     everything = (1 << len(neighbours)) - 1
@@ -200,7 +202,7 @@ def _coloured(candidates: int, neighbours: list[int], spare: int) -> tuple[list[
 
 
 def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) -> Floats32:
-    """Weigh how well every two pairs of points agree: a turn about the vertical and a shift keep distances.
+    """Weigh how well every two pairs of points agree: rotation about the vertical and translation keep distances.
 
     Args:
         query: (N, 2) metres, the pairs' points in the scan.
@@ -209,8 +211,8 @@ def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) 
 
     Returns:
         (N, N) symmetric, 0 where two pairs contradict each other, lie too close together or are the same one, else
-        exp(-d^2 / 2 spread^2) of the difference d of their distances. Mirror images keep distances too: what follows
-        has to look at the residuals.
+        exp(-d^2 / 2 spread^2) of the difference d of their distances. Mirror images keep distances too: the caller has
+        to check the residuals.
 
     Raises:
         ValueError: the two sides are of different numbers.
@@ -228,6 +230,6 @@ def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) 
 
 
 def _distances(xy: Floats) -> Floats32:
-    """Distances (N, N) between points; they are subtracted before single precision takes over."""
+    """Distances (N, N) between points, subtracted in double precision."""
     step = [(xy[:, None, k] - xy[None, :, k]).astype(np.float32) for k in (0, 1)]
     return np.asarray(np.hypot(*step))

@@ -1,6 +1,4 @@
-"""How alike a query is to every place of the map at every heading: dense correlation, by FFT in blocks."""
-
-# FOLDED coview_stream/localization/search/learned/correlation.py: """A query in cells, made coarser and turned about its middle."""
+"""Dense correlation of a query with a map at every cell and heading, by FFT in blocks."""
 
 from __future__ import annotations
 
@@ -11,41 +9,40 @@ import numpy.typing as npt
 from scipy import fft
 
 from coview_stream.geometry.arrays import Complexes, Floats, Floats32, Ints, Reals
-from coview_stream.localization.search.learned.feature_index import FeatureIndex, transformed
+from coview_stream.localization.search.learned.feature_index import FeatureIndex, half_spectra
 
-COVERED = 0.6
-"""Share of a query's weight that has to lie on surveyed cells."""
+MIN_COVERAGE = 0.6
+"""Share of a query's weight that has to lie on surveyed cells; set by hand: at it, scatter has grown by 1.3."""
 
-_AT_ONCE = 32 << 20  # bytes of the products that are transformed back together
-
-_LEAST = 1e-6  # weight of nothing
+_BATCH_BYTES = 32 << 20  # of the products that are transformed back together; set by hand
+_EPSILON = 1e-6  # a smaller weight is none
 
 
 def correlate(
     query: Floats32,
     weight: Floats32,
-    coarse_map: FeatureIndex,
+    index: FeatureIndex,
     yaws: npt.ArrayLike,
     blocks: Ints | None = None,
-    covered: float | None = COVERED,
+    min_coverage: float | None = MIN_COVERAGE,
 ) -> Floats32:
     """Mean inner product of a query's cells with the map's, for its middle at every cell's centre, at every heading.
 
-    A query that reaches beyond the map has less to be compared with. Its sum over all weights would count what nobody
-    surveyed as cells that do not look alike, and lose the right place at the map's edge to a wrong one inside. With
-    ``covered``, the mean is over what lies on surveyed cells: the right place scores what it would score anywhere. A
-    mean of few cells scatters more, though, and chance would favour the map's rim; below a share of 0.6 a place is
-    not scored (at it, scatter has grown by 1.3). That is -inf, not 0: wrong places may well score less than 0, and no
-    evidence is none against it. Who adds up several queries takes -inf for their median.
+    A query that reaches beyond the map has less to be compared with. A mean over all weights would count unsurveyed
+    cells as dissimilar ones, and lose the right place at the map's edge to a wrong one inside. So the mean is over the
+    surveyed cells: the right place scores what it would score anywhere. A mean of few cells scatters more, though, and
+    chance would prefer the map's rim; a place with less than ``min_coverage`` of the weight on surveyed cells is not
+    scored. That is -inf, not 0: wrong places may well score less than 0, and no evidence is none against it. To add up
+    several queries, replace -inf by their median.
 
     Args:
-        query: (C, h, h), h even, each cell's features times its weight (see :func:`~.turning.coarser`); row along
+        query: (C, h, h), h even, each cell's features times its weight (see :func:`downsample`); row along
             y, column along x of the query's frame, the robot between the four cells in the middle.
         weight: (h, h) not negative. What lies more than h / 2 cells from the middle is left out.
-        coarse_map: of the same cells and channels, with a margin of at least h / 2.
+        index: of the same cells and channels, with a margin of at least h / 2.
         yaws: (K,) headings of the query's frame in the map, radians.
         blocks: blocks of the map to score (all); see :meth:`FeatureIndex.blocks_near`.
-        covered: least share of the weight on surveyed cells; None divides by all the weight, wherever it lies.
+        min_coverage: smallest share of the weight on surveyed cells; None divides by all the weight.
 
     Returns:
         (K, H, W); -inf where nothing was scored. The memory's order is (H, W, K): headings of a cell lie together.
@@ -54,91 +51,89 @@ def correlate(
         ValueError: query and map do not fit, or no cell has a weight.
     """
     headings = np.asarray(yaws, dtype=np.float64)
-    _check(query, weight, coarse_map, headings)
-    waves = _waves(query, weight, coarse_map, headings)
-    chosen = np.arange(len(coarse_map)) if blocks is None else np.unique(blocks)
-    scores = np.full((coarse_map.height, coarse_map.width, len(headings)), -np.inf, dtype=np.float32)
+    _check(query, weight, index, headings)
+    waves = _waves(query, weight, index, headings)
+    chosen = np.arange(len(index)) if blocks is None else np.unique(blocks)
+    scores = np.full((index.height, index.width, len(headings)), -np.inf, dtype=np.float32)
     per_block = 8 * len(waves[0].spectra) * len(headings)
-    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _AT_ONCE))):
+    for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _BATCH_BYTES))):
         if len(group):
             for wave, part in zip(waves, np.split(scores, len(waves), axis=2), strict=True):
-                _score(part, group, coarse_map, wave, covered)
+                _score(part, group, index, wave, min_coverage)
     return np.asarray(scores.transpose(2, 0, 1))
 
 
 @dataclass(frozen=True)
 class _Wave:
-    """Spectra (bins, K, C + 1) to multiply a map's with, and the row and column at which its margin's end is found."""
+    """Spectra (bins, K, C + 1) to multiply the map's with, and the row and column at which the valid part begins."""
 
     spectra: Complexes
     first: int
 
 
 def _waves(
-    query: Floats32, weight: Floats32, coarse_map: FeatureIndex, yaws: Floats
+    query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats
 ) -> tuple[_Wave] | tuple[_Wave, _Wave]:
-    """Spectra of a turned query, the weight's last, over the sum of the weights."""
+    """Spectra of the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
     half, size = len(weight) // 2, len(yaws) // 2
-    # a correlation with what is turned by half a turn is a convolution: the same spectra, not conjugate
+    # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
     twice = len(yaws) == 2 * size and np.allclose(
         np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9
     )
     images = rotate_images(np.concatenate([query, weight[None]]), yaws[:size] if twice else yaws)
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
-    if not (total > _LEAST).all():
+    if not (total > _EPSILON).all():
         raise ValueError("no cell of the query has a weight")
     images *= (1.0 / total)[:, None]
-    spectra = transformed(images, coarse_map.block, coarse_map.workers)
-    before = _Wave(np.conjugate(spectra), coarse_map.margin - half)
-    return (before, _Wave(spectra, coarse_map.margin + half)) if twice else (before,)
+    spectra = half_spectra(images, index.block, index.workers)
+    before = _Wave(np.conjugate(spectra), index.margin - half)
+    return (before, _Wave(spectra, index.margin + half)) if twice else (before,)
 
 
-def _check(query: Floats32, weight: Floats32, coarse_map: FeatureIndex, yaws: Floats) -> None:
+def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats) -> None:
     if query.ndim != 3 or weight.shape != query.shape[1:] or yaws.ndim != 1 or not len(yaws):
         raise ValueError(
             f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit"
         )
-    if len(query) != coarse_map.channels:
-        raise ValueError(f"the query has {len(query)} channels, the map {coarse_map.channels}")
-    if query.shape[1] > 2 * coarse_map.margin:
+    if len(query) != index.channels:
+        raise ValueError(f"the query has {len(query)} channels, the map {index.channels}")
+    if query.shape[1] > 2 * index.margin:
         raise ValueError(
-            f"the query has {query.shape[1]} cells a side, the map allows for {2 * coarse_map.margin}"
+            f"the query has {query.shape[1]} cells a side, the map allows for {2 * index.margin}"
         )
 
 
 def _score(
-    scores: Floats32, group: Ints, coarse_map: FeatureIndex, wave: _Wave, covered: float | None
+    scores: Floats32, group: Ints, index: FeatureIndex, wave: _Wave, min_coverage: float | None
 ) -> None:
-    """Fill in the places (H, W, K) that some blocks answer for."""
+    """Fill in the scores (H, W, K) of the valid parts of some blocks."""
     spectra = wave.spectra
-    mean = _back(np.matmul(coarse_map.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), coarse_map, wave)
-    if covered is not None:
-        gaps = np.flatnonzero(~coarse_map.whole(group))
+    mean = _back(np.matmul(index.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), index, wave)
+    if min_coverage is not None:
+        gaps = np.flatnonzero(~index.gapless(group))
         if len(gaps):
-            share = _back(
-                coarse_map.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], coarse_map, wave
-            )
-            # a share of just so much must not depend on how the transforms round
-            enough = share >= max(covered - 1e-5, _LEAST)
-            mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _LEAST), -np.inf)
+            share = _back(index.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], index, wave)
+            # a share equal to the minimum must not depend on how the transforms round
+            enough = share >= max(min_coverage - 1e-5, _EPSILON)
+            mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _EPSILON), -np.inf)
     for k, block in enumerate(group):
-        rows, cols = coarse_map.place_of(block)
+        rows, cols = index.cells_of(block)
         scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
 
 
-def _back(product: Complexes, coarse_map: FeatureIndex, wave: _Wave) -> Floats32:
-    """Correlations (places, places, blocks, K) from products of spectra (bins, blocks, K)."""
-    size, last = coarse_map.block, wave.first + coarse_map.places
+def _back(product: Complexes, index: FeatureIndex, wave: _Wave) -> Floats32:
+    """Correlations (valid, valid, blocks, K) from products of spectra (bins, blocks, K)."""
+    size, last = index.block, wave.first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
-    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=coarse_map.workers)[wave.first : last]
-    return np.asarray(fft.irfft(rows, size, axis=1, workers=coarse_map.workers)[:, wave.first : last])
+    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=index.workers)[wave.first : last]
+    return np.asarray(fft.irfft(rows, size, axis=1, workers=index.workers)[:, wave.first : last])
 
 
 def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:
     """Mean of ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and of the weights.
 
     Returns:
-        (C, H / ratio, W / ratio), (H / ratio, W / ratio): what :func:`~.correlation.correlate` takes.
+        (C, H / ratio, W / ratio), (H / ratio, W / ratio): what :func:`correlate` takes.
 
     Raises:
         ValueError: the ratio does not divide the sides, or the weights have another shape.
@@ -156,7 +151,7 @@ def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> 
 
 
 def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
-    """Sample images on a grid of odd size about their middle, turned by each heading.
+    """Sample images on a grid of odd size about their middle, rotated by each heading.
 
     Args:
         images: (C, h, h), h even: the middle lies between cells. What is farther from it than h / 2 cells is left

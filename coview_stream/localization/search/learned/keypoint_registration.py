@@ -1,6 +1,4 @@
-"""From a place to within a few metres, to a pose: by keypoints that agree."""
-
-# FOLDED coview_stream/localization/search/learned/keypoint_registration.py: """Turn about the vertical and shift that lay points on their partners, in closed form."""
+"""Keypoint registration: from a place good to a few metres to a pose, by keypoints that agree."""
 
 from __future__ import annotations
 
@@ -21,18 +19,23 @@ Start = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class KeypointMatch:
-    """``p_map = R(yaw) p_query + (x, y)``, and what it rests on."""
+    """Pose ``p_map = R(yaw) p_query + (x, y)`` and the pairs of keypoints behind it.
+
+    Attributes:
+        x: metres.
+        y: metres.
+        yaw: radians in (-pi, pi].
+        inliers: pairs that agree with the pose.
+        exact: whether it is proved that no more pairs agree with each other.
+        rms: root mean square of their residuals in the plane, metres.
+    """
 
     x: float
     y: float
     yaw: float
-    """Radians in (-pi, pi]."""
     inliers: int
-    """Pairs of keypoints that agree with the pose."""
     exact: bool
-    """Whether it is proved that no more pairs agree with each other."""
     rms: float
-    """Root mean square of their residuals in the plane, metres."""
 
 
 def refine_by_keypoints(
@@ -43,7 +46,7 @@ def refine_by_keypoints(
     Args:
         query: keypoints in the query's frame, whose origin is the middle of what it has seen.
         known: keypoints of the map, or of its part that matters, in the map's frame.
-        start: where the query's frame lies in the map, more or less.
+        start: where the query's frame lies in the map, approximately.
         config: tolerances and what a match has to be.
 
     Returns:
@@ -51,15 +54,15 @@ def refine_by_keypoints(
     """
     config = config or LearnedMatchConfig()
     near = known.around(start[:2], config.reach + config.max_shift)
-    possible = _meeting(query, near, start, config)
-    pairs, _ = nearest_pairs(query.descriptors, near.descriptors, most=config.pairs, possible=possible)
+    possible = _possible_pairs(query, near, start, config)
+    pairs, _ = nearest_pairs(query.descriptors, near.descriptors, max_pairs=config.pairs, possible=possible)
     if len(pairs) < config.min_inliers:
         return None
-    left, right = query.where(pairs[:, 0]), near.where(pairs[:, 1])
+    left, right = query.select(pairs[:, 0]), near.select(pairs[:, 1])
     clique = maximum_clique(consistency_graph(left.xy, right.xy, config), config.nodes)
     members = pairs[clique.members]
     while len(members) >= config.min_inliers:
-        found = _aligned(query, near, members)
+        found = _fit(query, near, members)
         fits = found.residuals < config.tolerance
         if fits.all():
             return _match(found, len(members), clique.exact) if _close(found, start, config) else None
@@ -68,8 +71,8 @@ def refine_by_keypoints(
     return None
 
 
-def _meeting(query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig) -> Bools:
-    """Mask (N, M) of the pairs that lie on each other in some pose that would be accepted."""
+def _possible_pairs(query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig) -> Bools:
+    """Mask (N, M) of the pairs that coincide in some pose that would be accepted."""
     c, s = math.cos(start[2]), math.sin(start[2])
     there = query.xy @ np.array([[c, s], [-s, c]]) + start[:2]
     gap = np.hypot(there[:, None, 0] - known.xy[None, :, 0], there[:, None, 1] - known.xy[None, :, 1])
@@ -77,9 +80,9 @@ def _meeting(query: Keypoints, known: Keypoints, start: Start, config: LearnedMa
     return np.asarray(gap <= config.max_shift + config.tolerance + swing[:, None])
 
 
-def _aligned(query: Keypoints, known: Keypoints, members: Ints) -> RigidFit2D:
-    """Lay the members (P, 2) on each other, the certain ones more firmly."""
-    left, right = query.where(members[:, 0]), known.where(members[:, 1])
+def _fit(query: Keypoints, known: Keypoints, members: Ints) -> RigidFit2D:
+    """Fit the members (P, 2), weighted by their certainty."""
+    left, right = query.select(members[:, 0]), known.select(members[:, 1])
     weights = 1.0 / (left.sigma.astype(np.float64) ** 2 + right.sigma.astype(np.float64) ** 2)
     return fit_rigid_2d(left.xy, right.xy, weights)
 
@@ -95,14 +98,19 @@ def _match(found: RigidFit2D, inliers: int, exact: bool) -> KeypointMatch:
 
 @dataclass(frozen=True)
 class RigidFit2D:
-    """``p_map = R(yaw) p_query + (x, y)``."""
+    """Pose ``p_map = R(yaw) p_query + (x, y)`` of a least-squares fit.
+
+    Attributes:
+        x: metres.
+        y: metres.
+        yaw: radians in (-pi, pi].
+        residuals: (N,) metres, in the plane.
+    """
 
     x: float
     y: float
     yaw: float
-    """Radians in (-pi, pi]."""
     residuals: Floats
-    """(N,) metres, in the plane."""
 
     @property
     def rms(self) -> float:
@@ -111,7 +119,7 @@ class RigidFit2D:
 
 
 def fit_rigid_2d(query: Floats, known: Floats, weights: Floats | None = None) -> RigidFit2D:
-    """Weighted least squares in the plane.
+    """Rotation about the vertical and translation that take points to their partners: weighted least squares.
 
     Args:
         query: (N, 2) metres.

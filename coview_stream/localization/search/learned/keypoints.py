@@ -1,6 +1,4 @@
-"""Keypoints: the cells of which the network is least uncertain."""
-
-# FOLDED coview_stream/localization/search/learned/keypoints.py: """Which keypoints of a scan look like which of the map."""
+"""Keypoints, the cells of which the network is least uncertain, and their mutual nearest pairs."""
 
 from __future__ import annotations
 
@@ -14,7 +12,13 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
 
 @dataclass(frozen=True)
 class Keypoints:
-    """``xy`` (N, 2) metres, ``descriptors`` (N, C), ``sigma`` (N,)."""
+    """Keypoints of one image.
+
+    Attributes:
+        xy: (N, 2) metres.
+        descriptors: (N, C), unit norm.
+        sigma: (N,) uncertainty.
+    """
 
     xy: Floats
     descriptors: Floats32
@@ -30,14 +34,14 @@ class Keypoints:
         """Return how many there are."""
         return len(self.xy)
 
-    def where(self, chosen: Bools | Ints) -> Keypoints:
-        """Return those chosen by a mask (N,) or by indices."""
+    def select(self, chosen: Bools | Ints) -> Keypoints:
+        """Return those that a mask (N,) or indices name."""
         return Keypoints(self.xy[chosen], self.descriptors[chosen], self.sigma[chosen])
 
     def around(self, xy: npt.ArrayLike, radius: float) -> Keypoints:
         """Return those within ``radius`` metres of ``xy`` (2,)."""
         step = self.xy - np.asarray(xy, dtype=np.float64)
-        return self.where(np.hypot(step[:, 0], step[:, 1]) <= radius)
+        return self.select(np.hypot(step[:, 0], step[:, 1]) <= radius)
 
 
 def keypoints(
@@ -49,7 +53,7 @@ def keypoints(
     count: int | None = 200,
     cell: float = 1.0,
 ) -> Keypoints:
-    """Take the ``count`` least uncertain of the cells that are so among their eight neighbours, best first.
+    """Find the cells that are less uncertain than their eight neighbours, the ``count`` best of them, best first.
 
     Args:
         local: (C, H, W) descriptors; row along y, column along x.
@@ -73,7 +77,7 @@ def keypoints(
 
 
 def local_minima(values: Reals) -> Bools:
-    """Mask (H, W) of finite values that no neighbour of eight undercuts; of equal ones the first counts."""
+    """Mask (H, W) of finite values that none of their eight neighbours is below; of equal ones the first counts."""
     height, width = values.shape
     padded = np.pad(values, 1, constant_values=np.inf)
     lowest = np.isfinite(values)
@@ -91,7 +95,7 @@ def nearest_pairs(
     query: Floats32,
     known: Floats32,
     *,
-    most: int = 300,
+    max_pairs: int = 300,
     possible: Bools | None = None,
 ) -> tuple[Ints, Floats32]:
     """Pair descriptors each of which is the most similar to the other, by inner product.
@@ -99,7 +103,7 @@ def nearest_pairs(
     Args:
         query: (N, C) unit descriptors.
         known: (M, C) unit descriptors.
-        most: pairs at most.
+        max_pairs: the most similar ones are kept.
         possible: (N, M) which pairs may be (all).
 
     Returns:
@@ -118,5 +122,5 @@ def nearest_pairs(
     row, forth, back = np.arange(len(query)), similarity.argmax(axis=1), similarity.argmax(axis=0)
     row = row[(back[forth] == row) & np.isfinite(similarity[row, forth])]
     values = similarity[row, forth[row]]
-    order = np.argsort(-values, kind="stable")[:most]
+    order = np.argsort(-values, kind="stable")[:max_pairs]
     return np.stack([row, forth[row]], axis=1)[order], values[order]

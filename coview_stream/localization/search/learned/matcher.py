@@ -1,4 +1,4 @@
-"""Learned re-localization on one map: a scan's features compared with the map's, at every place and heading."""
+"""Feature matcher: a scan's learned features compared with a map's at every station and heading."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from coview_stream.localization.search.learned.correlation import correlate, dow
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.localization.search.learned.keypoint_registration import refine_by_keypoints
 from coview_stream.localization.search.learned.keypoints import Keypoints, keypoints
+from coview_stream.localization.search.retrieval import ScoreVolume
 
 _SIZE = 64.0
 """Metres along the edge of a query's image."""
 
-_STEEPEST = 1.0  # metres per metre that the ground rises along a storey
-_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away
+_MAX_SLOPE = 1.0  # metres per metre that the ground rises along a storey; set by hand
+_MAX_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away
 _ROUNDING = 1e-6  # cells
-_SAMPLE = 200_000  # numbers are enough for a median
-_TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # what a tile's blocks have to reach from its middle, corners and all
+_SAMPLE = 200_000  # scores that a median is taken of; set by hand
+_TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # from a tile's middle to beyond its corners, metres
 
 
 @dataclass(frozen=True)
 class QueryFeatures:
-    """What the ground network saw around ``centre``.
+    """Features of a query: the ground network's output around ``centre``.
 
     Attributes:
-        features: of an image with ``centre`` in its middle, axes as the odometry frame's.
-        weight: (h, w) how much each cell of the local descriptors counts; zero beyond the reach.
-        centre: (3,) the robot, but on the ground; odometry frame, metres.
+        features: of an image with ``centre`` in its middle, along the axes of the odometry frame.
+        weight: (h, w) of each cell of the local descriptors; zero beyond the reach.
+        centre: (3,) the ground below the robot, odometry frame, metres.
     """
 
     features: Features
@@ -61,7 +62,7 @@ class QueryFeatures:
 
 
 class FeatureMatcher:
-    """All that searches of one map share: the map's features, ready to be searched, and the ground network.
+    """A map's learned features, ready to be searched, and the ground network: what searches of one map share.
 
     Nothing is loaded or made before the first query, or :meth:`prepare`.
     """
@@ -75,7 +76,7 @@ class FeatureMatcher:
         *,
         block: float = 2.0,
     ) -> None:
-        """Search the features of a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
+        """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
 
         Raises:
             MapError: they were made by other weights than those in ``directory`` (the package's).
@@ -85,7 +86,7 @@ class FeatureMatcher:
         self.features = features
         self.stations = stations
         self.config = config
-        self.match = LearnedMatchConfig(reach=config.reach)
+        self.match_config = LearnedMatchConfig(reach=config.reach)
         self._block = block
         self._directory = directory
 
@@ -95,20 +96,20 @@ class FeatureMatcher:
         return network("ground", self._directory, 1)
 
     @cached_property
-    def coarse(self) -> FeatureIndex:
+    def index(self) -> FeatureIndex:
         """The map's features on coarse cells, with their spectra."""
         whole, corner = self.features.coarse(self.config.cell)
         margin = round(0.5 * _SIZE / self.config.cell)
         surveyed = (whole != 0).any(axis=0)
-        # halves: the whole is kept beside its spectra, and its numbers come from single bytes anyway
+        # half precision: the features are kept beside their spectra, and come from single bytes anyway
         return FeatureIndex(
             whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin
         )
 
     @cached_property
-    def _everywhere(self) -> Ints:
-        """Blocks of the coarse map that have features at all."""
-        return self.coarse.blocks_near(self.features.tile_centres, _TILE_RADIUS)
+    def _feature_blocks(self) -> Ints:
+        """Blocks of the index that have any features."""
+        return self.index.blocks_near(self.features.tile_centres, _TILE_RADIUS)
 
     @property
     def dense(self) -> bool:
@@ -116,14 +117,14 @@ class FeatureMatcher:
         return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
-        """Load the network and make the map's spectra now, rather than at the first query.
+        """Load the network and make the map's spectra, or the first query does.
 
         Raises:
             InputError: the weights cannot be loaded. DependencyError: there is no onnxruntime, or a broken one.
         """
-        _ = self.network, self._everywhere if self.dense else self.coarse
+        _ = self.network, self._feature_blocks if self.dense else self.index
 
-    def view(self, points: Points, centre: Floats) -> QueryFeatures:
+    def encode(self, points: Points, centre: Floats) -> QueryFeatures:
         """Encode a gravity-aligned cloud (N, 3) around ``centre`` (3,), which is on the ground below the robot.
 
         Raises:
@@ -136,33 +137,33 @@ class FeatureMatcher:
         weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
         return QueryFeatures(features, weight, centre)
 
-    def distances(self, view: QueryFeatures, suggested: npt.ArrayLike = ()) -> Floats32:
-        """(M, S) of all stations and headings, lower is more alike; shift n means yaw -2 pi n / S.
+    def distances(self, query: QueryFeatures, near: npt.ArrayLike = ()) -> ScoreVolume:
+        """Distances (M, S) to all stations at all headings, lower is more similar; shift n means yaw -2 pi n / S.
 
-        Where the map is too large to be searched all over, it is searched around ``suggested`` (N, 2) as well, metres.
-        Their median is 1, which is also the distance where nothing was compared: it speaks neither for nor against.
+        A map too large to be searched all over is searched around the tiles most similar to the query, and around
+        ``near`` (N, 2), metres. The median is 1, which is also the distance where nothing was compared: no evidence.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
-        query, weight = downsample(view.features.local, view.weight, ratio)
+        local, weight = downsample(query.features.local, query.weight, ratio)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
-        blocks = self._everywhere if self.dense else self._alike(view, suggested)
-        read = self._at_stations(correlate(query, weight, self.coarse, yaws, blocks))
+        blocks = self._feature_blocks if self.dense else self._similar_blocks(query, near)
+        read = self._at_stations(correlate(local, weight, self.index, yaws, blocks))
         compared = np.isfinite(read)
         sample = read[:: max(1, read.size // _SAMPLE)]
         sample = sample[np.isfinite(sample)]
-        usual = np.median(sample) if len(sample) else np.float32(0.0)
-        found: Floats32 = np.float32(1.0 + usual) - read
+        median = np.median(sample) if len(sample) else np.float32(0.0)
+        found: ScoreVolume = np.float32(1.0 + median) - read
         found[~compared] = 1.0
         return found
 
-    def _at_stations(self, scores: Floats32) -> Floats32:
-        """Best (M, K) of the scores (K, H, W) whose cells have their middle in a station's block, -inf off the map.
+    def _at_stations(self, scores: Floats32) -> ScoreVolume:
+        """Best score (M, K) of the cells (K, H, W) that have their middle in a station's block, -inf off the map.
 
         A block smaller than a cell has the score of the cell around its station.
         """
         grid = scores.transpose(1, 2, 0)
-        xy = (self.stations[:, :2].astype(np.float64) - self.coarse.corner) / self.coarse.cell
-        half = 0.5 * self._block / self.coarse.cell
+        xy = (self.stations[:, :2].astype(np.float64) - self.index.corner) / self.index.cell
+        half = 0.5 * self._block / self.index.cell
         first, last = (np.ceil(xy + side - 0.5 - _ROUNDING).astype(np.int64) for side in (-half, half))
         first = np.where(last > first, first, np.floor(xy).astype(np.int64))
         size = np.maximum(last - first, 1)
@@ -174,19 +175,21 @@ class FeatureMatcher:
             read[inside] = np.maximum(read[inside], grid[row[inside], column[inside]])
         return read
 
-    def sharpened(self, hypotheses: list[Hypothesis], view: QueryFeatures) -> list[Hypothesis]:
-        """Move each hypothesis to where keypoints around it agree; where too few do, it stays."""
-        local, sigma = view.features.local, view.features.sigma
-        ours = keypoints(local, sigma, view.corner, mask=view.weight > 0, count=self.match.keypoints)
-        return [self._sharpened(each, ours, view.centre) for each in hypotheses]
+    def refine(self, hypotheses: list[Hypothesis], query: QueryFeatures) -> list[Hypothesis]:
+        """Move each hypothesis to the pose that keypoints around it agree on; where too few agree, it stays."""
+        local, sigma = query.features.local, query.features.sigma
+        query_keypoints = keypoints(
+            local, sigma, query.corner, mask=query.weight > 0, count=self.match_config.keypoints
+        )
+        return [self._refined(each, query_keypoints, query.centre) for each in hypotheses]
 
-    def _sharpened(self, hypothesis: Hypothesis, ours: Keypoints, centre: Floats) -> Hypothesis:
+    def _refined(self, hypothesis: Hypothesis, query_keypoints: Keypoints, centre: Floats) -> Hypothesis:
         T = hypothesis.T_map_odom
         x, y, z = transform(T, centre[None])[0].tolist()
-        patch = self.features.patch(np.array([x, y]), self.match.reach + self.match.max_shift)
+        patch = self.features.patch(np.array([x, y]), self.match_config.reach + self.match_config.max_shift)
         known = (patch.local != 0).any(axis=0)
-        theirs = keypoints(patch.local, patch.sigma, patch.corner, mask=known, count=None)
-        found = refine_by_keypoints(ours, theirs, (x, y, yaw_of(T)), self.match)
+        map_keypoints = keypoints(patch.local, patch.sigma, patch.corner, mask=known, count=None)
+        found = refine_by_keypoints(query_keypoints, map_keypoints, (x, y, yaw_of(T)), self.match_config)
         if found is None:
             return hypothesis
         z = self._ground(np.array([found.x, found.y]), np.array([x, y, z]))
@@ -198,20 +201,20 @@ class FeatureMatcher:
         away = np.hypot(*(self.stations[:, :2] - xy).T)
         rise = np.abs(self.stations[:, 2] - before[2])
         moved = float(np.hypot(*(xy - before[:2])))
-        same = np.flatnonzero((away <= 1.5 * self._block) & (rise <= _STEP + _STEEPEST * moved))
+        same = np.flatnonzero((away <= 1.5 * self._block) & (rise <= _MAX_STEP + _MAX_SLOPE * moved))
         if not len(same):
             return float(before[2])
         nearest = same[np.lexsort((rise[same], np.round(away[same], 2)))[0]]
         return float(self.stations[nearest, 2])
 
-    def _alike(self, view: QueryFeatures, suggested: npt.ArrayLike) -> Ints:
-        """Blocks of the coarse map around suggestions, and around the tiles that look most like the view."""
-        likeness = self.features.place.astype(np.float32) @ view.place
+    def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike) -> Ints:
+        """Blocks of the index around ``near`` (N, 2), and around the tiles most similar to the query."""
+        similarity = self.features.place.astype(np.float32) @ query.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
         found, number = np.unique(tile, axis=0, return_inverse=True)
         best = np.full(len(found), -np.inf, dtype=np.float32)
-        np.maximum.at(best, number.reshape(-1), likeness)
+        np.maximum.at(best, number.reshape(-1), similarity)
         chosen = found[np.argsort(-best, kind="stable")[: self.config.shortlist]]
         tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
-        near = np.vstack([tiles, np.asarray(suggested, dtype=np.float64).reshape(-1, 2)])
-        return self.coarse.blocks_near(near, _TILE_RADIUS)
+        middles = np.vstack([tiles, np.asarray(near, dtype=np.float64).reshape(-1, 2)])
+        return self.index.blocks_near(middles, _TILE_RADIUS)

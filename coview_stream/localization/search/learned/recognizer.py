@@ -1,4 +1,4 @@
-"""Learned features as a source of hypotheses; apart from the others, for it brings half of SciPy along."""
+"""Place recognizer by learned features; in a module of its own, for it imports SciPy, which takes a while."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
 from coview_stream.localization.search.request import SearchRequest
 
-_MOST = 2  # times as many hypotheses as peaks, where stations lie above each other
+_MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other; set by hand
 
 
 class LearnedRecognizer:
-    """Votes by learned features; its peaks are made exact by keypoints of the newest keyframe that voted."""
+    """Recognizer by learned features; keypoints of the newest keyframe that voted refine its peaks."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: FeatureMatcher) -> None:
         self.config = config
         self.learned = learned
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
         self.consensus = Consensus(base_map.stations, base_map.config.block, peaks)
-        self._view: QueryFeatures | None = None
+        self._query: QueryFeatures | None = None
 
-    def vote(self, query: SearchRequest) -> None:
-        """Compare what the ground network sees around the robot with the map's features."""
-        if len(query.surroundings) < self.config.keyframe.min_points:
+    def vote(self, request: SearchRequest) -> None:
+        """Compare the ground network's features around the robot with the map's."""
+        if len(request.surroundings) < self.config.keyframe.min_points:
             return
-        centre = on_ground(query.surroundings, query.position)
-        self._view = self.learned.view(query.surroundings, centre)
-        suggested = [transform(T, query.position[None])[0, :2] for T in query.suggested]
-        self.consensus.vote(centre, {"learned": self.learned.distances(self._view, suggested)})
+        centre = on_ground(request.surroundings, request.position)
+        self._query = self.learned.encode(request.surroundings, centre)
+        hinted = [transform(T, request.position[None])[0, :2] for T in request.hints]
+        self.consensus.vote(centre, {"learned": self.learned.distances(self._query, hinted)})
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks on every storey that they may be on, each moved to where keypoints agree."""
+        """Return the consensus' peaks on every storey that they may be on, refined by keypoints."""
         peaks = [replace(each, learned=True) for each in self.consensus.hypotheses()]
-        if self._view is None or not peaks:
+        if self._query is None or not peaks:
             return peaks
-        same = [self._same_but_height(each, peaks[0], self._view) for each in peaks]
+        same = [self._same_but_height(each, peaks[0], self._query) for each in peaks]
         if not all(same):
             lead = (peaks[same.index(False)].score - peaks[0].score) / math.sqrt(len(self.consensus))
             peaks = [replace(each, lead=lead * own) for each, own in zip(peaks, same, strict=True)]
@@ -50,11 +50,11 @@ class LearnedRecognizer:
         for peak in peaks:
             for each in self._storeys(peak):
                 found.setdefault((each.station, each.shift), each)
-        named = list(found.values())[: _MOST * self.config.learned.peaks]
-        return self.learned.sharpened(named, self._view)
+        named = list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
+        return self.learned.refine(named, self._query)
 
     def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
-        """Return a peak, and its likes at the stations above and below: from above they look the same."""
+        """Return a peak, and the same at the stations above and below: from above they look alike."""
         if peak.station is None:
             return [peak]
         stations, own = self.consensus.stations, self.consensus.stations[peak.station]
@@ -69,8 +69,8 @@ class LearnedRecognizer:
             for k, rise in rises.items()
         ]
 
-    def _same_but_height(self, one: Hypothesis, other: Hypothesis, view: QueryFeatures) -> bool:
-        here, there = (transform(each.T_map_odom, view.centre[None])[0, :2] for each in (one, other))
+    def _same_but_height(self, one: Hypothesis, other: Hypothesis, query: QueryFeatures) -> bool:
+        here, there = (transform(each.T_map_odom, query.centre[None])[0, :2] for each in (one, other))
         turn = abs(wrap_angle(yaw_of(one.T_map_odom) - yaw_of(other.T_map_odom)))
         rule = self.consensus.config
         return math.dist(here, there) < rule.distinct_distance and turn < rule.distinct_yaw
@@ -78,7 +78,7 @@ class LearnedRecognizer:
     def clear(self) -> None:
         """Forget all votes."""
         self.consensus.clear()
-        self._view = None
+        self._query = None
 
     def __len__(self) -> int:
         """Return how many keyframes have voted."""

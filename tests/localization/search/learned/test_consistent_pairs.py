@@ -9,7 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coview_stream.localization.search.learned.consistent_pairs import largest, maximum_clique, relaxed
+from coview_stream.localization.search.learned.consistent_pairs import (
+    largest_clique,
+    maximum_clique,
+    relaxed_clique,
+)
 
 
 def random_graph(nodes, share, seed):
@@ -57,7 +61,7 @@ def test_the_search_equals_trying_everything(nodes, share, seed):
     expected = clique_number(weights)
     for found in (
         maximum_clique(weights, 100_000),
-        largest(weights > 0, np.empty(0, dtype=np.int64), 100_000),
+        largest_clique(weights > 0, np.empty(0, dtype=np.int64), 100_000),
     ):
         assert found.exact
         assert is_clique(weights, found.members)
@@ -75,12 +79,12 @@ def test_sixteen_nodes_equal_trying_everything(share):
 @given(st.integers(1, 60), st.floats(0.0, 1.0), st.integers(0, 10_000))
 def test_the_relaxation_claims_no_more_than_a_clique_that_cannot_grow(nodes, share, seed):
     weights = random_graph(nodes, share, seed)
-    members = relaxed(weights)
+    members = relaxed_clique(weights)
     assert len(members) >= 1
     assert is_clique(weights, members)
     others = np.setdiff1d(np.arange(nodes), members)
     assert not (weights[np.ix_(others, members)] > 0).all(axis=1).any()
-    proved = largest(weights > 0, members, 3000)
+    proved = largest_clique(weights > 0, members, 3000)
     assert is_clique(weights, proved.members)
     assert len(proved) >= len(members)
 
@@ -88,7 +92,7 @@ def test_the_relaxation_claims_no_more_than_a_clique_that_cannot_grow(nodes, sha
 @pytest.mark.parametrize(("nodes", "members", "share"), [(200, 20, 0.05), (400, 20, 0.05), (400, 80, 0.1)])
 def test_the_relaxation_finds_what_was_planted(nodes, members, share):
     weights, chosen = planted(nodes, members, share, 3)
-    np.testing.assert_array_equal(relaxed(weights), chosen)
+    np.testing.assert_array_equal(relaxed_clique(weights), chosen)
     found = maximum_clique(weights, 2000)
     np.testing.assert_array_equal(found.members, chosen)
     assert found.exact
@@ -99,28 +103,28 @@ def test_the_relaxation_comes_near_the_largest_where_nothing_stands_out():
     reached = []
     for seed in range(10):
         weights = random_graph(60, 0.5, seed)
-        reached.append(len(relaxed(weights)) / len(maximum_clique(weights, 100_000)))
+        reached.append(len(relaxed_clique(weights)) / len(maximum_clique(weights, 100_000)))
     assert np.mean(reached) > 0.87
 
 
 def test_the_search_finds_what_was_planted_without_a_start():
     weights, chosen = planted(300, 25, 0.2, 5)
-    found = largest(weights > 0, np.empty(0, dtype=np.int64), 20_000)
+    found = largest_clique(weights > 0, np.empty(0, dtype=np.int64), 20_000)
     np.testing.assert_array_equal(found.members, chosen)
     assert found.exact
 
 
 def test_out_of_branches_it_says_so_and_still_answers():
     weights = random_graph(120, 0.7, 0)
-    start = relaxed(weights)
-    short = largest(weights > 0, start, 20)
+    start = relaxed_clique(weights)
+    short = largest_clique(weights > 0, start, 20)
     assert not short.exact
     assert is_clique(weights, short.members)
     assert len(short) >= len(start)
-    longer = largest(weights > 0, start, 1_000_000)
+    longer = largest_clique(weights > 0, start, 1_000_000)
     assert longer.exact
     assert len(longer) >= len(short)
-    np.testing.assert_array_equal(longer.members, largest(weights > 0, start, 1_000_000).members)
+    np.testing.assert_array_equal(longer.members, largest_clique(weights > 0, start, 1_000_000).members)
 
 
 def test_graphs_of_one_kind():
@@ -130,7 +134,7 @@ def test_graphs_of_one_kind():
     assert len(maximum_clique(np.zeros((5, 5), np.float32), 10)) == 1
     full = np.ones((300, 300), np.float32)
     np.testing.assert_array_equal(maximum_clique(full, 10).members, np.arange(300))
-    deep = largest(full > 0, np.empty(0, dtype=np.int64), 2000)
+    deep = largest_clique(full > 0, np.empty(0, dtype=np.int64), 2000)
     np.testing.assert_array_equal(deep.members, np.arange(300))
     assert deep.exact
 
@@ -138,4 +142,4 @@ def test_graphs_of_one_kind():
 @pytest.mark.parametrize("start", [[0, 1], [2, 2]])
 def test_a_start_that_is_no_clique_is_refused(start):
     with pytest.raises(ValueError, match="no clique"):
-        largest(np.zeros((3, 3), bool), np.array(start), 10)
+        largest_clique(np.zeros((3, 3), bool), np.array(start), 10)

@@ -74,11 +74,11 @@ def by_loops(query, weight, known, surveyed, yaws, covered):
 
 
 @pytest.mark.parametrize("covered", [None, 0.6, 0.3])
-@pytest.mark.parametrize("most_bytes", [0, 1 << 30])
+@pytest.mark.parametrize("max_bytes", [0, 1 << 30])
 @pytest.mark.parametrize(
     "headings", [(0.0, 0.3, 2.0, -1.2), (0.4, 1.7, 0.4 - np.pi, 1.7 + np.pi)], ids=["any", "opposite"]
 )
-def test_it_equals_direct_sums(covered, most_bytes, headings):
+def test_it_equals_direct_sums(covered, max_bytes, headings):
     rng = np.random.default_rng(1)
     known = features(rng, 3, 11, 17)
     known[:, :5, :9] = 0.0
@@ -86,10 +86,10 @@ def test_it_equals_direct_sums(covered, most_bytes, headings):
     local, weights = features(rng, 3, 12, 12), rng.uniform(0.1, 1.0, (12, 12)).astype(np.float32)
     query, weight = downsample(local, weights)
     yaws = np.asarray(headings)
-    made = FeatureIndex(known, (0.0, 0.0), block=15, margin=4, most_bytes=most_bytes)
+    made = FeatureIndex(known, (0.0, 0.0), block=15, margin=4, max_bytes=max_bytes)
     assert len(made) == 2 * 3
-    assert (made.nbytes > 0) == (most_bytes > 0)
-    ours = correlate(query, weight, made, yaws, covered=covered)
+    assert (made.nbytes > 0) == (max_bytes > 0)
+    ours = correlate(query, weight, made, yaws, min_coverage=covered)
     expected = by_loops(query, weight, known, surveyed, yaws, covered)
     assert ours.shape == expected.shape == (4, 11, 17)
     assert ours.dtype == np.float32
@@ -116,7 +116,7 @@ def test_it_works_on_single_cells_of_half_precision_on_a_map_smaller_than_a_quer
     known = features(rng, 8, 20, 9).astype(np.float16)
     query = seen_at(known.astype(np.float32), 11, 4, YAWS[2], 32)
     weight = disk(32)
-    scores = correlate(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS, covered=0.1)
+    scores = correlate(query * weight, weight, FeatureIndex(known, (0, 0)), YAWS, min_coverage=0.1)
     assert np.unravel_index(scores.argmax(), scores.shape) == (2, 11, 4)
 
 
@@ -136,7 +136,7 @@ def test_the_maps_edge_neither_favours_nor_punishes():
     assert np.isneginf(scores[50, 0])  # 54 % lie on the map
     assert np.isneginf(scores[0, 0])
     assert np.isfinite(scores[5:95, 16:84]).all()
-    punished = correlate(query, weight, coarse, [0.0], covered=None)[0]
+    punished = correlate(query, weight, coarse, [0.0], min_coverage=None)[0]
     assert np.isfinite(punished).all()
     assert punished[50, 5] < 0.8 * inside
 
@@ -169,8 +169,8 @@ def test_each_block_answers_for_its_own_cells_only():
     coarse = FeatureIndex(np.ones((1, 70, 130), np.float16), (0, 0), block=64)
     answered = np.zeros((70, 130), int)
     for block in range(len(coarse)):
-        answered[coarse.place_of(block)] += 1
-        rows, cols = coarse.place_of(block)
+        answered[coarse.cells_of(block)] += 1
+        rows, cols = coarse.cells_of(block)
         middle = centre_of(coarse, (rows.start + rows.stop - 1) / 2, (cols.start + cols.stop - 1) / 2)
         assert coarse.blocks_near([middle], 0.5).tolist() == [block]
     assert (answered == 1).all()

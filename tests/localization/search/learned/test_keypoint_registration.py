@@ -156,9 +156,9 @@ def test_nothing_matches_nothing():
     query, known = views(np.random.default_rng(3), (0.0, 0.0, 0.0))
     none = np.zeros(0, dtype=np.int64)
     for one, other in (
-        (query.where(none), known),
-        (query, known.where(none)),
-        (query.where(none), known.where(none)),
+        (query.select(none), known),
+        (query, known.select(none)),
+        (query.select(none), known.select(none)),
     ):
         assert refine_by_keypoints(one, other, (0.0, 0.0, 0.0)) is None
     assert refine_by_keypoints(query, known, (1000.0, 0.0, 0.0)) is None

@@ -87,11 +87,11 @@ def test_pairs_equal_the_definition():
         for j in range(33):
             if similarity[i, j] == similarity[i].max() == similarity[:, j].max():
                 expected.add((i, j))
-    pairs, values = nearest_pairs(query, known, most=10_000)
+    pairs, values = nearest_pairs(query, known, max_pairs=10_000)
     assert {(int(i), int(j)) for i, j in pairs} == expected
     np.testing.assert_array_equal(values, similarity[pairs[:, 0], pairs[:, 1]])
     assert (np.diff(values) <= 0).all()
-    few, best = nearest_pairs(query, known, most=5)
+    few, best = nearest_pairs(query, known, max_pairs=5)
     np.testing.assert_array_equal(few, pairs[:5])
     np.testing.assert_array_equal(best, values[:5])
 

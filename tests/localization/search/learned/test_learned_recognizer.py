@@ -25,9 +25,9 @@ def named(heights, peaks=5):
     flat[(xy == HERE).all(axis=1), SHIFT] = -1.0
     flat[(xy == THERE).all(axis=1), SHIFT] = 0.2
     learned = SimpleNamespace(
-        view=lambda points, centre: SimpleNamespace(centre=centre),
+        encode=lambda points, centre: SimpleNamespace(centre=centre),
         distances=lambda view, suggested: np.tile(flat, (len(heights), 1)),
-        sharpened=lambda hypotheses, view: hypotheses,
+        refine=lambda hypotheses, view: hypotheses,
     )
     source = LearnedRecognizer(
         SimpleNamespace(stations=stations, config=SimpleNamespace(block=2.0)), config, learned

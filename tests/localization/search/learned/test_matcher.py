@@ -95,9 +95,9 @@ def test_they_are_searched_around_suggestions_too(planted, stations):
 def test_only_small_maps_are_prepared_to_be_searched_all_over(planted, stations):
     large = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0))
     small = FeatureMatcher(planted.features, stations, LearnedConfig())
-    for known, prepared in ((large, {"coarse"}), (small, {"coarse", "_everywhere"})):
+    for known, prepared in ((large, {"index"}), (small, {"index", "_feature_blocks"})):
         known.prepare()
-        assert {"coarse", "_everywhere"} & set(vars(known)) == prepared
+        assert {"index", "_feature_blocks"} & set(vars(known)) == prepared
 
 
 def at(xy, yaw, centre, z=0.0):
@@ -111,7 +111,7 @@ def test_keypoints_make_a_hypothesis_exact(planted, known):
     rough = Hypothesis(
         at(xy + np.array([1.5, -2.0]), yaw + np.radians(5), centre, 2.5), 17, 4, -3.0, learned=True
     )
-    (exact,) = known.sharpened([rough], view)
+    (exact,) = known.refine([rough], view)
     there = transform(exact.T_map_odom, centre[None])[0]
     assert np.hypot(*(there[:2] - xy)) < 0.4
     assert there[2] == pytest.approx(0.02 * 13.0)  # the nearest station's: keypoints know no heights
@@ -124,7 +124,7 @@ def test_where_keypoints_do_not_agree_a_hypothesis_stays(planted, known):
     view = planted.seen((13.4, 27.8), 0.83, np.zeros(3))
     wrong = Hypothesis(at((-50.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
     beyond = Hypothesis(at((950.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
-    assert known.sharpened([wrong, beyond], view) == [wrong, beyond]
+    assert known.refine([wrong, beyond], view) == [wrong, beyond]
 
 
 def pointwise(image):
@@ -152,7 +152,7 @@ def test_from_clouds_to_a_pose(map_points, monkeypatch, xy, degrees):
     known.network = pointwise
     centre = np.array([50.0, -8.0, 3.0])
     near = cloud[np.hypot(*(cloud[:, :2] - place[:2]).T) < 29.0]
-    view = known.view(transform(inverse(at(xy, yaw, centre)), near).astype(np.float32), centre)
+    view = known.encode(transform(inverse(at(xy, yaw, centre)), near).astype(np.float32), centre)
 
     def errors(hypothesis):
         gap = transform(hypothesis.T_map_odom, centre[None])[0] - place
@@ -165,7 +165,7 @@ def test_from_clouds_to_a_pose(map_points, monkeypatch, xy, degrees):
     assert turn < 8.0
     if degrees % 90 == 0:  # then cells lie on cells, and such simple descriptors are alike enough
         rough = Hypothesis(at(place[:2] + np.array([1.5, -1.0]), yaw + np.radians(6), centre), 3, 4, -3.0)
-        metres, turn = errors(*known.sharpened([rough], view))
+        metres, turn = errors(*known.refine([rough], view))
         assert metres < 0.2
         assert turn < 0.5
 
@@ -174,7 +174,7 @@ def test_a_cloud_becomes_a_view(known):
     """By the network of the package, whatever it is worth: shapes, norms, and where it counts."""
     rng = np.random.default_rng(0)
     cloud = rng.uniform([-23, -28, 0], [37, 32, 5], (20_000, 3)).astype(np.float32)
-    view = known.view(cloud, np.array([7.0, 2.0, 0.0]))
+    view = known.encode(cloud, np.array([7.0, 2.0, 0.0]))
     assert view.features.local.shape[1:] == view.weight.shape == (64, 64)
     assert np.linalg.norm(view.place) == pytest.approx(1.0, abs=1e-4)
     assert view.weight[32, 32] > 0
