@@ -48,7 +48,7 @@ def finite_rows(rows: Points) -> tuple[Points, Bools | None]:
     """Return a copy of the finite rows (K, 3) of (N, 3), and which (N,) they are: None if all are."""
     if np.isfinite(rows).all():
         return rows.copy(order="C"), None
-    finite: Bools = np.isfinite(rows).all(axis=1)
+    finite: Bools = np.all(np.isfinite(rows), axis=1)
     return rows.compress(finite, axis=0), finite
 
 

@@ -1,4 +1,4 @@
-"""A robot's odometry of the last seconds: what continues it, what does not, and the pose at a frame's stamp."""
+"""Buffer of a robot's odometry of the last seconds: kinds of samples, and the pose at a frame's stamp."""
 
 from __future__ import annotations
 
@@ -10,25 +10,27 @@ from enum import StrEnum
 import numpy as np
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.geometry.rotations import slerp
-from coview_stream.geometry.transforms import Pose, inverse, pose_from, rotation_angle, yaw_of
+from coview_stream.geometry.arrays import Ints
+from coview_stream.geometry.transforms import Pose, Poses, interpolate, inverse, rotation_angle, yaw_of
 from coview_stream.messages.types import OdometryMessage
 
 _NS = 1_000_000_000
-_STEADY = 5  # samples that must run on before a clock counts as restarted
+
+# set by hand, all of them
+_MIN_RESTART_SAMPLES = 5  # in a row, before a clock counts as restarted
 _SLACK = 0.5  # metres that a sample may always be off: corrections by a lidar odometry, rough stamps
 _SLACK_SPEED = 3.0  # metres per second by which any robot may have sped up meanwhile
 _SPEED_FACTOR = 3.0  # times its speed of the last seconds
-_RECENT = 2 * _NS
+_SPEED_WINDOW_NS = 2 * _NS
 _JUMP_ANGLE = np.radians(20.0)
 
 
 class SampleKind(StrEnum):
-    """What an odometry sample was to the samples before it."""
+    """Relation of an odometry sample to the samples before it."""
 
     CONTINUES = "continues"
     GAP = "gap"
-    """It comes after a short pause: the place has to be verified again."""
+    """It comes after a short pause: the pose has to be verified again."""
     OUTAGE = "outage"
     """It comes after a long pause: the robot may have been carried anywhere."""
     JUMP = "jump"
@@ -42,8 +44,8 @@ class SampleKind(StrEnum):
 @dataclass(frozen=True)
 class _Entry:
     sample: OdometryMessage
-    travelled: float
-    turned: float
+    travelled: float  # metres since the first sample
+    turned: float  # radians since the first sample
 
     @property
     def stamp_ns(self) -> int:
@@ -52,10 +54,15 @@ class _Entry:
 
 @dataclass(frozen=True)
 class Segment:
-    """Odometry around a frame: stamps (K,) int64 ns and poses (K, 4, 4) odometry <- body."""
+    """Odometry around a frame.
 
-    stamps: np.ndarray
-    poses: np.ndarray
+    Attributes:
+        stamps: (K,) nanoseconds, increasing.
+        poses: (K, 4, 4) odometry <- body, metres.
+    """
+
+    stamps: Ints
+    poses: Poses
 
 
 class OdometryBuffer:
@@ -73,24 +80,27 @@ class OdometryBuffer:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Drop all samples."""
         self.newest: OdometryMessage | None = None
         self.arrived = float("-inf")
         self.travelled = self.turned = 0.0
         self._samples: deque[_Entry] = deque()
-        self._strange: deque[tuple[float, int]] = deque(maxlen=_STEADY)  # local time, stamp
-        self._strange_since = float("inf")
+        self._discontinuous: deque[int] = deque(maxlen=_MIN_RESTART_SAMPLES)  # stamps
+        self._discontinuous_since = float("inf")
 
     def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> SampleKind:
-        """Take in a sample that came at local time ``now``; only duplicates and strays leave no trace.
+        """Take in a sample and return its kind; duplicates and samples out of order are not kept.
 
-        ``unreachable``: none could have come since the last one, for nobody was connected.
+        Args:
+            sample: the sample.
+            now: local time (seconds) at which it came.
+            unreachable: no sample could have come since the last one: the connection was down.
         """
         longest = self.config.max_network_outage if unreachable else self.config.max_outage
-        verdict = self._classify(sample, now, longest)
-        if verdict in (SampleKind.DUPLICATE, SampleKind.OUT_OF_ORDER):
-            return verdict
-        if verdict in (SampleKind.JUMP, SampleKind.RESTART, SampleKind.OUTAGE):
+        kind = self._classify(sample, now, longest)
+        if kind in (SampleKind.DUPLICATE, SampleKind.OUT_OF_ORDER):
+            return kind
+        if kind in (SampleKind.JUMP, SampleKind.RESTART, SampleKind.OUTAGE):
             self.clear()
         elif self.newest is not None:
             step = inverse(self.newest.T_odom_body) @ sample.T_odom_body
@@ -98,12 +108,12 @@ class OdometryBuffer:
             self.turned += abs(yaw_of(step))  # as the engine counts it
         self.newest, self.arrived = sample, now
         self._samples.append(_Entry(sample, self.travelled, self.turned))
-        self._strange.clear()
-        self._strange_since = float("inf")
+        self._discontinuous.clear()
+        self._discontinuous_since = float("inf")
         oldest = sample.stamp_ns - round(self.config.odometry_history * _NS)
         while self._samples[0].stamp_ns < oldest:
             self._samples.popleft()
-        return verdict
+        return kind
 
     def _classify(self, sample: OdometryMessage, now: float, longest: float) -> SampleKind:
         last = self.newest
@@ -115,7 +125,7 @@ class OdometryBuffer:
         # a single stray stamp must not shut out all that follow, so one far ahead has to be confirmed as well
         ahead = seconds > self.config.odometry_history + 2.0 * (now - self.arrived)
         if seconds < 0 or ahead:
-            if not self._runs_on(sample.stamp_ns, now):
+            if not self._is_new_sequence(sample.stamp_ns, now):
                 return SampleKind.OUT_OF_ORDER
             return SampleKind.RESTART if seconds < 0 else SampleKind.OUTAGE
         if seconds > longest:
@@ -125,37 +135,40 @@ class OdometryBuffer:
             return SampleKind.JUMP
         return SampleKind.GAP if seconds > self.config.odometry_timeout else SampleKind.CONTINUES
 
-    def _runs_on(self, stamp_ns: int, now: float) -> bool:
-        """Whether the samples that did not continue the buffer continue each other, for long enough."""
-        if self._strange and stamp_ns <= self._strange[-1][1]:
-            self._strange.clear()
-        if not self._strange:
-            self._strange_since = now
-        self._strange.append((now, stamp_ns))
-        return len(self._strange) == _STEADY and now - self._strange_since >= self.config.restart_after
+    def _is_new_sequence(self, stamp_ns: int, now: float) -> bool:
+        """Whether the samples that do not continue the buffer have continued each other for long enough."""
+        if self._discontinuous and stamp_ns <= self._discontinuous[-1]:
+            self._discontinuous.clear()
+        if not self._discontinuous:
+            self._discontinuous_since = now
+        self._discontinuous.append(stamp_ns)
+        return (
+            len(self._discontinuous) == _MIN_RESTART_SAMPLES
+            and now - self._discontinuous_since >= self.config.restart_after
+        )
 
     def _impossible(self, step: Pose, seconds: float) -> bool:
-        far = _SLACK + min(self.config.max_speed, self._usual_speed()) * seconds
-        wide = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
-        return bool(np.linalg.norm(step[:3, 3]) > far or rotation_angle(step) > wide)
+        max_distance = _SLACK + min(self.config.max_speed, self._max_plausible_speed()) * seconds
+        max_angle = max(_JUMP_ANGLE, self.config.max_turn_rate * seconds)
+        return bool(np.linalg.norm(step[:3, 3]) > max_distance or rotation_angle(step) > max_angle)
 
-    def _usual_speed(self) -> float:
-        """Metres per second that the robot may be driving now, by what it did lately; infinite while unknown."""
+    def _max_plausible_speed(self) -> float:
+        """Bound the robot's speed, metres per second, by that of the last seconds; infinite while unknown."""
         newest = self._samples[-1]
-        past = next(s for s in self._samples if s.stamp_ns >= newest.stamp_ns - _RECENT)
+        past = next(s for s in self._samples if s.stamp_ns >= newest.stamp_ns - _SPEED_WINDOW_NS)
         seconds = (newest.stamp_ns - past.stamp_ns) / _NS
         if seconds < 0.2:
             return float("inf")
         return _SLACK_SPEED + _SPEED_FACTOR * (newest.travelled - past.travelled) / seconds
 
     def covers(self, stamp_ns: int) -> int:
-        """-1 if the buffer starts after ``stamp_ns``, 1 if it has not come that far yet, 0 if the stamp lies within."""
+        """Return -1 if the buffer starts after ``stamp_ns``, 1 if it ends before, 0 if the stamp lies within."""
         if self.newest is None or stamp_ns > self.newest.stamp_ns:
             return 1
         return -1 if stamp_ns < self._samples[0].stamp_ns else 0
 
     def at(self, stamp_ns: int) -> Pose | None:
-        """Pose (4, 4) odometry <- body at a stamp within, interpolated; None outside or in a gap."""
+        """Interpolate the pose (4, 4) odometry <- body at a stamp; None outside of the buffer or in a gap."""
         if self.covers(stamp_ns) != 0:
             return None
         k = bisect_left(self._samples, stamp_ns, key=lambda s: s.stamp_ns)
@@ -165,10 +178,11 @@ class OdometryBuffer:
         before = self._samples[k - 1]
         if after.stamp_ns - before.stamp_ns > self.config.max_gap * _NS:
             return None
-        return _between(before.sample, after.sample, stamp_ns)
+        share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+        return interpolate(before.sample.T_odom_body, after.sample.T_odom_body, share)
 
     def driven_since(self, stamp_ns: int) -> tuple[float, float]:
-        """Metres driven and radians turned from a stamp, or the oldest sample that is remembered, until now."""
+        """Return metres driven and radians turned since a stamp, or since the oldest sample in the buffer."""
         if not self._samples:
             return 0.0, 0.0
         k = max(0, bisect_left(self._samples, stamp_ns + 1, key=lambda s: s.stamp_ns) - 1)
@@ -181,9 +195,3 @@ class OdometryBuffer:
         last = min(len(stamps), bisect_left(stamps, end_ns) + 1)
         poses = [self._samples[k].sample.T_odom_body for k in range(first, last)]
         return Segment(np.array(stamps[first:last], dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
-
-
-def _between(a: OdometryMessage, b: OdometryMessage, stamp_ns: int) -> Pose:
-    share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-    turn = slerp(a.T_odom_body[:3, :3], b.T_odom_body[:3, :3], share)
-    return pose_from(turn, (1 - share) * a.T_odom_body[:3, 3] + share * b.T_odom_body[:3, 3])

@@ -1,17 +1,15 @@
-"""Deskew: move a sweep's points to where they would have been seen at the frame's stamp."""
+"""Deskewing: a sweep's points moved to where they would have been seen at the frame's stamp."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import slerp
-from coview_stream.geometry.transforms import Points, Pose, inverse
+from coview_stream.geometry.transforms import Points, Pose, interpolate, inverse
 from coview_stream.odometry.buffer import Segment
 
 _STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s
-
-_INSTANT = 1e-4  # seconds
+_INSTANT = 1e-4  # seconds: times that differ by less are one
 
 
 def deskew(points: Points, times: Floats, segment: Segment, stamp_ns: int, T_odom_body: Pose) -> Points:
@@ -32,11 +30,10 @@ def deskew(points: Points, times: Floats, segment: Segment, stamp_ns: int, T_odo
     if max(-low, high) < _INSTANT:
         return points
     grid = np.linspace(low, high, _STEPS)
-    T_body_odom = inverse(T_odom_body)
-    relative = T_body_odom @ segment.poses
+    relative = inverse(T_odom_body) @ segment.poses
     k = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, len(at) - 2)
     share = (grid - at[k]) / (at[k + 1] - at[k])
-    turns = slerp(relative[k, :3, :3], relative[k + 1, :3, :3], share).astype(np.float32)
-    shifts = np.column_stack([np.interp(grid, at, relative[:, k, 3]) for k in range(3)]).astype(np.float32)
+    motion = interpolate(relative[k], relative[k + 1], share).astype(np.float32)
     step = np.rint((known - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
-    return np.asarray(np.einsum("nij,nj->ni", turns[step], points) + shifts[step], dtype=np.float32)
+    moved = np.einsum("nij,nj->ni", motion[step, :3, :3], points) + motion[step, :3, 3]
+    return np.asarray(moved, dtype=np.float32)

@@ -1,15 +1,13 @@
-"""Where down is, from the ground around a lidar: a plane through the lowest points, if there is one.
+"""Gravity's direction in the body frame, from the ground around a lidar and the walls on it.
 
-The ground's normal is gravity's direction only where the ground is level; walls correct it where there are some
-(:mod:`coview_stream.odometry.gravity`). On a slope without walls the odometry frame leans with the slope.
+The ground is a plane through the lowest points, if there is one. Its normal is gravity's direction only where the
+ground is level; walls, which are vertical also where the ground slopes, correct it. On a slope without walls the
+odometry frame leans with the slope.
+
+Measured once, by no command that is kept, on nine simulated worlds, 20 frames each (town, campus, village, industrial;
+vlp16, os64, mid360): the ground's normal leans 0.4 to 4.1 degrees against gravity (medians), corrected by the walls
+0.05 to 0.33. The walls of these worlds are exactly vertical; real ones nearly so.
 """
-
-# FOLDED coview_stream/odometry/gravity.py: """Up, from what stands upright: walls are vertical where the ground slopes.
-#
-# Measured on nine simulated worlds, 20 frames each (town, campus, village, industrial; vlp16, os64, mid360): the ground's
-# normal leans 0.4 to 4.1 degrees against gravity (medians), with the walls taken into account 0.05 to 0.33. The walls
-# of these worlds are plumb; real ones nearly so.
-# """
 
 from __future__ import annotations
 
@@ -20,25 +18,31 @@ import numpy as np
 from coview_stream.config.odometry import MAX_TILT
 from coview_stream.geometry.arrays import Floats, Indices, Reals
 
+SLOPE = float(np.radians(4.0))
+"""One sigma of how far the ground's normal leans, radians; set by hand, after the figures above."""
+
+# the ground; set by hand
 _REACH = 25.0  # metres around the sensor
-
 _CELL = 1.0  # metres: of each such cell the lowest point
-
 _BAND = 0.15  # metres to both sides of the plane
+_MIN_HEIGHT = 0.1  # metres of the sensor above the ground
+_TRIALS = 400  # planes through three points
+_REFINEMENTS = 5
+_MIN_CELLS = 40
+_MIN_SHARE = 0.4  # of the cells whose lowest point could be ground
+_MAX_BELOW = 0.25  # of all cells may lie below the plane: a table top is not the ground
+_MIN_EXTENT = 2.0  # metres, one sigma, of the ground's cells along the shorter axis
 
-_LEAST_HEIGHT = 0.1  # metres of the sensor above the ground
-
-_TRIES = 400
-
-_ROUNDS = 5  # of refinement
-
-_LEAST_CELLS = 40
-
-_LEAST_SHARE = 0.4  # of the cells whose lowest point could be ground
-
-_MOST_BELOW = 0.25  # of all cells may lie below the plane: a table top is not the ground
-
-_LEAST_SPREAD = 2.0  # metres, one sigma, of the ground's cells along the shorter axis
+# patches of wall; set by hand
+_WALL_POINTS = 20_000  # of a cloud are looked at
+_WALL_REACH = 40.0  # metres around the sensor
+_WALL_CELL = 2.0  # metres: points of one such cube are fitted by a plane
+_WALL_MIN_POINTS = 8
+_WALL_MAX_THICKNESS = 0.04  # metres, one sigma, off the plane
+_WALL_MIN_WIDTH = 0.2  # metres, one sigma, along the shorter axis in the plane
+_WALL_MAX_LEAN = np.sin(np.radians(15.0))
+_WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
+_WALL_ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -61,34 +65,50 @@ class Ground:
 
 
 def find_ground(points: Reals) -> Ground | str:
-    """Find the ground in a cloud (N, 3), body frame with z about up, metres; or say in a clause why there is none."""
+    """Find the ground in a cloud (N, 3), body frame with z about up, metres; or return why there is none."""
     lowest = _lowest(np.asarray(points, dtype=np.float64))
-    if len(lowest) < _LEAST_CELLS:
+    if len(lowest) < _MIN_CELLS:
         return f"only {len(lowest)} cells of {_CELL:g} m within {_REACH:g} m hold points"
-    plane = _refined(lowest, _best_of_many(lowest))
+    plane = _refined(lowest, _consensus_plane(lowest))
     if plane is None:
         return "no plane below the sensor fits three of the lowest points"
     up, height = plane
-    if up[2] < np.cos(MAX_TILT) or height < _LEAST_HEIGHT:  # it wandered there while it was refined
+    if up[2] < np.cos(MAX_TILT) or height < _MIN_HEIGHT:  # refinement moved it there
         return "the best plane does not lie below the sensor"
     above = lowest @ up + height
     inside = np.abs(above) < _BAND
     share, below = float(inside.mean()), float((above < -2 * _BAND).mean())
-    if inside.sum() < _LEAST_CELLS or share < _LEAST_SHARE:
-        return (
-            f"the best plane holds {share:.0%} of the lowest points around; {_LEAST_SHARE:.0%} are asked for"
-        )
-    if below > _MOST_BELOW:
+    if inside.sum() < _MIN_CELLS or share < _MIN_SHARE:
+        return f"the best plane holds {share:.0%} of the lowest points around; {_MIN_SHARE:.0%} are asked for"
+    if below > _MAX_BELOW:
         return f"{below:.0%} of the lowest points around lie below the best plane"
-    spread = np.sqrt(np.linalg.eigvalsh(np.cov(lowest[inside].T))[1])
-    if spread < _LEAST_SPREAD:
-        return f"the best plane is a strip, {spread:.1f} m wide (one sigma)"
+    extent = np.sqrt(np.linalg.eigvalsh(np.cov(lowest[inside].T))[1])
+    if extent < _MIN_EXTENT:
+        return f"the best plane is a strip, {extent:.1f} m wide (one sigma)"
     corrected, walls = gravity_from_walls(points, up)
     return Ground(corrected, float(height), share, int(inside.sum()), walls)
 
 
-def aligned(up: Floats) -> Floats:
-    """Rotation (3, 3) that turns ``up`` (3,) to z and keeps x pointing forward: odometry <- body at the start."""
+def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple[Floats, int]:
+    """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
+
+    Without walls, or with walls that all face one way, it stays as it is in the directions that they leave open.
+
+    Returns:
+        The unit vector, and the number of wall patches it was taken from.
+    """
+    normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
+    better = up
+    for _ in range(_WALL_ROUNDS):
+        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's: a car's door is no wall
+        information = (normals.T * weights) @ normals + np.eye(3) / sigma**2
+        better = np.linalg.solve(information, up / sigma**2)
+        better /= np.linalg.norm(better)
+    return better, len(normals)
+
+
+def level_rotation(up: Floats) -> Floats:
+    """Return the rotation (3, 3), odometry <- body, that turns ``up`` (3,) to z and keeps x pointing forward."""
     x = np.array([1.0, 0.0, 0.0]) - up[0] * up
     x /= np.linalg.norm(x)  # up leans by 60 degrees at most, so x is never along it
     return np.stack([x, np.cross(up, x), up])
@@ -103,16 +123,16 @@ def _lowest(points: Floats) -> Floats:
     return np.asarray(near[order][first])
 
 
-def _best_of_many(lowest: Floats) -> tuple[Floats, float] | None:
-    """Of planes through three points each, the one that most points lie in."""
+def _consensus_plane(lowest: Floats) -> tuple[Floats, float] | None:
+    """Find, of planes through three points each, the one that most points lie in (RANSAC)."""
     rng = np.random.default_rng(0)  # equal clouds have equal grounds
-    a, b, c = np.moveaxis(lowest[rng.integers(len(lowest), size=(_TRIES, 3))], 1, 0)
+    a, b, c = np.moveaxis(lowest[rng.integers(len(lowest), size=(_TRIALS, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     usable = lengths > 1.0  # square metres, twice the triangle's: slivers say nothing
     normals = normals[usable] / lengths[usable, None] * np.sign(normals[usable, 2:])
     heights = -(normals * a[usable]).sum(axis=1)
-    ground = (normals[:, 2] > np.cos(MAX_TILT)) & (heights > _LEAST_HEIGHT)
+    ground = (normals[:, 2] > np.cos(MAX_TILT)) & (heights > _MIN_HEIGHT)
     if not ground.any():
         return None
     normals, heights = normals[ground], heights[ground]
@@ -122,8 +142,8 @@ def _best_of_many(lowest: Floats) -> tuple[Floats, float] | None:
 
 
 def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats, float] | None:
-    """Least squares over what lies in the plane, a few times over."""
-    for _ in range(_ROUNDS if plane else 0):
+    """Fit the plane to the points within it by least squares, a few times over."""
+    for _ in range(_REFINEMENTS if plane else 0):
         assert plane is not None
         up, height = plane
         inside = lowest[np.abs(lowest @ up + height) < _BAND]
@@ -134,46 +154,6 @@ def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats
     return plane
 
 
-SLOPE = float(np.radians(4.0))
-"""One sigma of how far the ground's normal leans, radians."""
-
-_MOST_POINTS = 20_000
-
-_WALL_REACH = 40.0  # metres around the sensor
-
-_WALL_CELL = 2.0  # metres: points of one such cube are fitted by a plane
-
-_LEAST_POINTS = 8
-
-_THICKEST = 0.04  # metres, one sigma, off the plane
-
-_LEAST_WIDTH = 0.2  # metres, one sigma, along the shorter axis in the plane
-
-_UPRIGHT = np.sin(np.radians(15.0))
-
-_WALL_SIGMA = np.radians(2.0)  # of a patch; farther off it counts less and less
-
-_WALL_ROUNDS = 10
-
-
-def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple[Floats, int]:
-    """Return ``up`` (3,), good to ``sigma`` radians, corrected by the walls in a cloud (N, 3), metres.
-
-    Where there are none, or all face one way, it stays as it is in the directions that they say nothing of.
-
-    Returns:
-        The unit vector, and how many patches of wall it was taken from.
-    """
-    normals = _patches(points[:: 1 + len(points) // _MOST_POINTS].astype(np.float64), up)
-    better = up
-    for _ in range(_WALL_ROUNDS):
-        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's: a car's door is no wall
-        information = (normals.T * weights) @ normals + np.eye(3) / sigma**2
-        better = np.linalg.solve(information, up / sigma**2)
-        better /= np.linalg.norm(better)
-    return better, len(normals)
-
-
 def _patches(points: Floats, up: Floats) -> Floats:
     """Return normals (K, 3) of the flat, roughly upright pieces of surface around."""
     near = points[(points**2).sum(axis=1) < _WALL_REACH**2]
@@ -182,10 +162,10 @@ def _patches(points: Floats, up: Floats) -> Floats:
     mean = _sums(near, which, len(count)) / count[:, None]
     off = near - mean[which]
     moments = _sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), which, len(count)) / count[:, None]
-    spread, axes = np.linalg.eigh(moments[count >= _LEAST_POINTS].reshape(-1, 3, 3))
+    variances, axes = np.linalg.eigh(moments[count >= _WALL_MIN_POINTS].reshape(-1, 3, 3))
     normals = axes[:, :, 0]
-    flat = (spread[:, 0] < _THICKEST**2) & (spread[:, 1] > _LEAST_WIDTH**2)
-    return np.asarray(normals[flat & (np.abs(normals @ up) < _UPRIGHT)])
+    flat = (variances[:, 0] < _WALL_MAX_THICKNESS**2) & (variances[:, 1] > _WALL_MIN_WIDTH**2)
+    return np.asarray(normals[flat & (np.abs(normals @ up) < _WALL_MAX_LEAN)])
 
 
 def _sums(values: Floats, which: Indices, count: int) -> Floats:

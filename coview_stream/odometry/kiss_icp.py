@@ -1,8 +1,8 @@
-"""The one place that imports kiss-icp (MIT; Vizzo et al., RA-L 2023), and what keeps it from ending the process.
+"""Scan registration by kiss-icp (MIT; Vizzo et al., RA-L 2023), which no other module imports.
 
-Its deskewing normalises the time stamps of a frame and takes the result for a rotation, unchecked: where all are equal,
-or one is not finite, 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``). So it never gets a time stamp from us,
-deskewing is off, and the frames come deskewed by our own :func:`~coview_stream.odometry.deskew.deskew`, which refers them
+kiss-icp's own deskewing normalises the time stamps of a frame and takes the result for a rotation, unchecked: where
+all are equal, or one is not finite, 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``). So deskewing is off, it
+gets no time stamps, and the frames come deskewed by :func:`~coview_stream.odometry.deskew.deskew`, which refers them
 to the frame's stamp as well: kiss-icp's refers them to the sweep's end, or its middle, by version.
 """
 
@@ -20,8 +20,8 @@ from coview_stream.geometry.transforms import Pose, inverse
 _NO_TIMES = np.zeros(0)
 
 
-class Registration(Protocol):
-    """Places frames in a local map that grows with them."""
+class ScanRegistration(Protocol):
+    """Registration of frames to a local map that grows with them."""
 
     def register(self, points: Floats, guess: Pose) -> Pose:
         """Return the pose (4, 4) of a deskewed frame (N, 3), local map <- body, from a guess near it; add the frame."""
@@ -40,15 +40,15 @@ class KissRegistration:
         self.clear()
 
     def register(self, points: Floats, guess: Pose) -> Pose:
-        """As of :class:`Registration`."""
+        """As of :class:`ScanRegistration`."""
         icp = self._icp
-        # it predicts by the last motion, whatever the time between
+        # register_frame predicts by the last motion, for any time between: so the guess goes in as that motion
         icp.last_delta = inverse(icp.last_pose) @ guess
         icp.register_frame(points, _NO_TIMES)
         return np.array(icp.last_pose, dtype=np.float64)
 
     def clear(self) -> None:
-        """As of :class:`Registration`."""
+        """As of :class:`ScanRegistration`."""
         self._icp = self._kiss_icp(self._settings)
 
 

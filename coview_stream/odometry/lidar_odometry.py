@@ -1,18 +1,17 @@
 """Odometry from lidar frames alone: each frame is registered to a local map of those before it."""
 
-# FOLDED coview_stream/odometry/lidar_odometry.py: """What a frame must be before anything is registered: a wrong one costs an error here, and the local map beyond."""
-
 from __future__ import annotations
 
 import numpy as np
 
 from coview_stream.config.odometry import LidarOdometryConfig, down
 from coview_stream.errors import CloudError, RunError
-from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.geometry.rotations import exp_so3, slerp
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.rotations import exp_so3
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
+    interpolate,
     inverse,
     is_pose,
     norms,
@@ -20,32 +19,31 @@ from coview_stream.geometry.transforms import (
     pose_from,
     rotation_angle,
 )
+from coview_stream.geometry.validation import check_stamp, cloud_rows, finite_rows, to_array
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
-from coview_stream.odometry.gravity import Ground, aligned, find_ground, gravity_from_walls
-from coview_stream.odometry.kiss_icp import KissRegistration, Registration
+from coview_stream.odometry.gravity import Ground, find_ground, gravity_from_walls, level_rotation
+from coview_stream.odometry.kiss_icp import KissRegistration, ScanRegistration
 
-_NS = 1e9
-
-_BRIEF = 0.02  # seconds: a motion over less is mostly noise and predicts nothing
-
+# set by hand, all of them
+_MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise and predicts nothing
+_MIN_SWEEP_SECONDS = 1e-4  # times that differ by less are one
+_MAX_SWEEP_SECONDS = 1.0  # from the stamp: points farther away in time have another clock
 _SLACK = 0.5  # metres that a registration may always move: the first motion cannot be predicted
-
 _SLACK_ANGLE = np.radians(20.0)
-
-_DRIFT = float(np.radians(1.5))  # one sigma by which registration tilts a frame against the one before
+_TILT_DRIFT = float(np.radians(1.5))  # one sigma by which registration tilts a frame against the one before
 
 
 class LidarOdometry:
     """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
 
     The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
-    then, level. It drifts, but not in tilt where there are walls. The motion between two frames is predicted from that
-    before, over the time between their stamps; it deskews the frame, too. Costs: see ``docs/odometry.md``; kiss-icp
-    holds the interpreter lock.
+    then, level. It drifts, but not in tilt where there are walls. The motion between two frames is predicted from the
+    one before, over the time between their stamps, and deskews the frame as well. ``docs/odometry.md`` has the costs;
+    kiss-icp holds the interpreter lock.
 
     Attributes:
-        config: see there.
+        config: the settings.
         ground: the plane that gravity was taken from; None before it is found, and where gravity was given.
         points: (N, 3) float32, the finite points of the newest frame, deskewed: what to give to a ``Localizer``.
         restarts: how often the local map was begun anew, after a gap or an impossible motion: what the robot drove
@@ -53,7 +51,7 @@ class LidarOdometry:
     """
 
     def __init__(
-        self, config: LidarOdometryConfig | None = None, registration: Registration | None = None
+        self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None
     ) -> None:
         """Begin with nothing; ``registration`` replaces kiss-icp.
 
@@ -65,18 +63,18 @@ class LidarOdometry:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next frame begins another odometry frame."""
+        """Forget all frames: the next one begins another odometry frame."""
         self.ground: Ground | None = None
         self.points: Points = np.empty((0, 3), dtype=np.float32)
         self.restarts = 0
         self._pose: Pose | None = None
         self._local = np.eye(4)  # the same in the local map, whose tilt drifts
         self._stamp = 0.0
-        self._rest()
+        self._forget_motion()
         self._registration.clear()
 
     def step(self, points: Points, point_times: Floats | None, stamp: float) -> Pose:
-        """Take in one frame and say where it was taken.
+        """Take in one frame and return where it was taken.
 
         Args:
             points: (N, 3) body frame (x forward, z up), metres; rows with NaN are dropped.
@@ -93,9 +91,8 @@ class LidarOdometry:
                 robot makes. RunError: the stamp is not finite, or not later than the one before. The odometry is as
                 good as before: skip the frame and go on.
         """
-        finite, times = validate(points, point_times, self.config)
-        if not np.isfinite(stamp):
-            raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
+        finite, times = _validated(points, point_times, self.config)
+        check_stamp(stamp)
         if self._pose is None:
             return self._begin(finite, stamp)
         seconds = stamp - self._stamp
@@ -106,17 +103,17 @@ class LidarOdometry:
             )
         if seconds > self.config.max_gap:
             self._restart()
-        guess = self._local @ self._motion(seconds)
+        guess = self._local @ self._predicted_motion(seconds)
         if times is not None:
             finite = self._deskewed(finite, times)
         local = self._registration.register(finite.astype(np.float64), guess)
         step = inverse(self._local) @ local
-        self._check(step, seconds)
-        if seconds >= _BRIEF:
+        self._check_motion(step, seconds)
+        if seconds >= _MIN_MOTION_SECONDS:
             self._step, self._step_seconds = step, seconds
         self._pose = orthonormal(self._pose @ step)
         if self.config.level_with_walls:
-            self._plumb(finite)
+            self._level_with_walls(finite)
         self._local, self._stamp, self.points = orthonormal(local), stamp, finite
         return np.array(self._pose)
 
@@ -132,41 +129,43 @@ class LidarOdometry:
             self.ground, up = found, found.up
         else:
             up = -down(self.config.gravity)
-        start = pose_from(aligned(up), np.zeros(3))
+        start = pose_from(level_rotation(up), np.zeros(3))
         self._local = self._registration.register(points.astype(np.float64), start)
         self._pose, self._stamp, self.points = start, stamp, points
         return np.array(start)
 
-    def _plumb(self, points: Points) -> None:
-        """Turn the pose about where it is until walls stand upright again, as far as they are believed."""
+    def _level_with_walls(self, points: Points) -> None:
+        """Turn the pose about its position until walls are vertical again, by the weight they have."""
         assert self._pose is not None
         up = self._pose[2, :3]
-        better, _ = gravity_from_walls(points, up, _DRIFT)
+        better, _ = gravity_from_walls(points, up, _TILT_DRIFT)
         axis = np.cross(better, up)
         sine = float(np.linalg.norm(axis))
         if sine > 0.0:
             turn = exp_so3(axis * (np.arcsin(min(1.0, sine)) / sine))
             self._pose[:3, :3] = self._pose[:3, :3] @ turn
 
-    def _motion(self, seconds: float) -> Pose:
-        """Motion over ``seconds``, which may be negative, if it goes on like the last one."""
-        share = seconds / self._step_seconds
-        turn = slerp(np.eye(3), self._step[:3, :3], share)
-        return pose_from(turn, share * self._step[:3, 3])
+    def _predicted_motion(self, seconds: float) -> Pose:
+        """Extrapolate the last motion (4, 4) to ``seconds``, which may be negative."""
+        return interpolate(np.eye(4), self._step, seconds / self._step_seconds)
 
     def _deskewed(self, points: Points, times: Floats) -> Points:
-        ends = sweep_interval(times)
+        ends = _sweep_interval(times)
         if ends is None:
             return points
-        stamps = np.array([round(_NS * t) for t in ends], dtype=np.int64)
-        sweep = Segment(stamps, np.array([self._motion(t) for t in ends]))
+        stamps = np.array([round(1e9 * t) for t in ends], dtype=np.int64)
+        sweep = Segment(stamps, np.array([self._predicted_motion(t) for t in ends]))
         return deskew(points, times, sweep, 0, np.eye(4))
 
-    def _check(self, step: Pose, seconds: float) -> None:
-        """Refuse what no robot drives. The local map holds the frame already, at the wrong place: begin it anew."""
+    def _check_motion(self, step: Pose, seconds: float) -> None:
+        """Refuse a motion that no robot makes; the local map, which holds the frame at a wrong place, is begun anew."""
         far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
-        most = _SLACK + self.config.max_speed * seconds
-        if is_pose(step) and far <= most and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
+        allowed = _SLACK + self.config.max_speed * seconds
+        if (
+            is_pose(step)
+            and far <= allowed
+            and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds)
+        ):
             return
         self._restart()
         raise CloudError(
@@ -179,54 +178,43 @@ class LidarOdometry:
         self.restarts += 1
         self._local = self._pose
         self._registration.clear()
-        self._rest()
+        self._forget_motion()
 
-    def _rest(self) -> None:
+    def _forget_motion(self) -> None:
         self._step, self._step_seconds = np.eye(4), 1.0
 
 
-_INSTANT = 1e-4  # seconds: times that differ by less are one
-
-_LONGEST_SWEEP = 1.0  # seconds from the stamp: points farther away in time have another clock
-
-
-def validate(
+def _validated(
     points: Points, times: Floats | None, config: LidarOdometryConfig
 ) -> tuple[Points, Floats | None]:
-    """Finite points (N, 3) float32, and their times (N,).
+    """Return the finite points, a copy (N, 3) float32, and their times (N,).
 
     Raises:
         CloudError: another shape, times that are not one per point, or too few points in range.
     """
-    try:
-        with np.errstate(over="ignore"):
-            rows = np.asarray(points).astype(np.float32)  # a copy: the caller may write the next frame there
-        at = None if times is None else np.asarray(times, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise CloudError(f"frame is not an array of numbers ({error}); expected (N, 3) float32") from error
-    if rows.ndim != 2 or rows.shape[1] != 3:
-        raise CloudError(f"frame has shape {rows.shape}; expected (N, 3)")
+    rows = cloud_rows(points)
+    at = None if times is None else to_array(times, np.float64, "times")
     if at is not None and at.shape != (len(rows),):
         raise CloudError(
-            f"frame has {len(rows)} points and times of shape {at.shape}; give one time per point"
+            f"cloud has {len(rows)} points and times of shape {at.shape}; give one time per point"
         )
-    finite: Bools = np.all(np.isfinite(rows), axis=1)
-    if not finite.all():
-        rows, at = rows[finite], None if at is None else at[finite]
+    finite, kept = finite_rows(rows)
+    if at is not None and kept is not None:
+        at = at[kept]
     with np.errstate(over="ignore"):
-        ranges = norms(rows)
+        ranges = norms(finite)
     usable = int(((ranges > config.min_range) & (ranges < config.max_range)).sum())
     if usable < config.min_points:
         raise CloudError(
-            f"frame has {usable} of {len(finite)} points between {config.min_range:g} and {config.max_range:g} m; "
+            f"cloud has {usable} of {len(rows)} points between {config.min_range:g} and {config.max_range:g} m; "
             f"lidar odometry needs {config.min_points}: is the sensor covered, or the cloud not in its frame?"
         )
-    return rows, at
+    return finite, at
 
 
-def sweep_interval(times: Floats) -> tuple[float, float] | None:
-    """First and last of times (N,) in seconds around the stamp; None if they do not differ, or are no such times."""
+def _sweep_interval(times: Floats) -> tuple[float, float] | None:
+    """Return the first and last of times (N,), seconds after the stamp; None if they do not differ, or lie far off."""
     known = times[np.isfinite(times)]
-    if not len(known) or np.abs(known).max() > _LONGEST_SWEEP or np.ptp(known) < _INSTANT:
+    if not len(known) or np.abs(known).max() > _MAX_SWEEP_SECONDS or np.ptp(known) < _MIN_SWEEP_SECONDS:
         return None
     return float(known.min()), float(known.max())

@@ -6,8 +6,8 @@ import numpy as np
 
 from coview_stream.clouds.trajectory import Poses
 from coview_stream.config.node import NodeConfig
-from coview_stream.geometry.arrays import Bools, Floats, Ints
-from coview_stream.geometry.rotations import slerp
+from coview_stream.geometry.arrays import Bools, Ints
+from coview_stream.geometry.transforms import interpolate
 from coview_stream.odometry.buffer import Segment
 
 SAME_NS = 1000
@@ -48,7 +48,7 @@ class Track:
         for side, value in ((before, 0.0), (after, 1.0)):
             same = np.abs(stamps - self.stamps[side]) <= SAME_NS
             share, known = np.where(same, value, share), known | same
-        return _between(self.poses[before], self.poses[after], share), known
+        return interpolate(self.poses[before], self.poses[after], share), known
 
     def around(self, begin_ns: int, end_ns: int, stamp_ns: int) -> Segment:
         """Return the samples from the last before ``begin_ns`` to the first after ``end_ns``.
@@ -61,10 +61,3 @@ class Track:
         low, high = np.searchsorted(self._part, part, "left"), np.searchsorted(self._part, part, "right")
         chosen = slice(max(0, first, low), min(last, high))
         return Segment(self.stamps[chosen], self.poses[chosen])
-
-
-def _between(a: Poses, b: Poses, share: Floats) -> Poses:
-    poses = np.array(a)
-    poses[:, :3, :3] = slerp(a[:, :3, :3], b[:, :3, :3], share)
-    poses[:, :3, 3] += share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
-    return poses

@@ -8,7 +8,7 @@ from fake_lidar_odometry import frame
 
 from coview_stream.config.odometry import LidarOdometryConfig, down, parse_gravity
 from coview_stream.errors import ConfigError
-from coview_stream.odometry.gravity import aligned, find_ground
+from coview_stream.odometry.gravity import find_ground, level_rotation
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.2), (-0.3, 0.15)])
@@ -63,7 +63,7 @@ def test_equal_clouds_have_equal_grounds(scene):
 
 def test_alignment_turns_up_to_z_and_keeps_the_heading():
     up = np.array([0.2, -0.1, 0.9]) / np.linalg.norm([0.2, -0.1, 0.9])
-    R = aligned(up)
+    R = level_rotation(up)
     assert np.allclose(R @ up, [0, 0, 1])
     assert np.allclose(R @ R.T, np.eye(3))
     assert np.linalg.det(R) > 0

@@ -206,7 +206,7 @@ def test_walls_undo_a_tilt_that_drifts(cloud):
 
 def test_a_localizer_goes_by_it(world_map, world_drive):
     from coview_stream.localization.localizer import Localizer
-    from coview_stream.localization.result import State
+    from coview_stream.localization.state import State
 
     odometry = LidarOdometry(registration=Truth(world_drive.T_map_body))
     localizer = Localizer(world_map)

@@ -10,8 +10,7 @@ import numpy as np
 
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import slerp
-from coview_stream.geometry.transforms import Pose, pose_from
+from coview_stream.geometry.transforms import Pose, interpolate
 from coview_stream.recordings.run import Run
 
 _LONE_PERIOD = 0.1  # seconds between repetitions of a run of one frame, which has no rate of its own
@@ -115,9 +114,6 @@ def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[Beat]:
     count = round((dues[k + 1] - dues[k]) * rate)
     if count < 2:
         return
-    start, end = run.poses[k : k + 2, :3, :3]
     for share in np.arange(1, count) / count:
-        due, stamp, position = (
-            a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps, run.poses[:, :3, 3])
-        )
-        yield Beat(float(due), float(stamp), pose_from(slerp(start, end, share), position), None)
+        due, stamp = (a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps))
+        yield Beat(float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None)
