@@ -1,8 +1,9 @@
-"""The speed of everything, with verdicts: ``python -m bench [NAME...] [--json FILE] [--quick] [--list]``.
+"""The figures of the documentation: ``python -m bench NAME [options]``; without a name, the speed of everything.
 
-Each benchmark runs in a process of its own, with 1 and with 2 threads where that matters, and prints a row per
-figure: ours, the best formulation without us beside it (medians, taken in turns), how many times better ours
-is, and whether the target holds. Exit code 1 if any does not. Run it on an otherwise idle machine.
+Prints a row per figure: ours, the best formulation without us beside it (medians, taken in turns), how many times
+better ours is, and whether the target holds; then the tables that a benchmark has of its own. The suite runs each
+benchmark in a process of its own, with 1 and with 2 threads where that matters. Exit code 1 if a target does not hold,
+2 if nothing could be measured. Run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -11,35 +12,48 @@ import argparse
 import json
 import math
 import os
+import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from bench.harness.files import whole
 from bench.harness.rows import Row
-from bench.harness.running import counted, run
-from bench.harness.suite import OWN, SUITE, Entry
-from bench.harness.tables import line, rule
+from bench.harness.suite import BENCHMARKS, Benchmark, counted, run
+from bench.harness.tables import HEAD, WIDTHS, cells, filled, line, machine, rule, suite_tables
+from coview_stream.errors import CoViewError, InputError
 
-HEAD = ("benchmark", "ours", "baseline", "unit", "ratio", "target", "verdict")
-_WIDTHS = (60, 9, 9, 7, 7, 12, 13)
 _BUSY = 0.7  # load average: someone else computes
-_VERDICTS = {True: "holds", False: "DOES NOT HOLD", None: "informs"}
 
 
-def cells(row: Row) -> list[str]:
-    """One line of the table."""
-    verdict = _VERDICTS[row.holds]
-    return [
-        row.name, _figure(row.ours), _figure(row.baseline), row.unit, _figure(row.ratio), row.target, verdict
-    ]  # fmt: skip
-
-
-def _figure(value: float | None) -> str:
-    if value is None or not math.isfinite(value):
-        return "-"
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+def _parser(name: str) -> argparse.ArgumentParser:
+    """Options that all share, and those of the named benchmark."""
+    module = BENCHMARKS[name].load() if name else sys.modules[__name__]
+    parser = argparse.ArgumentParser(
+        prog=f"python -m bench {name}".rstrip(), description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="smaller sizes; says little about the targets")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows: a list of objects")
+    parser.add_argument(
+        "--write", type=Path, metavar="PAGE", help="put the tables into their places in a page"
+    )
+    parser.add_argument(
+        "--read", type=Path, metavar="FILE", help="take the rows from --json, measure nothing"
+    )
+    parser.add_argument(
+        "--threads", type=int, choices=(1, 2), help="one count instead of each benchmark's own"
+    )
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR", help="keeps worlds and answers (COVIEW_BENCH, or temporary)"
+    )
+    parser.add_argument("--list", action="store_true", help="name all benchmarks and end")
+    parser.add_argument("--rows-to", type=int, help=argparse.SUPPRESS)
+    if hasattr(module, "options"):
+        module.options(parser)
+    return parser
 
 
 class _Progress:
@@ -60,20 +74,17 @@ class _Progress:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
-def _measure(entries: Sequence[Entry], threads: int | None, quick: bool) -> list[Row]:
-    rows: list[Row] = []
-    for entry in entries:
-        for count in _thread_counts(entry, threads):
-            progress = _Progress(entry.name if count is None else f"{entry.name}, {counted(count)}")
-            for row in run(entry, count, quick, progress):
-                progress.clear()
-                rows.append(row)
-                print(line(cells(row), _WIDTHS), flush=True)
+def _apart(name: str, words: Sequence[str], threads: int | None, limit_s: float) -> Iterator[Row]:
+    """Rows of a benchmark in processes of its own, one for each thread count."""
+    for count in _thread_counts(BENCHMARKS[name], threads):
+        progress = _Progress(name if count is None else f"{name}, {counted(count)}")
+        for row in run(name, words, count, limit_s, progress):
             progress.clear()
-    return rows
+            yield row
+        progress.clear()
 
 
-def _thread_counts(entry: Entry, asked: int | None) -> list[int | None]:
+def _thread_counts(entry: Benchmark, asked: int | None) -> list[int | None]:
     """Return the counts to run with: the one asked for, else its own as far as the machine has cores."""
     if asked is not None:
         return [asked]
@@ -81,66 +92,90 @@ def _thread_counts(entry: Entry, asked: int | None) -> list[int | None]:
     return [count for count in entry.threads if count is None or count <= cores] or [None]
 
 
-def _write(file: Path, rows: Sequence[Row]) -> None:
-    """Write the rows under a passing name first: the file is whole, or not there."""
-    part = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        part.write_text(json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False) + "\n")
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
+def _measured(name: str, words: Sequence[str], asked: argparse.Namespace) -> Iterator[Row]:
+    if asked.read:
+        try:
+            yield from [Row.from_dict(values) for values in json.loads(asked.read.read_text())]
+        except (ValueError, TypeError) as error:
+            raise InputError(f"--read {asked.read} is not what --json writes: {error}") from error
+    elif not name:
+        for each, entry in BENCHMARKS.items():
+            if entry.suite is not None:
+                quick = ["--quick"] * asked.quick
+                yield from _apart(each, [*entry.suite, *quick], asked.threads, entry.limit_s)
+    elif BENCHMARKS[name].threads and asked.rows_to is None:
+        yield from _apart(name, words, asked.threads, math.inf)
+    else:
+        yield from BENCHMARKS[name].load().rows(asked)
 
 
-def _refused(options: Any, suite: Sequence[Entry]) -> str:
-    """Say what is wrong with the arguments, in one line; empty if nothing is."""
-    known = [entry.name for entry in suite]
-    for name in options.names:
-        if name in OWN and name not in known:
-            return f"{name} is a command of its own: python -m bench.{name}"
-        if name not in known:
-            return f"no benchmark {name!r}; there are {', '.join(known)}"
-    if options.json and not options.json.parent.is_dir():
-        return f"--json {options.json}: there is no directory {options.json.parent}"
-    if options.json and options.json.is_dir():
-        return f"--json {options.json}: this is a directory, name a file"
+def _refused(asked: argparse.Namespace) -> str:
+    """Say what is wrong with the files that were named, in one line; empty if nothing is."""
+    if asked.json and not (asked.json.parent.is_dir() and not asked.json.is_dir()):
+        return f"--json {asked.json}: name a file in a directory that exists"
+    for option, file in (("--write", asked.write), ("--read", asked.read)):
+        if file and not file.is_file():
+            return f"{option} {file}: there is no such file"
     return ""
 
 
-def main(arguments: Sequence[str] | None = None, suite: Sequence[Entry] = SUITE) -> int:
-    """Run the suite, or the named part of it."""
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks to run (all)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows: a list of objects")
-    parser.add_argument("--quick", action="store_true", help="smaller sizes; says little about the targets")
-    parser.add_argument(
-        "--threads", type=int, choices=(1, 2), help="one count instead of each benchmark's own"
-    )
-    parser.add_argument("--list", action="store_true", help="name the benchmarks and end")
-    options = parser.parse_args(arguments)
-    if wrong := _refused(options, suite):
-        print(f"bench: {wrong}", file=sys.stderr)
+def _tables(name: str, rows: Sequence[Row], asked: argparse.Namespace) -> dict[str, str]:
+    """Return the tables that a benchmark has of its own, by their places in a page."""
+    module: Any = BENCHMARKS[name].load() if name else None
+    if not rows or not hasattr(module, "tables"):
+        return {}
+    return {f"bench {name} {each}".strip(): text for each, text in module.tables(rows, asked).items()}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one benchmark, or the suite."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    name = words.pop(0) if words and not words[0].startswith("-") else ""
+    if name and name not in BENCHMARKS:
+        print(f"bench: no benchmark {name!r}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 2
-    if options.list:
-        print("\n".join(f"{entry.name:14}{entry.what}" for entry in suite))
-        print(
-            "\nCommands of their own:\n" + "\n".join(f"bench.{name:14}{what}" for name, what in OWN.items())
-        )
+    asked = _parser(name).parse_args(words)
+    asked.command = shlex.join(["python", "-m", "bench", *filter(None, [name]), *words])
+    if asked.list:
+        print("\n".join(f"{each:14}{entry.what}" for each, entry in BENCHMARKS.items() if entry.what))
         return 0
-    chosen = [entry for entry in suite if not options.names or entry.name in options.names]
-    begin = time.monotonic()
-    if (load := os.getloadavg()[0]) > _BUSY:
-        print(f"bench: the machine is busy (load {load:.1f}); figures and ratios suffer", file=sys.stderr)
-    print(line(HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
+    if asked.work:
+        os.environ["COVIEW_BENCH"] = str(asked.work)
+    label = f"bench {name}".rstrip()
+    if wrong := _refused(asked):
+        print(f"{label}: {wrong}", file=sys.stderr)
+        return 2
+    begin, rows = time.monotonic(), []
     try:
-        rows = _measure(chosen, options.threads, options.quick)
+        if asked.rows_to is not None:
+            with os.fdopen(asked.rows_to, "w") as out:
+                for row in _measured(name, words, asked):
+                    print(json.dumps(row.to_dict(), allow_nan=False), file=out, flush=True)
+            return 0
+        if (load := os.getloadavg()[0]) > _BUSY and not asked.read:
+            print(f"{label}: the machine is busy (load {load:.1f}); times suffer", file=sys.stderr)
+        print(line(HEAD, WIDTHS), rule(WIDTHS), sep="\n", flush=True)
+        for row in _measured(name, words, asked):
+            rows.append(row)
+            print(line(cells(row), WIDTHS), flush=True)
+        own = _tables(name, rows, asked)
+        print(*(f"\n{place}\n\n{text}" for place, text in own.items()), sep="\n")
+        if asked.json:
+            with whole(asked.json) as part:
+                text = json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False)
+                part.write_text(f"{text}\n")
+        if asked.write:
+            places = {"machine": machine()} | suite_tables(rows) | own
+            asked.write.write_text(filled(asked.write.read_text(), places))
     except KeyboardInterrupt:
-        print("\nbench: interrupted, nothing written", file=sys.stderr)
+        print(f"\n{label}: interrupted, nothing written", file=sys.stderr)
         return 130
-    if options.json:
-        _write(options.json, rows)
-    judged = [row.holds for row in rows if row.holds is not None]
-    print(f"\n{sum(judged)} of {len(judged)} targets hold; {time.monotonic() - begin:.0f} s")
-    return 0 if all(judged) else 1
+    except CoViewError as error:
+        print(f"{label}: {error}", file=sys.stderr)
+        return 2
+    verdicts = [row.holds for row in rows if row.holds is not None]
+    print(f"\n{sum(verdicts)} of {len(verdicts)} targets hold; {time.monotonic() - begin:.0f} s")
+    return 0 if all(verdicts) and rows else 1
 
 
 if __name__ == "__main__":

@@ -1,19 +1,19 @@
-"""What each choice of the method is worth: ``python -m bench.ablation [--seeds N ...] [--markdown F]``.
+"""What each choice of the method is worth.
 
 Every variant changes a choice (the last ones several of the paper's at once) and runs on the same simulated
 worlds: Scan Context against co-view context, exhaustive retrieval against ring key, consensus against the
 single minimum, with and without a common zero for the heights. Per variant: how often the search names the
 right place (from one keyframe, from five), then the whole localizer on the same run. What is done stays in
-``--worlds``.
+``--work``.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -22,23 +22,15 @@ from typing import Any
 import numpy as np
 
 from bench.accuracy.stages import WINDOW, Bank, Variant, places
+from bench.harness.files import code_line, fingerprint, folder, isolated, remembered
+from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
-from bench.harness.worlds import (
-    KINDS,
-    LIDARS,
-    TUNED_SEEDS,
-    fingerprint,
-    isolated,
-    map_of,
-    prepare,
-    remembered,
-    world_name,
-)
+from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, map_of, prepare, world_name
 from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RetrievalConfig
 from coview_stream.sim import SimulationConfig
 
 SEEDS = tuple(range(2101, 2109))
-"""Held out: nobody tunes on them, nor on those of ``bench.accuracy``."""
+"""Held out: nobody tunes on them, nor on those of ``python -m bench accuracy``."""
 
 _RING_KEY = RetrievalConfig(mode="ring_key")
 _SINGLE = ConsensusConfig(mode="single")
@@ -55,11 +47,10 @@ VARIANTS = (
     Variant("single minimum, no consensus", consensus=_SINGLE),
     Variant("keyframe's zero at the sensor", DescriptorConfig(ground_zero=False)),
     Variant("co-view alone, zero at the sensor", _COC(ground_zero=False)),
-    Variant("co-view alone, visibility from the eye", _COC(visibility="eye")),
-    Variant("co-view alone, no visibility test", _COC(visibility="off")),
     Variant("all three: co-view, ring key, single", _COC(), _RING_KEY, _SINGLE),
     Variant("all three: strict, ring key, single", _STRICT, _RING_KEY, _SINGLE),
 )
+"""The last one is the paper's own method."""
 
 Measured = dict[str, dict[str, Any]]
 """Variant name -> its measures in one world."""
@@ -86,109 +77,82 @@ def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Meas
 
 def _localize(world: Path, bank: Bank, variant: Variant) -> dict[str, Any]:
     """Run the whole localizer on the world's run."""
-    from coview_stream.clouds import open_run, read_tum
-    from coview_stream.offline import locate
+    from coview_stream.clouds import read_tum
+    from coview_stream.localization.offline import locate
+    from coview_stream.recordings.open_run import open_run
     from coview_stream.report.evaluation import evaluate
 
     config = LocalizerConfig(retrieval=variant.retrieval, consensus=variant.consensus)
-    begin = time.perf_counter()
     posed = locate(bank.map(variant.descriptor), open_run(world / "run"), config).posed
-    seconds = round(time.perf_counter() - begin, 2)
     poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
     verdict = evaluate((np.array([fix.stamp for fix in posed]), poses), read_tum(world / "truth.tum"))
-    return {**json.loads(verdict.to_json()), "locate_s": seconds}
+    return dict(json.loads(verdict.to_json()))
 
 
 def measure(
-    folder: Path, config: SimulationConfig, names: Sequence[str], call: Any = isolated
-) -> tuple[Measured, str]:
-    """Measures of the variants in one world, each in a process of its own, and the code they are of."""
+    folder: Path, config: SimulationConfig, names: Sequence[str], call: Callable[..., Any] = isolated
+) -> Measured:
+    """Measures of the variants in one world, each in a process of its own."""
+    parts = ("bench/accuracy/ablation.py", "bench/accuracy/stages.py")
     spec = {
-        "world": config.to_dict(),
-        "variants": list(names),
-        "code": fingerprint(),
-        "bench": fingerprint("bench/accuracy/ablation.py", "bench/accuracy/stages.py"),
-    }
+        "world": config.to_dict(), "variants": list(names), "code": fingerprint(), "bench": fingerprint(*parts)
+    }  # fmt: skip
 
     def make() -> Measured:
         call(prepare, folder, config)
         return dict(call(ablate, folder, config, names))
 
-    file = folder / "results" / f"ablation-{world_name(config)}.json"
-    return remembered(file, spec, make), str(spec["code"])
+    return remembered(folder / "results" / f"ablation-{world_name(config)}.json", spec, make)
 
 
-def aggregate(worlds: Sequence[Measured], names: Sequence[str]) -> list[list[str]]:
-    """One row per variant, over all worlds; a run without a fix counts as an endless first fix."""
-    rows = []
-    for name in names:
-        got = [world[name] for world in worlds]
-        total = {key: sum(g[key] for g in got) for key in ("keyframes", "top1", "windows", "coarse")}
-        means = [g["translation"]["mean"] for g in got if g["translation"]]
-        turns = [g["rotation"]["mean"] for g in got if g["rotation"]]
-        first = np.median([np.inf if g["first_fix_m"] is None else g["first_fix_m"] for g in got])
-        rows.append([
-            name,
-            _share(total["top1"], total["keyframes"]),
-            _share(total["coarse"], total["windows"]),
-            f"{sum(g['success'] for g in got)} of {len(got)}",
-            f"{sum(g['false_frames'] for g in got)} of {sum(g['posed'] for g in got)}",
-            number(float(np.mean(means)) if means else None, 3),
-            number(float(np.mean(turns)) if turns else None, 3),
-            number(float(first) if np.isfinite(first) else None, 1),
-        ])  # fmt: skip
-    return rows
+def total(name: str, got: Sequence[dict[str, Any]]) -> Row:
+    """Row of a variant over all its worlds; a run without a fix counts as an endless first fix."""
+    sums = {
+        key: sum(each[key] for each in got)
+        for key in ("keyframes", "top1", "windows", "coarse", "success", "false_frames", "posed")
+    }
+    means = {key: [each[key]["mean"] for each in got if each[key]] for key in ("translation", "rotation")}
+    first = float(np.median([np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in got]))
+    top1 = sums["top1"] / sums["keyframes"] if sums["keyframes"] else np.nan
+    coarse = sums["coarse"] / sums["windows"] if sums["windows"] else np.nan
+    errors = {key: float(np.mean(each)) if each else np.nan for key, each in means.items()}
+    shown = [
+        number(top1, 2), number(coarse, 2), f"{sums['success']} of {len(got)}",
+        f"{sums['false_frames']} of {sums['posed']}", number(errors["translation"], 3),
+        number(errors["rotation"], 3), number(first if np.isfinite(first) else None, 1),
+    ]  # fmt: skip
+    details = {"variant": name, "cells": shown, "keyframes": sums["keyframes"], "worlds": got}
+    return informs(f"ablation/{name}: top-1", 100 * top1, "%", details)
 
 
-def _share(part: int, whole: int) -> str:
-    return f"{part / whole:.2f}" if whole else "-"
-
-
-def report(measured: dict[int, Measured], names: Sequence[str], length: float, code: str) -> str:
-    """Return the tables, held-out seeds and tuned-on seeds apart."""
-    parts = []
-    for title, tuned in (("Held-out seeds", False), ("Seeds that were TUNED on", True)):
-        seeds = [seed for seed in measured if (seed in TUNED_SEEDS) is tuned]
-        if not seeds:
-            continue
-        votes = sum(measured[seed][names[0]]["keyframes"] for seed in seeds)
-        what = ", ".join(world_name(world_of(seed, length)) for seed in seeds)
-        parts += [
-            f"{title}: {len(seeds)} worlds, {length:.0f} m driven in each: {what}. {votes} keyframes vote.",
-            "",
-            table(_HEAD, aggregate([measured[seed] for seed in seeds], names)),
-            "",
-        ]
-    return "\n".join([*parts, f"Code {code}, {time.strftime('%Y-%m-%d')}."])
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the ablation."""
-    parser = argparse.ArgumentParser(prog="python -m bench.ablation", description=__doc__)
-    parser.add_argument(
-        "--worlds", type=Path, default=Path("out/worlds"), help="worlds, maps, results (out/worlds)"
-    )
-    parser.add_argument(
-        "--seeds", type=int, nargs="+", default=list(SEEDS), help=f"({SEEDS[0]} to {SEEDS[-1]})"
-    )
+def options(parser: ArgumentParser) -> None:
+    """Add the worlds."""
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, help=f"({SEEDS[0]} to {SEEDS[-1]})")
     parser.add_argument("--length", type=float, default=24.0, help="metres driven in each world (24)")
-    parser.add_argument("--markdown", type=Path, metavar="F", help="write the table there too")
-    options = parser.parse_args(arguments)
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield a row per variant; seeds that were tuned on are told apart."""
     names = [variant.name for variant in VARIANTS]
-    measured, codes = {}, set()
-    for seed in dict.fromkeys(options.seeds):
-        begin = time.perf_counter()
-        config = world_of(seed, options.length)
-        measured[seed], code = measure(options.worlds, config, names)
-        codes.add(code)
-        seconds = time.perf_counter() - begin
-        print(f"{world_name(config)}: {seconds:.0f} s", file=sys.stderr, flush=True)
-    text = report(measured, names, options.length, " and ".join(sorted(codes)))
-    print(text)
-    if options.markdown:
-        options.markdown.write_text(text + "\n")
-    return 0
+    measured = {}
+    for seed in dict.fromkeys(asked.seeds[:1] if asked.quick else asked.seeds):
+        begin, config = time.perf_counter(), world_of(seed, asked.length)
+        measured[seed] = measure(folder(), config, names)
+        print(f"{world_name(config)}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+    for tuned in (False, True):
+        if worlds := [each for seed, each in measured.items() if (seed in TUNED_SEEDS) is tuned]:
+            for name in names:
+                row = total(name, [world[name] for world in worlds])
+                row.details["tuned"] = tuned
+                yield row
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Held-out seeds, and in a table apart those that were tuned on."""
+    out = {}
+    for place, tuned in (("", False), ("tuned", True)):
+        if chosen := [row.details for row in rows if row.details["tuned"] is tuned]:
+            shown = table(_HEAD, [[each["variant"], *each["cells"]] for each in chosen])
+            worlds, votes = len(chosen[0]["worlds"]), chosen[0]["keyframes"]
+            out[place] = f"{worlds} worlds, {votes} keyframes vote.\n\n{shown}\n\n{code_line()}"
+    return out

@@ -1,36 +1,25 @@
-"""How accurate, how often right, and never falsely so: ``python -m bench.accuracy [--quick] [--worlds DIR]``.
+"""How accurate, how often right, and never falsely so.
 
 Simulates held-out worlds, builds their maps and localizes a run in each; then runs on the map of another
-world of the same kind, where the only right answer is no pose. Prints a row per run and a verdict per target;
-exit code 1 if one is missed. One process per run, one at a time; what is done stays in ``--worlds``, so that
-it can resume.
+world of the same kind, where the only right answer is no pose. One process per run, one at a time; what is done stays
+in ``--work``, so that it can resume.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
-from collections.abc import Sequence
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.harness.tables import line, number, rule, table
-from bench.harness.worlds import (
-    KINDS,
-    LIDARS,
-    UTM,
-    fingerprint,
-    isolated,
-    map_of,
-    peak_megabytes,
-    prepare,
-    remembered,
-    world_name,
-)
+from bench.harness.files import code_line, fingerprint, folder, isolated, peak_megabytes, remembered
+from bench.harness.rows import Row, bounded, informs, judged
+from bench.harness.tables import number, table
+from bench.harness.worlds import KINDS, LIDARS, UTM, map_of, prepare, world_name
 from coview_stream.sim import SimulationConfig
 
 FIRST_SEED = 2001
@@ -46,15 +35,13 @@ _CHANGED = (0.0, 0.2, 0.0, 0.3, 0.25)
 MOST_TRANSLATION, MOST_ROTATION, MOST_FIRST_FIX, MOST_MEGABYTES = 0.08, 0.3, 10.0, 1536.0
 """The targets: metres, degrees, metres driven, MB."""
 
-_SELF = "bench/accuracy/accuracy.py"
-
-Row = dict[str, Any]
-
 _HEAD = (
     "world", "size", "changed", "UTM", "driven m", "map Mpts", "success", "false", "posed %", "e_t m",
     "e_r deg", "first m", "p50 ms", "locate s", "MB",
 )  # fmt: skip
-_WIDTHS = (29, 4, 7, 3, 8, 8, 7, 5, 7, 6, 7, 7, 6, 8, 6)
+
+Run = dict[str, Any]
+"""What one run came to: the figures of ``evaluate``, and where it was."""
 
 
 def held_out_worlds() -> list[SimulationConfig]:
@@ -73,157 +60,116 @@ def held_out_worlds() -> list[SimulationConfig]:
     ]
 
 
-def outside_pairs(worlds: Sequence[SimulationConfig]) -> list[tuple[SimulationConfig, SimulationConfig]]:
-    """12 pairs (run, map): every kind with every lidar, on the map of the next world of the same kind."""
-    return [(worlds[k], worlds[k + 4]) for k in range(12)]
+def pairs(quick: bool = False) -> list[tuple[SimulationConfig, SimulationConfig]]:
+    """(run, map) of all 24 worlds, then of 12 runs on the map of the next world of the same kind; or of 4 and 2."""
+    worlds = held_out_worlds()
+    inside = [worlds[k] for k in (0, 21, 6, 11)] if quick else worlds  # one of each kind, the small ones
+    strangers = [(0, 16), (21, 17)] if quick else [(k, k + 4) for k in range(12)]
+    return [*((world, world) for world in inside), *((worlds[a], worlds[b]) for a, b in strangers)]
 
 
-def quick(worlds: Sequence[SimulationConfig]) -> tuple[list[SimulationConfig], list[Any]]:
-    """Four of the worlds, one of each kind, and two runs outside the map."""
-    few = [worlds[k] for k in (0, 21, 6, 11)]  # the small ones
-    return few, [(few[0], worlds[16]), (few[1], worlds[17])]
-
-
-def measure(folder: Path, run: SimulationConfig, site: SimulationConfig) -> Row:
+def measure(folder: Path, run: SimulationConfig, site: SimulationConfig) -> Run:
     """Localize one world's run on a map; judged against the truth if the map is its own."""
     from coview_stream import BaseMap
-    from coview_stream.clouds import open_run, read_tum
-    from coview_stream.offline import locate
+    from coview_stream.clouds import read_tum
+    from coview_stream.localization.offline import locate
+    from coview_stream.recordings.open_run import open_run
     from coview_stream.report.evaluation import evaluate
 
     base_map = BaseMap.load(map_of(folder, site))
     begin = time.perf_counter()
     located = locate(base_map, open_run(folder / world_name(run) / "run"))
-    row: Row = {
+    found: Run = {
         "locate_s": round(time.perf_counter() - begin, 2),
         "p50_ms": round(1e3 * float(np.median(located.seconds)), 2),
         "megabytes": peak_megabytes(),
         "map_points": len(base_map.points),
-        "state": located.state.value,
+        "state": located.state.reported,
         "reason": located.keyframes[-1].reason if located.keyframes else "",
         "frames": located.frames,
         "posed": len(located.posed),
     }
-    if run == site:
-        poses = np.array([fix.T_map_body for fix in located.posed]).reshape(-1, 4, 4)
-        estimate = np.array([fix.stamp for fix in located.posed]), poses
-        row |= json.loads(evaluate(estimate, read_tum(folder / world_name(run) / "truth.tum")).to_json())
-    else:
-        row |= {"false_frames": len(located.posed), "success": not located.posed}
-    return row
+    if run != site:
+        return found | {"false_frames": len(located.posed), "success": not located.posed}
+    poses = np.array([fix.T_map_body for fix in located.posed]).reshape(-1, 4, 4)
+    estimate = np.array([fix.stamp for fix in located.posed]), poses
+    return found | json.loads(evaluate(estimate, read_tum(folder / world_name(run) / "truth.tum")).to_json())
 
 
-def run_one(folder: Path, run: SimulationConfig, site: SimulationConfig, call: Any = isolated) -> Row:
-    """Prepare the worlds and measure, each in its own process; a crash makes a row that has failed."""
-    spec = {"run": run.to_dict(), "map": site.to_dict(), "code": fingerprint(), "bench": fingerprint(_SELF)}
+def run_one(
+    folder: Path, run: SimulationConfig, site: SimulationConfig, call: Callable[..., Any] = isolated
+) -> Run:
+    """Prepare the worlds and measure, each in its own process; a crash makes a run that has failed."""
+    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/accuracy.py")}
     name = world_name(run) if run == site else f"{world_name(run)}-on-{site.seed}"
 
-    def make() -> Row:
+    def make() -> Run:
         seconds = [call(prepare, folder, config) for config in dict.fromkeys((run, site))]
         return {**seconds[0], **call(measure, folder, run, site)}
 
     try:
-        row = remembered(folder / "results" / f"{name}.json", spec, make)
-    except Exception as error:  # the other rows are still worth having; the verdict counts this one as failed
-        row = {"error": f"{type(error).__name__}: {error}", "success": False, "false_frames": 0, "posed": 0}
-    return row | {"name": name, "run": run.to_dict(), "outside": run != site, "code": spec["code"]}
+        spec = {"run": run.to_dict(), "map": site.to_dict(), **code}
+        found = remembered(folder / "results" / f"{name}.json", spec, make)
+    except Exception as error:  # the other runs are still worth having; the verdict counts this one as failed
+        found = {"error": f"{type(error).__name__}: {error}", "success": False, "false_frames": 0, "posed": 0}
+    return found | {"name": name, "run": run.to_dict(), "outside": run != site}
 
 
-def cells(row: Row) -> list[str]:
+def cells(run: Run) -> list[str]:
     """One line of the table."""
-    run, frames = row["run"], row.get("frames")
-    translation, rotation = row.get("translation") or {}, row.get("rotation") or {}
-    points = row.get("map_points")
+    world, frames, points = run["run"], run.get("frames"), run.get("map_points")
+    means = [(run.get(key) or {}).get("mean") for key in ("translation", "rotation")]
     return [
-        row["name"] + ("!" if "error" in row else ""),
-        f"{run['size']:.0f}",
-        f"{run['changed']:.0%}",
-        "yes" if any(run["origin"]) else "no",
-        f"{run['length']:.0f}",
-        number(points / 1e6 if points else None, 2),
-        "yes" if row["success"] else "NO",
-        str(row["false_frames"]),
-        number(100 * row["posed"] / frames if frames else None, 1),
-        number(translation.get("mean"), 3),
-        number(rotation.get("mean"), 3),
-        number(row.get("first_fix_m"), 1),
-        number(row.get("p50_ms"), 0),
-        number(row.get("locate_s"), 0),
-        number(row.get("megabytes"), 0),
-    ]
+        run["name"] + ("!" if "error" in run else ""), f"{world['size']:.0f}", f"{world['changed']:.0%}",
+        "yes" if any(world["origin"]) else "no", f"{world['length']:.0f}",
+        number(points / 1e6 if points else None, 2), "yes" if run["success"] else "NO", str(run["false_frames"]),
+        number(100 * run["posed"] / frames if frames else None, 1), *(number(mean, 3) for mean in means),
+        number(run.get("first_fix_m"), 1), number(run.get("p50_ms"), 0), number(run.get("locate_s"), 0),
+        number(run.get("megabytes"), 0),
+    ]  # fmt: skip
 
 
-def verdicts(rows: Sequence[Row]) -> list[tuple[str, str, str, bool]]:
-    """Judge: (what, target, measured, met) per target; without a fix the first fix is endless."""
-    inside, outside = [r for r in rows if not r["outside"]], [r for r in rows if r["outside"]]
-    means = [r["translation"]["mean"] for r in inside if r.get("translation")]
-    turns = [r["rotation"]["mean"] for r in inside if r.get("rotation")]
+def verdicts(runs: Sequence[Run]) -> Iterator[Row]:
+    """Judge all runs together; without a fix the first fix is endless."""
+    inside, outside = [r for r in runs if not r["outside"]], [r for r in runs if r["outside"]]
+    succeeded, false = (sum(r[key] for r in inside) for key in ("success", "false_frames"))
+    said = f"{succeeded} of {len(inside)}"
+    yield judged("accuracy/runs localised", said, "all", succeeded == len(inside), succeeded)
+    yield judged("accuracy/false frames", str(false), "0", false == 0, false)
+    for what, key, unit, most in (
+        ("translation", "translation", "m", MOST_TRANSLATION),
+        ("rotation", "rotation", "deg", MOST_ROTATION),
+    ):
+        means = [r[key]["mean"] for r in inside if r.get(key)] or [np.inf]
+        mean = float(np.mean(means))
+        said = f"{mean:.3f} (worst run {max(means):.3f})"
+        yield judged(f"accuracy/mean {what} error, {unit}", said, f"<= {most}", mean <= most, mean)
     first = [np.inf if r.get("first_fix_m") is None else r["first_fix_m"] for r in inside]
-    succeeded, false = sum(r["success"] for r in inside), sum(r["false_frames"] for r in inside)
-    e_t = float(np.mean(means)) if means else np.inf
-    e_r = float(np.mean(turns)) if turns else np.inf
-    fix = float(np.median(first)) if first else np.inf
-    memory = max((r.get("megabytes", 0.0) for r in rows), default=0.0)
-    strays, quiet = sum(r["posed"] for r in outside), sum(r["success"] for r in outside)
-    return [
-        ("runs localised", "all", f"{succeeded} of {len(inside)}", succeeded == len(inside)),
-        ("false frames", "0", str(false), false == 0),
-        (
-            "mean translation error, m",
-            f"<= {MOST_TRANSLATION}",
-            f"{e_t:.3f} (worst run {max(means, default=np.inf):.3f})",
-            e_t <= MOST_TRANSLATION,
-        ),
-        (
-            "mean rotation error, deg",
-            f"<= {MOST_ROTATION}",
-            f"{e_r:.3f} (worst run {max(turns, default=np.inf):.3f})",
-            e_r <= MOST_ROTATION,
-        ),
-        ("median first fix, m", f"<= {MOST_FIRST_FIX:.0f}", f"{fix:.1f}", fix <= MOST_FIRST_FIX),
-        ("outside: poses", "0", f"{strays} in {len(outside)} runs", strays == 0 and quiet == len(outside)),
-        ("peak memory of locate, MB", f"< {MOST_MEGABYTES:.0f}", f"{memory:.0f}", memory < MOST_MEGABYTES),
-    ]
+    yield bounded("accuracy/median first fix", float(np.median(first or [np.inf])), "m", MOST_FIRST_FIX)
+    strays, quiet = sum(r["posed"] for r in outside), all(r["success"] for r in outside)
+    said = f"{strays} in {len(outside)} runs"
+    yield judged("accuracy/outside: poses", said, "0", strays == 0 and quiet, strays)
+    memory = max((r.get("megabytes", 0.0) for r in runs), default=0.0)
+    yield bounded("accuracy/peak memory of locate", memory, "MB", MOST_MEGABYTES)
 
 
-def summary(rows: Sequence[Row]) -> str:
-    """Lay out the verdicts, what went wrong, and which code was measured."""
-    judged = [(*texts, "met" if met else "MISSED") for *texts, met in verdicts(rows)]
-    lines = [table(("target", "asked", "measured", "verdict"), judged), ""]
-    for row in rows:
-        if "error" in row:
-            lines.append(f"- {row['name']}: {row['error']}")
-        elif not row["success"]:
-            lines.append(f"- {row['name']}: {row['state']}, {row['posed']} poses; {row['reason']}")
-    versions = sorted({row["code"] for row in rows})
-    if len(versions) > 1:
-        lines.append("- the code was edited meanwhile: these rows are not of one version")
-    return "\n".join([*lines, f"Code {', '.join(versions)}, {time.strftime('%Y-%m-%d')}."])
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield a row per run with all its figures, then the targets."""
+    runs = []
+    for run, site in pairs(asked.quick):
+        runs.append(run_one(folder(), run, site))
+        mean = (runs[-1].get("translation") or {}).get("mean", np.nan)
+        yield informs(f"accuracy/{runs[-1]['name']}", mean, "m", runs[-1])
+    yield from verdicts(runs)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(prog="python -m bench.accuracy", description=__doc__)
-    parser.add_argument(
-        "--worlds", type=Path, default=Path("out/worlds"), help="worlds, maps, results (out/worlds)"
-    )
-    parser.add_argument("--quick", action="store_true", help="4 runs and 2 outside instead of 24 and 12")
-    parser.add_argument("--json", type=Path, metavar="F", help="write all rows and verdicts")
-    options = parser.parse_args(arguments)
-    worlds = held_out_worlds()
-    inside, outside = quick(worlds) if options.quick else (worlds, outside_pairs(worlds))
-    rows: list[Row] = []
-    print(line(_HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
-    for run, site in [*((world, world) for world in inside), *outside]:
-        rows.append(run_one(options.worlds, run, site))
-        print(line(cells(rows[-1]), _WIDTHS), flush=True)
-    print(f"\n{summary(rows)}")
-    judged = verdicts(rows)
-    if options.json:
-        named = [dict(zip(("what", "asked", "measured", "met"), v, strict=True)) for v in judged]
-        options.json.write_text(json.dumps({"rows": rows, "verdicts": named}, indent=1) + "\n")
-    return 0 if all(met for *_, met in judged) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """All runs; what went wrong in which, and the code that was measured."""
+    runs = [row.details for row in rows if row.details]
+    notes = []
+    for run in runs:
+        if "error" in run:
+            notes.append(f"- {run['name']}: {run['error']}")
+        elif not run["success"]:
+            notes.append(f"- {run['name']}: {run['state']}, {run['posed']} poses; {run['reason']}")
+    return {"": table(_HEAD, [cells(run) for run in runs]), "notes": "\n".join([*notes, code_line()])}

@@ -14,21 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream import BaseMap
-from coview_stream.basemap import store
+from coview_stream.basemap import file_format
 from coview_stream.basemap.stations import describe_storeys
-from coview_stream.clouds import open_run, read_tum
-from coview_stream.config import (
-    Channel,
-    ConsensusConfig,
-    DescriptorConfig,
-    KeyframeConfig,
-    RetrievalConfig,
-)
-from coview_stream.geometry import Points, Pose, inverse, transform, wrap_angle, yaw_of
-from coview_stream.place.consensus import Consensus
-from coview_stream.place.descriptor import describe, ground_below
-from coview_stream.place.keyframes import KeyframeBuffer
-from coview_stream.place.retrieval import Retrieval, Volume
+from coview_stream.clouds import read_tum
+from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig, RetrievalConfig
+from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.geometry.arrays import Floats32
+from coview_stream.geometry.transforms import Points, Pose, inverse, transform, wrap_angle, yaw_of
+from coview_stream.localization.search.consensus import Consensus
+from coview_stream.localization.search.keyframes import KeyframeBuffer
+from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.recordings.open_run import open_run
 
 WINDOW = 5
 """Keyframes that vote together in the coarse measure."""
@@ -77,7 +73,7 @@ class Bank:
     """One map's geometry, and its stations described in as many ways as are asked for, each once."""
 
     def __init__(self, path: Path) -> None:
-        arrays, self._parameters, _ = store.load(path)
+        arrays, self._parameters, _ = file_format.load(path)
         self._geometry = {name: a for name, a in arrays.items() if not name.startswith("descriptor.")}
         self.built = BaseMap(arrays, self._parameters)
         self._known: dict[Channel, npt.NDArray[np.float16]] = {}
@@ -127,7 +123,7 @@ class _Search:
         self._window = Consensus(stations, block, replace(variant.consensus, window=WINDOW))
         self.places = Places()
 
-    def vote(self, seen: Seen, centre: npt.NDArray[np.float64], volumes: dict[Channel, Volume]) -> None:
+    def vote(self, seen: Seen, centre: npt.NDArray[np.float64], volumes: dict[Channel, Floats32]) -> None:
         self._alone.vote(centre, volumes)
         self._window.vote(centre, volumes)
         self.places.keyframes += 1
@@ -142,7 +138,7 @@ def places(world: Path, variants: list[Variant], bank: Bank) -> dict[str, Places
     searches = [_Search(variant, bank.built) for variant in variants]
     scorers: dict[tuple[object, ...], Retrieval] = {}
     for seen in keyframes_of(world, bank.built.origin, variants[0].descriptor):
-        known: dict[tuple[object, ...], Volume] = {}
+        known: dict[tuple[object, ...], Floats32] = {}
         for search in searches:
             descriptor, volumes = search.variant.descriptor, {}
             centre = seen.position.copy()

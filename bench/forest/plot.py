@@ -3,13 +3,14 @@
 The airborne scan of the plot (27 x 26 m, ponderosa) is put into the middle of each tile (another, coniferous
 forest), thinned to the density of the tile; the query is the mobile scan of the plot at several headings. It is one
 plot, from another forest than what surrounds it, and smaller than what a query usually shows: a check, no statistic.
-Queries of the tiles themselves cannot be made, for nobody has scanned them from the ground.
+Queries of the tiles themselves cannot be made, for they were never scanned from the ground.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ import numpy.typing as npt
 
 from bench.forest.methods import METHODS, Methods
 from bench.forest.tables import EXACT_DEGREES, EXACT_METRES, recall, success
-from bench.forest.worlds import Drive
+from bench.forest.worlds import Drive, noted
+from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.geometry import Points, inverse, pose_from, rot_z, transform
+from coview_stream.geometry.transforms import Points, inverse, pose_from, rot_z, transform
 
 Floats = npt.NDArray[np.float64]
 
@@ -33,24 +35,22 @@ _VOXEL = 0.1  # metres: the mobile scan is as dense as no robot's
 _RADIUS = 30.0
 
 
-def measured(data: Path, tiles: Sequence[str] = TILES) -> list[dict[str, Any]]:
-    """Ask all methods for the plot in each tile, at each heading.
+def measured(data: Path, name: str) -> list[dict[str, Any]]:
+    """Ask all methods for the plot in a tile, at each heading.
 
     Raises:
         InputError: a scan cannot be read.
     """
     air, ground = (_metres(data / "forest_plot" / name) for name in ("ALS_Clip.laz", "MLS_Clip.laz"))
-    answers = []
-    for name in tiles:
-        whole, shift = pasted(_metres(data / "forest_als" / name), air, np.random.default_rng(7))
-        with tempfile.TemporaryDirectory() as folder:
-            base = Path(folder) / "base.npy"
-            np.save(base, (whole - whole.mean(axis=0)).astype(np.float32))
-            methods = Methods(BaseMap.build(base, radius=_RADIUS, learned=True))
-        offset = shift - whole.mean(axis=0)
-        for k in range(HEADINGS):
-            drive = standing(ground + offset, 0.4 + 2 * np.pi * k / HEADINGS)
-            answers.append({"world": name, "kind": "real plot", "first": not k, **methods.ask(drive)})
+    whole, shift = pasted(_metres(data / "forest_als" / name), air, np.random.default_rng(7))
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder) / "base.npy"
+        np.save(base, (whole - whole.mean(axis=0)).astype(np.float32))
+        methods = Methods(BaseMap.build(base, radius=_RADIUS, learned=True))
+    moved, answers = ground + shift - whole.mean(axis=0), []
+    for k in range(HEADINGS):
+        drive = standing(moved, 0.4 + 2 * np.pi * k / HEADINGS)
+        answers.append({"world": name, "kind": "real plot", "first": not k, **methods.ask(drive)})
     return answers
 
 
@@ -95,16 +95,31 @@ def _metres(file: Path) -> Floats:
     return np.asarray(cloud.points.astype(np.float64) + cloud.origin)
 
 
-def plot_table(answers: Sequence[dict[str, Any]]) -> str:
+def options(parser: ArgumentParser) -> None:
+    """Add where the scans are."""
+    parser.add_argument("data", type=Path, help="holds forest_plot/ and forest_als/")
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield a row per tile, with every answer."""
+    for name in TILES[1:] if asked.quick else TILES:
+        answers = measured(asked.data, name)
+        share = 100 * success(answers, "after", EXACT_METRES, EXACT_DEGREES)
+        yield informs(f"forest_plot/{name}: within 0.3 m and 1 deg", share, "%", {"answers": answers})
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """AR@1 / AR@5 by method over all tiles and headings, and how exactly the plot was registered."""
-    rows = [
+    answers = [answer for row in rows for answer in row.details["answers"]]
+    shown = [
         [method, f"{100 * recall(answers, method, 1):.0f} / {100 * recall(answers, method, 5):.0f}"]
         for method in METHODS
     ]
     poses = [answer["after"] for answer in answers if answer["after"] is not None]
     metres = float(np.median([pose[0] for pose in poses])) if poses else None
     share = success(answers, "after", EXACT_METRES, EXACT_DEGREES)
-    rows.append(["registered within 0.3 m and 1 deg, %", f"{100 * share:.0f}"])
-    rows.append(["registered: median metres off, wrong places included", number(metres, 2)])
+    shown.append(["registered within 0.3 m and 1 deg, %", f"{100 * share:.0f}"])
+    shown.append(["registered: median metres off, wrong places included", number(metres, 2)])
     chance = 100 * float(np.mean([answer["chance"] for answer in answers]))
-    return table((f"AR@1 / AR@5, %, {len(answers)} queries, chance {chance:.1f}", ""), rows)
+    head = (f"AR@1 / AR@5, %, {len(answers)} queries, chance {chance:.1f}", "")
+    return {"": noted(table(head, shown), "forest_plot DATA")}

@@ -1,9 +1,13 @@
-"""Whole runs in forests, searched by the paper's descriptors, by learned features, and by both; and outside the map."""
+"""Whole runs in forests, searched by the paper's descriptors, by learned features, and by both; and outside the map.
+
+In the usual worlds, or in those that ``--world`` names, each also on the map of the next.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,17 +15,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.forest.common import WORLDS, code, on_disk, say, weights
-from bench.forest.drives import RUNS, shortened, world_of
 from bench.forest.tables import NEAR_DEGREES, NEAR_METRES
-from bench.forest.worlds import base_of
+from bench.forest.worlds import (
+    RUNS,
+    WORLDS,
+    base_of,
+    code,
+    noted,
+    on_disk,
+    place,
+    say,
+    shortened,
+    weights,
+    world_of,
+)
+from bench.harness.files import fingerprint, remembered
+from bench.harness.rows import Row, failed, informs
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Told, errors
-from bench.harness.worlds import fingerprint, remembered
 from coview_stream.config import LocalizerConfig, Reloc
 
 Floats = npt.NDArray[np.float64]
-Row = dict[str, Any]
+Run = dict[str, Any]
 
 MODES: tuple[Reloc, ...] = ("coview", "learned", "auto")
 _HEAD = (
@@ -49,8 +64,9 @@ def map_of(world: Path) -> Path:
 def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Told, Floats]:
     """Localize the run of a world on a map: what was said of each frame, and the true poses (N, 4, 4)."""
     from coview_stream import BaseMap
-    from coview_stream.clouds import open_run, read_tum
-    from coview_stream.offline import locate
+    from coview_stream.clouds import read_tum
+    from coview_stream.localization.offline import locate
+    from coview_stream.recordings.open_run import open_run
 
     run = open_run(world / "run")
     stamps, truth = read_tum(world / "truth.tum")
@@ -61,13 +77,13 @@ def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Told, Floats]:
     for k, fix in enumerate(located.fixes):
         if fix.T_map_body is not None:
             known[k] = fix.T_map_body
-    states = [fix.state.value for fix in located.fixes]
+    states = [fix.state.reported for fix in located.fixes]
     reasons = [fix.evidence.reason if fix.evidence else "" for fix in located.fixes]
     told = Told(said, states, reasons, known, np.full((len(said), 6, 6), np.nan), np.array(located.seconds))
     return told, truth[nearest]
 
 
-def scored(told: Told, truth: Floats, outside: bool) -> Row:
+def scored(told: Told, truth: Floats, outside: bool) -> Run:
     """Figures of one run; outside the map every pose is a false one."""
     error = errors(told, truth)
     known = told.tracking
@@ -93,55 +109,53 @@ def _rms(values: Floats) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
-def all_runs(folder: Path, quick: bool, worlds: Sequence[Path]) -> tuple[list[Row], list[str]]:
-    """Rows of all runs in all modes, each also on the map of the next, and what went wrong.
+def options(parser: ArgumentParser) -> None:
+    """Add worlds on disk."""
+    parser.add_argument(
+        "--world", type=Path, nargs="+", default=[], metavar="DIR", help="instead of the usual runs"
+    )
 
-    ``worlds`` are directories on disk, in place of the usual runs; a single one has no other map to be outside of.
-    """
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Localize all runs in all modes, each also on the map of the next if there is one."""
+    folder = place()
     folder.mkdir(parents=True, exist_ok=True)
-    few = [shortened(run, 40.0) for run in RUNS[1:4:2]] if quick else list(RUNS)
-    openers = [lambda path=path: path for path in worlds] or [
-        lambda run=run: world_of(folder, run) for run in few
+    few = [shortened(run, 40.0) for run in RUNS[1:4:2]] if asked.quick else list(RUNS)
+    jobs: list[tuple[str, Any, Any]] = [
+        (path.name, lambda path=path: path, on_disk(path)) for path in asked.world
     ]
-    names = [path.name for path in worlds] or [run.name for run in few]
-    specs: list[Any] = [on_disk(path) for path in worlds] or [asdict(run) for run in few]
-    rows, troubles = [], []
-    for k, name in enumerate(names):
-        other = (k + 1) % len(names)
-        sites = [(k, False)] + ([(other, True)] if other != k else [])
-        for site, outside in sites:
+    jobs = jobs or [(run.name, lambda run=run: world_of(folder, run), asdict(run)) for run in few]
+    for k, (name, _, _) in enumerate(jobs):
+        for site in dict.fromkeys((k, (k + 1) % len(jobs))):
+            label = name if site == k else f"{name} on {jobs[site][0]}"
             for reloc in MODES:
-                label = name if not outside else f"{name} on {names[site]}"
+                begin = time.perf_counter()
                 try:
-                    rows.append(
-                        _row(
-                            folder, label, reloc, openers[k], openers[site], outside, [specs[k], specs[site]]
-                        )
-                    )
+                    run = _run(folder, label, reloc, jobs[k], jobs[site])
                 except Exception as error:  # the other runs are still worth having; the exit code tells
-                    troubles.append(f"{label}, {reloc}: {type(error).__name__}: {error}")
-                    say(troubles[-1])
-    return rows, troubles
+                    yield failed(f"forest_runs/{label}, {reloc}", f"{type(error).__name__}: {error}")
+                    continue
+                say(f"{label}, {reloc}: {time.perf_counter() - begin:.0f} s")
+                yield informs(f"forest_runs/{label}, {reloc}: false", run["false"], "", run)
 
 
-def _row(folder: Path, label: str, reloc: Reloc, world: Any, site: Any, outside: bool, spec: Any) -> Row:
+def _run(
+    folder: Path, label: str, reloc: Reloc, world: tuple[str, Any, Any], site: tuple[str, Any, Any]
+) -> Run:
+    outside = world is not site
 
-    def make() -> Row:
-        return scored(*followed(world(), map_of(_kept(folder, site())), reloc), outside)
+    def make() -> Run:
+        return scored(*followed(world[1](), map_of(_kept(folder, site[1]())), reloc), outside)
 
-    begin = time.perf_counter()
     wanted = {
-        "runs": spec,
+        "runs": [world[2], site[2]],
         "reloc": reloc,
         "weights": weights(),
         "code": fingerprint(),
         "bench": fingerprint(*WORLDS, "bench/forest/runs.py", "bench/harness/trajectory_scores.py"),
     }
-    row = remembered(folder / "runs" / f"{label.replace(' ', '-')}-{reloc}.json", wanted, make)
-    say(
-        f"{label}, {reloc}: {time.perf_counter() - begin:.0f} s, {row['false']} false, first {row['first_fix_m']}"
-    )
-    return {"run": label, "reloc": reloc, "outside": outside, **row}
+    kept = folder / "runs" / f"{label.replace(' ', '-')}-{reloc}.json"
+    return {"run": label, "reloc": reloc, "outside": outside, **remembered(kept, wanted, make)}
 
 
 def _kept(folder: Path, world: Path) -> Path:
@@ -154,18 +168,19 @@ def _kept(folder: Path, world: Path) -> Path:
     return link
 
 
-def runs_table(rows: Sequence[Row]) -> str:
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per run, map and mode."""
     shown = [
         [
-            row["run"], row["reloc"], number(row["driven_m"], 0), number(row["first_fix_m"], 1),
-            number(100 * row["posed"], 0), number(_share(row["posed_after"]), 0), number(row["rmse_m"], 3),
-            number(row["rmse_deg"], 2), str(row["false"]), number(row["searching_ms"], 0),
+            run["run"], run["reloc"], number(run["driven_m"], 0), number(run["first_fix_m"], 1),
+            number(100 * run["posed"], 0), number(_percent(run["posed_after"]), 0), number(run["rmse_m"], 3),
+            number(run["rmse_deg"], 2), str(run["false"]), number(run["searching_ms"], 0),
         ]
-        for row in rows
+        for run in (row.details for row in rows if row.details)
     ]  # fmt: skip
-    return table(_HEAD, shown)
+    about = " --quick" * asked.quick + " --world" * bool(asked.world) + " DIR" * len(asked.world)
+    return {"": noted(table(_HEAD, shown), f"forest_runs{about}")}
 
 
-def _share(value: float | None) -> float | None:
+def _percent(value: float | None) -> float | None:
     return None if value is None else 100 * value

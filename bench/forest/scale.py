@@ -12,28 +12,26 @@ from __future__ import annotations
 
 import os
 import time
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.forest.chains import Chain
-from bench.forest.common import say
-from bench.forest.query import query_of
-from bench.forest.worlds import drawn
+from bench.forest.query import Chain, query_of
+from bench.forest.worlds import drawn, noted, place
+from bench.harness.rows import Row, bounded
 from bench.harness.tables import number, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry import pose_from, transform
-from coview_stream.place.consensus import Consensus, Hypothesis
-from coview_stream.place.descriptor import ground_below
-from coview_stream.place.learned.feature_map import FeatureMap
-from coview_stream.place.learned.feature_tiles import TILE
-from coview_stream.query import Query
-from coview_stream.sources import Knowledge
+from coview_stream.descriptors.coview import ground_below
+from coview_stream.descriptors.feature_map import TILE, FeatureMap
+from coview_stream.geometry.transforms import pose_from, transform
+from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.localization.search.request import SearchRequest
 
 Ints = npt.NDArray[np.int64]
 
@@ -99,7 +97,7 @@ def _within(at: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any])
     return np.asarray(((at[:, :2] >= low) & (at[:, :2] < high)).all(axis=1))
 
 
-def home(hypothesis: Hypothesis, query: Query, low: Ints) -> Hypothesis:
+def home(hypothesis: Hypothesis, query: SearchRequest, low: Ints) -> Hypothesis:
     """Move a hypothesis to its likeness in the original."""
     at = transform(hypothesis.T_map_odom, query.position[None])[0, :2]
     edge = CUT * float(TILE)
@@ -109,18 +107,18 @@ def home(hypothesis: Hypothesis, query: Query, low: Ints) -> Hypothesis:
     )
 
 
-def scaled(folder: Path) -> Iterator[dict[str, Any]]:
+def rows(asked: Namespace) -> Iterator[Row]:
     """Seconds of each part of a query, medians over a few, for each size of the map."""
     config = LocalizerConfig(reloc="learned")
-    place = drawn(folder, _SEED, _QUERIES)
-    base_map = BaseMap.build(place.base, radius=30.0, learned=True)
-    queries = [query_of(drive, config)[0] for drive in place.drives]
+    there = drawn(place(), _SEED, _QUERIES)
+    base_map = BaseMap.build(there.base, radius=30.0, learned=True)
+    queries = [query_of(drive, config)[0] for drive in there.drives]
     chain = Chain(base_map, config)
-    for side in SIDES:
+    for side in SIDES[:1] if asked.quick else SIDES:
         features, stations, low = enlarged(base_map, side)
         begin = time.perf_counter()
         whole = _LargeMap(base_map, features, stations)
-        learned = Knowledge.of(whole, config).learned
+        learned = SearchIndex.of(whole, config).learned
         assert learned is not None
         learned.prepare()
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
@@ -131,25 +129,29 @@ def scaled(folder: Path) -> Iterator[dict[str, Any]]:
             consensus.clear()
             ticks = [time.perf_counter()]
             centre = np.array([*query.position[:2], ground_below(query.surroundings, query.position)])
-            view = learned.view(query.surroundings, centre)
+            view = learned.encode(query.surroundings, centre)
             ticks.append(time.perf_counter())
             volume = learned.distances(view)
             ticks.append(time.perf_counter())
             consensus.vote(centre, {"learned": volume})
             named = consensus.hypotheses()
             ticks.append(time.perf_counter())
-            named = learned.sharpened(named, view)
+            named = learned.refine(named, view)
             ticks.append(time.perf_counter())
             chain.register([home(each, query, low) for each in named], chain.source(query), query)
             ticks.append(time.perf_counter())
             spent.append(np.diff(ticks).tolist())
         medians = np.median(np.array(spent[1:]), axis=0).tolist()  # the first one waits for memory and crops
         total = float(np.median(np.array(spent[1:]).sum(axis=1)))
-        say(f"{side} x {side} tiles: {total:.2f} s a query")
-        yield {
-            "km2": features.tile_area / 1e6, "stations": len(stations), "prepare": prepared, "total": total,
-            "limit": LIMITS[side], "threads": _threads(), **dict(zip(_PARTS, medians, strict=True)),
-        }  # fmt: skip
+        parts = dict(zip(_PARTS, medians, strict=True)) | {
+            "prepare": prepared,
+            "total": total,
+            "limit": LIMITS[side],
+        }
+        about = {"km2": features.tile_area / 1e6, "stations": len(stations), "threads": _threads(), **parts}
+        yield replace(
+            bounded(f"forest_scale/{about['km2']:.2f} km2", total, "s", LIMITS[side]), details=about
+        )
 
 
 class _LargeMap(BaseMap):
@@ -165,7 +167,7 @@ def _threads() -> str:
     return ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in names)
 
 
-def scale_table(rows: Sequence[dict[str, Any]]) -> str:
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per size of the map, seconds."""
     head = (
         "map, km2",
@@ -175,11 +177,13 @@ def scale_table(rows: Sequence[dict[str, Any]]) -> str:
         "query, s",
         "limit, s",
     )
+    sizes = [row.details for row in rows]
     shown = [
         [
-            number(row["km2"], 2), str(row["stations"]), number(row["prepare"], 2),
-            *(number(row[part], 3) for part in _PARTS), number(row["total"], 2), number(row["limit"], 1),
+            number(size["km2"], 2), str(size["stations"]), number(size["prepare"], 2),
+            *(number(size[part], 3) for part in _PARTS), number(size["total"], 2), number(size["limit"], 1),
         ]
-        for row in rows
+        for size in sizes
     ]  # fmt: skip
-    return f"{table(head, shown)}\n\n{rows[0]['threads']}; {os.cpu_count()} cores."
+    text = f"{table(head, shown)}\n\n{sizes[0]['threads']}; {os.cpu_count()} cores."
+    return {"": noted(text, "forest_scale")}

@@ -178,13 +178,13 @@ def tables(answers: Sequence[Answer]) -> dict[str, str]:
     """All tables by the names of their places in docs/forest.md; worlds on disk alone have places of their own."""
     if all(answer["kind"] == "on disk" for answer in answers):
         return {
-            "forest disk recall": recall_table(answers),
-            "forest disk metric": metric_table(answers),
-            "forest disk compared": compared_table(answers),
+            "disk recall": recall_table(answers),
+            "disk metric": metric_table(answers),
+            "disk compared": compared_table(answers),
         }
     return {
-        "forest recall": recall_table(answers),
-        "forest metric": metric_table(answers),
-        "forest compared": compared_table(answers),
-        "forest times": times_table(answers),
+        "recall": recall_table(answers),
+        "metric": metric_table(answers),
+        "compared": compared_table(answers),
+        "times": times_table(answers),
     }

@@ -1,71 +1,81 @@
-"""The benchmarks that ``python -m bench`` runs, and the process that each of them runs in.
-
-``python -m bench.suite MODULE FD [--quick]`` is that process: it imports the module and writes each row as a line
-of JSON to the open file descriptor FD, so that what a benchmark prints does not mix with its rows.
-"""
+"""The names that ``python -m bench`` knows, and a benchmark in a process of its own."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
+import math
 import os
+import select
+import signal
+import subprocess
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
+
+from bench.harness.rows import Row, failed
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A benchmark of the suite."""
+class Benchmark:
+    """One name: where its ``rows`` are and how it is run.
 
-    name: str
+    Attributes:
+        module: to import, below ``bench``.
+        what: it measures, in one line.
+        threads: thread counts to run it with, each in a process of its own; None leaves the count to the machine.
+            Empty: it runs in this process, as long as it takes.
+        suite: the words it is run with when no name is given; None: it is not part of the suite.
+        limit_s: wall time after which it is ended in the suite: a row that does not hold.
+    """
+
+    module: str
     what: str
-    threads: tuple[int | None, ...] = (1, 2)
-    """Thread counts to run it with; None leaves the count to the machine."""
+    threads: tuple[int | None, ...] = ()
+    suite: tuple[str, ...] | None = None
     limit_s: float = 240.0
-    """Wall time after which it is ended: a row that does not hold."""
-    module: str = ""
-    """Where its ``rows`` are, if not in ``bench.NAME``."""
 
-    @property
-    def source(self) -> str:
-        """Module to import."""
-        return self.module or f"bench.speed.{self.name}"
+    def load(self) -> Any:
+        """Import its module."""
+        return importlib.import_module(f"bench.{self.module}")
 
 
-SUITE = (
-    Entry("kernels", "each kernel beside its NumPy twin"),
-    Entry("match", "one query against all stations at all shifts, top-K"),
-    Entry("learned_match", "dense correlation and cliques of learned re-localization"),
-    Entry("intake", "a frame: transform, filter, voxels, polar bins"),
-    Entry("describe", "descriptor and co-visibility of a keyframe"),
-    Entry("map_build", "descriptors of 10,000 stations", threads=(None,)),
-    Entry("registration", "trimmed ICP beside small_gicp"),
-    Entry("engine", "Localizer.step on a large map: times, CPU share, memory", threads=(None,)),
-    Entry("start", "import, first run, ready to serve", threads=(None,), module="bench.stream.start"),
-    Entry(
-        "peers",
-        "other libraries on the same queries",
-        threads=(None,),
-        limit_s=420.0,
-        module="bench.peers.summary",
+_BOTH, _ANY = (1, 2), (None,)
+
+BENCHMARKS = {
+    "kernels": Benchmark("speed.kernels", "each kernel beside its NumPy twin", _BOTH, ()),
+    "match": Benchmark("speed.match", "one query against all stations at all shifts, top-K", _BOTH, ()),
+    "learned_match": Benchmark(
+        "speed.learned_match", "dense correlation and cliques of learned re-localization", _BOTH, ()
     ),
-)
-
-OWN = {
-    "accuracy": "errors, share localised and false fixes in held-out worlds",
-    "ablation": "what each choice of the method is worth",
-    "build_map": "seconds and memory of building a map",
-    "forest": "learned re-localization beside descriptors and canopy heights",
-    "ground": "the ground filter on labelled LAS files",
-    "tracking": "errors, covariance, loss and recovery while tracked",
-    "stream": "robots over zenoh: rates, delays, attacks",
-    "peers": "each peer in each world, every answer as JSON",
-    "plots": "the plots of docs/performance.md",
-    "where": "where the time of a step goes, stage by stage",
-    "publish": "puts measured tables into docs/performance.md",
+    "frame": Benchmark(
+        "speed.frame", "a frame: transform, filter, voxels; the descriptor of a keyframe", _BOTH, ()
+    ),
+    "map_build": Benchmark("speed.map_build", "descriptors of 10,000 stations", _ANY, ()),
+    "registration": Benchmark("speed.registration", "trimmed ICP beside small_gicp", _BOTH, ()),
+    "engine": Benchmark("speed.engine", "Localizer.step on a large map: times, CPU share, memory", _ANY, ()),
+    "start": Benchmark("stream.start", "import, first run, ready to serve", _ANY, ()),
+    "peers": Benchmark(
+        "peers.peers", "other libraries on the same queries", _ANY, ("--places", "10", "--limit", "30"), 420.0
+    ),
+    "accuracy": Benchmark("accuracy.accuracy", "errors, runs localised and false fixes in held-out worlds"),
+    "ablation": Benchmark("accuracy.ablation", "what each choice of the method is worth"),
+    "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),
+    "where": Benchmark("speed.where", "where the time of a step goes, stage by stage"),
+    "plots": Benchmark("speed.plots", "the plots of docs/performance.md"),
+    "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
+    "forest": Benchmark("forest.forest", "learned re-localization beside descriptors and canopy heights"),
+    "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),
+    "forest_scale": Benchmark("forest.scale", "time of a learned query on 0.1 and 1 km2"),
+    "forest_plot": Benchmark("forest.plot", "a real plot among real airborne tiles"),
+    "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
 }
-"""Benchmarks with a command and tables of their own: ``python -m bench.NAME``."""
+"""Name, and what it is; in the suite's order."""
 
 
 def thread_settings(threads: int | None) -> dict[str, str]:
@@ -75,14 +85,87 @@ def thread_settings(threads: int | None) -> dict[str, str]:
     return dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "COVIEW_THREADS"), str(threads))
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the rows of one module (see above)."""
-    module, descriptor, *options = arguments
-    with os.fdopen(int(descriptor), "w") as out:
-        for row in importlib.import_module(module).rows(quick="--quick" in options):
-            print(json.dumps(row.to_dict(), allow_nan=False), file=out, flush=True)
-    return 0
+def counted(threads: int) -> str:
+    """Say a number of threads."""
+    return "1 thread" if threads == 1 else f"{threads} threads"
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+ROOT = Path(__file__).parents[2]
+_BEAT_S = 0.2
+
+
+def environment(threads: int | None = None) -> dict[str, str]:
+    """Return ours, with both import roots of this checkout in front and so many threads."""
+    path = os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "kernels"), os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "PYTHONPATH": path, **thread_settings(threads)}
+
+
+def run(
+    name: str,
+    words: Sequence[str],
+    threads: int | None,
+    limit_s: float = math.inf,
+    beat: Callable[[float], None] = lambda seconds: None,
+) -> Iterator[Row]:
+    """Yield the rows of ``python -m bench NAME WORDS`` as they come; ``beat`` is told the seconds so far.
+
+    A benchmark that ends in an exception, is killed, runs past its limit or yields nothing adds a row that does
+    not hold and says so; what it printed itself is shown on stderr only then.
+    """
+    conditions = (threads and counted(threads), "--quick" in words and "quick")
+    label = "".join(f", {said}" for said in conditions if said)
+    read, write = os.pipe()
+    with tempfile.TemporaryFile("w+") as said, os.fdopen(read, "rb", buffering=0) as pipe:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "bench", name, *words, "--rows-to", str(write)],
+            env=environment(threads), pass_fds=(write,), stdin=subprocess.DEVNULL, stdout=said,
+            stderr=subprocess.STDOUT, start_new_session=True,  # so that its own children end with it
+        )  # fmt: skip
+        os.close(write)
+        deadline, count = time.monotonic() + limit_s, 0
+        try:
+            for line in _lines(pipe, process, deadline, beat):
+                count += 1
+                row = Row.from_dict(json.loads(line))
+                yield replace(row, name=f"{row.name}{label}")
+            why = _verdict(process, deadline, count, limit_s)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        if why:
+            said.seek(0)
+            print("\n".join(said.read().splitlines()[-12:]), file=sys.stderr)
+            yield failed(f"{name}{label}", why)
+
+
+def _lines(
+    pipe: IO[bytes], process: subprocess.Popen[bytes], deadline: float, beat: Callable[[float], None]
+) -> Iterator[bytes]:
+    """Whole lines until the process has closed its end, or is gone (its children may hold it), or time is up."""
+    held, begin = b"", time.monotonic()
+    while (left := deadline - time.monotonic()) > 0:
+        beat(time.monotonic() - begin)
+        over = process.poll() is not None
+        if not select.select([pipe], [], [], 0.0 if over else min(_BEAT_S, left))[0]:
+            if over:
+                return
+            continue
+        chunk = os.read(pipe.fileno(), 1 << 16)
+        if not chunk:
+            return
+        *lines, held = (held + chunk).split(b"\n")
+        yield from lines
+
+
+def _verdict(process: subprocess.Popen[bytes], deadline: float, count: int, limit_s: float) -> str:
+    """Say why the benchmark has failed; empty if it has not."""
+    try:
+        code = process.wait(max(1.0, deadline - time.monotonic()))
+    except subprocess.TimeoutExpired:
+        return f"ran past its {limit_s:g} s"
+    if code < 0:
+        return f"ended by signal {signal.Signals(-code).name}"
+    if code:
+        return f"ended with exit code {code}"
+    return "" if count else "yielded no row"

@@ -1,20 +1,27 @@
-"""Simulated worlds for the benchmarks: made once, kept on disk, made again when their makers change."""
+"""Simulated worlds for the benchmarks, made once and kept, and places along a run.
+
+A place is what a robot that was just switched on there sees, at the end of a drive of eight metres. The localizer gets
+the five keyframes of that drive one after the other, other libraries the same points at once, as one gravity-aligned
+submap about the robot.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import resource
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
-from multiprocessing import get_context
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
-import coview_kernels
-import coview_stream
-from coview_stream.config import MapConfig
+import numpy as np
+import numpy.typing as npt
+
+from bench.harness.files import fingerprint, remembered_seconds
+from coview_stream import BaseMap
+from coview_stream.clouds import read_tum
+from coview_stream.config import DescriptorConfig, KeyframeConfig, MapConfig
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
+from coview_stream.localization.search.keyframes import KeyframeBuffer
+from coview_stream.localization.search.request import RequestSpec, SearchRequest
+from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings.run import Run
 from coview_stream.sim import SimulationConfig
 
 TUNED_SEEDS = frozenset(range(1, 21))
@@ -24,16 +31,16 @@ KINDS = ("town", "campus", "village", "industrial")
 LIDARS = ("vlp16", "os64", "mid360")
 UTM = (512_000.0, 5_403_000.0, 120.0)
 
-_SIMULATOR = ("coview_stream/sim",)
-_MAPPER = (*_SIMULATOR, "coview_stream/basemap", "coview_stream/clouds", "coview_stream/place/descriptor.py")
-_ROOTS = {
-    "coview_stream": Path(coview_stream.__file__).parent,
-    "coview_kernels": Path(coview_kernels.__file__).parent,
-    "bench": Path(__file__).parents[1],
-}
-_PRODUCT = ("coview_stream", "coview_kernels")
-
-Result = TypeVar("Result")
+SIMULATOR = ("coview_stream/sim",)
+MAPPER = (
+    *SIMULATOR,
+    "coview_stream/basemap",
+    "coview_stream/clouds",
+    "coview_stream/descriptors",
+    "coview_stream/localization/search",
+    "coview_kernels",
+)
+"""What makes worlds, and what makes their maps."""
 
 
 def world_name(config: SimulationConfig) -> str:
@@ -49,14 +56,13 @@ def prepare(folder: Path, config: SimulationConfig) -> dict[str, float]:
     from coview_stream.sim import simulate
 
     out = folder / world_name(config)
-    wanted = {"world": config.to_dict(), "code": fingerprint(*_SIMULATOR)}
-    seconds = remembered_seconds(
-        out / "simulated.json", wanted, lambda: simulate(out, config, overwrite=True)
-    )
-    wanted = {"map": asdict(MapConfig()), "code": fingerprint(*_MAPPER, "coview_kernels")}
+    world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
+    made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
     return {
-        "simulate_s": seconds,
-        "build_s": remembered_seconds(out / "built.json", wanted, lambda: _build(out)),
+        "simulate_s": remembered_seconds(
+            out / "simulated.json", world, lambda: simulate(out, config, overwrite=True)
+        ),
+        "build_s": remembered_seconds(out / "built.json", made, lambda: _build(out)),
     }
 
 
@@ -65,60 +71,91 @@ def map_of(folder: Path, config: SimulationConfig) -> Path:
     return folder / world_name(config) / "site.coview"
 
 
-def remembered_seconds(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> float:
-    """Seconds that ``make`` took, now or when ``file`` was written for an equal ``spec``."""
-    import time
-
-    def timed() -> dict[str, Any]:
-        begin = time.perf_counter()
-        make()
-        return {"seconds": round(time.perf_counter() - begin, 2)}
-
-    return float(remembered(file, spec, timed)["seconds"])
-
-
-def remembered(file: Path, spec: dict[str, Any], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return the result in ``file`` if it was made for an equal ``spec``; else make it and keep it there.
-
-    This is what lets an interrupted benchmark resume, yet never on the results of other code: ``spec`` holds
-    a :func:`fingerprint`.
-    """
-    spec = json.loads(json.dumps(spec))
-    if file.is_file():
-        known = json.loads(file.read_text())
-        if known["spec"] == spec:
-            return dict(known["result"])
-    result = make()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(".part")
-    part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
-    part.replace(file)
-    return dict(json.loads(json.dumps(result)))
-
-
-def fingerprint(*parts: str) -> str:
-    """Short hash of the Python sources below ``parts`` (of the whole product, if none are named)."""
-    total = hashlib.sha256()
-    for part in parts or _PRODUCT:
-        root, _, below = part.partition("/")
-        path = _ROOTS[root] / below
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            total.update(str(file.relative_to(_ROOTS[root])).encode() + file.read_bytes())
-    return total.hexdigest()[:10]
-
-
-def isolated(work: Callable[..., Result], *args: Any) -> Result:
-    """Call ``work`` in a fresh process: its memory is its own, and given back."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(work, *args).result()
-
-
-def peak_megabytes() -> float:
-    """Largest resident memory of this process so far, MB (Linux counts in KiB)."""
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
-
-
 def _build(out: Path) -> None:
-    from coview_stream import BaseMap
-
     BaseMap.build(out / "base.laz").save(out / "site.coview")
+
+
+KEYFRAMES = 5
+"""Keyframes of a query: a drive of eight metres."""
+
+WORLDS = {
+    "town": SimulationConfig("town", "vlp16", seed=2201, size=240.0, length=90.0),
+    "campus": SimulationConfig("campus", "os64", seed=2202, size=240.0, length=90.0),
+}
+"""Airborne base map (20 pulses per square metre), ground run; seeds that nothing was tuned on."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """One query with its answer.
+
+    Attributes:
+        queries: of the keyframes, oldest first, for the localizer.
+        submap: (N, 3) float32 all points of the keyframes, metres: axes of the odometry (gravity aligned), zero at
+            the robot.
+        T_map_submap: (4, 4) the truth; the map's coordinates are relative to its origin.
+    """
+
+    queries: list[SearchRequest]
+    submap: Points
+    T_map_submap: Pose
+
+    def errors(self, T_map_submap: Pose) -> tuple[float, float]:
+        """Distance (metres) and angle (degrees) of an answer from the truth."""
+        off = inverse(self.T_map_submap) @ T_map_submap
+        cosine = np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+        return float(np.linalg.norm(off[:3, 3])), float(np.degrees(np.arccos(cosine)))
+
+    @property
+    def T_odom_submap(self) -> Pose:
+        """(4, 4): where the robot is in the odometry frame, without its turn."""
+        return pose_from(np.eye(3), self.queries[-1].position)
+
+
+def world(folder: Path, scene: str) -> Path:
+    """Simulate a world and build its map unless that is done; return its directory."""
+    prepare(folder, WORLDS[scene])
+    return folder / world_name(WORLDS[scene])
+
+
+def base_map(folder: Path, scene: str) -> BaseMap:
+    """Load the map of a world."""
+    return BaseMap.load(map_of(folder, WORLDS[scene]))
+
+
+def places(folder: Path, scene: str, count: int) -> list[Place]:
+    """``count`` places, evenly along the run of a world that is there."""
+    there, site = folder / world_name(WORLDS[scene]), base_map(folder, scene)
+    run, (_, truth) = open_run(there / "run"), read_tum(there / "truth.tum")
+    settings = KeyframeConfig()
+    position = np.array([T[:3, 3] for T in run.poses])
+    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    last = driven[-1] - KEYFRAMES * settings.distance
+    starts = np.searchsorted(driven, np.linspace(0.0, last, count))
+    return [_place(run, truth, int(start), site.origin, settings, site.descriptor_config) for start in starts]
+
+
+def _place(
+    run: Run,
+    truth: npt.NDArray[np.float64],
+    start: int,
+    origin: npt.NDArray[np.float64],
+    settings: KeyframeConfig,
+    descriptor: DescriptorConfig,
+) -> Place:
+    buffer, queries = KeyframeBuffer(settings), []
+    for index in range(start, len(run)):
+        frame = run.read(index)
+        T_odom_body = frame.T_odom_body.copy()
+        T_odom_body[:3, 3] -= run.poses[start][:3, 3]
+        keyframe = buffer.add(frame.points, T_odom_body, frame.stamp)
+        if keyframe is not None:
+            queries.append(SearchRequest.of(buffer, keyframe, frame.points, RequestSpec(descriptor)))
+        if len(queries) == KEYFRAMES:
+            break
+    position = queries[-1].position
+    submap = (buffer.recent(KEYFRAMES) - position.astype(np.float32)).astype(np.float32)
+    T_map_body = truth[index].copy()
+    T_map_body[:3, 3] -= origin
+    T_submap_body = pose_from(T_odom_body[:3, :3], np.zeros(3))
+    return Place(queries, submap, T_map_body @ inverse(T_submap_body))

@@ -1,98 +1,219 @@
-"""Other libraries on the same queries, on this machine: ``python -m bench.peers [--json FILE] [--quick]``.
+"""Other libraries on the same queries, on this machine.
 
-Per world and peer: how often it is right (within 3 m and 5 degrees, and within 1 m) and vouches for it, how often
-it vouches for a wrong pose, its errors when right, the median time of a query and the time to prepare the map. The
-queries are those of a robot that was switched on eight metres ago; what each peer is given and how it is set says
-the module of its name in ``bench/peers``. Extra ``peers``; who is not installed gets a line that says so.
+Per peer: how often it is right (within 3 m and 5 degrees, and within 1 m) and vouches for it, how often it vouches for
+a wrong pose, its errors when right, the median time of a query and the time to prepare the map. The queries are those
+of a robot that was switched on eight metres ago; ``bench/peers/libraries.py`` says what each peer is given and how it
+is set. A trial ends after ``--limit`` seconds, so that a slow peer answers the first queries only; both sides' shares
+are of those. Extra ``peers``; a peer that is not installed gets a line that says so.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import importlib.util
 import math
+import pickle
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+import tempfile
+import time
+from argparse import SUPPRESS, ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from bench.harness.places import WORLDS
-from bench.harness.tables import line, number, rule
-from bench.peers.contest import contest
-from bench.peers.method import Peer
-from bench.peers.roster import PEERS
-from bench.peers.trial import Trial
-from bench.speed.engine import folder
+import numpy as np
 
-PLACES, QUICK = 20, 4
-LIMIT_S = 180.0
+from bench.harness.files import folder, isolated
+from bench.harness.rows import Row, bounded, failed, informs
+from bench.harness.suite import run
+from bench.harness.tables import number, table
+from bench.harness.worlds import WORLDS, map_of, places, world
+from bench.peers.methods import OUR_TRACKING, OURS, PEERS, Peer
+from coview_stream.errors import InputError
 
-HEAD = (
+NEAR, ALIGNED = 3.0, 5.0
+"""A pose is right within this, metres and degrees (the papers' success)."""
+
+_HEAD = (
     "peer", "world", "right < 3 m", "< 1 m", "false accepts", "found", "e_t m", "e_r deg", "query ms", "map s"
 )  # fmt: skip
-_WIDTHS = (24, 7, 11, 8, 13, 8, 6, 7, 8, 6)
 
 
-def cells(trial: Trial) -> list[str]:
-    """One line of the table; counts are of the queries that were asked."""
+@dataclass
+class Trial:
+    """What one peer did on one world's queries, or why it did nothing.
 
-    def of(count: int) -> str:
-        return f"{count} of {trial.asked}"
+    ``answers`` are of the queries in order: ``seconds``, ``vouched``, ``score``, and ``metres`` and ``degrees`` from
+    the truth, None without a pose. Queries that it did not come to are missing.
+    """
 
-    metres, degrees = (None if math.isnan(e) else e for e in trial.median_error())
-    seconds, prepare = trial.milliseconds(), trial.prepare_s
-    return [
-        trial.peer, trial.scene, of(trial.succeeded()), of(trial.succeeded(1.0)), str(trial.false_accepts()),
-        of(trial.found()), number(metres, 2), number(degrees, 2),
-        number(None if math.isnan(seconds) else seconds, 0), number(None if math.isnan(prepare) else prepare, 1),
-    ]  # fmt: skip
+    peer: str
+    scene: str
+    asked: int
+    prepare_s: float | None = None
+    answers: list[dict[str, Any]] = field(default_factory=list)
+    trouble: str = ""
+
+    def _right(self, answer: dict[str, Any], metres: float) -> bool:
+        return bool(
+            answer["vouched"] and answer["metres"] is not None
+            and answer["metres"] < metres and answer["degrees"] < ALIGNED
+        )  # fmt: skip
+
+    def succeeded(self, metres: float = NEAR) -> int:
+        """Count answers that it vouches for and that are right."""
+        return sum(self._right(a, metres) for a in self.answers)
+
+    def false_accepts(self) -> int:
+        """Count answers that it vouches for and that are wrong."""
+        return sum(bool(a["vouched"]) and not self._right(a, NEAR) for a in self.answers)
+
+    def found(self) -> int:
+        """Count right answers, vouched for or not: what a perfect check would make of it."""
+        return sum(self._right(a | {"vouched": True}, NEAR) for a in self.answers)
+
+    def median_error(self) -> tuple[float, float]:
+        """Metres and degrees, over the right answers that it vouches for; NaN without one."""
+        right = [(a["metres"], a["degrees"]) for a in self.answers if self._right(a, NEAR)]
+        metres, degrees = np.median(right, axis=0) if right else (np.nan, np.nan)
+        return float(metres), float(degrees)
+
+    def cells(self) -> list[str]:
+        """One line of the table; counts are of the queries that were asked."""
+        counts = (self.succeeded(), self.succeeded(1.0), self.false_accepts(), self.found())
+        right, near, false, found = (f"{count} of {self.asked}" for count in counts)
+        metres, degrees = self.median_error()
+        return [
+            self.peer, self.scene, right, near, false.split()[0], found, number(metres, 2), number(degrees, 2),
+            number(milliseconds([self]), 0), number(self.prepare_s, 1),
+        ]  # fmt: skip
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run all peers on all worlds."""
-    parser = argparse.ArgumentParser(prog="python -m bench.peers", description=__doc__)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every answer of every peer")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} places a world instead of {PLACES}")
-    parser.add_argument("--worlds", type=Path, default=folder(), help=f"keeps the worlds ({folder()})")
+def milliseconds(trials: Sequence[Trial]) -> float:
+    """Return the median time of all queries; NaN without one."""
+    return 1e3 * float(np.median([a["seconds"] for t in trials for a in t.answers] or [math.nan]))
+
+
+def share(trials: Sequence[Trial]) -> float:
+    """Return how many of the answered queries have a right answer that the peer vouches for, %."""
+    return 100.0 * sum(t.succeeded() for t in trials) / max(1, sum(len(t.answers) for t in trials))
+
+
+def compared(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) -> Iterator[Row]:
+    """Rows of one peer beside ``reference``, our answers to the same queries; ``ours``: it is one of ours itself."""
+    name = f"peers/{theirs[0].peer}"
+    answered = [trial for trial in theirs if trial.answers]
+    if not answered:
+        why = "; ".join(dict.fromkeys(trial.trouble or "no answer" for trial in theirs))
+        yield failed(name, why) if ours else informs(f"{name}: {why}", math.nan, "")
+        return
+    false = sum(trial.false_accepts() for trial in answered)
+    if ours:
+        yield bounded(f"{name}, false accepts", false, "", 0)
+        yield informs(f"{name}, right", share(theirs), "%")
+        yield informs(f"{name}, time of a query", milliseconds(theirs), "ms")
+        return
+    same = [
+        replace(mine, answers=mine.answers[: len(trial.answers)])  # as far as theirs came
+        for trial in answered
+        for mine in reference
+        if mine.scene == trial.scene
+    ]
+    right, their_right = share(same), share(answered)
+    ratio = right / their_right if their_right else None
+    yield Row(f"{name}, right", right, their_right, "%", ratio, "as often", right >= their_right)
+    took, their_took = milliseconds(same), milliseconds(answered)
+    yield Row(f"{name}, time of a query", took, their_took, "ms", their_took / took)
+    yield informs(f"{name}, its false accepts", false, "")
+
+
+def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: Path, limit_s: float) -> Trial:
+    """Let a peer answer, in a process of its own; what it did before a crash or the limit counts."""
+    trial = Trial(peer.name, scene, count)
+    if peer.module and importlib.util.find_spec(peer.module) is None:
+        trial.trouble = f"not installed; pip install {peer.package}"
+        return trial
+    for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file)], None, limit_s):
+        if row.holds is False:
+            trial.trouble = row.name.removeprefix("peers: ")
+        elif row.details:
+            trial.answers.append(row.details)
+        else:
+            trial.prepare_s = row.ours
+    return trial
+
+
+def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
+    """Yield the seconds of a peer's preparation, then those of each query with its answer."""
+    from coview_stream import BaseMap
+
+    peer = next(peer for peer in PEERS if peer.name == name)
+    found = pickle.loads(Path(places_file).read_bytes())
+    site = BaseMap.load(Path(map_file))
+    begin = time.perf_counter()
+    method = peer.make(site)
+    yield informs("trial/prepare", time.perf_counter() - begin, "s")
+    for k, place in enumerate(found):
+        begin = time.perf_counter()
+        answer = method.answer(place)
+        seconds = time.perf_counter() - begin
+        T = answer.T_map_submap
+        metres, degrees = (None, None) if T is None else place.errors(T)
+        said = {"seconds": seconds, "vouched": answer.vouched, "score": answer.score}
+        yield informs(f"trial/query {k}", seconds, "s", {**said, "metres": metres, "degrees": degrees})
+
+
+def contest(count: int, limit_s: float, peers: Sequence[Peer] = PEERS) -> Iterator[Trial]:
+    """Yield a trial per world and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
+    with tempfile.TemporaryDirectory() as scratch:
+        for scene, config in WORLDS.items():
+            file = Path(scratch) / scene
+            isolated(_keep, folder(), scene, count, file)
+            for peer in peers:
+                print(f"... {peer.name}, {scene}", file=sys.stderr, flush=True)
+                yield run_trial(peer, scene, count, map_of(folder(), config), file, limit_s)
+
+
+def _keep(folder: Path, scene: str, count: int, file: Path) -> None:
+    import coview_kernels
+
+    world(folder, scene)
+    file.write_bytes(pickle.dumps(places(folder, scene, count), protocol=pickle.HIGHEST_PROTOCOL))
+    coview_kernels.shutdown()
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add how many places, how long, and who."""
+    parser.add_argument("--trial", nargs=3, help=SUPPRESS)
+    parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
+    parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world and peer (180 s)")
     parser.add_argument(
-        "--only", nargs="+", metavar="PEER", help="those whose name has this in it: small_gicp kiss"
+        "--only", nargs="+", metavar="PEER", help="those whose name has this in it, beside ours: kiss"
     )
-    parser.add_argument(
-        "--limit", type=float, default=LIMIT_S, metavar="S", help=f"per world and peer ({LIMIT_S:g} s)"
-    )
-    options = parser.parse_args(arguments)
-    unknown = [word for word in options.only or () if not any(_is_named(peer, word) for peer in PEERS)]
-    if unknown:
-        print(
-            f"bench.peers: no peer {', '.join(unknown)}; there are {'; '.join(p.name for p in PEERS)}",
-            file=sys.stderr,
-        )
-        return 2
-    chosen = [peer for peer in PEERS if not options.only or any(_is_named(peer, w) for w in options.only)]
-    count, trials = QUICK if options.quick else PLACES, []
-    print(line(HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
-    for trial in contest(options.worlds, count, options.limit, chosen, tuple(WORLDS)):
-        trials.append(trial)
-        if trial.prepare_s == trial.prepare_s:  # it came that far
-            print(line(cells(trial), _WIDTHS), flush=True)
-        if trial.trouble:
-            print(f"  {trial.peer}, {trial.scene}: {trial.trouble}", flush=True)
-    if options.json:
-        text = json.dumps([_plain(trial) for trial in trials], indent=1, allow_nan=False) + "\n"
-        part = options.json.with_name(options.json.name + ".part")
-        part.write_text(text)
-        part.replace(options.json)
-    return 0
 
 
-def _is_named(peer: Peer, word: str) -> bool:
-    return word.lower() in peer.name.lower()
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Compare ours with every peer: share of right poses, time of a query, false accepts."""
+    if asked.trial:
+        yield from _asked(*asked.trial)
+        return
+    words = [word.lower() for word in asked.only or [""]]
+    chosen = [p for p in PEERS if p.name in (OURS, OUR_TRACKING) or any(w in p.name.lower() for w in words)]
+    if unknown := [word for word in words if not any(word in peer.name.lower() for peer in chosen)]:
+        raise InputError(f"no peer {', '.join(unknown)}; there are {'; '.join(p.name for p in PEERS)}")
+    trials = list(contest(4 if asked.quick else asked.places, asked.limit, chosen))
+    for peer in chosen:
+        theirs = [trial for trial in trials if trial.peer == peer.name]
+        reference = [trial for trial in trials if trial.peer == (OUR_TRACKING if peer.tracking else OURS)]
+        details = {"trials": [asdict(trial) for trial in theirs]}
+        for row in compared(theirs, reference, ours=peer.name.startswith(OURS)):
+            yield replace(row, details=details)
+            details = {}
 
 
-def _plain(trial: Trial) -> dict[str, object]:
-    values = asdict(trial)
-    return {**values, "prepare_s": None if math.isnan(trial.prepare_s) else trial.prepare_s}
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """All peers in all worlds; those that did nothing say why below."""
+    trials = [Trial(**values) for row in rows for values in row.details.get("trials", ())]
+    trials.sort(key=lambda trial: list(WORLDS).index(trial.scene))
+    troubles = [f"{trial.peer}, {trial.scene}: {trial.trouble}" for trial in trials if trial.trouble]
+    return {"worlds": "\n\n".join([table(_HEAD, [trial.cells() for trial in trials]), *troubles])}

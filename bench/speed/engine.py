@@ -12,16 +12,15 @@ nobody wins time by being wrong, the share of frames with a pose so that nobody 
 from __future__ import annotations
 
 import itertools
-import os
-import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench.harness.files import folder
 from bench.harness.rows import Row, bounded, informs, reached
 from bench.harness.worlds import map_of, prepare, world_name
 
@@ -53,16 +52,19 @@ class Drive:
     memory: dict[int, float] = field(default_factory=dict)
 
 
-def town(length: float) -> Any:
-    """Describe the simulated town."""
+def opened(length: float) -> tuple[Any, Any, Any]:
+    """Map, run and true poses (N, 4, 4) of the simulated town, with warm kernels."""
+    import coview_kernels
+    from coview_stream import BaseMap
+    from coview_stream.clouds import read_tum
+    from coview_stream.recordings.open_run import open_run
     from coview_stream.sim import SimulationConfig
 
-    return SimulationConfig("town", "os64-2048", seed=4004, size=240.0, length=length)
-
-
-def folder() -> Path:
-    """Where worlds are kept between calls; environment ``COVIEW_BENCH`` names another place."""
-    return Path(os.environ.get("COVIEW_BENCH") or Path(tempfile.gettempdir()) / "coview-bench")
+    config = SimulationConfig("town", "os64-2048", seed=4004, size=240.0, length=length)
+    prepare(folder(), config)
+    world = folder() / world_name(config)
+    coview_kernels.warm_up()
+    return BaseMap.load(map_of(folder(), config)), open_run(world / "run"), read_tum(world / "truth.tum")[1]
 
 
 def frames_of(run: Any, count: int) -> Iterator[tuple[int, int]]:
@@ -78,7 +80,7 @@ def drive(base_map: Any, run: Any, truth: np.ndarray, count: int) -> Drive:
     import psutil
 
     from coview_stream import Localizer
-    from coview_stream.fix import State
+    from coview_stream.localization.state import State
 
     rng = np.random.default_rng(0)
     frames = [run.read(k) for k in range(len(run))]
@@ -101,19 +103,11 @@ def drive(base_map: Any, run: Any, truth: np.ndarray, count: int) -> Drive:
     return out
 
 
-def rows(quick: bool = False) -> Iterator[Row]:
+def rows(asked: Namespace) -> Iterator[Row]:
     """Drive, and judge the times."""
-    import coview_kernels
-    from coview_stream import BaseMap
-    from coview_stream.clouds import open_run, read_tum
-
-    config = town(12.0 if quick else 36.0)
-    prepare(folder(), config)
-    world = folder() / world_name(config)
-    base_map, run = BaseMap.load(map_of(folder(), config)), open_run(world / "run")
-    coview_kernels.warm_up()
-    count = 600 if quick else 10_000
-    done = drive(base_map, run, read_tum(world / "truth.tum")[1], count)
+    base_map, run, truth = opened(12.0 if asked.quick else 36.0)
+    count = 600 if asked.quick else 10_000
+    done = drive(base_map, run, truth, count)
     name = f"engine/{len(base_map)} stations, {POINTS} points"
     wall, tracking = np.array(done.wall) * 1e3, np.array(done.tracking)
     p50, p99 = np.percentile(wall, [50, 99])
@@ -132,7 +126,7 @@ def rows(quick: bool = False) -> Iterator[Row]:
         f"{name}: error, rms", float(np.sqrt((known**2).mean())) if len(known) else np.nan, "m", ERROR
     )
     yield reached(f"{name}: frames with a pose", 100.0 * len(known) / count, "%", POSED)
-    if not quick:
+    if not asked.quick:
         settled = min((tick for tick in done.memory if tick >= _SETTLED), default=0)
         growth = max(done.memory[t] for t in done.memory if t >= settled) - done.memory[settled]
         yield bounded(f"engine/memory growth, frames {settled} to {count}", growth, "MB", GROWTH)

@@ -21,7 +21,8 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from argparse import Namespace
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,9 +30,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.harness.places import base_map, places, world
+from bench.harness.files import folder
 from bench.harness.rows import REPEAT, Row, against, bounded, informs, medians
-from bench.speed.engine import folder
+from bench.harness.worlds import base_map, places, world
 
 STATIONS, MANY = 9_527, 100_000
 BEST = 10
@@ -40,7 +41,6 @@ LOOP = 150.0  # times as fast as the plain C++ loop, one thread each
 BUILD_MS = 300.0
 
 F16, F32 = npt.NDArray[np.float16], npt.NDArray[np.float32]
-Side = Callable[[], Any]
 
 
 class Spectral:
@@ -95,11 +95,11 @@ def _best(correlation: F32, k: int) -> tuple[npt.NDArray[Any], ...]:
     return chosen, correlation[:, chosen].argmax(axis=0), 1.0 - top[chosen]
 
 
-def rows(quick: bool = False) -> Iterator[Row]:
-    """Rows of the suite."""
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Top-K beside the best of NumPy, then sizes and limits."""
     import coview_kernels as kernels
 
-    repeat = 5 if quick else REPEAT
+    repeat = 5 if asked.quick else REPEAT
     known, queries = town()
     bandwidth = gigabytes_per_second()
     yield informs("match/memory bandwidth, a large array summed by one thread", bandwidth, "GB/s")
@@ -203,7 +203,7 @@ def plain_loop(stations: F16, query: F32) -> tuple[float, int, int, float] | Non
 
 def town() -> tuple[dict[str, F16], dict[str, F32]]:
     """Descriptors (M, R, S) and a keyframe's (R, S), by channel, of a simulated town."""
-    from coview_stream.place.descriptor import describe, ground_below
+    from coview_stream.descriptors.coview import describe, ground_below
 
     world(folder(), "town")
     site = base_map(folder(), "town")

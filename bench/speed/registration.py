@@ -1,4 +1,4 @@
-"""Registration beside small_gicp: ``python -m bench registration``, or ``python -m bench.registration SITE RUN TRUTH``.
+"""Registration beside small_gicp: of a simulated town, or ``python -m bench registration SITE RUN TRUTH``.
 
 Places along a drive with a simulated 64-beam lidar in an airborne town map (or a map, run and truth of one's own).
 Every way gets the same 10,000 points of the last five metres' frames (thinned to 0.25 m within 50 m), the same tile
@@ -24,10 +24,9 @@ The time is taken with the threads that COVIEW_THREADS grants.
 
 from __future__ import annotations
 
-import argparse
-import math
 import time
-from collections.abc import Callable, Iterator
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,13 +34,28 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.harness.files import folder
 from bench.harness.rows import Row, against, informs
+from bench.harness.tables import number, table
+from bench.harness.worlds import map_of, prepare, world_name
 from coview_kernels import nearest, runtime, transform_unique, warm_up
-from coview_stream.basemap.basemap import BaseMap
+from coview_stream import BaseMap
+from coview_stream.clouds import read_tum
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry import Pose, inverse, lengths, pose_from, rot_z, rotation_angle, transform
-from coview_stream.pose.registration import LocalMap, LocalMaps, Source, register
-from coview_stream.pose.source import height_above_lowest
+from coview_stream.geometry.transforms import (
+    Pose,
+    inverse,
+    norms,
+    pose_from,
+    rot_z,
+    rotation_angle,
+    transform,
+)
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, RegistrationCloud
+from coview_stream.localization.registration.prepare_scan import height_above_lowest
+from coview_stream.localization.registration.register import register
+from coview_stream.recordings.open_run import open_run
+from coview_stream.sim import SimulationConfig
 
 POINTS, VOXEL, REACH, WINDOW = 10_000, 0.25, 50.0, 5.0
 LEAST = 1.5
@@ -50,13 +64,13 @@ STARTS = {"tracking": (0.05, np.radians(0.3)), "search": (0.5, np.radians(3.0))}
 COARSE = {"tracking": (0.8,), "search": (1.5, 0.8)}
 FINE, NTH = (0.4,), 5
 WAYS = ("GICP", "VGICP")
-_CLEAR = 0.5  # metres above the ground, as in coview_stream.pose.source
+_CLEAR = 0.5  # metres above the ground, as the engine's registration has it
 
 
 class Place(NamedTuple):
     """A scan (N, 3) in the odometry frame, where the robot is in it, the truth and the map around it."""
 
-    source: Source
+    source: RegistrationCloud
     position: npt.NDArray[np.float64]
     truth: Pose
     target: LocalMap
@@ -71,38 +85,42 @@ class Trials(NamedTuple):
 
     def rms(self) -> npt.NDArray[np.float64]:
         """Root mean squares (2,) of both errors, metres and degrees."""
-        return np.array([math.sqrt(float(np.mean(v**2))) for v in (self.metres, self.degrees)])
+        return np.asarray(np.sqrt(np.mean(np.square(self[1:]), axis=1)))
 
     def no_worse_than(self, other: Trials) -> bool:
         """Whether both errors' root mean squares equal the other's within 5 % or are smaller."""
         return bool((self.rms() <= EQUAL * other.rms()).all())
 
-    def __str__(self) -> str:
-        right = float(((self.metres < 0.1) & (self.degrees < 0.5)).mean())
-        (a, b), (e, f) = (np.percentile(v, [50, 95]) for v in (self.metres * 100, self.ms))
-        c, d = np.percentile(self.degrees, [50, 95])
-        metres, degrees = self.rms()
-        return f"{100 * metres:7.2f}{a:6.1f}{b:6.1f} {degrees:8.3f}{c:7.3f}{d:7.3f} {100 * right:8.0f}{e:8.1f}{f:7.1f}"
+    def details(self) -> dict[str, list[float]]:
+        """Root mean square, median and 95th percentile of each, and the share that is right, %."""
+        right = 100 * float(((self.metres < 0.1) & (self.degrees < 0.5)).mean())
+        metres, degrees = self.rms().tolist()
+        cm, deg, ms = (
+            np.percentile(v, [50, 95]).tolist() for v in (self.metres * 100, self.degrees, self.ms)
+        )
+        return {"cm": [100 * metres, *cm], "deg": [degrees, *deg], "right": [right], "ms": ms}
 
 
-def rows(quick: bool = False) -> Iterator[Row]:
+def options(parser: ArgumentParser) -> None:
+    """Add data of one's own."""
+    parser.add_argument("data", type=Path, nargs="*", help="map, run and truth: SITE.coview RUN TRUTH.tum")
+    parser.add_argument("--places", type=int, default=31, help="along the run (31)")
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
     """Compare with each of small_gicp's ways, from each kind of start."""
-    from bench.harness.worlds import map_of, prepare, world_name
-    from bench.speed.engine import folder
-    from coview_stream.sim import SimulationConfig
-
-    config = SimulationConfig("town", "os64", seed=4005, size=200.0, length=60.0)
-    prepare(folder(), config)
-    world = folder() / world_name(config)
-    found = list(places(map_of(folder(), config), world / "run", world / "truth.tum", 11 if quick else 31))
-    yield from compare(found)
+    if asked.data:
+        site, run, truth = asked.data
+    else:
+        config = SimulationConfig("town", "os64", seed=4005, size=200.0, length=60.0)
+        prepare(folder(), config)
+        world = folder() / world_name(config)
+        site, run, truth = map_of(folder(), config), world / "run", world / "truth.tum"
+    yield from compare(list(places(site, run, truth, 11 if asked.quick else asked.places)))
 
 
 def places(site: Path, run: Path, truth: Path, count: int) -> Iterator[Place]:
     """Spread ``count`` places over a run."""
-    from coview_stream.clouds.runs import open_run
-    from coview_stream.clouds.trajectory import read_tum
-
     base_map = BaseMap.load(site)
     maps = LocalMaps(base_map, 60.0, crops=1000)
     stamps, poses = read_tum(truth)
@@ -110,11 +128,11 @@ def places(site: Path, run: Path, truth: Path, count: int) -> Iterator[Place]:
     wanted = set(np.linspace(0, len(frames) - 1, count + 1).astype(int)[1:].tolist())
     recent: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float32]]] = []
     anchor = frames[0].T_odom_body[:3, 3]  # odometry may begin anywhere; float32 should not
-    for number, frame in enumerate(frames):
+    for index, frame in enumerate(frames):
         T = pose_from(frame.T_odom_body[:3, :3], frame.T_odom_body[:3, 3] - anchor)
         recent.append((T[:3, 3], transform(T, frame.points)))
         recent = [r for r in recent if np.linalg.norm(r[0] - T[:3, 3]) < WINDOW]
-        if number not in wanted:
+        if index not in wanted:
             continue
         k = int(np.argmin(np.abs(stamps - frame.stamp)))
         T_map_body = pose_from(poses[k][:3, :3], poses[k][:3, 3] - base_map.origin)
@@ -124,12 +142,12 @@ def places(site: Path, run: Path, truth: Path, count: int) -> Iterator[Place]:
             yield Place(source, T[:3, 3], T_map_body @ inverse(T), target)
 
 
-def _source(points: npt.NDArray[np.float32], position: npt.NDArray[np.float64]) -> Source:
-    near = points.compress(lengths(points, position.astype(np.float32)) < REACH, axis=0)
+def _source(points: npt.NDArray[np.float32], position: npt.NDArray[np.float64]) -> RegistrationCloud:
+    near = points.compress(norms(points, position.astype(np.float32)) < REACH, axis=0)
     thin, _ = transform_unique(near, np.eye(4), VOXEL)
     height = height_above_lowest(thin)
     some = np.sort(np.random.default_rng(1).permutation(len(thin))[:POINTS])
-    return Source(thin[some], height[some] > _CLEAR, height[some])
+    return RegistrationCloud(thin[some], height[some] > _CLEAR, height[some])
 
 
 def start(place: Place, kind: str, seed: int) -> Pose:
@@ -152,34 +170,41 @@ def error(place: Place, T: Pose | None) -> tuple[float, float]:
 
 
 def compare(found: list[Place]) -> Iterator[Row]:
-    """Print the table of errors and times, and yield the rows."""
+    """Yield the rows of all places."""
     warm_up()
     threads = runtime.workers()
     peers = [SmallGicp(place.target, threads) for place in {id(p.target): p for p in found}.values()]
-    by_target = {id(peer.target): peer for peer in peers}
     for peer in peers:
         nearest(peer.target.grid, peer.target.points[:1], 1.0)  # sorts the tile
-    print(f"{len(found)} places, {POINTS} points, {threads} threads; right: below 0.1 m and 0.5 degrees")
-    heads = f"{'cm rms':>7}{'p50':>6}{'p95':>6} {'deg rms':>8}{'p50':>7}{'p95':>7}"
-    print(f"{'':28}{heads} {'right %':>8}{'ms p50':>8}{'p95':>7}")
     for kind in STARTS:
-        results = _trials(found, kind, _sides(kind, by_target))
-        for name, trials in results.items():
-            print(f"{kind + ', ' + name:28}{trials}")
+        results = _trials(found, kind, _sides(kind, {id(peer.target): peer for peer in peers}))
         ours = results["ours"]
         for way in WAYS:
             for name, least in ((way, LEAST), (f"{way}, align only", None)):
-                theirs = results[name]
-                took, took_them = float(np.median(ours.ms)), float(np.median(theirs.ms))
+                took, took_them = (float(np.median(trials.ms)) for trials in (ours, results[name]))
                 row = against(f"registration/{kind}: {name}", took, took_them, "ms", least)
                 if least is not None:
-                    holds = bool(row.holds) and ours.no_worse_than(theirs)
+                    holds = bool(row.holds) and ours.no_worse_than(results[name])
                     row = replace(row, target=f">= {LEAST:g} at equal error", holds=holds)
                 yield row
         for name in ("ours", *WAYS):
             metres, degrees = results[name].rms()
-            yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm")
+            about = {"way": f"{kind}, {name}", "trials": results[name].details()}
+            yield informs(
+                f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm", about
+            )
             yield informs(f"registration/{kind}: {name}, rms of the rotation's error", degrees, "deg")
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Errors and times of all ways: root mean square, median, 95th percentile."""
+    head = ("way", "cm rms", "p50", "p95", "deg rms", "p50", "p95", "right %", "ms p50", "p95")
+    lines = []
+    for each in (row.details for row in rows if row.details):
+        cm, deg, right, ms = (each["trials"][key] for key in ("cm", "deg", "right", "ms"))
+        texts = [(cm, 2), (deg, 3), (right, 0), (ms, 1)]
+        lines.append([each["way"], *(number(value, digits) for part, digits in texts for value in part)])
+    return {"errors": table(head, lines)} if lines else {}
 
 
 Way = Callable[[Place, Pose], tuple[float, Pose | None]]
@@ -187,22 +212,19 @@ Way = Callable[[Place, Pose], tuple[float, Pose | None]]
 
 def _sides(kind: str, peers: dict[int, SmallGicp]) -> dict[str, Way]:
     def ours(place: Place, begin: Pose) -> tuple[float, Pose | None]:
-        clock = time.perf_counter()
-        config, about = RegistrationConfig(), place.position
-        scales = COARSE[kind] + FINE
-        answer = register(place.source, begin, place.target, config, scales, centre=about, thin=NTH)
+        clock, config = time.perf_counter(), RegistrationConfig()
+        about, target = place.position, place.target
+        answer = register(place.source.every(NTH), begin, target, config, COARSE[kind], centre=about)
+        if answer is not None:
+            answer = register(place.source, answer.T_map_source, target, config, FINE, centre=about)
         return time.perf_counter() - clock, None if answer is None else answer.T_map_source
 
     def theirs(way: str, whole: bool) -> Way:
-        def go(place: Place, begin: Pose) -> tuple[float, Pose | None]:
-            return peers[id(place.target)].align(way, place.source.points, begin, whole)
-
-        return go
+        return lambda place, begin: peers[id(place.target)].align(way, place.source.points, begin, whole)
 
     sides: dict[str, Way] = {"ours": ours}
     for way in WAYS:
-        sides[way] = theirs(way, True)
-        sides[f"{way}, align only"] = theirs(way, False)
+        sides |= {way: theirs(way, True), f"{way}, align only": theirs(way, False)}
     return sides
 
 
@@ -227,12 +249,10 @@ class SmallGicp:
     def __init__(self, target: LocalMap, threads: int) -> None:
         import small_gicp
 
-        self.target = target
+        self.target, self._threads = target, threads
         self._library: Any = small_gicp
-        self._threads = threads
-        points = target.points.astype(np.float64)
         self._map, self._tree = small_gicp.preprocess_points(
-            points, downsampling_resolution=0.05, num_threads=threads
+            target.points.astype(np.float64), downsampling_resolution=0.05, num_threads=threads
         )
         self._voxels = small_gicp.GaussianVoxelMap(1.0)
         self._voxels.insert(self._map)
@@ -251,25 +271,7 @@ class SmallGicp:
         within = 2.0 if way == "VGICP" else 1.0
         about = {"num_threads": self._threads, "max_correspondence_distance": within}
         if way == "VGICP":
-            answer = self._library.align(self._voxels, source, begin, **about)
+            answer = self._library.align(self._voxels, source, begin, about)
         else:
-            answer = self._library.align(self._map, source, self._tree, begin, **about)
+            answer = self._library.align(self._map, source, self._tree, begin, about)
         return time.perf_counter() - clock, np.array(answer.T_target_source)
-
-
-def main() -> None:
-    """Compare on data of one's own."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("site", type=Path, metavar="SITE.coview")
-    parser.add_argument("run", type=Path, metavar="RUN")
-    parser.add_argument("truth", type=Path, metavar="TRUTH.tum")
-    parser.add_argument("--places", type=int, default=31)
-    chosen = parser.parse_args()
-    for row in compare(list(places(chosen.site, chosen.run, chosen.truth, chosen.places))):
-        print(row)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,16 +1,15 @@
-"""Where the time of a step goes while tracking: ``python -m bench.where [--frames N]``.
+"""Where the time of a step goes while tracking, stage by stage.
 
-The drive of ``bench engine`` with a clock around each stage, median and 95th percentile of wall time over the frames
-that register (about one in nine) and over the others, which take their frame in and answer by odometry. Stages that
-are part of another are indented below it. The clocks cost some microseconds each.
+The drive of ``python -m bench engine`` with a clock around each stage, median and 95th percentile of wall time over the
+frames that register (about one in nine) and over the others, which take their frame in and answer by odometry. Stages
+that are part of another are indented below it. The clocks cost some microseconds each.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
-import sys
 import time
+from argparse import ArgumentParser, Namespace
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,21 +17,23 @@ from typing import Any
 
 import numpy as np
 
+from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
-from bench.harness.worlds import map_of, prepare, world_name
-from bench.speed.engine import drive, folder, town
+from bench.speed.engine import drive, opened
 
 FRAMES = 1500
 _SETTLED = 300  # frames before the numbers count
-_HEAD = ("stage", "ms, median", "ms, 95 %")
 
 Times = dict[str, float]
 
 
 def stages() -> list[tuple[str, Any, str]]:
     """Return what is timed: name in the table, and where the function is looked up."""
-    from coview_stream import localizer, tracking
-    from coview_stream.pose import attempt, registration, verification
+    from coview_stream.localization import localizer
+    from coview_stream.localization.registration import register as registration
+    from coview_stream.localization.registration import verification
+    from coview_stream.localization.tracking import map_matching as attempt
+    from coview_stream.localization.tracking import tracker as tracking
 
     return [
         ("take the frame in, check it", localizer.Localizer, "_checked"),
@@ -50,14 +51,13 @@ def stages() -> list[tuple[str, Any, str]]:
 
 @contextmanager
 def clocks(known: Sequence[tuple[str, Any, str]]) -> Iterator[Times]:
-    """Add up the seconds that each stage takes, until the block ends; clear the dictionary whenever you like."""
+    """Add up the seconds that each stage takes, until the block ends; the dictionary may be cleared at any time."""
     spent: Times = defaultdict(float)
     before = [vars(owner)[name] for _, owner, name in known]
     try:
         for label, owner, name in known:
-            bound = getattr(owner, name)
+            timed = _timed(getattr(owner, name), label, spent)
             fixed = isinstance(vars(owner)[name], classmethod)
-            timed = _timed(bound, label, spent)
             setattr(owner, name, staticmethod(timed) if fixed else timed)
         yield spent
     finally:
@@ -79,60 +79,51 @@ def _timed(stage: Callable[..., Any], label: str, spent: Times) -> Callable[...,
 
 def measured(frames: int) -> list[Times]:
     """Seconds of every stage and of the ``step``, frame by frame."""
-    import coview_kernels
-    from coview_stream import BaseMap, Localizer
-    from coview_stream.clouds import open_run, read_tum
+    from coview_stream import Localizer
 
-    config = town(36.0)
-    prepare(folder(), config)
-    world = folder() / world_name(config)
-    base_map = BaseMap.load(map_of(folder(), config))
-    coview_kernels.warm_up()
+    base_map, run, truth = opened(36.0)
     out: list[Times] = []
     with clocks([*stages(), ("step", Localizer, "step")]) as spent:
-        whole = Localizer.step
+        timed = Localizer.step
 
         def noted(*arguments: Any) -> Any:
             spent.clear()
-            fix = whole(*arguments)
+            fix = timed(*arguments)
             out.append(dict(spent))
             return fix
 
         Localizer.step = noted  # type: ignore[method-assign]  # clocks put the original back
-        drive(base_map, open_run(world / "run"), read_tum(world / "truth.tum")[1], frames)
+        drive(base_map, run, truth, frames)
     return out[_SETTLED:]
 
 
-def shown(frames: Sequence[Times]) -> str:
-    """Lay out the stages of some frames, in order."""
-    rows = []
-    for label in ["step", *(label for label, _, _ in stages())]:
-        values = 1e3 * np.array([frame.get(label, 0.0) for frame in frames])
-        if values.any():
-            rows.append(
-                [label.replace("  ", "· "), *(number(float(np.percentile(values, q)), 2) for q in (50, 95))]
-            )
-    return table(_HEAD, rows)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Drive and print both tables."""
-    parser = argparse.ArgumentParser(prog="python -m bench.where", description=__doc__)
+def options(parser: ArgumentParser) -> None:
+    """Add how many frames."""
     parser.add_argument(
         "--frames", type=int, default=FRAMES, help=f"({FRAMES}; the first {_SETTLED} do not count)"
     )
-    options = parser.parse_args(arguments)
-    if options.frames <= _SETTLED:
-        print(f"bench.where: --frames {options.frames}: {_SETTLED} go by before it counts", file=sys.stderr)
-        return 2
-    frames = measured(options.frames)
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Medians of the stages, of both kinds of frames."""
+    frames = measured(600 if asked.quick else max(asked.frames, _SETTLED + 1))
     for title, chosen in (
-        ("frames that register", [f for f in frames if "update" in f]),
-        ("all others", [f for f in frames if "update" not in f]),
+        ("frames that register", [each for each in frames if "update" in each]),
+        ("all others", [each for each in frames if "update" not in each]),
     ):
-        print(f"\n{title}: {len(chosen)} of {len(frames)}\n\n{shown(chosen) if chosen else 'none'}")
-    return 0
+        for label in ["step", *(label for label, _, _ in stages())]:
+            values = 1e3 * np.array([frame.get(label, 0.0) for frame in chosen])
+            if values.any():
+                p50, p95 = np.percentile(values, [50, 95])
+                about = {"part": f"{title}: {len(chosen)} of {len(frames)}", "stage": label, "p95": p95}
+                yield informs(f"where/{title}, {label.strip()}", p50, "ms", about)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Both kinds of frames, stage by stage, in one text."""
+    parts: dict[str, list[list[str]]] = defaultdict(list)
+    for row in rows:
+        stage = row.details["stage"].replace("  ", "· ")
+        parts[row.details["part"]].append([stage, number(row.ours, 2), number(row.details["p95"], 2)])
+    head = ("stage", "ms, median", "ms, 95 %")
+    return {"": "\n\n".join(f"{part}\n\n{table(head, cells)}" for part, cells in parts.items())}

@@ -21,7 +21,7 @@ import numpy as np
 
 from bench.stream.drive import Drive, RobotPlan, schedule, stamp_of
 from bench.stream.scores import Floats, Posed, Told
-from bench.stream.wire import CLOUDS, ODOMETRY, read_pose
+from bench.stream.wire import CLOUDS, ODOMETRY, read_pose, rubbish
 
 METRONOME = "bench/metronome"
 TICK = 0.1
@@ -157,6 +157,23 @@ def send(
     conn.send(
         Sent({robot: rows[np.argsort(rows[:, 0])] for robot, rows in tables.items()}, done, lag, longest)
     )
+
+
+def vandalise(
+    conn: Connection, endpoint: str, robots: Sequence[str], rate: float, base: str = "coview"
+) -> None:
+    """Send rubbish to the robots' inputs, ``rate`` messages a second, until told to stop; sends back how many."""
+    source = rubbish(7)
+    keys = [f"{base}/{robot}/in/{name}" for robot in robots for name in ("cloud", "odom")]
+    with open_session("client", connect=[endpoint]) as session:
+        conn.send("ready")
+        due, count = float(conn.recv()), 0
+        while not conn.poll(max(0.0, due - time.monotonic())):
+            payload, encoding, attachment = next(source)
+            session.put(keys[count % len(keys)], payload, encoding=encoding or None, attachment=attachment)
+            count += 1
+            due = max(due + 1.0 / rate, time.monotonic() - 0.5)
+    conn.send(count)
 
 
 @dataclass

@@ -16,11 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.stream.scores import Floats
-from bench.stream.wire import Points
-from coview_stream.clouds import open_run, read_tum
-
-EPOCH_NS = 1_700_000_000 * 10**9
-"""Where the robots' sensor clocks begin: no clock of the machine, as a robot's is none of the node's."""
+from bench.stream.wire import EPOCH_NS, Points
+from coview_stream.clouds import read_tum
+from coview_stream.recordings.open_run import open_run
 
 RESTARTED = 1000.0
 """Seconds by which a robot's clock jumps back in phase ``restart``."""

@@ -11,15 +11,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from bench.harness.files import folder
 from bench.harness.rows import Row, bounded
+from bench.harness.suite import environment
 from bench.harness.worlds import map_of, prepare
-from bench.speed.engine import folder
-from bench.stream.node import environment
 
 IMPORT, READY, FIRST = 0.25, 2.0, 10.0  # seconds
 _REPEAT, _SERVES = 31, 7
@@ -55,11 +56,11 @@ def served(map_path: Path, cache: Path | None = None) -> float:
         node.communicate(timeout=_PATIENCE)
 
 
-def rows(quick: bool = False) -> Iterator[Row]:
+def rows(asked: Namespace) -> Iterator[Row]:
     """Time each start a few times."""
     from coview_stream.sim import SimulationConfig
 
-    repeat, serves = (5, 1) if quick else (_REPEAT, _SERVES)
+    repeat, serves = (5, 1) if asked.quick else (_REPEAT, _SERVES)
     yield bounded(
         "start/import coview_stream", float(np.median([imported() for _ in range(repeat)])), "s", IMPORT
     )

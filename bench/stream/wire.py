@@ -1,11 +1,15 @@
-"""Messages as a stranger would write them: from the documented contract only, with none of the product's codecs."""
+"""Messages as a stranger would write them: from the documented contract only, with none of the product's codecs.
+
+And random bytes and almost valid messages, for every input key of a robot.
+"""
 
 from __future__ import annotations
 
 import functools
 import json
+import random
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -143,3 +147,51 @@ def _matrix(position: list[float], orientation: list[float]) -> Floats:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(orientation).as_matrix(), position
     return T
+
+
+EPOCH_NS = 1_700_000_000 * 10**9
+"""Where the robots' sensor clocks begin: no clock of the machine, as a robot's is none of the node's."""
+
+_LARGE = 1 << 20
+_RUBBISH = (
+    b"", b"{}", b"null", b"[" * 5000, b'{"stamp_ns": 1e400}', b"\xff\xfe",
+    b'{"stamp_ns": 1, "position": [0, 0], "orientation": [0, 0, 0, 1]}',
+    b'{"stamp_ns": 1, "position": [NaN, 0, 0], "orientation": [0, 0, 0, 1]}',
+    b'{"stamp_ns": 1, "position": [0, 0, 0], "orientation": [0, 0, 0, 0]}',
+    b'{"stamp_ns": "x", "position": "y", "orientation": null}',
+    b'{"stamp_ns": ' + b"9" * 5000 + b', "position": [0,0,0], "orientation": [0,0,0,1]}',
+    b"\0\1\0\0" + b"\xff" * 400, b"\0\0\0\0" + b"\0" * 60,
+)  # fmt: skip
+_STRANGE = (
+    "",
+    "text/plain",
+    "application/x-unheard-of",
+    "application/cdr;some_msgs/msg/Other",
+    "a;b;c;d",
+    "image/png",
+)
+
+
+def rubbish(seed: int) -> Iterator[Message]:
+    """Endless: random bytes, fixed nasties, and valid messages with flipped bytes or a missing end."""
+    rng = random.Random(seed)
+    points = np.zeros((300, 3), np.float32)
+    valid = [make(points, EPOCH_NS) for make in CLOUDS.values()]
+    valid += [make(np.eye(4), EPOCH_NS) for make in ODOMETRY.values()]
+    while True:
+        draw = rng.random()
+        encoding = rng.choice((*ENCODINGS, *_STRANGE, f"x{rng.randrange(10**6)}/y"))
+        attachment = rng.choice((None, b"", rng.randbytes(8), rng.randbytes(33), struct.pack("<q", EPOCH_NS)))
+        if draw < 0.5:
+            yield rng.randbytes(rng.randrange(5001)), encoding, attachment
+        elif draw < 0.52:
+            yield rng.randbytes(_LARGE), encoding, attachment
+        elif draw < 0.65:
+            yield rng.choice(_RUBBISH), encoding, attachment
+        else:
+            payload, true, beside = rng.choice(valid)
+            broken = bytearray(payload[: rng.randrange(len(payload))] if rng.random() < 0.5 else payload)
+            for _ in range(rng.randrange(1, 9)):
+                if broken:
+                    broken[rng.randrange(len(broken))] = rng.randrange(256)
+            yield bytes(broken), true, rng.choice((beside, beside, None, rng.randbytes(8)))

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.tracking.worlds import in_gap
-from coview_stream.geometry import Points, Pose, inverse, pose_from, rot_z, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
 from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 
@@ -182,7 +182,7 @@ def scaled(drive: Drive, factor: float) -> Drive:
 
 
 def over_the_gap(drive: Drive) -> Drive:
-    """Mark where the drive leads through the gap of the map (see :func:`bench.tracking_worlds.in_gap`)."""
+    """Mark where the drive leads through the gap of the map (see :func:`bench.tracking.worlds.in_gap`)."""
     inside = np.r_[False, in_gap(drive.truth, drive.truth[:, :3, 3]), False].astype(int)
     begins, ends = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1)
     events = [

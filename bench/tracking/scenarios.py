@@ -1,4 +1,4 @@
-"""What ``bench.tracking`` measures: which worlds are driven through, and what befalls the robot there.
+"""What ``python -m bench tracking`` measures: which worlds are driven through, and what befalls the robot there.
 
 Seeds 5001 to 5010 are for reporting only: nobody tunes on them. Calibrate on others: ``worlds(5100)``.
 """
@@ -113,7 +113,7 @@ def worlds(seeds: int = SEEDS) -> tuple[World, ...]:
 
 
 def scenarios(seeds: int = SEEDS) -> tuple[Scenario, ...]:
-    """All that ``python -m bench.tracking`` measures, in the worlds of the seeds that follow ``seeds``."""
+    """All that ``python -m bench tracking`` measures, in the worlds of the seeds that follow ``seeds``."""
     every = worlds(seeds)
     town, campus, forest = every[0], every[5], every[7]
     return (

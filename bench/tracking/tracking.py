@@ -1,36 +1,35 @@
-"""How tracking holds, loses and recovers: ``python -m bench.tracking [NAME...] [--json F] [--plot F] [--seeds N]``.
+"""How tracking holds, loses and recovers.
 
 Ten plain drives of 300 to 600 m in towns, on campuses and in sparse forests, with odometry that drifts by 0.5 to 5 %;
 and drives on which the robot is kidnapped or carried, crosses 100 m without a map, is covered for half a minute, meets
 a changed world (30 %), or has an odometry that jumps, starts again or is 5 % out of scale
-(:mod:`bench.tracking_scenarios`). The truth only scores. NAME picks the scenarios whose names contain it; worlds, maps
-and answers stay in ``--worlds``, so that a run can be made in portions and an unchanged engine is not asked twice.
+(:mod:`bench.tracking.scenarios`). The truth only scores. NAME picks the scenarios whose names contain it; worlds, maps
+and answers stay in ``--work``, so that a run can be made in portions and an unchanged engine is not asked twice.
 
 Coverage is the share of the poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by
-itself, of several by their squared Mahalanobis distance. Exit code 1 if a target is missed.
+itself, of several by their squared Mahalanobis distance.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
+from argparse import ArgumentParser, Namespace
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.harness.tables import line, number, rule, table
-from bench.harness.trajectory_scores import errors, score
-from bench.harness.worlds import fingerprint
-from bench.tracking.coverage import WITHIN, coverage_table, honest, pooled, shares, spread
-from bench.tracking.drives import drift_share
-from bench.tracking.plot import draw
-from bench.tracking.run import told_of
+from bench.harness.files import code_line, fingerprint, folder, remembered
+from bench.harness.rows import Row, informs, judged
+from bench.harness.tables import number, table
+from bench.harness.trajectory_scores import Told, errors, score
+from bench.tracking.coverage import WITHIN, coverage_table, draw, honest, pooled, shares, spread
+from bench.tracking.drives import Drive, drift_share, seen
 from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
+from bench.tracking.worlds import Recorded, map_of, open_world
+from coview_stream.errors import InputError
 
 MOST_METRES, MOST_DEGREES, MOST_RECOVERY = 0.12, 0.35, 20.0
 """The targets: root mean squares over the plain drives, and metres driven after an event."""
@@ -38,166 +37,177 @@ MOST_METRES, MOST_DEGREES, MOST_RECOVERY = 0.12, 0.35, 20.0
 _JUDGED = ("x", "y", "z", "yaw", "x,y", "x,y,z")
 """What the coverage target is about; roll, pitch and the whole pose are told."""
 
-Row = dict[str, Any]
-
 _HEAD = (
     "scenario", "drift %", "driven m", "right %", "first m", "rmse m", "max m", "rmse deg", "max deg", "false",
     "false s", "> 0.5 m", "lost", "back m", "back s", "p50 ms", "p99 ms",
 )  # fmt: skip
-_WIDTHS = (31, 7, 8, 7, 7, 6, 6, 8, 7, 5, 7, 7, 4, 6, 6, 6, 6)
+
+Figures = dict[str, Any]
 
 
-def measure(folder: Path, scenario: Scenario) -> tuple[Row, Any]:
+def options(parser: ArgumentParser) -> None:
+    """Add which scenarios, and the picture."""
+    parser.add_argument("names", nargs="*", metavar="NAME", help="part of a scenario's name (all)")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the coverage")
+    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"ten worlds after N ({SEEDS})")
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield a row per drive with all its figures, then the targets."""
+    every = QUICK if asked.quick else scenarios(asked.seeds)
+    chosen = [each for each in every if not asked.names or any(name in each.name for name in asked.names)]
+    if not chosen:
+        raise InputError(
+            f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in every)}"
+        )
+    drives, parts = [], []
+    for scenario in chosen:
+        figures, squared = measure(folder(), scenario)
+        drives.append(figures)
+        parts.append(squared)
+        yield informs(f"tracking/{scenario.name}", _of(figures, "metres", "rmse"), "m", figures)
+    together = pooled(parts)
+    found = shares(together)
+    yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
+    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", {"coverage": found})
+    yield from verdicts(drives, found, asked.quick)
+    if asked.plot:
+        draw(together, asked.plot, f"python -m bench tracking: {len(drives)} drives, code {fingerprint()}")
+
+
+def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
+    """Drives, coverage, and what was lost and found again."""
+    drives = [row.details for row in rows if "metres" in row.details]
+    found = next(row.details["coverage"] for row in rows if list(row.details) == ["coverage"])
+    shown = {"": table(_HEAD, [cells(figures) for figures in drives]), "coverage": coverage_table(found)}
+    return shown | {"events": "\n".join([*_events(drives), code_line()])}
+
+
+def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Any]:
     """Return the figures of a scenario, and the squared distances that its coverage is made of."""
     told, drive = told_of(folder, scenario)
-    row = score(told, drive.truth, drive.driven, [(e.what, e.begin, e.end) for e in drive.events])
+    figures = score(told, drive.truth, drive.driven, [(e.what, e.begin, e.end) for e in drive.events])
     parts = spread(told, errors(told, drive.truth))
     drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
-    row |= {
-        "name": scenario.name,
-        "plain": scenario.plain,
-        "drift": drift,
-        "coverage": shares(pooled([parts])),
-    }
-    return row, parts
+    about = {"name": scenario.name, "plain": scenario.plain, "drift": drift}
+    return figures | about | {"coverage": shares(pooled([parts]))}, parts
 
 
-def cells(row: Row) -> list[str]:
+def told_of(folder: Path, scenario: Scenario) -> tuple[Told, Drive]:
+    """Return what the localizer said on a scenario's drive, now or when the same code ran before, and the drive.
+
+    Worlds, maps and answers are kept in ``folder``.
+    """
+    recorded = open_world(folder, scenario.world)
+    drive = scenario.drive(recorded.truth)
+    site = map_of(folder, scenario.world, scenario.variant)
+    out = folder / "tracking-results" / scenario.name.replace("/", "-")
+    arrays = out.with_suffix(".npz")
+    spec = {"code": fingerprint(), "bench": fingerprint("bench/tracking"), "scenario": repr(scenario.world)}
+
+    def work() -> dict[str, Any]:
+        told = follow(site, recorded, drive)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(arrays, **vars(told))
+        return {"frames": len(drive)}
+
+    remembered(out.with_suffix(".json"), spec, work)
+    with np.load(arrays) as kept:
+        fields = dict(kept)
+    texts = {name: fields.pop(name).tolist() for name in ("states", "reasons")}
+    return Told(**texts, **fields), drive
+
+
+def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
+    """Feed a drive to a new localizer, which is told frames and odometry and nothing else; write down what it says."""
+    from coview_stream import BaseMap, Localizer
+    from coview_stream.errors import CloudError, RunError
+
+    count = len(drive)
+    poses, covariances = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
+    seconds, states, reasons = np.zeros(count), [], []
+    localizer = Localizer(BaseMap.load(site))
+    for k in range(count):
+        cloud = seen(recorded.read(int(drive.frames[k])), int(drive.cover[k]), int(drive.frames[k]))
+        begin = time.perf_counter()
+        try:
+            fix = localizer.step(cloud, drive.odometry[k], float(drive.stamps[k]))
+        except (CloudError, RunError) as error:
+            states.append("SKIPPED")
+            reasons.append(str(error))
+            continue
+        seconds[k] = time.perf_counter() - begin
+        states.append(fix.state.reported)
+        reasons.append(fix.evidence.reason if fix.evidence else "")
+        if fix.T_map_body is not None:
+            poses[k] = fix.T_map_body
+        if fix.covariance is not None:
+            covariances[k] = fix.covariance
+    return Told(drive.stamps, states, reasons, poses, covariances, seconds)
+
+
+def _of(figures: Figures, *keys: str) -> float:
+    """One figure below another; NaN where there is none."""
+    for key in keys:
+        figures = (figures or {}).get(key)  # type: ignore[assignment]
+    return np.nan if figures is None else float(figures)  # type: ignore[arg-type]
+
+
+def cells(figures: Figures) -> list[str]:
     """One line of the table; of several events the worst."""
-    metres, degrees = row["metres"] or {}, row["degrees"] or {}
-    back = [[e[key] for e in row["events"]] for key in ("recovery_m", "recovery_s")]
-    steps = row["tracking_step_ms"] or {}
+    back = [[event[key] for event in figures["events"]] for key in ("recovery_m", "recovery_s")]
+    first = figures["first_fix_m"]
     return [
-        row["name"],
-        number(100 * row["drift"], 1),
-        f"{row['driven_m']:.0f}",
-        number(100 * row["share_right"], 1),
-        number(row["first_fix_m"], 1),
-        number(metres.get("rmse"), 3),
-        number(metres.get("max"), 2),
-        number(degrees.get("rmse"), 2),
-        number(degrees.get("max"), 1),
-        str(row["false_frames"]),
-        number(row["false_s"], 1),
-        str(row["doubtful_frames"]),
-        str(row["losses"]),
+        figures["name"], number(100 * figures["drift"], 1), f"{figures['driven_m']:.0f}",
+        number(100 * figures["share_right"], 1), number(first, 1), number(_of(figures, "metres", "rmse"), 3),
+        number(_of(figures, "metres", "max"), 2), number(_of(figures, "degrees", "rmse"), 2),
+        number(_of(figures, "degrees", "max"), 1), str(figures["false_frames"]), number(figures["false_s"], 1),
+        str(figures["doubtful_frames"]), str(figures["losses"]),
         *("" if not part else "never" if None in part else f"{max(part):.1f}" for part in back),
-        number(steps.get("p50"), 1),
-        number(steps.get("p99"), 0),
-    ]
+        number(_of(figures, "tracking_step_ms", "p50"), 1), number(_of(figures, "tracking_step_ms", "p99"), 0),
+    ]  # fmt: skip
 
 
 def verdicts(
-    rows: Sequence[Row], found: dict[str, dict[str, Any]], quick: bool = False
-) -> list[tuple[str, str, str, bool]]:
-    """Judge: (what, target, measured, met) per target. ``found`` is the coverage of all drives together.
+    drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick: bool = False
+) -> Iterator[Row]:
+    """Judge all drives together; ``found`` is their coverage.
 
     ``quick`` drives are too short to be found again on, and too few for a coverage.
     """
-    plain = [row for row in rows if row["plain"]]
-    out = []
-    for what, key, most in (
-        ("rmse of plain drives, m", "metres", MOST_METRES),
-        ("rmse of plain drives, deg", "degrees", MOST_DEGREES),
-    ):
+    plain = [figures for figures in drives if figures["plain"]]
+    for unit, key, most in (("m", "metres", MOST_METRES), ("deg", "degrees", MOST_DEGREES)):
         if plain:
-            each = [row[key]["rmse"] if row[key] else np.inf for row in plain]
+            each = np.nan_to_num([_of(figures, key, "rmse") for figures in plain], nan=np.inf)
             mean = float(np.sqrt(np.mean(np.square(each))))
-            text = f"{mean:.3f} (worst drive {max(each):.3f})"
-            out.append((what, f"<= {most}", text, mean <= most))
-    false, seconds = sum(row["false_frames"] for row in rows), sum(row["false_s"] for row in rows)
-    out.append(("false frames", "0", f"{false} ({seconds:.1f} s)", false == 0))
+            said = f"{mean:.3f} (worst drive {max(each):.3f})"
+            yield judged(f"tracking/rmse of plain drives, {unit}", said, f"<= {most}", mean <= most, mean)
+    false, seconds = (sum(figures[key] for figures in drives) for key in ("false_frames", "false_s"))
+    yield judged("tracking/false frames", f"{false} ({seconds:.1f} s)", "0", false == 0, false)
     if quick:
-        return out
-    events = [event for row in rows for event in row["events"]]
-    if events:
+        return
+    if events := [event for figures in drives for event in figures["events"]]:
         metres = [np.inf if e["recovery_m"] is None else e["recovery_m"] for e in events]
         late = sum(m > MOST_RECOVERY for m in metres)
-        text = f"{np.median(metres):.1f} median, {max(metres):.1f} worst; {late} of {len(metres)} later"
-        out.append(("recovery, m driven", f"<= {MOST_RECOVERY:.0f}", text, not late))
+        said = f"{np.median(metres):.1f} median, {max(metres):.1f} worst; {late} of {len(metres)} later"
+        yield judged("tracking/recovery, m driven", said, f"<= {MOST_RECOVERY:.0f}", not late, max(metres))
     for part in ("first minute", "later"):
-        wrong = [name for name in _JUDGED if not honest(found[part][name])]
         if found[part]["yaw"]["frames"]:
-            text = f"out of it: {'; '.join(wrong)}" if wrong else "all within"
-            out.append((f"coverage, {part}", f"+-{100 * WITHIN:.0f} points", text, not wrong))
-    return out
+            wrong = [name for name in _JUDGED if not honest(found[part][name])]
+            said = f"out of it: {'; '.join(wrong)}" if wrong else "all within"
+            yield judged(f"tracking/coverage, {part}", said, f"+-{100 * WITHIN:.0f} points", not wrong)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark, or some of its scenarios."""
-    parser = argparse.ArgumentParser(prog="python -m bench.tracking", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help="part of a scenario's name (all)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows, coverage and verdicts")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the coverage")
-    parser.add_argument(
-        "--worlds", type=Path, default=Path("out/worlds"), help="worlds, maps, answers (out/worlds)"
-    )
-    parser.add_argument("--quick", action="store_true", help="two short drives in one small town")
-    parser.add_argument(
-        "--seeds", type=int, default=SEEDS, metavar="N", help=f"worlds of the ten seeds after N ({SEEDS})"
-    )
-    parser.add_argument("--list", action="store_true", help="name the scenarios and end")
-    options = parser.parse_args(arguments)
-    every = QUICK if options.quick else scenarios(options.seeds)
-    chosen = [s for s in every if not options.names or any(name in s.name for name in options.names)]
-    if not chosen:
-        print(f"bench.tracking: no scenario like {' or '.join(options.names)}; see --list", file=sys.stderr)
-        return 2
-    if options.list:
-        print("\n".join(scenario.name for scenario in chosen))
-        return 0
-    for option, path in (("--json", options.json), ("--plot", options.plot)):
-        if path is not None and (path.is_dir() or not path.parent.is_dir()):
-            print(f"bench.tracking: {option} {path}: name a file in a directory that exists", file=sys.stderr)
-            return 2
-    return _run(chosen, options)
-
-
-def _run(chosen: Sequence[Scenario], options: argparse.Namespace) -> int:
-    rows: list[Row] = []
-    parts = []
-    print(line(_HEAD, _WIDTHS), rule(_WIDTHS), sep="\n", flush=True)
-    for scenario in chosen:
-        row, squared = measure(options.worlds, scenario)
-        rows.append(row)
-        parts.append(squared)
-        print(line(cells(row), _WIDTHS), flush=True)
-    together = pooled(parts)
-    found = shares(together)
-    judged = verdicts(rows, found, options.quick)
-    print(f"\n{coverage_table(found)}\n\n{_said(rows)}")
-    print(
-        table(
-            ("target", "asked", "measured", "verdict"),
-            [(*v[:3], "met" if v[3] else "MISSED") for v in judged],
-        )
-    )
-    code = fingerprint()
-    print(f"\nCode {code}, {time.strftime('%Y-%m-%d')}.")
-    if options.json:
-        named = [dict(zip(("what", "asked", "measured", "met"), v, strict=True)) for v in judged]
-        whole = {"code": code, "rows": rows, "coverage": found, "verdicts": named}
-        options.json.write_text(json.dumps(whole, indent=1) + "\n")
-    if options.plot:
-        draw(together, options.plot, f"python -m bench.tracking: {len(rows)} drives, code {code}")
-    return 0 if all(met for *_, met in judged) else 1
-
-
-def _said(rows: Sequence[Row]) -> str:
+def _events(drives: Sequence[Figures]) -> list[str]:
     """List the losses by reason, and what each event came to."""
-    lines = [f"- {row['name']}: lost {n} x, {reason}" for row in rows for reason, n in _counted(row)]
-    for row in rows:
-        for event in row["events"]:
+    lines = [
+        f"- {figures['name']}: lost {n} x, {reason}"
+        for figures in drives
+        for reason, n in Counter(figures["reasons"]).most_common()
+    ]
+    for figures in drives:
+        for event in figures["events"]:
             m, s = event["recovery_m"], event["recovery_s"]
             back = "never right again" if m is None else f"right after {m:.1f} m, {s:.1f} s"
-            lines.append(f"- {row['name']}: {event['what']}: {event['false_s']:.1f} s false, {back}")
-    return "\n".join(lines) + ("\n" if lines else "")
-
-
-def _counted(row: Row) -> list[tuple[str, int]]:
-    reasons: list[str] = row["reasons"]
-    return Counter(reasons).most_common()
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            lines.append(f"- {figures['name']}: {event['what']}: {event['false_s']:.1f} s false, {back}")
+    return lines

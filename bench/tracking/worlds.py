@@ -6,8 +6,8 @@ in a scenario is made of those frames. Frames are kept as int16 steps of 4 mm, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 
-from bench.harness.worlds import fingerprint, remembered_seconds
+from bench.harness.files import fingerprint, remembered_seconds, whole
+from bench.harness.worlds import MAPPER, SIMULATOR
 from coview_stream.config import MapConfig
-from coview_stream.geometry import Points
+from coview_stream.geometry.transforms import Points
 from coview_stream.report.evaluation import driven
 from coview_stream.sim import KINDS, SimulationConfig
 from coview_stream.sim.scenes import Scene, build_scene
@@ -38,10 +39,6 @@ CHANGED = 0.3
 
 _TREES, _UNDERGROWTH = 0.012, 0.008  # per square metre, of a sparse forest
 _SELF = "bench/tracking/worlds.py"
-_MAPPER = (
-    "coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds", "coview_stream/place/descriptor.py",
-    "coview_kernels", _SELF,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class World:
 
     Attributes:
         kind: town, campus or sparse-forest (120 stems per hectare, a third of the simulator's forest).
-        drift: share of the distance, over 100 m (see :func:`bench.tracking_drives.drift_share`).
+        drift: share of the distance, over 100 m (see :func:`bench.tracking.drives.drift_share`).
     """
 
     kind: str
@@ -105,7 +102,7 @@ class Recorded:
 def open_world(folder: Path, world: World) -> Recorded:
     """Open the drive of a world, simulated now unless it is there."""
     out = folder / world.name
-    wanted = {"world": asdict(world) | {"drift": 0}, "code": fingerprint("coview_stream/sim", _SELF)}
+    wanted = {"world": asdict(world) | {"drift": 0}, "code": fingerprint(*SIMULATOR, _SELF)}
     remembered_seconds(out / "simulated.json", wanted, lambda: _simulate(out, world))
     rows = np.memmap(out / "frames.i16", np.int16, "r").reshape(-1, 3)
     return Recorded(np.load(out / "truth.npy"), np.load(out / "counts.npy"), rows)
@@ -117,7 +114,7 @@ def map_of(folder: Path, world: World, variant: str = "plain") -> Path:
     out = folder / world.name
     file = out / f"{variant}.coview"
     wanted = {
-        "world": asdict(world) | {"drift": 0}, "map": asdict(MapConfig()), "code": fingerprint(*_MAPPER),
+        "world": asdict(world) | {"drift": 0}, "map": asdict(MapConfig()), "code": fingerprint(*MAPPER, _SELF),
     }  # fmt: skip
     makers: dict[str, Callable[[], Floats]] = {
         "plain": lambda: np.load(out / "base.npy").astype(np.float64),
@@ -206,7 +203,7 @@ def _simulate(out: Path, world: World) -> None:
     out.mkdir(parents=True, exist_ok=True)
     np.save(out / "base.npy", _scanned(scene, world).astype(np.float32))
     np.save(out / "truth.npy", truth)
-    with _whole(out / "frames.i16") as part, part.open("wb") as stream:
+    with whole(out / "frames.i16") as part, part.open("wb") as stream:
         counts = [_write(stream, points) for points in frames(scene, world.config, truth)]
     np.save(out / "counts.npy", np.array(counts, dtype=np.int64))
 
@@ -214,13 +211,6 @@ def _simulate(out: Path, world: World) -> None:
 def _write(stream: Any, points: Points) -> int:
     stream.write(np.round(points / STEP).astype(np.int16).tobytes())
     return len(points)
-
-
-@contextmanager
-def _whole(file: Path) -> Iterator[Path]:
-    part = file.with_suffix(".part")
-    yield part
-    part.replace(file)
 
 
 def _scanned(scene: Scene, world: World) -> Floats:

@@ -1,0 +1,193 @@
+"""The other libraries, each with the settings that favour it."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.harness.worlds import Place
+from bench.peers.methods import Answer, started
+from coview_stream import BaseMap
+from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.geometry.transforms import Points, inverse, norms, pose_from
+
+
+class KissMatcher:
+    """KISS-Matcher 1.0 (MIT): FasterPFH, ROBIN pruning, GNC; the submap against the whole map.
+
+    Settings in its favour: of voxels of 0.7, 1, 1.5 and 2 m (its authors advise one that grows with the map; at 0.5 m
+    the whole map takes minutes), each with its default solver and with Quatro, made for level clouds, the pair that
+    was right most often on six places of either world; radii, noise bounds and 5,000 correspondences of its defaults.
+    Both clouds are its own to thin; nothing can be prepared but the cloud. It vouches by its own example's rule: a
+    valid solution with five final inliers or more.
+    """
+
+    VOXEL, INLIERS = 1.0, 5
+
+    def __init__(self, site: BaseMap) -> None:
+        import kiss_matcher
+
+        config = kiss_matcher.KISSMatcherConfig(voxel_size=self.VOXEL, use_quatro=True)
+        self._matcher: Any = kiss_matcher.KISSMatcher(config)
+        self._map = np.array(site.points, dtype=np.float32)
+
+    def answer(self, place: Place) -> Answer:
+        """Match, prune and solve."""
+        found = self._matcher.estimate(place.submap, self._map)
+        inliers = int(self._matcher.get_num_final_inliers())
+        T = pose_from(np.asarray(found.rotation), np.asarray(found.translation).ravel())
+        return Answer(T, bool(found.valid) and inliers >= self.INLIERS, inliers)
+
+
+class MapClosures:
+    """MapClosures 2.2 (MIT): ORB features of density images, a tree of binary words, 2D RANSAC.
+
+    The map is cut into local maps, and the submap is the query that may close a loop with one of them. Settings in its
+    favour: local maps of the submap's own reach (60 m about their centre) every 15 m, much denser than its pipeline
+    makes them; its own 0.5 m voxels, density threshold, Hamming distance and ground alignment; the best of all closures
+    counts. It vouches by its pipeline's rule: more than five inliers.
+    """
+
+    SPACING, REACH, VOXEL = 15.0, 60.0, 0.5
+    _LEAST_POINTS = 1000
+    _APART = 10  # between the numbers of queries: neighbours in number are never compared
+
+    def __init__(self, site: BaseMap) -> None:
+        from map_closures.config import MapClosuresConfig
+        from map_closures.map_closures import MapClosures as Closures
+
+        config = MapClosuresConfig()
+        self._least = config.inliers_threshold
+        self._closures: Any = Closures(config)
+        stations = site.stations
+        low, high = stations.min(axis=0)[:2], stations.max(axis=0)[:2]
+        centres = [
+            np.array([x, y, stations[np.hypot(stations[:, 0] - x, stations[:, 1] - y).argmin(), 2]])
+            for x in np.arange(low[0] + self.SPACING / 2, high[0], self.SPACING)
+            for y in np.arange(low[1] + self.SPACING / 2, high[1], self.SPACING)
+        ]
+        self._tiles = [c for c in centres if len(site.crop(c, self.REACH)[0]) >= self._LEAST_POINTS]
+        # closures are looked for with earlier numbers only: backwards, no tile is compared with another one
+        for number in reversed(range(len(self._tiles))):
+            points, _ = site.crop(self._tiles[number], self.REACH)
+            self._closures.get_closures(
+                number, self._thinned(points.astype(np.float64) - self._tiles[number])
+            )
+        self._asked = len(self._tiles) + self._APART
+
+    def answer(self, place: Place) -> Answer:
+        """Find the closure with most inliers among the tiles; those with earlier queries do not count."""
+        found = self._closures.get_closures(self._asked, self._thinned(place.submap.astype(np.float64)))
+        self._asked += self._APART
+        known = [c for c in found if c.source_id < len(self._tiles)]
+        best = max(known, key=lambda c: c.number_of_inliers, default=None)
+        if best is None:
+            return Answer(None, False)
+        T = pose_from(np.eye(3), self._tiles[best.source_id]) @ inverse(np.asarray(best.pose))
+        return Answer(T, best.number_of_inliers > self._least, best.number_of_inliers)
+
+    def _thinned(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Thin as its pipeline does before it asks."""
+        from map_closures.voxel_map import VoxelMap
+
+        voxels = VoxelMap(self.VOXEL, 2.0 * self.REACH)
+        voxels.add_points(points)
+        return np.asarray(voxels.point_cloud())
+
+
+class Features:
+    """Open3D (MIT): FPFH features, then RANSAC or fast global registration; the submap against the whole map.
+
+    Settings as its tutorial on global registration gives them, with a voxel for outdoor clouds: 1 m, normals within
+    2 voxels, features within 5, correspondences within 1.5 (RANSAC; 4 points, edge length 0.9, mutual filter off, 10^5
+    iterations at confidence 0.999) or half a voxel (FGR). The map's features are made once. It has no rule of its own
+    for when to believe a result; the tutorial looks at the fitness (share of points with a partner), so it vouches from
+    0.5.
+    """
+
+    VOXEL, FITNESS = 1.0, 0.5
+
+    def __init__(self, site: BaseMap, way: Literal["ransac", "fgr"]) -> None:
+        self._o3d: Any = open3d()
+        self._o3d.utility.random.seed(1)
+        self._way = way
+        self._map = self._described(np.array(site.points))
+
+    def answer(self, place: Place) -> Answer:
+        """Describe the submap, match and solve."""
+        cloud, feature = self._described(place.submap)
+        found = self._ransac(cloud, feature) if self._way == "ransac" else self._fast(cloud, feature)
+        T = np.array(found.transformation)
+        # FGR reports no fitness of its own for all versions: measured alike for both
+        registration = self._o3d.pipelines.registration
+        fit = registration.evaluate_registration(cloud, self._map[0], 1.5 * self.VOXEL, T)
+        return Answer(T, fit.fitness >= self.FITNESS, float(fit.fitness))
+
+    def _described(self, points: Points) -> tuple[Any, Any]:
+        o3d, search, voxel = self._o3d, self._o3d.geometry.KDTreeSearchParamHybrid, self.VOXEL
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
+        cloud = cloud.voxel_down_sample(voxel)
+        cloud.estimate_normals(search(radius=2 * voxel, max_nn=30))
+        cloud.orient_normals_to_align_with_direction((0.0, 0.0, 1.0))  # a viewpoint is not known for the map
+        feature = o3d.pipelines.registration.compute_fpfh_feature(cloud, search(radius=5 * voxel, max_nn=100))
+        return cloud, feature
+
+    def _ransac(self, cloud: Any, feature: Any) -> Any:
+        registration, near = self._o3d.pipelines.registration, 1.5 * self.VOXEL
+        return registration.registration_ransac_based_on_feature_matching(
+            cloud, self._map[0], feature, self._map[1], False, near,
+            registration.TransformationEstimationPointToPoint(False), 4,
+            [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+             registration.CorrespondenceCheckerBasedOnDistance(near)],
+            registration.RANSACConvergenceCriteria(100_000, 0.999),
+        )  # fmt: skip
+
+    def _fast(self, cloud: Any, feature: Any) -> Any:
+        registration = self._o3d.pipelines.registration
+        option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * self.VOXEL)
+        return registration.registration_fgr_based_on_feature_matching(
+            cloud, self._map[0], feature, self._map[1], option
+        )
+
+
+class SmallGicp:
+    """small_gicp 1.0 (MIT): GICP and VGICP of the submap to the map, from a pose nearby.
+
+    Settings of its documentation: covariances of 10 neighbours, voxels of 1 m for VGICP, correspondences within 1 m.
+    The map is prepared once, at 0.25 m. In its favour, the submap is cut to 50 m and thinned to 0.5 m, as our
+    registration does it: at its default of 0.25 m and without a cut it is as exact and takes two to four times as long
+    (measured). Thinning and covariances of the submap are part of a query, as ours are. All cores. It vouches when it
+    says that it has converged.
+    """
+
+    MAP, SUBMAP, REACH, VOXEL, NEAR = 0.25, 0.5, 50.0, 1.0, 1.0
+
+    def __init__(self, site: BaseMap, way: Literal["GICP", "VGICP"]) -> None:
+        import small_gicp
+
+        self._library: Any = small_gicp
+        self._threads = os.cpu_count() or 1
+        self._map, self._tree = self._prepared(np.array(site.points, dtype=np.float64), self.MAP)
+        self._voxels: Any = None
+        if way == "VGICP":
+            self._voxels = small_gicp.GaussianVoxelMap(self.VOXEL)
+            self._voxels.insert(self._map)
+
+    def _prepared(self, points: npt.NDArray[np.float64], voxel: float) -> Any:
+        return self._library.preprocess_points(
+            points, downsampling_resolution=voxel, num_neighbors=10, num_threads=self._threads
+        )
+
+    def answer(self, place: Place) -> Answer:
+        """Prepare the submap and align it."""
+        near = place.submap.compress(norms(place.submap) < self.REACH, axis=0).astype(np.float64)
+        source, _ = self._prepared(near, self.SUBMAP)
+        about = {"num_threads": self._threads, "max_correspondence_distance": self.NEAR}
+        if self._voxels is not None:
+            found = self._library.align(self._voxels, source, started(place), **about)
+        else:
+            found = self._library.align(self._map, source, self._tree, started(place), **about)
+        return Answer(np.array(found.T_target_source), bool(found.converged), float(found.num_inliers))

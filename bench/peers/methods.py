@@ -1,0 +1,168 @@
+"""Who takes part, what a peer has to do, and coview_stream itself.
+
+* As in the product: the search gets the keyframes of the drive one after the other and gives a pose once three of
+  them have confirmed it (``LocalizerConfig()``); the time is that of all keyframes until then.
+* One scan: the same search with ``stationary=True``, from one submap, which has to stand alone.
+* Tracking: registration at the scales that the tracker uses, then its verification, which is in the time, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from bench.harness.worlds import Place
+from coview_stream import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.verification import verify
+from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
+
+OFF, TURNED = 0.5, float(np.radians(3.0))
+"""How far from the truth tracking starts, metres and radians."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A pose (4, 4) map <- submap, or None; whether the method itself vouches for it, and its own score."""
+
+    T_map_submap: Pose | None
+    vouched: bool
+    score: float = 0.0
+
+
+class Method(Protocol):
+    """One way to localize; made for one map, asked many times."""
+
+    def answer(self, place: Place) -> Answer:
+        """Say where the submap lies, or that it is not known."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A method with its name, what it needs, and how it is made.
+
+    Attributes:
+        name: in tables and rows.
+        make: prepares a method for a map.
+        package: what has to be installed, as pip names it; empty for what comes with coview_stream.
+        module: that it imports as.
+        tracking: it starts from a pose nearby (0.5 m and 3 degrees off) instead of nowhere.
+    """
+
+    name: str
+    make: Callable[[BaseMap], Method]
+    package: str = ""
+    module: str = ""
+    tracking: bool = False
+
+
+def started(place: Place) -> Pose:
+    """Return ``T_map_submap`` (4, 4) that tracking starts from: the truth, off in a direction of the place's own."""
+    rng = np.random.default_rng(int(abs(place.T_map_submap[0, 3]) * 1e3))
+    heading, turn = rng.uniform(-np.pi, np.pi), TURNED * rng.choice([-1.0, 1.0])
+    off = pose_from(rot_z(turn), [OFF * np.cos(heading), OFF * np.sin(heading), 0.0])
+    return np.asarray(place.T_map_submap @ off)
+
+
+class Keyframes:
+    """The search over the keyframes of a drive."""
+
+    def __init__(self, site: BaseMap, stationary: bool = False) -> None:
+        import coview_kernels
+
+        coview_kernels.warm_up()
+        config = LocalizerConfig(stationary=stationary)
+        self._search = GlobalSearch(site, config, LocalMaps(site, config.registration.source_range))
+
+    def answer(self, place: Place) -> Answer:
+        """Search until a keyframe's verdict accepts a place."""
+        return self._search_all(place.queries, place)
+
+    def _search_all(self, queries: list[SearchRequest], place: Place) -> Answer:
+        self._search.clear()
+        score = 0.0
+        for query in queries:
+            verdict = self._search.update(query)
+            score = verdict.evidence.score
+            if verdict.accepted is not None:
+                return Answer(verdict.accepted.T_map_odom @ place.T_odom_submap, True, score)
+        return Answer(None, False, score)
+
+
+class OneScan(Keyframes):
+    """The search from one submap alone."""
+
+    def __init__(self, site: BaseMap) -> None:
+        super().__init__(site, stationary=True)
+
+    def answer(self, place: Place) -> Answer:
+        """Search with all points of the drive as if they were one scan."""
+        newest = place.queries[-1]
+        submap = place.submap + newest.position.astype(np.float32)
+        return self._search_all([replace(newest, submap=submap)], place)
+
+
+class Tracking:
+    """Registration from a pose nearby, believed if it passes the check that every registration must pass."""
+
+    def __init__(self, site: BaseMap) -> None:
+        import coview_kernels
+
+        coview_kernels.warm_up()
+        self._site = site
+        self._config = LocalizerConfig().registration
+        self._maps = LocalMaps(site, self._config.source_range)
+
+    def answer(self, place: Place) -> Answer:
+        """Register the submap."""
+        start = started(place)
+        source = prepare_scan(place.submap, np.zeros(3), self._config)
+        target = self._maps.around(transform(start, np.zeros((1, 3)))[0])
+        if target is None:
+            return Answer(None, False)
+        found = register(source, start, target, self._config, self._config.track, centre=np.zeros(3))
+        if found is None:
+            return Answer(None, False)
+        T, newest = found.T_map_source, place.queries[-1]
+        surveyed = self._site.surveyed(transform(T, source.points)[:, :2])
+        T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
+        evidence = verify(source, T, newest.seen, T_map_body, target, surveyed)
+        cause, _ = EvidenceBaseline().judge(evidence, LocalizerConfig().acceptance)
+        return Answer(T, cause is RejectionReason.VERIFIED, evidence.score)
+
+
+def _library(name: str, *options: Any) -> Callable[[BaseMap], Method]:
+    """Make a class of :mod:`bench.peers.libraries`, which imports what may not be installed only then."""
+
+    def make(site: BaseMap) -> Method:
+        from bench.peers import libraries
+
+        method: Method = getattr(libraries, name)(site, *options)
+        return method
+
+    return make
+
+
+OURS, OUR_TRACKING = "coview_stream", "coview_stream, tracking"
+
+PEERS = (
+    Peer(OURS, Keyframes),
+    Peer("coview_stream, one scan", OneScan),
+    Peer("KISS-Matcher", _library("KissMatcher"), "kiss-matcher", "kiss_matcher"),
+    Peer("MapClosures", _library("MapClosures"), "map-closures", "map_closures"),
+    Peer("Open3D FPFH + RANSAC", _library("Features", "ransac")),
+    Peer("Open3D FPFH + FGR", _library("Features", "fgr")),
+    Peer(OUR_TRACKING, Tracking, tracking=True),
+    Peer("small_gicp GICP", _library("SmallGicp", "GICP"), "small-gicp", "small_gicp", tracking=True),
+    Peer("small_gicp VGICP", _library("SmallGicp", "VGICP"), "small-gicp", "small_gicp", tracking=True),
+)
+"""The first of either kind is coview_stream."""
