@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from coview_stream.config import LocalizerConfig, MapConfig
     from coview_stream.errors import CoViewError
     from coview_stream.localization.localizer import Localizer
-    from coview_stream.localization.result import Fix, KeyframeEvidence, State
+    from coview_stream.localization.result import Fix, KeyframeEvidence
+    from coview_stream.localization.state import State
     from coview_stream.localization.tracking.monitor import RejectionReason
     from coview_stream.stream.client.client import RobotClient
 
@@ -47,7 +48,7 @@ _HOMES = {
     "LocalizerConfig": "config",
     "MapConfig": "config",
     "RobotClient": "stream.client.client",
-    "State": "localization.result",
+    "State": "localization.state",
 }
 
 

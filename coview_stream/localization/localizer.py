@@ -1,8 +1,8 @@
-"""The engine: frames and odometry in, fixes out. No clock, no network, no threads."""
+"""The localizer: frames and odometry in, fixes out. No clock, no network, no threads."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
@@ -11,28 +11,42 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_from, to_local, to_map_origin
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.keyframes import KeyframeBuffer, OdometryCheck
+from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer, OdometryCheck
 from coview_stream.localization.search.pose_hints import PoseHints
 from coview_stream.localization.search.recognizers import SearchIndex
-from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.tracking.monitor import LossMonitor, MatchVerdict, RejectionReason
+from coview_stream.localization.search.request import Epoch, SearchRequest
+from coview_stream.localization.state import Event, State, next_state
+from coview_stream.localization.tracking.map_matching import MapMatch
+from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason
 from coview_stream.localization.tracking.tracker import Tracker
 
-_HURRIED = 3.0  # times as far apart are registrations in a hurry
+_DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
 
 @dataclass(frozen=True)
 class _Frame:
+    """One frame, checked.
+
+    Attributes:
+        cloud: (N, 3) float32, body frame.
+        T_odom_body: (4, 4) odometry about the anchor.
+        stamp: seconds.
+        voxels: (M, 3) float32, one point per voxel, odometry frame about the anchor.
+        keyframe: the one that it completes; None while a place is known, and between keyframes.
+    """
+
     cloud: Points
-    T_odom_body: Pose  # about the anchor
+    T_odom_body: Pose
     stamp: float
+    voxels: Points
+    keyframe: Keyframe | None
 
 
 class Localizer:
-    """Tells where the robot is on a base map, or that it does not know (paper, Algorithm 1).
+    """Localization of one robot on a base map (paper, Algorithm 1, and a graph of poses from the first fix on).
 
     Attributes:
         base_map: the map; may be shared by many localizers.
@@ -45,9 +59,9 @@ class Localizer:
         base_map: BaseMap,
         config: LocalizerConfig | None = None,
         local_maps: LocalMaps | None = None,
-        knowledge: SearchIndex | None = None,
+        index: SearchIndex | None = None,
     ) -> None:
-        """Localize on a map; those of one thread may share ``local_maps``, its cache of crops, and ``knowledge``.
+        """Localize on a map; those of one thread may share ``local_maps``, its cache of crops, and ``index``.
 
         Raises:
             MapError, InputError, DependencyError: ``config.reloc`` is ``learned``, and that cannot be used here.
@@ -55,28 +69,28 @@ class Localizer:
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
-        self._search = GlobalSearch(base_map, self.config, self._local_maps, knowledge)
-        self._generation = 0
+        self._search = GlobalSearch(base_map, self.config, self._local_maps, index)
+        self._epoch: Epoch = (0, 0)
         self.reset()
 
-    def reset(self) -> None:
-        """Forget everything but the map."""
+    def reset(self, epoch: int = 0) -> None:
+        """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
         self.state = State.SEARCHING
+        self._epoch = (epoch, self._epoch[1] + 1)
         self._buffer = KeyframeBuffer(self.config.keyframe)
         self._search.reset()
         self._tracker = Tracker(self.base_map, self.config, self._local_maps)
-        self._anchor: Floats | None = None
-        self._evidence: KeyframeEvidence | None = None
+        self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
+        self._hints = PoseHints()
+        self._odometry_check = OdometryCheck()
+        self._anchor: Floats | None = None  # origin of odometry in use, so that float32 stays exact
         self._newest: _Frame | None = None
-        self._suggestions = PoseHints()
-        self._continuity = OdometryCheck()
-        self._doubt = LossMonitor(self.config.acceptance, self.config.tracking)
-        self._registered = 0.0  # stamp of the newest registration
-        self._generation += 1
+        self._evidence: KeyframeEvidence | None = None
+        self._registered_at = 0.0  # stamp of the newest registration
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Who names places to look at: "coview", "learned" or both."""
+        """Names of the recognizers that propose places: "coview", "learned" or both."""
         return self._search.names
 
     @property
@@ -84,8 +98,10 @@ class Localizer:
         """Descriptors (R, S) of the newest keyframe that searched, by channel; empty before the first."""
         return self._search.last_query
 
+    # ---- one frame
+
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:
-        """Take in one frame and say where the robot is.
+        """Localize by one more frame. Its steps are the headings of docs/method.md.
 
         Args:
             cloud: (N, 3) float32 body-frame points (x forward, z up), deskewed, metres; rows with NaN are dropped.
@@ -99,81 +115,80 @@ class Localizer:
             CloudError: the cloud has another shape or fewer than 10 finite points. RunError: the pose or stamp is not
                 finite or not rigid. Neither changes the localizer: count the frame, skip it and go on.
         """
-        query = self.take(cloud, T_odom_body, stamp)
-        if query is not None:
-            self.adopt(self._search.update(query))
+        frame = self._predict(cloud, T_odom_body, stamp)  # T_map_odom T_odom_body
+        match = None
+        if self.state.has_place:
+            match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
+        elif (request := self._search_request(frame)) is not None:
+            match = self._begin_tracking(self._search.update(request))  # eqs 1-13, over the whole map
+        if match is not None:
+            event = self._verify(match)  # evidence as usual here, agreement with odometry
+            self._update(match, event)  # the graph of poses and the state
         return self.fix()
 
-    def take(
-        self, cloud: Points, T_odom_body: Pose, stamp: float, hurry: bool = False
+    def add_frame(
+        self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False
     ) -> SearchRequest | None:
-        """First half of :meth:`step`, which never searches the map and so is quick.
+        """:meth:`step` without the search, and so quick.
 
         Args:
             cloud: as for :meth:`step`.
             T_odom_body: as for :meth:`step`.
             stamp: as for :meth:`step`.
-            hurry: others wait: while tracking, put registrations off that can wait, to every third metre.
+            defer: the caller is behind: while tracking, put registrations off that can wait, to every third metre.
 
         Returns:
             What has to be searched for, if anything: hand it to a :class:`GlobalSearch`, on another thread or in
-            another process if you like, and its verdict to :meth:`adopt`, between two frames. Meanwhile frames go on.
+            another process if you like, and its result to :meth:`apply_search_result`, between two frames. Meanwhile
+            frames go on.
 
         Raises:
             CloudError, RunError: as for :meth:`step`.
         """
-        cloud, T_odom_body = self._checked(cloud, T_odom_body, stamp)
-        self._newest = _Frame(cloud, T_odom_body, stamp)
-        if self.state is State.TRACKING:  # keyframes are for searching: a loss starts from nothing
-            self._tracker.observe(cloud, T_odom_body, self._buffer.voxelize(cloud, T_odom_body))
-            patience = _HURRIED if hurry else 1.0
-            due = self._tracker.due(patience)
-            still = stamp - self._registered >= patience * self.config.tracking.seconds
-            doubted = self._doubt.active or self._tracker.alarmed(T_odom_body)
-            if due or still or doubted:
-                self._track(cloud, T_odom_body, stamp, idle=not due, alone=doubted)
-            else:
-                self._tracker.look_around(T_odom_body)
-            return None
-        suggested = self._suggested(T_odom_body)
-        keyframe = self._buffer.add(cloud, T_odom_body, stamp)
-        self._tracker.observe(cloud, T_odom_body, self._buffer.newest)
-        if self._continuity.contradicts(self._buffer.newest, T_odom_body[:3, 3]):
-            self._break_off(stamp)
-            return None
-        if keyframe is None:
-            return None
-        needs, travelled = self._search.needs, self._tracker.travelled
-        return SearchRequest.of(self._buffer, keyframe, cloud, needs, travelled, self._generation, suggested)
+        frame = self._predict(cloud, T_odom_body, stamp)
+        if not self.state.has_place:
+            return self._search_request(frame)
+        match = self._match_to_map(frame, defer)
+        if match is not None:
+            self._update(match, self._verify(match))
+        return None
 
-    def _suggested(self, T_odom_body: Pose) -> tuple[Pose, ...]:
-        return () if self._anchor is None else self._suggestions.about(self._anchor, T_odom_body)
+    def apply_search_result(self, result: SearchResult) -> None:
+        """Start tracking where a search has accepted a place, or keep its reason for not doing so.
 
-    def adopt(self, verdict: SearchResult) -> None:
-        """Second half of :meth:`step`: take note of a search, and start tracking when one place stands alone.
-
-        A verdict from before a loss or a :meth:`reset` is ignored, and so is one that comes while tracking.
+        A result from before a loss or a :meth:`reset` is ignored, and so is one that comes while a place is known.
         """
-        newest = self._newest
-        if verdict.generation != self._generation or self.state is State.TRACKING or newest is None:
-            return
-        self._evidence = verdict.evidence
-        if verdict.accepted is not None:
-            self._tracker.start(verdict.accepted.registration, newest.T_odom_body, verdict.travelled)
-            self._suggestions.clear()
-            self.state = State.TRACKING
-            self._doubt.clear()
-            self._buffer.clear()
-            # it may have driven on or been carried since
-            self._note(self._tracker.update(newest.cloud, newest.T_odom_body), newest.stamp, verdict.evidence)
-        elif self.state is not State.LOST:
-            self.state = verdict.evidence.state
+        match = self._begin_tracking(result)
+        if match is not None:
+            self._update(match, self._verify(match))
 
-    def suggest(self, T_map_body: Pose) -> None:
-        """Say that the robot may be here at the next frame, until a place is accepted or :meth:`reset`.
+    def fix(self) -> Fix:
+        """Return what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
+        newest, evidence = self._newest, self._evidence
+        if newest is None:
+            raise RuntimeError("no frame yet; call add_frame or step first")
+        if self.state is not State.TRACKING or self._anchor is None:
+            return Fix(newest.stamp, self.state, evidence=evidence)
+        T_map_local = orthonormal(self._tracker.T_map_odom)
+        T_map_body = T_map_local @ newest.T_odom_body
+        return Fix(
+            newest.stamp,
+            self.state,
+            pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
+            to_map_origin(T_map_local, self._anchor, self.base_map.origin),
+            self._tracker.reported_covariance(),
+            max(0.0, evidence.score - evidence.rival) if evidence else 0.0,
+            evidence,
+            self._tracker.drift,
+        )
 
-        It is never trusted: the search registers, verifies and judges it as whatever it finds itself. Ignored while
-        the state is TRACKING.
+    # ---- what the caller knows
+
+    def hint_pose(self, T_map_body: Pose) -> None:
+        """Hint that the robot may be here at the next frame, until a place is accepted or :meth:`reset`.
+
+        A hint is never trusted: the search registers, verifies and judges it like any other hypothesis. Ignored while
+        a place is known.
 
         Args:
             T_map_body: (4, 4) in the frame of the map's sources, as :attr:`Fix.T_map_body`, metres.
@@ -182,89 +197,124 @@ class Localizer:
             RunError: it is not a finite rigid transform, or no place on this planet.
         """
         local = validate_pose(T_map_body, self.base_map.origin)
-        if self.state is not State.TRACKING:
-            self._suggestions.robot_at(local)
+        if not self.state.has_place:
+            self._hints.robot_at(local)
 
-    def suspect(self) -> None:
+    def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
-        self._tracker.forget_points()
-        if self.state is State.TRACKING:
-            self._doubt.begin()
+        self._tracker.forget_scans()
+        self._handle(Event.VERIFICATION_REQUIRED)
 
-    def fix(self) -> Fix:
-        """Say what is known after the newest frame, as :meth:`step` does; RuntimeError before the first."""
-        if self._newest is None:
-            raise RuntimeError("no frame yet; call take or step first")
-        return self._fix(self._newest.T_odom_body, self._newest.stamp)
+    # ---- the steps
 
-    def _track(self, cloud: Points, T_odom_body: Pose, stamp: float, idle: bool, alone: bool) -> None:
-        """Correct the drift since the last registration, and verify again that the place is right.
+    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> _Frame:
+        """Check a frame, and move the predicted pose on by its odometry."""
+        cloud, T = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
+        if self._anchor is None:
+            self._anchor = T[:3, 3].copy()
+        T = to_local(T, self._anchor)
+        if self.state.has_place:  # keyframes are for searching: a loss starts from nothing
+            keyframe, voxels = None, self._buffer.voxelize(cloud, T)
+        else:
+            keyframe = self._buffer.add(cloud, T, stamp)
+            voxels = self._buffer.newest
+        self._tracker.add_scan(voxels, T)
+        self._newest = _Frame(cloud, T, stamp, voxels, keyframe)
+        return self._newest
 
-        ``idle``: by its odometry the robot stands still. It may be carried, so what it saw before does not count.
-        ``alone``: nor does it where there is a doubt.
-        """
-        self._note(self._tracker.update(cloud, T_odom_body, idle, alone), stamp)
+    def _search_request(self, frame: _Frame) -> SearchRequest | None:
+        """Return what has to be searched for: the keyframe that a frame completes."""
+        assert self._anchor is not None  # there is a frame
+        hints = self._hints.about(self._anchor, frame.T_odom_body)
+        if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
+            self._restart_search(frame.stamp)
+            return None
+        if frame.keyframe is None:
+            return None
+        spec, travelled = self._search.spec, self._tracker.travelled
+        return SearchRequest.of(
+            self._buffer, frame.keyframe, frame.cloud, spec, travelled, self._epoch, hints
+        )
 
-    def _note(self, judgement: MatchVerdict, stamp: float, found: KeyframeEvidence | None = None) -> None:
-        """Draw the consequences of a registration; one that confirms what the search has ``found`` adds nothing."""
-        self._registered = stamp
-        reason = self._doubt.note(judgement, stamp, self._tracker.travelled)
-        if found is not None and judgement.verified:
-            return
-        if self._doubt.hopeless:
-            self._lose()
-        doubtful = self.state is State.TRACKING and self._doubt.active
-        self._evidence = KeyframeEvidence(
-            stamp, State.AMBIGUOUS if doubtful else self.state, reason, judgement.score, 0.0, judgement.evidence,
-            cause=judgement.cause, innovation=judgement.innovation,
-        )  # fmt: skip
+    def _begin_tracking(self, result: SearchResult) -> MapMatch | None:
+        """Begin at the place that a search has accepted, if any, with a registration of the newest frame there."""
+        newest = self._newest
+        if result.epoch != self._epoch or self.state.has_place or newest is None:
+            return None
+        self._evidence = result.evidence
+        if result.accepted is None:
+            proposed = result.evidence.state is State.AMBIGUOUS
+            self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
+            return None
+        self._handle(Event.PLACE_ACCEPTED)
+        self._tracker.start(result.accepted.registration, newest.T_odom_body, result.travelled)
+        self._monitor.clear()
+        self._hints.clear()
+        self._buffer.clear()
+        # the robot may have driven on or been carried since the keyframe
+        match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
+        return replace(match, confirms_search=True)
 
-    def _lose(self) -> None:
-        """Search again from nothing: what lost the place may be an odometry that jumped or started anew.
+    def _match_to_map(self, frame: _Frame, defer: bool = False) -> MapMatch | None:
+        """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
+        patience = _DEFERRED if defer else 1.0
+        due = self._tracker.needs_registration(patience)
+        waited = frame.stamp - self._registered_at >= patience * self.config.tracking.seconds
+        newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
+        if due or waited or newest_only:
+            return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
+        self._tracker.prefetch_map(frame.T_odom_body)
+        return None
+
+    def _verify(self, match: MapMatch) -> Event:
+        """Return what a registration means for the place; its evidence is the next fix's, where it adds any."""
+        assert self._newest is not None  # it is of the newest frame
+        stamp, verdict = self._newest.stamp, match.verdict
+        event, reason = self._monitor.verify(verdict, stamp, self._tracker.travelled)
+        self._registered_at = stamp
+        if not (match.confirms_search and verdict.verified):
+            self._evidence = KeyframeEvidence(
+                stamp, next_state(self.state, event), reason, verdict.score, 0.0, verdict.evidence,
+                cause=verdict.cause, innovation=verdict.innovation,
+            )  # fmt: skip
+        return event
+
+    def _update(self, match: MapMatch, event: Event) -> None:
+        """Correct the pose by a registration that is believed, and move on to the state that follows."""
+        assert self._newest is not None  # as in _verify
+        self._tracker.update(match, self._newest.T_odom_body)
+        self._handle(event)
+
+    # ---- states
+
+    def _handle(self, event: Event) -> None:
+        """Move on to the state that an event leads to (docs/tracking.md has the table)."""
+        before, self.state = self.state, next_state(self.state, event)
+        if self.state is State.LOST and before is not State.LOST:
+            self._forget_place()
+
+    def _forget_place(self) -> None:
+        """Search again from nothing: what lost the place may be an odometry that jumped or began anew.
 
         It may also be the sensor or the map, so where odometry says that the robot is now is worth a try.
         """
         if self._anchor is not None:
-            self._suggestions.frames_were(self._tracker.T_map_odom, self._anchor)
-        self.state, self._anchor = State.LOST, None
+            self._hints.odometry_continues(self._tracker.T_map_odom, self._anchor)
+        self._anchor = None
         self._buffer.clear()
-        self._continuity.clear()
-        self._tracker.forget()
-        self._generation += 1
+        self._odometry_check.clear()
+        self._tracker.forget_odometry()
+        self._next_epoch()
 
-    def _break_off(self, stamp: float) -> None:
-        """Search again from nothing, for the keyframes so far do not belong together with what is seen now."""
+    def _restart_search(self, stamp: float) -> None:
+        """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
-        self._tracker.forget_points()
-        self._generation += 1
-        if self.state is State.AMBIGUOUS:
-            self.state = State.SEARCHING
+        self._tracker.forget_scans()
+        self._next_epoch()
+        self._handle(Event.SCANS_CONTRADICT)
         reason = "searching anew: frames do not fit together where odometry puts them"
         self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=RejectionReason.ODOMETRY)
 
-    def _fix(self, T_odom_body: Pose, stamp: float) -> Fix:
-        evidence = self._evidence
-        if self.state is not State.TRACKING or self._anchor is None:
-            return Fix(stamp, self.state, evidence=evidence)
-        if self._doubt.active:  # a pose that the newest registration speaks against is none
-            return Fix(stamp, State.AMBIGUOUS, evidence=evidence)
-        T_map_local = orthonormal(self._tracker.T_map_odom)
-        T_map_body = T_map_local @ T_odom_body
-        confidence = max(0.0, evidence.score - evidence.rival) if evidence else 0.0
-        return Fix(
-            stamp,
-            self.state,
-            pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
-            to_map_origin(T_map_local, self._anchor, self.base_map.origin),
-            self._tracker.reported_covariance(),
-            confidence,
-            evidence,
-            self._tracker.drift,
-        )
-
-    def _checked(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:
-        """Finite float32 points, and the pose relative to the first one so that float32 stays exact."""
-        finite, T = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
-        if self._anchor is None:
-            self._anchor = T[:3, 3].copy()
-        return finite, to_local(T, self._anchor)
+    def _next_epoch(self) -> None:
+        """Begin another epoch: requests on their way belong to what has been forgotten."""
+        self._epoch = (self._epoch[0], self._epoch[1] + 1)

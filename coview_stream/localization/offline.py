@@ -21,7 +21,8 @@ from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.transforms import pose_from, pose_from_tum
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.state import State
 from coview_stream.recordings.run import Frame, Run
 
 Progress = Callable[[int, int, Fix | None], None]
@@ -77,7 +78,7 @@ class RunResult:
             np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
         )
         return {
-            "state": self.state.value,
+            "state": self.state.reported,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
             "frames": self.frames,
@@ -204,7 +205,7 @@ def summary(located: RunResult) -> str:
     """Say it in a few lines for a person."""
     posed = located.posed
     lines = [
-        f"{'state':<18} {located.state.value}",
+        f"{'state':<18} {located.state.reported}",
         f"{'localised':<18} {len(posed)} of {located.frames} frames",
     ]
     if posed:

@@ -1,36 +1,23 @@
-"""What the localizer says after every frame: state, pose, covariance, and the evidence behind them."""
+"""The localizer's answer to a frame: state, pose, covariance, and the evidence behind them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from enum import StrEnum
+from dataclasses import dataclass, fields
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.verification import Evidence
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.odometry_noise import Drift
 
 _SHARES = tuple(f.name for f in fields(Evidence))
 
 
-class State(StrEnum):
-    """What the localizer knows of its place."""
-
-    SEARCHING = "SEARCHING"
-    """No place explains what the robot sees well enough (or too little has been seen)."""
-    AMBIGUOUS = "AMBIGUOUS"
-    """A place does, but another does too, or it has not been confirmed yet."""
-    TRACKING = "TRACKING"
-    """The pose is known."""
-    LOST = "LOST"
-    """It was known; the evidence has gone. Searching again."""
-
-
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """Why a keyframe decided what it decided.
+    """The evidence of one keyframe, and what it decided.
 
     Attributes:
         stamp: seconds.
@@ -63,7 +50,7 @@ class KeyframeEvidence:
         parts = {n: round(shares[n], 4) if n in shares else None for n in _SHARES}
         return {
             "stamp": self.stamp,
-            "state": self.state.value,
+            "state": self.state.reported,
             "reason": self.reason,
             "score": round(self.score, 4),
             "rival": round(self.rival, 4),
@@ -95,7 +82,7 @@ class Fix:
 
     Attributes:
         stamp: seconds, of the frame.
-        state: see :class:`State`.
+        state: see :class:`~coview_stream.localization.state.State`.
         T_map_body: (4, 4) float64 in the frame of the map's sources; None unless TRACKING.
         T_map_odom: (4, 4) float64, the correction behind it; None unless TRACKING.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2; None unless TRACKING. The angles are small
@@ -113,10 +100,5 @@ class Fix:
     T_map_odom: Pose | None = None
     covariance: Floats | None = None
     confidence: float = 0.0
-    evidence: KeyframeEvidence | None = field(default=None)
+    evidence: KeyframeEvidence | None = None
     drift: Drift | None = None
-
-    @property
-    def doubted(self) -> bool:
-        """Whether AMBIGUOUS means that a place that was found is in doubt, not that a search has yet to decide."""
-        return self.state is State.AMBIGUOUS and self.evidence is not None and self.evidence.cause is not None

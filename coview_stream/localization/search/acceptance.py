@@ -1,4 +1,4 @@
-"""When to believe what a search has found: once one place has stood alone, often and clearly enough."""
+"""The decision on a search: a place is accepted once it has stood alone, often and clearly enough."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.result import KeyframeEvidence, State
+from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.refinement import Candidate
-from coview_stream.localization.search.request import SearchRequest, same_place
+from coview_stream.localization.search.request import Epoch, SearchRequest, same_place
+from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"
 """What an evidence's reason ends with where learned features have named the best hypothesis."""
@@ -17,107 +18,121 @@ BY_FEATURES = " (by learned features)"
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What one keyframe's search came to: the accepted candidate if any, why, and the query's book-keeping."""
+    """What one keyframe's search came to.
+
+    Attributes:
+        accepted: the place, once there is one.
+        evidence: of the best candidate, with the state it leads to and the reason.
+        travelled: metres that odometry had driven at the keyframe.
+        epoch: the request's.
+    """
 
     accepted: Candidate | None
     evidence: KeyframeEvidence
     travelled: float = 0.0
-    generation: int = 0
+    epoch: Epoch = (0, 0)
 
 
 class AcceptanceTest:
-    """Judges keyframe by keyframe, and remembers the favourite and what has spoken for it."""
+    """Judges keyframe by keyframe; remembers the leading place and the evidence that has added up for it."""
 
     def __init__(self, config: LocalizerConfig) -> None:
         self.config = config
         self.clear()
 
     def clear(self) -> None:
-        """Have no favourite."""
-        self._favourite: Candidate | None = None
+        """Forget the leading place."""
+        self._leading: Candidate | None = None
         self._confirmed = 0
-        self._proof = 0.0
+        self._evidence_sum = 0.0
 
-    def judge(self, candidates: list[Candidate], query: SearchRequest, votes: int) -> SearchResult:
-        """Take in a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
+    def decide(self, candidates: list[Candidate], request: SearchRequest, votes: int) -> SearchResult:
+        """Judge a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
         if not candidates:
             self.clear()
             reason = "no hypothesis fits the map" if votes else "too few points to search with"
-            return SearchResult(None, KeyframeEvidence(query.stamp, State.SEARCHING, reason))
+            evidence = KeyframeEvidence(request.stamp, State.SEARCHING, reason)
+            return SearchResult(None, evidence, request.travelled, request.epoch)
         best = candidates[0]
-        here = [same_place(c.T_map_odom, best.T_map_odom, query) for c in candidates]
+        here = [same_place(c.T_map_odom, best.T_map_odom, request) for c in candidates]
         rival = max(
             (c.evidence.score for c, same in zip(candidates, here, strict=True) if not same), default=0.0
         )
-        favour = max(c.hypothesis.lead for c, same in zip(candidates, here, strict=True) if same)
-        if not self._agrees(best, query):
+        lead = max(c.hypothesis.lead for c, same in zip(candidates, here, strict=True) if same)
+        if not self._agrees(best, request):
             self.clear()
-        state, doubt = self._doubt(best.evidence, rival, favour)
-        if doubt is None and not self._has_rivals(best, candidates, query, votes):
+        state, reason = self._objection(best.evidence, rival, lead)
+        if not reason and not self._has_rivals(best, candidates, request, votes):
             needed = self.config.acceptance.confirmations
-            doubt = f"rivals rest on {votes} keyframes' votes, {needed} needed"
-        if doubt is None:
-            self._favourite = best
+            reason = f"rivals rest on {votes} keyframes' votes, {needed} needed"
+        if not reason:
+            self._leading = best
             self._confirmed += 1
-            self._proof += self._increment(best.evidence, favour)
-            state, doubt = self._confirmation()
+            self._evidence_sum += self._increment(best.evidence, lead)
+            state, reason = self._confirmation()
         if best.hypothesis.station is None:
-            doubt += FROM_THERE
+            reason += FROM_THERE
         elif best.hypothesis.learned:
-            doubt += BY_FEATURES
-        return SearchResult(
-            best if state is State.TRACKING else None,
-            KeyframeEvidence(
-                query.stamp, state, doubt, best.evidence.score, rival, best.evidence,
-                best.hypothesis.station, None if best.hypothesis.learned else best.hypothesis.shift,
-            ),
+            reason += BY_FEATURES
+        evidence = KeyframeEvidence(
+            request.stamp, state, reason, best.evidence.score, rival, best.evidence,
+            best.hypothesis.station, None if best.hypothesis.learned else best.hypothesis.shift,
         )  # fmt: skip
+        accepted = best if state is State.TRACKING else None
+        return SearchResult(accepted, evidence, request.travelled, request.epoch)
 
-    def _doubt(self, evidence: Evidence, rival: float, favour: float) -> tuple[State, str | None]:
-        """Say why this keyframe does not count for its best candidate; None if it does."""
-        rule, alone = self.config.acceptance, self.config.stationary
-        # two that do not know of each other name the same place: each may be less sure of it
-        clear = not alone and favour >= rule.favoured_lead
-        least = rule.single_score if alone else rule.favoured_score if clear else rule.score
-        ground = rule.favoured_ground if clear else rule.ground
-        lead = rule.single_lead if alone else rule.lead
-        if evidence.score < least or evidence.inside < rule.inside:
-            return State.SEARCHING, f"no place fits: best score {evidence.score:.2f}, {least:.2f} needed"
-        if evidence.ground < ground:
-            return State.AMBIGUOUS, f"the ground does not fit: {evidence.ground:.2f}, {ground:.2f} needed"
-        if evidence.score - rival < lead:
+    def _objection(self, evidence: Evidence, rival: float, lead: float) -> tuple[State, str]:
+        """Return why this keyframe does not count for its best candidate; an empty reason if it does.
+
+        ``lead`` is by how much learned features favour the place.
+        """
+        rule, single = self.config.acceptance, self.config.stationary
+        # co-view and learned votes agree, so relax both thresholds
+        agreed = not single and lead >= rule.learned_lead
+        min_score = rule.single_score if single else rule.learned_score if agreed else rule.score
+        min_ground = rule.learned_ground if agreed else rule.ground
+        min_lead = rule.single_lead if single else rule.lead
+        if evidence.score < min_score or evidence.inside < rule.min_overlap:
+            return State.SEARCHING, f"no place fits: best score {evidence.score:.2f}, {min_score:.2f} needed"
+        if evidence.ground < min_ground:
+            return (
+                State.AMBIGUOUS,
+                f"the ground does not fit: {evidence.ground:.2f}, {min_ground:.2f} needed",
+            )
+        if evidence.score - rival < min_lead:
             return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
-        return State.AMBIGUOUS, None
+        return State.AMBIGUOUS, ""
 
     def _has_rivals(
-        self, best: Candidate, candidates: list[Candidate], query: SearchRequest, votes: int
+        self, best: Candidate, candidates: list[Candidate], request: SearchRequest, votes: int
     ) -> bool:
         """Whether enough keyframes have voted for what else it might be; a place found by votes needs no more."""
         voted = any(
-            c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, query)
+            c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, request)
             for c in candidates
         )
         return voted or votes >= self.config.acceptance.confirmations
 
-    def _increment(self, evidence: Evidence, favour: float) -> float:
-        """Return what a keyframe that counts adds to the proof: less if much of what it saw is not on the map.
+    def _increment(self, evidence: Evidence, lead: float) -> float:
+        """Return what a keyframe adds to the evidence: less if much of what it saw is not on the map.
 
         More if the place is also the one that learned features favour most, for they know nothing of its fit.
         """
         rule = self.config.acceptance
-        beyond = evidence.score - (rule.favoured_floor if favour > 0 else rule.proof_floor)
-        return max(0.0, beyond) * min(1.0, evidence.inside / rule.inside_fully)
+        beyond = evidence.score - (rule.learned_floor if lead > 0 else rule.evidence_floor)
+        return max(0.0, beyond) * min(1.0, evidence.inside / rule.full_overlap)
 
     def _confirmation(self) -> tuple[State, str]:
         rule = self.config.acceptance
         if self.config.stationary:
             return State.TRACKING, "one scan, and it stands alone"
-        reason = f"confirmed by {self._confirmed} keyframes, proof {self._proof:.2f} of {rule.proof:.2f}"
-        enough = self._confirmed >= rule.confirmations and self._proof >= rule.proof
+        total = f"{self._evidence_sum:.2f} of {rule.evidence_sum:.2f}"
+        reason = f"confirmed by {self._confirmed} keyframes, proof {total}"
+        enough = self._confirmed >= rule.confirmations and self._evidence_sum >= rule.evidence_sum
         return State.TRACKING if enough else State.AMBIGUOUS, reason
 
-    def _agrees(self, best: Candidate, query: SearchRequest) -> bool:
+    def _agrees(self, best: Candidate, request: SearchRequest) -> bool:
         rule = self.config.acceptance
-        return self._favourite is not None and same_place(
-            best.T_map_odom, self._favourite.T_map_odom, query, rule.agree_distance, rule.agree_angle
+        return self._leading is not None and same_place(
+            best.T_map_odom, self._leading.T_map_odom, request, rule.agree_distance, rule.agree_angle
         )

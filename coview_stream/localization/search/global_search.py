@@ -9,24 +9,23 @@ from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.scan_matcher import ScanInput
 from coview_stream.localization.search.acceptance import AcceptanceTest, SearchResult
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import Candidate, Refinement
-from coview_stream.localization.search.request import RequestSpec, SearchRequest, same_place
-
-__all__ = ["Candidate", "GlobalSearch", "Query", "Verdict"]
+from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
 
 _REMEMBERED = 2  # best candidates that the next keyframe tries again
 
 
 class GlobalSearch:
-    """Votes, registers the best hypotheses, verifies them, and accepts one only when it stands alone.
+    """Search of the whole map, a keyframe at a time (paper, Algorithm 1); docs/method.md follows its steps.
 
     Attributes:
-        coview: the source of hypotheses that the paper has; None if it is not used.
-        learned: the source by learned features; None if it is not used.
+        coview: the recognizer by the paper's descriptors; None if it is not used.
+        learned: the recognizer by learned features; None if it is not used.
     """
 
     def __init__(
@@ -34,40 +33,28 @@ class GlobalSearch:
         base_map: BaseMap,
         config: LocalizerConfig,
         local_maps: LocalMaps,
-        knowledge: SearchIndex | None = None,
+        index: SearchIndex | None = None,
     ) -> None:
-        """Search a map; searches of one map may share ``knowledge``. Raises what :meth:`SearchIndex.of` does."""
+        """Search a map; searches of one map may share ``index``. Raises what :meth:`SearchIndex.of` does."""
         self.base_map = base_map
-        # eight places a keyframe: GICP would have to prepare the map at each, and tracking starts with it anyway
+        # many places a keyframe: GICP would have to prepare the map at each, and tracking starts with it anyway
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
-        self.local_maps = local_maps
-        known = knowledge or SearchIndex.of(base_map, config)
-        self.learned: PlaceRecognizer | None = None
-        if known.learned is not None:
-            from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
-
-            self.learned = LearnedRecognizer(base_map, config, known.learned)
-        # together they name no more than can be registered in time
-        peaks = config.consensus.peaks
-        peaks = peaks if known.learned is None else min(peaks, config.learned.peaks)
-        self.coview = (
-            None if known.retrieval is None else CoViewRecognizer(base_map, config, known.retrieval, peaks)
-        )
-        self._sources: list[PlaceRecognizer] = [s for s in (self.coview, self.learned) if s is not None]
+        index = index or SearchIndex.of(base_map, config)
+        self.coview, self.learned = _recognizers(base_map, config, index)
+        self._recognizers = [each for each in (self.coview, self.learned) if each is not None]
         self._refinement = Refinement(base_map, self.config, local_maps)
-        self._decision = AcceptanceTest(self.config)
-        self._remembered: list[Hypothesis] = []
-        self._trials = HintSchedule()
-        self._generation = 0
+        self._acceptance = AcceptanceTest(self.config)
+        self._epoch: Epoch = (0, 0)
+        self.clear()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its sources of hypotheses."""
-        return tuple(n for n, s in (("coview", self.coview), ("learned", self.learned)) if s is not None)
+        """Names of its recognizers."""
+        return tuple(n for n, r in (("coview", self.coview), ("learned", self.learned)) if r is not None)
 
     @property
-    def needs(self) -> RequestSpec:
-        """What its queries have to have."""
+    def spec(self) -> RequestSpec:
+        """What its requests have to bring."""
         return RequestSpec(
             None if self.coview is None else self.base_map.descriptor_config,
             None if self.learned is None else self.config.learned.reach,
@@ -80,11 +67,11 @@ class GlobalSearch:
 
     def clear(self) -> None:
         """Forget all votes and confirmations."""
-        for source in self._sources:
-            source.clear()
-        self._remembered = []
-        self._trials = HintSchedule()
-        self._decision.clear()
+        for recognizer in self._recognizers:
+            recognizer.clear()
+        self._remembered: list[Hypothesis] = []
+        self._hints = HintSchedule()
+        self._acceptance.clear()
 
     def reset(self) -> None:
         """Forget the newest descriptors as well."""
@@ -92,54 +79,84 @@ class GlobalSearch:
         if self.coview is not None:
             self.coview.last_query = {}
 
-    def update(self, query: SearchRequest) -> SearchResult:
-        """Take in one keyframe and judge; once a place is accepted, the next query starts the search anew."""
-        if query.generation != self._generation:
+    def update(self, request: SearchRequest) -> SearchResult:
+        """Search the map for one keyframe; a request of another epoch, or one after an acceptance, starts anew."""
+        if request.epoch != self._epoch:
             self.clear()
-            self._generation = query.generation
-        for source in self._sources:
-            source.vote(query)
-        # what was good at the last keyframe is tried again, whatever the votes say now
-        hypotheses = [*self._voted(query), *self._remembered]
-        suggested = self._suggested(query)
-        moving = prepare_scan(query.submap, query.position, self.config.registration)
-        candidates = self._refinement.refine([*hypotheses, *suggested], moving, query)
-        if suggested:
-            self._trials.tried(self._refuted(suggested, candidates, query))
+            self._epoch = request.epoch
+        scan = ScanInput(
+            prepare_scan(request.submap, request.position, self.config.registration),
+            request.cloud,
+            request.T_odom_body,
+        )
+        votes = self._vote(request)  # eqs 1-9: descriptors, distances to all stations at all turns
+        hypotheses, hints = self._propose(request)  # eq. 12: peaks of the consensus as T_map_odom
+        registered = self._register([*hypotheses, *hints], scan)  # eq. 13, coarse scales
+        candidates = self._verify(registered, scan)  # eq. 13, fine scales, and the evidence there
+        self._remember(candidates, hints, request)
+        return self._decide(candidates, request, votes)
+
+    def _vote(self, request: SearchRequest) -> int:
+        """Let every recognizer compare the keyframe with the map; return how many keyframes have voted."""
+        for recognizer in self._recognizers:
+            recognizer.vote(request)
+        return max(map(len, self._recognizers))
+
+    def _propose(self, request: SearchRequest) -> tuple[list[Hypothesis], list[Hypothesis]]:
+        """Return what the votes name and what was good at the last keyframe; and the hints to try now."""
+        learned = [] if self.learned is None else self.learned.hypotheses()
+        coview = [] if self.coview is None else self.coview.hypotheses()
+
+        def known(each: Hypothesis, others: list[Hypothesis]) -> bool:
+            return any(same_place(each.T_map_odom, other.T_map_odom, request) for other in others)
+
+        # a place that both name stands once, if keypoints have made the learned one exact: that one
+        exact = [each for each in learned if each.exact]
+        voted = [each for each in coview if not known(each, exact)] + learned
+        hints = [each for each in self._hints.due(request.hints) if not known(each, self._remembered)]
+        return [*voted, *self._remembered], hints
+
+    def _register(self, hypotheses: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
+        """Register every hypothesis at the coarse scales."""
+        return self._refinement.coarse(hypotheses, scan)
+
+    def _verify(self, registered: list[Candidate], scan: ScanInput) -> list[Candidate]:
+        """Register the promising ones at the fine scales and verify them; best first."""
+        return self._refinement.fine(registered, scan)
+
+    def _remember(self, candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest) -> None:
+        """Keep what the next keyframe tries again: the best candidates, and hints that were not refuted."""
+        least = self.config.acceptance.score
+        if hints:
+            best = max((c.evidence.score for c in candidates if c.hypothesis.station is None), default=0.0)
+            positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
+            # where the map knows nothing, a keyframe does not speak against a hint
+            surveyed = all(self.base_map.surveyed(position).all() for position in positions)
+            self._hints.tried(refuted=surveyed and best < least)
         self._remembered = [
             replace(c.hypothesis, T_map_odom=c.T_map_odom, lead=0.0)
             for c in candidates[:_REMEMBERED]
-            if c.evidence.score >= self.config.acceptance.score
+            if c.evidence.score >= least
         ]
-        verdict = self._decision.judge(candidates, query, max(map(len, self._sources)))
-        if verdict.accepted is not None:
+
+    def _decide(self, candidates: list[Candidate], request: SearchRequest, votes: int) -> SearchResult:
+        """Accept the best candidate, or say why not yet."""
+        result = self._acceptance.decide(candidates, request, votes)
+        if result.accepted is not None:
             self.clear()
-        return replace(verdict, travelled=query.travelled, generation=query.generation)
+        return result
 
-    def _voted(self, query: SearchRequest) -> list[Hypothesis]:
-        """Return what the sources name, and only once what both do, if one of the two is exact: that one."""
-        learned = [] if self.learned is None else self.learned.hypotheses()
-        coview = [] if self.coview is None else self.coview.hypotheses()
-        return [
-            each
-            for each in coview
-            if not any(o.exact and same_place(each.T_map_odom, o.T_map_odom, query) for o in learned)
-        ] + learned
 
-    def _suggested(self, query: SearchRequest) -> list[Hypothesis]:
-        """Return the suggestions to try now, but none that is remembered from the last keyframe."""
-        return [
-            each
-            for each in self._trials.due(query.suggested)
-            if not any(same_place(each.T_map_odom, other.T_map_odom, query) for other in self._remembered)
-        ]
+def _recognizers(
+    base_map: BaseMap, config: LocalizerConfig, index: SearchIndex
+) -> tuple[CoViewRecognizer | None, PlaceRecognizer | None]:
+    """Return the recognizers by descriptors and by learned features, each None where it is not used."""
+    learned: PlaceRecognizer | None = None
+    if index.learned is not None:
+        from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
 
-    def _refuted(
-        self, suggested: list[Hypothesis], candidates: list[Candidate], query: SearchRequest
-    ) -> bool:
-        """Whether this keyframe speaks against all suggestions; where the map knows nothing, it does not."""
-        best = max((c.evidence.score for c in candidates if c.hypothesis.station is None), default=0.0)
-        known = [
-            self.base_map.surveyed(robot_position(h.T_map_odom, query.T_odom_body)).all() for h in suggested
-        ]
-        return all(known) and best < self.config.acceptance.score
+        learned = LearnedRecognizer(base_map, config, index.learned)
+    # together they name no more than can be registered in time
+    peaks = config.consensus.peaks if learned is None else min(config.consensus.peaks, config.learned.peaks)
+    coview = None if index.retrieval is None else CoViewRecognizer(base_map, config, index.retrieval, peaks)
+    return coview, learned

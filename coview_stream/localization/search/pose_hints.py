@@ -1,4 +1,4 @@
-"""Places where the robot may be before anything has been searched for: hypotheses to verify, never trusted."""
+"""Hints of where the robot may be, from before the search: hypotheses to verify, never trusted."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis
 
-_TRIES = 5  # keyframes in a row that must refute all suggestions before they are tried less often
-_PAUSE = 4  # keyframes between two tries then
+_TRIES = 5  # keyframes in a row that must refute all hints before they are tried less often; set by hand
+_PAUSE = 4  # keyframes between two tries then; set by hand
 
 FROM_THERE = " (from the last known place)"
-"""What an evidence's reason ends with where the best hypothesis began as a suggestion."""
+"""What an evidence's reason ends with where the best hypothesis began as a hint."""
 
 
 class PoseHints:
-    """What a localizer offers its search: poses ``T_map_odom`` in an odometry frame that keeps its origin.
+    """Hints of a localizer to its search: ``T_map_odom`` in an odometry frame that keeps its origin.
 
     The localizer's own odometry frame has its origin moved to an anchor; here it is undone, for after a loss there is
     another anchor. Map coordinates are the map's own.
@@ -33,11 +33,11 @@ class PoseHints:
         self._awaited, self._known = None, ()
 
     def robot_at(self, T_map_body: Pose) -> None:
-        """Suggest that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
+        """Hint that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
         self._awaited = T_map_body
 
-    def frames_were(self, T_map_odom: Pose, anchor: Floats) -> None:
-        """Suggest, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
+    def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
+        """Hint, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
         self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
 
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
@@ -52,7 +52,7 @@ class PoseHints:
 
 
 class HintSchedule:
-    """Which suggestions a search tries at a keyframe: all, until a few keyframes in a row have refuted them.
+    """Schedule of hints: all are tried at every keyframe, until a few in a row have refuted them.
 
     Then at every fifth, not never: the sensor may only have been covered.
     """
@@ -62,23 +62,23 @@ class HintSchedule:
         self._refuted = 0
         self._wait = 0
 
-    def due(self, suggested: Sequence[Pose]) -> list[Hypothesis]:
+    def due(self, hints: Sequence[Pose]) -> list[Hypothesis]:
         """Return those to be tried at this keyframe, as hypotheses with no station behind them."""
-        of = tuple(T.tobytes() for T in suggested)
+        of = tuple(T.tobytes() for T in hints)
         if of != self._of:
             self._of, self._refuted, self._wait = of, 0, 0
         if self._wait:
             self._wait -= 1
             return []
-        return [Hypothesis(T, None, None, 0.0) for T in suggested]
+        return [Hypothesis(T, None, None, 0.0) for T in hints]
 
     def tried(self, refuted: bool) -> None:
-        """Take note of a keyframe at which they were tried, and whether it spoke against all of them."""
+        """Count a keyframe at which they were tried, and whether it spoke against all of them."""
         self._refuted = self._refuted + 1 if refuted else 0
         if self._refuted >= _TRIES:
             self._wait = _PAUSE
 
 
 def robot_position(T_map_odom: Pose, T_odom_body: Pose) -> Floats:
-    """Return where (1, 2) in the map a suggestion puts the robot."""
+    """Return the robot's position (1, 2) in the map, as a hint has it."""
     return transform(T_map_odom, T_odom_body[None, :3, 3])[:, :2]

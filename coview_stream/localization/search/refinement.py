@@ -1,4 +1,4 @@
-"""Hypotheses of ``T_map_odom`` made exact: registered coarse to fine, and verified."""
+"""Hypotheses of ``T_map_odom`` made exact: registered coarse to fine (eq. 13), and verified."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
 from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
-from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior, Registration
-from coview_stream.localization.registration.verification import Evidence, verify
+from coview_stream.localization.registration.scan_matcher import ScanInput, register_and_verify
+from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.request import SearchRequest
 
-_COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through
-_COARSE_EVERY = 3  # of the source's points, for the coarse scales only every third
+_COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through; set by hand
+_COARSE_EVERY = 3  # the coarse scales register every third point
 _COARSE_ITERATIONS = 8
-_HOPELESS = (
-    0.5  # of the best (or needed) score: what has less than this share after them is not refined further
-)
+_MIN_SHARE = 0.5  # of the best (or needed) score: with less than that a candidate stays coarse; set by hand
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A registered and verified hypothesis of ``T_map_odom``."""
+    """A registered and verified hypothesis of ``T_map_odom``.
+
+    Attributes:
+        hypothesis: where it began.
+        registration: what came of it.
+        evidence: shares of the scan that fit the map there.
+    """
 
     hypothesis: Hypothesis
     registration: Registration
@@ -40,63 +43,62 @@ class Candidate:
 
 
 class Refinement:
-    """Registers hypotheses against the map around them and verifies what comes out."""
+    """Two rounds of registration: all hypotheses coarsely, then the promising ones finely."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
         self.base_map = base_map
         self.config = config
         self.local_maps = local_maps
 
-    def refine(
-        self, hypotheses: list[Hypothesis], source: RegistrationCloud, query: SearchRequest
-    ) -> list[Candidate]:
-        """Return verified candidates, best first. All go through the coarse scales, the promising ones through all."""
+    def coarse(self, hypotheses: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
+        """Return what the coarse scales make of every hypothesis, best first; without those that find no hold."""
+        scales = self.config.registration.search[:_COARSE_SCALES]
+        thinned = scan.cloud.every(_COARSE_EVERY)
+        found = [self._candidate(each, scan, scales, thinned) for each in hypotheses]
+        return _best_first([each for each in found if each is not None])
+
+    def fine(self, candidates: list[Candidate], scan: ScanInput) -> list[Candidate]:
+        """Return the candidates, best first; the promising ones, and the best one's rival, at the finest scales."""
         scales = self.config.registration.search
-        rough = source.every(_COARSE_EVERY)
-        coarse = [
-            candidate
-            for hypothesis in hypotheses
-            if (candidate := self._candidate(hypothesis, rough, source, query, scales[:_COARSE_SCALES]))
-        ]
-        coarse.sort(key=lambda c: -c.evidence.score)
-        enough = _HOPELESS * max(coarse[0].evidence.score if coarse else 0.0, self.config.acceptance.score)
-        fine: list[Candidate] = []
-        for rank, candidate in enumerate(coarse):
+        scales = scales[_COARSE_SCALES:] or scales[-1:]
+        best = candidates[0].evidence.score if candidates else 0.0
+        enough = _MIN_SHARE * max(best, self.config.acceptance.score)
+        refined: list[Candidate | None] = []
+        for rank, candidate in enumerate(candidates):
             # the best and its rival are compared on equal terms; what is far below them stays as it is
-            if coarse[0].evidence.score < enough or (rank > 1 and candidate.evidence.score < enough):
-                fine.append(candidate)
+            if best < enough or (rank > 1 and candidate.evidence.score < enough):
+                refined.append(candidate)
                 continue
-            again = replace(candidate.hypothesis, T_map_odom=candidate.T_map_odom)
-            refined = self._candidate(again, source, source, query, scales[_COARSE_SCALES:] or scales[-1:])
-            if refined is not None:
-                fine.append(refined)
-        return sorted(fine, key=lambda c: -c.evidence.score)
+            start = replace(candidate.hypothesis, T_map_odom=candidate.T_map_odom)
+            refined.append(self._candidate(start, scan, scales))
+        return _best_first([each for each in refined if each is not None])
 
     def _candidate(
         self,
         hypothesis: Hypothesis,
-        moving: RegistrationCloud,
-        source: RegistrationCloud,
-        query: SearchRequest,
+        scan: ScanInput,
         scales: tuple[float, ...],
+        thinned: RegistrationCloud | None = None,
     ) -> Candidate | None:
-        """Register ``moving`` from the hypothesis and verify with ``source``; None if it finds no hold or tilts."""
+        """Register and verify; None off the map, where too few points find a partner, or where the result leans."""
         start = hypothesis.T_map_odom
-        target = self.local_maps.around(transform(start, query.position[None])[0])
+        target = self.local_maps.around(transform(start, scan.T_odom_body[None, :3, 3])[0])
         if target is None:
             return None
+        settings = self.config.registration
         level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
-        upright = Prior(level, gravity_information(self.config.registration.gravity_sigma))
-        iterations = None if moving is source else _COARSE_ITERATIONS
-        found = register(
-            moving, start, target, self.config.registration, scales, upright, query.position, iterations
+        upright = Prior(level, gravity_information(settings.gravity_sigma))
+        iterations = None if thinned is None else _COARSE_ITERATIONS
+        match = register_and_verify(
+            self.base_map, scan, start, target, settings, scales, upright, thinned, iterations
         )
-        if found is None or tilt_of(found.T_map_source) > self.config.acceptance.max_tilt:
+        if match.registration is None or tilt_of(match.T_map_odom) > self.config.acceptance.max_tilt:
             return None
-        T = found.T_map_source
-        surveyed = self.base_map.surveyed(transform(T, source.points)[:, :2])
-        evidence = verify(source, T, query.seen, T @ query.T_odom_body, target, surveyed)
-        return Candidate(hypothesis, found, evidence)
+        return Candidate(hypothesis, match.registration, match.evidence)
+
+
+def _best_first(candidates: list[Candidate]) -> list[Candidate]:
+    return sorted(candidates, key=lambda c: -c.evidence.score)
 
 
 def gravity_information(sigma: float) -> Floats:

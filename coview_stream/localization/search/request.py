@@ -1,30 +1,38 @@
-"""What a search has to know of a keyframe; plain data, so that it may be asked later and elsewhere."""
+"""A keyframe as the search needs it: plain data, so that the search may run later and in another process."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
 from coview_stream.config import DescriptorConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle
-from coview_stream.localization.registration.verification import RangeImage
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
-_SUBMAP_KEYFRAMES = 4  # of the newest in the local scan that is registered: more are smeared by drift
-_SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one
-_SAME_ANGLE = np.radians(5.0)
+_SUBMAP_KEYFRAMES = (
+    4  # of the newest in the submap that is registered: more are smeared by drift; set by hand
+)
+_SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
+_SAME_ANGLE = np.radians(5.0)  # likewise
+
+Epoch = tuple[int, int]
+"""What belongs together in time: the number of the odometry frame, and how often the localizer has begun anew."""
 
 
-def _nothing() -> Points:
+def _no_points() -> Points:
     return np.empty((0, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class RequestSpec:
-    """What queries have to bring: a scan for ``descriptor``, surroundings up to ``reach`` metres; None for neither."""
+    """What requests have to bring.
+
+    Attributes:
+        descriptor: the local scan's descriptor; None if no scan is needed.
+        reach: radius of the surroundings, metres; None if they are not needed.
+    """
 
     descriptor: DescriptorConfig | None
     reach: float | None = None
@@ -32,7 +40,7 @@ class RequestSpec:
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """All that a search needs to know of one keyframe; whoever searches may do it later and elsewhere.
+    """One keyframe to search the map for.
 
     Attributes:
         stamp: seconds, of the keyframe.
@@ -41,8 +49,8 @@ class SearchRequest:
         submap: (N, 3) float32 points of the newest keyframes, odometry frame: what is registered.
         cloud: (N, 3) float32 newest frame, body frame.
         travelled: metres that odometry had driven.
-        generation: of the localizer's memory; a query of another generation starts the search anew.
-        suggested: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
+        epoch: of the localizer's memory; a request of another epoch starts the search from nothing.
+        hints: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
         surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
             compared.
     """
@@ -53,19 +61,14 @@ class SearchRequest:
     submap: Points
     cloud: Points
     travelled: float = 0.0
-    generation: int = 0
-    suggested: tuple[Pose, ...] = ()
-    surroundings: Points = field(default_factory=_nothing)
+    epoch: Epoch = (0, 0)
+    hints: tuple[Pose, ...] = ()
+    surroundings: Points = field(default_factory=_no_points)
 
     @property
     def position(self) -> Floats:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
-
-    @cached_property
-    def seen(self) -> RangeImage:
-        """The newest frame by direction."""
-        return RangeImage.of(self.cloud)
 
     @classmethod
     def of(
@@ -73,33 +76,31 @@ class SearchRequest:
         buffer: KeyframeBuffer,
         keyframe: Keyframe,
         cloud: Points,
-        needs: RequestSpec,
+        spec: RequestSpec,
         travelled: float = 0.0,
-        generation: int = 0,
-        suggested: tuple[Pose, ...] = (),
+        epoch: Epoch = (0, 0),
+        hints: tuple[Pose, ...] = (),
     ) -> SearchRequest:
-        """Ask about the newest keyframe of a buffer; ``cloud`` (N, 3) is its newest frame, body frame."""
-        scan = surroundings = _nothing()
-        if needs.descriptor is not None:
-            radius, voxel = needs.descriptor.radius, needs.descriptor.voxel
-            scan = buffer.virtual_scan(keyframe.position, radius, voxel)
-        if needs.reach is not None:
-            surroundings = buffer.virtual_scan(keyframe.position, needs.reach, buffer.config.voxel)
+        """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is its newest frame, body frame."""
+        scan = surroundings = _no_points()
+        if spec.descriptor is not None:
+            scan = buffer.virtual_scan(keyframe.position, spec.descriptor.radius, spec.descriptor.voxel)
+        if spec.reach is not None:
+            surroundings = buffer.virtual_scan(keyframe.position, spec.reach, buffer.config.voxel)
         submap = buffer.recent(_SUBMAP_KEYFRAMES)
         return cls(
-            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, generation, suggested,
-            surroundings,
+            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, surroundings
         )  # fmt: skip
 
 
 def same_place(
     T_a: Pose,
     T_b: Pose,
-    query: SearchRequest,
+    request: SearchRequest,
     distance: float = _SAME_DISTANCE,
     angle: float = float(_SAME_ANGLE),
 ) -> bool:
     """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
-    a, b = T_a @ query.T_odom_body, T_b @ query.T_odom_body
+    a, b = T_a @ request.T_odom_body, T_b @ request.T_odom_body
     apart = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
     return apart < distance and rotation_angle(inverse(a) @ b) < angle

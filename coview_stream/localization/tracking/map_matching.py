@@ -1,9 +1,8 @@
-"""One attempt to register a scan from a belief about its pose: what was found, and what is to be thought of it."""
+"""Matching to the map while tracking: one scan registered from a belief about its pose, verified and judged."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -11,113 +10,106 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, inverse, tilt_of, transform
+from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
-from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.result import Prior
-from coview_stream.localization.registration.verification import Evidence, RangeImage, verify
+from coview_stream.localization.registration.scan_matcher import ScanInput, register_and_verify
+from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
 
 @dataclass(frozen=True)
-class ScanInput:
-    """What is registered: the newest frames' points (odometry frame), the newest frame (body), its odometry (4, 4)."""
-
-    source: RegistrationCloud
-    cloud: Points
-    T_odom_body: Pose
-
-    @cached_property
-    def seen(self) -> RangeImage:
-        """The newest frame by direction."""
-        return RangeImage.of(self.cloud)
-
-
-@dataclass(frozen=True)
 class MapMatch:
-    """A registration and its judgement.
+    """One registration while tracking, and the verdict on it.
 
     Attributes:
-        judgement: whether it is believed, were it not for odometry.
+        verdict: whether it is believed, and why not.
         T_map_body: (4, 4) as the map alone has it.
         covariance: (6, 6) of that, over (rx, ry, rz, x, y, z) along the map's axes.
         innovation: squared Mahalanobis distance from where the graph predicts the pose.
+        scan: what was registered; None where nothing could be.
+        target: the map around it; None likewise.
+        confirms_search: it is the first at an accepted place; verified, it adds nothing to the search's evidence.
     """
 
-    judgement: MatchVerdict
+    verdict: MatchVerdict
     T_map_body: Pose
     covariance: Floats
-    innovation: float
+    innovation: float = 0.0
+    scan: ScanInput | None = None
+    target: LocalMap | None = None
+    confirms_search: bool = False
+
+    @classmethod
+    def without_registration(cls, verdict: MatchVerdict, belief: Estimate) -> MapMatch:
+        """Return the match of a scan that finds no hold: the belief stays."""
+        return cls(verdict, belief.T_map_body, belief.covariance)
 
 
-@dataclass(frozen=True)
 class MapMatcher:
     """Registers, verifies and judges scans on a base map.
 
     Attributes:
         base_map: knows where it has been surveyed.
         config: of registration and acceptance.
+        baseline: usual evidence, which new evidence is judged by.
     """
 
-    base_map: BaseMap
-    config: LocalizerConfig
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, baseline: EvidenceBaseline) -> None:
+        self.base_map = base_map
+        self.config = config
+        self.baseline = baseline
 
-    def attempt(
+    def match(
         self,
         scan: ScanInput,
         belief: Estimate,
         target: LocalMap,
         scales: tuple[float, ...],
-        habit: EvidenceBaseline,
         graph: PoseGraph,
     ) -> MapMatch:
-        """Register, verify and judge; where the numbers leave nothing to hold on to, the belief stays.
+        """Register (eq. 13), verify and judge; where the numbers leave nothing to hold on to, the belief stays.
 
         Args:
             scan: what to register.
             belief: pose and covariance that it starts from, and that take part in it as a prior.
             target: the map around it.
             scales: largest correspondence distance of each scale, metres.
-            habit: what evidence has been like.
             graph: predicts the pose.
         """
         settings, acceptance = self.config.registration, self.config.acceptance
         T_start = belief.T_map_body @ inverse(scan.T_odom_body)
         information = _inverted(belief.covariance)
         if information is None:
-            return _unheld(belief, "what is believed so far has a covariance without an inverse")
+            return _no_hold(belief, "what is believed so far has a covariance without an inverse")
         prior = Prior(T_start, information)
-        found = register(scan.source, T_start, target, settings, scales, prior, scan.T_odom_body[:3, 3])
-        T = T_start if found is None else found.T_map_source
-        surveyed = self.base_map.surveyed(transform(T, scan.source.points)[:, :2])
-        evidence = verify(scan.source, T, scan.seen, T @ scan.T_odom_body, target, surveyed)
-        cause, reason = habit.judge(evidence, acceptance)
-        if found is None:
+        found = register_and_verify(self.base_map, scan, T_start, target, settings, scales, prior)
+        cause, reason = self.baseline.judge(found.evidence, acceptance)
+        if found.registration is None:
             if cause is RejectionReason.VERIFIED:
-                return _unheld(belief, "too few points have a partner in the map", evidence)
-            return MapMatch(MatchVerdict(cause, reason, evidence), belief.T_map_body, belief.covariance, 0.0)
-        if tilt_of(T) > acceptance.max_tilt:
-            cause, reason = (
-                RejectionReason.TILT,
-                f"leans {np.degrees(tilt_of(T)):.0f} degrees against gravity",
-            )
+                return _no_hold(belief, "too few points have a partner in the map", found.evidence)
+            return MapMatch.without_registration(MatchVerdict(cause, reason, found.evidence), belief)
+        tilt = tilt_of(found.T_map_odom)
+        if tilt > acceptance.max_tilt:
+            cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
         try:
-            alone = remove_prior(
-                T @ scan.T_odom_body, found.information, belief.T_map_body, information, settings
+            T_map_body = found.T_map_odom @ scan.T_odom_body
+            own = remove_prior(
+                T_map_body, found.registration.information, belief.T_map_body, information, settings
             )
-            covariance = registration_covariance(alone.information, settings)
-            innovation = graph.innovation(alone.T_map_body, covariance)
+            covariance = registration_covariance(own.information, settings)
+            innovation = graph.innovation(own.T_map_body, covariance)
         except InputError as error:
-            return _unheld(belief, str(error), evidence)
-        judgement = MatchVerdict(cause, reason, evidence, innovation)
-        return MapMatch(judgement, alone.T_map_body, covariance, innovation)
+            return _no_hold(belief, str(error), found.evidence)
+        verdict = MatchVerdict(cause, reason, found.evidence, innovation)
+        return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target)
 
 
-def _unheld(belief: Estimate, reason: str, evidence: Evidence | None = None) -> MapMatch:
-    judgement = MatchVerdict(RejectionReason.FITNESS, f"no hold: {reason}", evidence)
-    return MapMatch(judgement, belief.T_map_body, belief.covariance, 0.0)
+def _no_hold(belief: Estimate, reason: str, evidence: Evidence | None = None) -> MapMatch:
+    verdict = MatchVerdict(RejectionReason.FITNESS, f"no hold: {reason}", evidence)
+    return MapMatch.without_registration(verdict, belief)
 
 
 def _inverted(covariance: Floats) -> Floats | None:

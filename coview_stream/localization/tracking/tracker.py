@@ -1,6 +1,8 @@
-"""Tracking: registrations of the newest frames and odometry between them, in one graph of poses."""
+"""Tracking: registrations of the newest scans and odometry between them, in one graph of poses."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,21 +17,23 @@ from coview_stream.localization.registration.covariance import (
     swap_rotation_translation,
 )
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
-from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.result import Registration
+from coview_stream.localization.registration.scan_matcher import ScanInput
 from coview_stream.localization.tracking.displacement_check import DisplacementCheck
-from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, ScanInput
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.odometry_noise import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
-_LEAST_SOURCE = 100  # points to register
-_IDLE_DRIVE = 0.2  # metres: what standing still until the next look counts as
+_MIN_POINTS = 100  # to register; set by hand
+_STANDING_DRIVE = 0.2  # metres: what standing still until the next registration counts as; set by hand
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
+"""Covariance of a place that the search has accepted and that may not have converged yet; set by hand."""
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
-"""What odometry may be off by where it contradicts the lidar: wheels that slip, a robot that is carried."""
+"""Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried; set by hand."""
 
 
 class Tracker:
@@ -40,146 +44,149 @@ class Tracker:
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
-        self.base_map = base_map
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
         self._graph = PoseGraph(config.graph)
-        self._odometer = OdometryTracker(config.tracking)
-        self._habit = EvidenceBaseline()
-        self._glance = DisplacementCheck()
-        self._recent = ScanBuffer(config.tracking)
-        self._unseen = 0  # frames since the last update
-        self._shared = SharedErrorModel(config.registration)
+        self._odometry = OdometryTracker(config.tracking)
+        self._baseline = EvidenceBaseline()
+        self._matcher = MapMatcher(base_map, config, self._baseline)
+        self._displacement = DisplacementCheck()
+        self._scans = ScanBuffer(config.tracking)
+        self._unregistered = 0  # frames since the newest registration
+        self._shared_error = SharedErrorModel(config.registration)
 
     @property
     def travelled(self) -> float:
         """Metres that odometry has driven."""
-        return self._odometer.travelled
+        return self._odometry.travelled
 
-    # ---- frames
+    @property
+    def drift(self) -> Drift:
+        """How fast odometry seems to drift."""
+        return self._odometry.drift
 
-    def observe(self, cloud: Points, T_odom_body: Pose, thin: Points | None = None) -> None:
-        """Remember a frame's points (body frame) and how far odometry has driven.
+    # ---- scans
 
-        ``thin`` is what :func:`coview_stream.localization.registration.prepare_scan.voxelized` makes of it, if that is known already.
-        """
-        self._odometer.move(T_odom_body)
-        points = voxelized(cloud, T_odom_body, self.config.keyframe) if thin is None else thin
-        self._recent.add(points, self.travelled)
-        self._unseen += 1
+    def add_scan(self, points: Points, T_odom_body: Pose) -> None:
+        """Add a frame's points (N, 3), one per voxel, odometry frame, and how far odometry has driven."""
+        self._odometry.add_pose(T_odom_body)
+        self._scans.add(points, self.travelled)
+        self._unregistered += 1
 
-    def forget(self) -> None:
-        """Drop the remembered frames: what made the robot lose its place may be an odometry that jumped."""
-        self.forget_points()
-        self._odometer.break_off()
+    def forget_odometry(self) -> None:
+        """Drop the scans and the newest odometry: what lost the place may be an odometry that jumped."""
+        self.forget_scans()
+        self._odometry.forget_pose()
 
-    def forget_points(self) -> None:
+    def forget_scans(self) -> None:
         """Drop the points that the next registration would use beside the next frame's."""
-        self._recent.clear()
+        self._scans.clear()
 
-    def look_around(self, T_odom_body: Pose) -> None:
+    def prefetch_map(self, T_odom_body: Pose) -> None:
         """Crop the map here already, on a frame that registers nothing: a new crop takes as long as a registration."""
         if (target := self._target(T_odom_body)) is not None:
             target.prepare(self.config.registration.method)
 
     # ---- when to register
 
-    def due(self, patience: float = 1.0) -> bool:
+    def needs_registration(self, patience: float = 1.0) -> bool:
         """Whether the robot has driven or turned far enough for another registration; ``patience`` times as far."""
-        driven, turned = self._odometer.since_keyframe()
+        driven, turned = self._odometry.since_keyframe()
         settings = self.config.tracking
         if driven >= patience * settings.distance or turned >= patience * settings.turn:
             return True
         if driven < patience * settings.min_distance:
             return False
-        grown = self.drift.variances(driven, turned)
+        variances = self.drift.variances(driven, turned)
         yaw, position = patience * settings.max_yaw_sigma, patience * settings.max_position_sigma
-        return bool(grown[2] > yaw**2 or grown[3] > position**2)
+        return bool(variances[2] > yaw**2 or variances[3] > position**2)
 
-    def alarmed(self, T_odom_body: Pose) -> bool:
+    def looks_displaced(self, T_odom_body: Pose) -> bool:
         """Whether the newest frame lies on the map so much less than the ones before that it should be registered."""
-        target, points = self._target(T_odom_body), self._recent.newest
+        target, points = self._target(T_odom_body), self._scans.newest
         if target is None or points is None:
             return False
-        return self._glance.alarming(points, T_odom_body[:3, 3], self.T_map_odom, target)
+        return self._displacement.is_displaced(points, T_odom_body[:3, 3], self.T_map_odom, target)
 
     # ---- the belief
 
     def start(self, registration: Registration, T_odom_body: Pose, travelled: float) -> None:
-        """Begin with an accepted fix, found where odometry had driven ``travelled`` metres, at the newest frame.
+        """Begin with an accepted place, found where odometry had driven ``travelled`` metres, at the newest frame.
 
         It may not have converged yet: its own covariance is not believed.
         """
-        self._habit.clear()
-        self._glance.clear()
-        self._shared.clear()
+        self._baseline.clear()
+        self._displacement.clear()
+        self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
         drifted = self.drift.covariance(self.travelled - travelled, 0.0)
         self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
 
-    def update(
-        self, cloud: Points, T_odom_body: Pose, idle: bool = False, alone: bool = False
-    ) -> MatchVerdict:
-        """Register the newest frames from the predicted pose, judge, and correct the belief if that went well.
+    def match_to_map(
+        self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False
+    ) -> MapMatch:
+        """Register the newest scans from the predicted pose (eq. 13), verify and judge.
 
         Args:
-            cloud: (N, 3) the newest frame, body frame, which has been observed.
+            cloud: (N, 3) the newest frame, body frame, which has been added.
             T_odom_body: (4, 4) its odometry.
-            idle: by its odometry the robot stands still: use only frames since the last update, and believe the
-                odometry a little less; standing and looking again and again must not add up to certainty.
-            alone: use the newest frame alone: something is wrong with it, or with what came before.
+            standing_still: by its odometry the robot stands still: use only frames since the last registration, and
+                believe the odometry a little less; standing and looking again and again must not add up to certainty.
+            newest_only: use the newest frame alone: something is wrong with it, or with what came before.
         """
-        graph = self._moved(T_odom_body, idle)
-        most = 1 if alone else max(1, self._unseen) if idle else MAX_FRAMES
-        self._recent.keep(most)
-        self._unseen = 0
+        belief = self._predict(T_odom_body, standing_still)
+        self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
+        self._unregistered = 0
         target = self._target(T_odom_body)
         if target is None:
-            return MatchVerdict(RejectionReason.OFF_MAP, "the map is empty here")
-        newest = self._recent.newest
-        source = prepare_scan(self._recent.window(), T_odom_body[:3, 3], self.config.registration)
+            verdict = MatchVerdict(RejectionReason.OFF_MAP, "the map is empty here")
+            return MapMatch.without_registration(verdict, belief)
+        points = prepare_scan(self._scans.window(), T_odom_body[:3, 3], self.config.registration)
+        newest = self._scans.newest
         # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
-        seen = 0 if newest is None else min(len(source.points), len(newest))
-        if newest is None or seen < _LEAST_SOURCE:
-            return self._rejected(MatchVerdict(RejectionReason.BLIND, f"only {seen} points to register"))
-        scan = ScanInput(source, cloud, T_odom_body)
-        belief = graph.estimate
-        tried = self._attempt(scan, belief, target, self.config.registration.track)
+        seen = 0 if newest is None else min(len(points.points), len(newest))
+        if seen < _MIN_POINTS:
+            verdict = MatchVerdict(RejectionReason.BLIND, f"only {seen} points to register")
+            return MapMatch.without_registration(verdict, belief)
+        scan = ScanInput(points, cloud, T_odom_body)
+        match = self._matcher.match(scan, belief, target, self.config.registration.track, self._graph)
         limit = self.config.acceptance.max_innovation
-        if alone or not tried.judgement.verified or tried.innovation > limit:
-            doubted = Estimate(belief.T_map_body, belief.covariance + _SLIP)
-            again = self._attempt(scan, doubted, target, self.config.registration.search[1:])
-            tried = max(tried, again, key=_rank)
-        if not tried.judgement.verified:
-            return self._rejected(tried.judgement)
-        if tried.innovation > limit:
-            return self._slipped(tried, belief, T_odom_body)
-        graph.correct(tried.T_map_body, tried.covariance)
-        self._believe(T_odom_body)
-        self._learn(tried)
-        self._shared.learn(source, self.T_map_odom, target, T_odom_body[:3, 3])
-        self._glance.learn(newest, T_odom_body[:3, 3], self.T_map_odom, target)
-        return tried.judgement
+        if newest_only or not match.verdict.verified or match.innovation > limit:
+            wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
+            scales = self.config.registration.search[1:]
+            again = self._matcher.match(scan, wider, target, scales, self._graph)
+            match = max(match, again, key=_rank)
+        if match.verdict.verified and match.innovation > limit:
+            return _contradicting_odometry(match, belief)
+        return match
+
+    def update(self, match: MapMatch, T_odom_body: Pose) -> None:
+        """Correct the belief by a registration at the newest frame; a rejected one leaves it as it is."""
+        verdict = match.verdict
+        if verdict.cause is RejectionReason.ODOMETRY:
+            # go on where the lidar says, for the next frame to confirm
+            self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
+        elif verdict.verified:
+            self._graph.correct(match.T_map_body, match.covariance)
+            self._set_belief(T_odom_body)
+            self._learn(match, T_odom_body[:3, 3])
+            return
+        self._scans.clear()  # bad frames among the newest must not spoil the next registration too
 
     def predicted_covariance(self) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
-        last = self._odometer.pose
+        last = self._odometry.pose
         if not len(self._graph) or last is None:
             return np.asarray(_START.copy())
         belief = self._graph.estimate
         here = self.T_map_odom @ last
         carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
-        return np.asarray(carried + self.drift.covariance(*self._odometer.since_keyframe()))
+        return np.asarray(carried + self.drift.covariance(*self._odometry.since_keyframe()))
 
     def reported_covariance(self) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
-        return swap_rotation_translation(self.predicted_covariance() + self._shared.covariance)
-
-    @property
-    def drift(self) -> Drift:
-        """How fast odometry seems to drift."""
-        return self._odometer.drift
+        return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance)
 
     # ---- inside
 
@@ -189,47 +196,39 @@ class Tracker:
     def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
         self._graph.start(T_map_body, covariance)
-        self._odometer.unlearn()
-        self._odometer.mark(T_odom_body)
-        self._believe(T_odom_body)
+        self._odometry.forget_registration()
+        self._odometry.set_keyframe(T_odom_body)
+        self._set_belief(T_odom_body)
 
-    def _moved(self, T_odom_body: Pose, idle: bool) -> PoseGraph:
-        """Add a keyframe where odometry leads."""
-        driven, turned = self._odometer.since_keyframe()
-        spread = self.drift.covariance(driven + _IDLE_DRIVE * idle, turned)
-        self._graph.move(self._odometer.motion(T_odom_body), spread)
-        self._odometer.mark(T_odom_body)
-        return self._graph
+    def _predict(self, T_odom_body: Pose, standing_still: bool) -> Estimate:
+        """Add a keyframe where odometry leads, and return what is believed of it."""
+        driven, turned = self._odometry.since_keyframe()
+        spread = self.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
+        self._graph.move(self._odometry.motion(T_odom_body), spread)
+        self._odometry.set_keyframe(T_odom_body)
+        return self._graph.estimate
 
-    def _attempt(
-        self, scan: ScanInput, belief: Estimate, target: LocalMap, scales: tuple[float, ...]
-    ) -> MapMatch:
-        registrar = MapMatcher(self.base_map, self.config)
-        return registrar.attempt(scan, belief, target, scales, self._habit, self._graph)
-
-    def _believe(self, T_odom_body: Pose) -> None:
+    def _set_belief(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self._graph.estimate.T_map_body @ inverse(T_odom_body)
 
-    def _learn(self, tried: MapMatch) -> None:
-        """Take note of what a registration says of odometry, and of what evidence is like here."""
-        assert tried.judgement.evidence is not None  # it was verified
-        self._habit.learn(tried.judgement.evidence)
-        self._odometer.learn(tried.T_map_body, tried.covariance)
-
-    def _rejected(self, judgement: MatchVerdict) -> MatchVerdict:
-        """Believe nothing of it: bad frames among the newest must not spoil the next registration too."""
-        self._recent.clear()
-        return judgement
-
-    def _slipped(self, tried: MapMatch, belief: Estimate, T_odom_body: Pose) -> MatchVerdict:
-        """Go on where the lidar says, for the next frame to confirm: odometry says otherwise."""
-        gap = boxminus(tried.T_map_body, belief.T_map_body)
-        metres, degrees = float(np.linalg.norm(gap[3:])), np.degrees(float(np.linalg.norm(gap[:3])))
-        self._restart(tried.T_map_body, tried.covariance + self._shared.covariance, T_odom_body)
-        self._recent.clear()
-        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
-        return MatchVerdict(RejectionReason.ODOMETRY, reason, tried.judgement.evidence, tried.innovation)
+    def _learn(self, match: MapMatch, position: Floats) -> None:
+        """Learn from a verified registration: odometry's drift, what is usual here, what errors repeat."""
+        evidence, scan, target, newest = match.verdict.evidence, match.scan, match.target, self._scans.newest
+        assert evidence is not None and scan is not None and target is not None and newest is not None
+        self._baseline.learn(evidence)
+        self._odometry.learn(match.T_map_body, match.covariance)
+        self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
+        self._displacement.learn(newest, position, self.T_map_odom, target)
 
 
-def _rank(tried: MapMatch) -> tuple[bool, float]:
-    return tried.judgement.verified, tried.judgement.score
+def _rank(match: MapMatch) -> tuple[bool, float]:
+    return match.verdict.verified, match.verdict.score
+
+
+def _contradicting_odometry(match: MapMatch, belief: Estimate) -> MapMatch:
+    """Return a match with the verdict that the place fits, but not where odometry leads."""
+    gap = boxminus(match.T_map_body, belief.T_map_body)
+    metres, degrees = float(np.linalg.norm(gap[3:])), np.degrees(float(np.linalg.norm(gap[:3])))
+    reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
+    verdict = MatchVerdict(RejectionReason.ODOMETRY, reason, match.verdict.evidence, match.innovation)
+    return replace(match, verdict=verdict)

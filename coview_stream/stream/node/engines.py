@@ -1,4 +1,4 @@
-"""The engine of many robots on one map, in two halves: the quick one tracks, the slow one searches.
+"""Engines of many robots on one map: the quick one tracks, the slow one searches.
 
 They share nothing but the map's file, so each can have a process of its own: a search of 0.3 s must delay neither the
 frames of other robots nor the pose clock. A third one, :mod:`coview_stream.stream.node.odometry_engine`, needs no map.
@@ -24,7 +24,7 @@ from coview_stream.localization.tracking.pose_graph import PoseGraph
 from coview_stream.odometry.deskew import deskew
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, Job, Result, SearchJob
 
-_CROPS = 24  # of the map with their search grids, shared by all robots
+_CROPS = 24  # of the map with their search grids, shared by all robots; set by hand
 
 
 class Engine(Protocol):
@@ -40,7 +40,7 @@ class Engine(Protocol):
 
     @property
     def kernels(self) -> tuple[str, ...]:
-        """Those that its jobs launch, to be compiled before the first."""
+        """Kernels that its jobs launch, to be compiled before the first."""
         ...
 
     def prepare(self) -> None:
@@ -49,7 +49,7 @@ class Engine(Protocol):
 
 
 class TrackEngine:
-    """Takes in frames: keyframes, deskewing, registration around a known place."""
+    """Localizers of all robots: deskewing, keyframes, registration around a known place."""
 
     kernels = ("transform_unique", "nearest", "align_planes")
 
@@ -58,9 +58,8 @@ class TrackEngine:
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
         self._robots: dict[str, tuple[int, Localizer]] = {}
-        self._knowledge = SearchIndex.of(
-            base_map, self.config, load=False
-        )  # what queries have to bring: others search
+        # without its weights: it says what requests have to bring, and the search engine searches
+        self._index = SearchIndex.of(base_map, self.config, load=False)
 
     def run(self, job: Job) -> FrameResult:
         """Take in one frame.
@@ -69,21 +68,21 @@ class TrackEngine:
             CloudError, RunError: the frame is unusable; nothing has changed.
         """
         if not isinstance(job, FrameJob):
-            raise TypeError(f"{type(job).__name__} is no frame")
+            raise TypeError(f"{type(job).__name__}: the tracking engine does frames")
         begin = time.perf_counter()
         localizer = self._localizer(job)
         points = job.points
         if job.times is not None and job.segment is not None:
             points = deskew(points, job.times, job.segment, job.stamp_ns, job.T_odom_body)
-        if job.verdict is not None:
-            localizer.adopt(job.verdict)
-        if job.suspect:
-            localizer.suspect()
-        if job.suggested is not None:
-            with contextlib.suppress(RunError):  # a guess of no use is no reason to drop the frame
-                localizer.suggest(job.suggested)
-        query = localizer.take(points, job.T_odom_body, job.stamp_ns * 1e-9, job.hurry)
-        return FrameResult(localizer.fix(), query, time.perf_counter() - begin)
+        if job.search_result is not None:
+            localizer.apply_search_result(job.search_result)
+        if job.require_verification:
+            localizer.require_verification()
+        if job.hint is not None:
+            with contextlib.suppress(RunError):  # a hint of no use is no reason to drop the frame
+                localizer.hint_pose(job.hint)
+        request = localizer.add_frame(points, job.T_odom_body, job.stamp_ns * 1e-9, job.defer)
+        return FrameResult(localizer.fix(), request, time.perf_counter() - begin)
 
     def forget(self, robot: str) -> None:
         """Drop a robot's localizer."""
@@ -94,17 +93,18 @@ class TrackEngine:
         PoseGraph(self.config.graph)
 
     def _localizer(self, job: FrameJob) -> Localizer:
+        """Return the robot's localizer, which forgets all but the map with a new epoch."""
         epoch, localizer = self._robots.get(job.robot, (None, None))
         if localizer is None:
-            localizer = Localizer(self.base_map, self.config, self._local_maps, self._knowledge)
-        elif epoch != job.epoch:
-            localizer.reset()
+            localizer = Localizer(self.base_map, self.config, self._local_maps, self._index)
+        if epoch != job.epoch:
+            localizer.reset(job.epoch)
         self._robots[job.robot] = job.epoch, localizer
         return localizer
 
 
 class SearchEngine:
-    """Searches the whole map for keyframes; all robots share the map's spectra and networks."""
+    """Global searches of all robots, which share the map's spectra and networks."""
 
     kernels = ("transform_unique", "describe_points", "nearest", "align_planes")
 
@@ -112,28 +112,26 @@ class SearchEngine:
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
-        self._robots: dict[str, tuple[int, GlobalSearch]] = {}
-        self._knowledge = SearchIndex.of(base_map, self.config)
+        self._searches: dict[str, GlobalSearch] = {}
+        self._index = SearchIndex.of(base_map, self.config)
 
     def run(self, job: Job) -> SearchResult:
-        """Search for one keyframe."""
+        """Search the map for one keyframe."""
         if not isinstance(job, SearchJob):
-            raise TypeError(f"{type(job).__name__} is no search")
-        epoch, search = self._robots.get(job.robot, (None, None))
+            raise TypeError(f"{type(job).__name__}: the search engine does searches")
+        search = self._searches.get(job.robot)
         if search is None:
-            search = GlobalSearch(self.base_map, self.config, self._local_maps, self._knowledge)
-        elif epoch != job.epoch:
-            search.clear()
-        self._robots[job.robot] = job.epoch, search
-        return search.update(job.query)
+            search = GlobalSearch(self.base_map, self.config, self._local_maps, self._index)
+            self._searches[job.robot] = search
+        return search.update(job.request)
 
     def forget(self, robot: str) -> None:
         """Drop a robot's votes."""
-        self._robots.pop(robot, None)
+        self._searches.pop(robot, None)
 
     def prepare(self) -> None:
         """Make the stations' spectra, and those of the map's learned features."""
-        self._knowledge.prepare()
+        self._index.prepare()
 
 
 def open_engine(

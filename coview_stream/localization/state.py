@@ -1,0 +1,83 @@
+"""The states of a robot, the events that change them, and the one table that says how (docs/tracking.md prints it)."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class State(StrEnum):
+    """How much is known of a robot's place."""
+
+    SEARCHING = "SEARCHING"
+    """No place explains what the robot sees well enough, or too little has been seen."""
+    AMBIGUOUS = "AMBIGUOUS"
+    """A place does, but another one does too, or it has not been confirmed yet."""
+    TRACKING = "TRACKING"
+    """The pose is known: the newest registration speaks for it."""
+    DOUBTED = "DOUBTED"
+    """A place is known, but it has to be verified before there is a pose again."""
+    LOST = "LOST"
+    """A place was known; the evidence has gone, and the whole map is searched again."""
+
+    @property
+    def reported(self) -> str:
+        """Name in messages and files, which know four states: DOUBTED is reported as AMBIGUOUS, with its cause."""
+        return State.AMBIGUOUS.value if self is State.DOUBTED else self.value
+
+    @property
+    def has_place(self) -> bool:
+        """Whether a place is known, with a pose (TRACKING) or without (DOUBTED)."""
+        return self in (State.TRACKING, State.DOUBTED)
+
+
+class Event(StrEnum):
+    """What can happen to a robot's place; the value is a clause for people."""
+
+    NO_PLACE = "the search finds no place that fits"
+    PLACE_PROPOSED = "the search finds a place that is not alone or not confirmed"
+    PLACE_ACCEPTED = "the search accepts a place"
+    MATCH_VERIFIED = "a registration speaks for the place"
+    MATCH_REJECTED = "a registration speaks against the place"
+    VERIFICATION_REQUIRED = "the robot may have been moved unseen"
+    PLACE_GIVEN_UP = "too much has spoken against the place, or for too long"
+    SCANS_CONTRADICT = "scans do not fit together where odometry puts them"
+    SILENCE = "odometry or usable frames stay away"
+    ODOMETRY_RESTARTED = "odometry paused, jumped or began anew: older scans no longer belong to it"
+
+
+_S, _E = State, Event
+
+TRANSITIONS: dict[tuple[State, Event], State] = {
+    (_S.SEARCHING, _E.PLACE_PROPOSED): _S.AMBIGUOUS,
+    (_S.SEARCHING, _E.PLACE_ACCEPTED): _S.TRACKING,
+    (_S.AMBIGUOUS, _E.NO_PLACE): _S.SEARCHING,
+    (_S.AMBIGUOUS, _E.PLACE_ACCEPTED): _S.TRACKING,
+    (_S.AMBIGUOUS, _E.SCANS_CONTRADICT): _S.SEARCHING,
+    (_S.AMBIGUOUS, _E.ODOMETRY_RESTARTED): _S.SEARCHING,
+    (_S.TRACKING, _E.MATCH_REJECTED): _S.DOUBTED,
+    (_S.TRACKING, _E.VERIFICATION_REQUIRED): _S.DOUBTED,
+    (_S.TRACKING, _E.PLACE_GIVEN_UP): _S.LOST,
+    (_S.TRACKING, _E.SILENCE): _S.LOST,
+    (_S.TRACKING, _E.ODOMETRY_RESTARTED): _S.LOST,
+    (_S.DOUBTED, _E.MATCH_VERIFIED): _S.TRACKING,
+    (_S.DOUBTED, _E.PLACE_GIVEN_UP): _S.LOST,
+    (_S.DOUBTED, _E.SILENCE): _S.LOST,
+    (_S.DOUBTED, _E.ODOMETRY_RESTARTED): _S.LOST,
+    (_S.LOST, _E.PLACE_ACCEPTED): _S.TRACKING,
+}
+"""The state that follows on an event; where a pair is missing, the event changes nothing.
+
+LOST stays LOST while the map is searched again: only an accepted place ends it.
+"""
+
+
+def next_state(state: State, event: Event) -> State:
+    """Return the state that an event leads to."""
+    return TRANSITIONS.get((state, event), state)
+
+
+def transition_table() -> str:
+    """Return :data:`TRANSITIONS` as the Markdown table of docs/tracking.md."""
+    rows = ["| state | event | next state |", "|---|---|---|"]
+    rows += [f"| {state} | {event.value} | {after} |" for (state, event), after in TRANSITIONS.items()]
+    return "\n".join(rows)
