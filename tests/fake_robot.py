@@ -8,9 +8,10 @@ import numpy as np
 
 from coview_stream.config import TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.odometry_noise import Drift
 from coview_stream.messages import encode_cloud, encode_odometry

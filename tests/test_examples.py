@@ -41,7 +41,8 @@ def block(name):
     return found[1]
 
 
-def test_locate_run(world, capsys):
+@pytest.mark.slow
+def test_example_locate_run(world, capsys):
     errors = example("locate_run.py")(world)
     assert len(errors) > 10
     assert max(errors) < 0.3
@@ -50,14 +51,16 @@ def test_locate_run(world, capsys):
     assert "mean position error" in out
 
 
-def test_custom_descriptor(world, capsys):
+@pytest.mark.slow
+def test_example_custom_descriptor(world, capsys):
     shares = example("custom_descriptor.py")(world)
     assert set(shares) == {"scan_context", "coview", "coview_strict"}
     assert max(shares["scan_context"], shares["coview"]) >= 0.5
     assert capsys.readouterr().out.count("keyframes") == len(shares)
 
 
-def test_single_scan(tmp_path, capsys):
+@pytest.mark.slow
+def test_example_single_scan(tmp_path, capsys):
     world = tmp_path / "world"
     simulate(world, SimulationConfig(scene="campus", sensor="os64", seed=2, size=140.0, length=0.0))
     fix = example("single_scan.py")(world / "base.laz", world / "run" / "frames" / "000000.pcd")
@@ -66,7 +69,8 @@ def test_single_scan(tmp_path, capsys):
     assert np.linalg.norm(fix.T_map_body[:3, 3] - truth[:3, 3]) < 0.3
 
 
-def test_robot(world_run, capsys):
+@pytest.mark.slow
+def test_example_robot(world_run, capsys):
     """A stand-in node answers every cloud with a pose of the same stamp."""
     net = FakeTransport()
 
@@ -90,13 +94,14 @@ def test_every_example_is_tested_and_short():
         assert len(path.read_text(encoding="utf-8").splitlines()) <= 60, f"{path.name} says too much"
 
 
-def test_the_readmes_python_runs(world, monkeypatch, capsys):
+@pytest.mark.slow
+def test_readme_python_runs(world, monkeypatch, capsys):
     monkeypatch.chdir(world.parents[1])
     exec(compile(block("python"), "README.md", "exec"), {})
     assert len(capsys.readouterr().out.splitlines()) > 10  # a line per frame that got a pose
 
 
-def test_the_readmes_commands_are_understood():
+def test_readme_commands_parse():
     lines = [
         line.split("#")[0] for name in ("command 1", "live", "commands") for line in block(name).splitlines()
     ]
@@ -106,7 +111,7 @@ def test_the_readmes_commands_are_understood():
         build_parser().parse_args(shlex.split(call))
 
 
-def test_what_the_readme_calls_missing_is_missing():
+def test_readme_lists_every_command():
     present = {name for name in COMMANDS if name in build_parser().format_help()}
     rows = re.findall(r"^\| not yet \| ((?:`\w+`(?:, )?)+)", README, re.MULTILINE)
     denied = set(re.findall(r"\w+", " ".join(rows)))

@@ -23,16 +23,17 @@ def run_python(script: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "statement",
     ["import coview_stream", "from coview_stream import *", "from coview_stream import BaseMap, Localizer"],
 )
-def test_import_loads_nothing_heavy(statement):
+def test_import_loads_no_heavy_library(statement):
     script = f"{statement}\nimport sys; print('loaded:', *sorted({set(HEAVY)!r} & set(sys.modules)))"
     assert run_python(script) == ["loaded:"]
 
 
-def test_all_is_sorted_and_resolvable():
+def test_dunder_all_is_sorted_and_resolvable():
     names = coview_stream.__all__
     assert sorted(names, key=lambda n: (n.startswith("_"), n)) == list(names)
     assert len(set(names)) == len(names)
@@ -42,12 +43,12 @@ def test_all_is_sorted_and_resolvable():
     assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "Cause", "KeyframeEvidence"} <= set(names)
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = coview_stream.no_such_name
 
 
-def test_one_error_tree():
+def test_all_errors_derive_from_coview_error():
     kinds = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, Exception)]
     assert len(kinds) >= 7
     for kind in kinds:

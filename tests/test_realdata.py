@@ -41,8 +41,9 @@ def located(request, tmp_path_factory):
     return built, code, folder, out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("located", SETS, indirect=True)
-def test_a_real_run_is_localized(located):
+def test_real_run_is_localized(located):
     built, code, folder, out = located
     assert (built, code) == (0, 0)
     verdict = evaluate(read_tum(out / "trajectory.tum"), read_tum(folder / "truth.tum"))
@@ -55,8 +56,9 @@ def test_a_real_run_is_localized(located):
     assert json.loads((out / "result.json").read_text())["state"] == "TRACKING"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("located", ["kitti04"], indirect=True)
-def test_a_real_run_on_the_wrong_map_gets_no_pose(located, tmp_path):
+def test_real_run_on_wrong_map_gets_no_pose(located, tmp_path):
     """The handheld run is no part of the street."""
     _, _, _, out = located
     code = main(
@@ -74,8 +76,9 @@ def test_a_real_run_on_the_wrong_map_gets_no_pose(located, tmp_path):
     assert json.loads((tmp_path / "result.json").read_text())["state"] in ("SEARCHING", "AMBIGUOUS")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("located", ["kitti04"], indirect=True)
-def test_a_far_odometry_origin_changes_nothing(located, tmp_path):
+def test_far_odometry_origin_changes_nothing(located, tmp_path):
     """UTM-like odometry of a real run: the same poses to a millimetre or so."""
     _, _, folder, out = located
     stamps, poses = read_tum(folder / "run" / "odometry.tum")
@@ -94,7 +97,8 @@ def test_a_far_odometry_origin_changes_nothing(located, tmp_path):
     np.testing.assert_allclose(there[1], here[1], atol=5e-3)
 
 
-def test_map_coordinates_of_a_real_site_survive(tmp_path):
+@pytest.mark.slow
+def test_utm_coordinates_of_a_real_site_are_kept(tmp_path):
     """The map of a road at UTM-like coordinates lies where its source says."""
     import laspy
 

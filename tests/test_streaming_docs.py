@@ -10,7 +10,8 @@ import numpy as np
 
 from coview_stream.cli import build_parser
 from coview_stream.config import AcceptanceConfig
-from coview_stream.localization.result import KeyframeEvidence, State
+from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry, decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record
 from coview_stream.messages.types import PoseMessage, Sample
@@ -28,7 +29,7 @@ def section(title):
     return re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", TEXT, re.MULTILINE | re.DOTALL)[1]
 
 
-def test_every_preset_and_its_keys():
+def test_docs_list_every_preset_and_its_keys():
     keys = section("Keys and encodings")
     for name, preset in PRESETS.items():
         assert f"`{name}`" in keys
@@ -39,14 +40,14 @@ def test_every_preset_and_its_keys():
         assert f"`{key}`" in keys
 
 
-def test_every_counter_and_no_other():
+def test_docs_list_every_counter():
     named = set(re.findall(r"`([a-z_]+)`", section("What the counters mean")))
     counters = set(Counters().to_json())
     assert counters <= named
     assert named - counters == {"counters", "errors", "latency_ms", "engine_ms", "longest_wait_s"}
 
 
-def test_how_long_a_doubt_lasts_and_what_ends_it():
+def test_docs_state_doubted_duration_and_exits():
     rule, words = AcceptanceConfig(), {2: "two", 3: "three", 10.0: "ten"}
     rows = re.findall(r"^\|.*AMBIGUOUS.*\|$", section("How the node behaves"), re.MULTILINE)
     rejected, blind, long = rows[:3]
@@ -57,13 +58,13 @@ def test_how_long_a_doubt_lasts_and_what_ends_it():
     assert f"{words[rule.confirmations]} registrations" in long
 
 
-def test_every_field_of_a_transition():
+def test_docs_list_every_transition_field():
     told = re.search(r"^`transitions` in the status.*?\n\n", TEXT, re.MULTILINE | re.DOTALL)[0]
     for name in Transition(1, None, State.TRACKING, State.LOST, "", None).to_json():
         assert f"`{name}`" in told
 
 
-def test_every_field_of_the_evidence():
+def test_docs_list_every_evidence_field():
     text = (DOCS / "method.md").read_text(encoding="utf-8")
     table = text.split("### Fields of the evidence")[1].split("\n## ")[0]
     named = [
@@ -76,7 +77,7 @@ def test_every_field_of_the_evidence():
     assert "(method.md#fields-of-the-evidence)" in TEXT
 
 
-def test_the_layouts_as_documented():
+def test_documented_layouts_match_codecs():
     encoding = re.search(r'z_encoding_from_str\(&encoding, "(.*?)"\)', TEXT)[1]
     rows = np.arange(6, dtype="<f4").tobytes()
     message = decode_cloud(Sample("k", rows, encoding, (5).to_bytes(8, "little", signed=True)))
@@ -86,14 +87,14 @@ def test_the_layouts_as_documented():
     assert decode_odometry(Sample("k", odometry.encode(), "application/json")).T_odom_body[0, 3] == 1.5
 
 
-def test_encodings_in_the_table_are_those_that_are_written():
+def test_documented_encodings_match_codecs():
     pose = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32)
     for name in ("json", "cdr", "foxglove"):
         assert f"`{encode_pose(pose, name).encoding}`" in TEXT
     assert f"`serve --pose-encoding cdr` ({len(encode_pose(pose, 'cdr').payload)} bytes)" in TEXT
 
 
-def test_what_smaller_poses_leave_out():
+def test_documented_fields_missing_in_smaller_pose_formats():
     full = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32, 0.25)
     missing = {}
     for name in ("cdr", "foxglove"):
@@ -108,7 +109,7 @@ def test_what_smaller_poses_leave_out():
     assert set(re.findall(r"`(\w+)`", said)) == missing["foxglove"]
 
 
-def test_the_clients_five_lines_run(monkeypatch, capsys):
+def test_documented_client_example_runs(monkeypatch, capsys):
     net = FakeTransport()
     monkeypatch.setattr(client, "open_client", lambda *endpoints: net)
 
@@ -126,7 +127,7 @@ def test_the_clients_five_lines_run(monkeypatch, capsys):
     assert net.closed  # a client closes what it opened
 
 
-def test_the_commands_are_understood():
+def test_documented_commands_parse():
     block = re.search(r"```bash\n(.*?)```", section("Quick start"), re.DOTALL)[1]
     calls = [line.split("#")[0].split("coview-stream ")[1] for line in block.splitlines()]
     assert len(calls) == 4

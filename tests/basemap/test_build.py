@@ -35,7 +35,7 @@ def whole(cut, tmp_path_factory):
     return BaseMap.build(path, **SMALL)
 
 
-def test_what_a_map_holds(whole, cut):
+def test_built_map_holds_points_stations_and_descriptors(whole, cut):
     assert 80 <= len(whole) <= 121
     assert whole.points.dtype == np.float32
     assert np.abs(whole.points[:, :2]).max() < 100
@@ -54,7 +54,7 @@ def test_what_a_map_holds(whole, cut):
     assert set(whole.sources) == {"site.npy"}
 
 
-def test_points_stay_where_they_were_to_a_centimetre(whole, cut):
+def test_map_points_lie_within_half_a_voxel_of_the_cloud(whole, cut):
     from scipy.spatial import cKDTree
 
     distance, _ = cKDTree(cut).query(whole.points + whole.origin - UTM)
@@ -62,7 +62,7 @@ def test_points_stay_where_they_were_to_a_centimetre(whole, cut):
     assert np.quantile(distance, 0.99) < 0.22
 
 
-def test_a_map_records_which_filter_found_its_ground(whole, cut, tmp_path, monkeypatch):
+def test_map_records_its_ground_filter(whole, cut, tmp_path, monkeypatch):
     assert whole.parameters["ground_filter"] == ("cloth" if cloth_available() else "morphological")
     monkeypatch.setitem(sys.modules, "CSF", None)
     np.save(tmp_path / "site.npy", cut + UTM)
@@ -71,7 +71,7 @@ def test_a_map_records_which_filter_found_its_ground(whole, cut, tmp_path, monke
     assert BaseMap.load(tmp_path / "site.coview").parameters["ground_filter"] == "morphological"
 
 
-def test_tiles_equal_one_file(whole, cut, tmp_path):
+def test_map_from_several_files_equals_map_from_one(whole, cut, tmp_path):
     west = cut[:, 0] < -5.0
     for name, part in (("west.las", cut[west]), ("east.ply", cut[~west])):
         write_cloud(tmp_path / name, part, UTM)
@@ -85,7 +85,7 @@ def test_tiles_equal_one_file(whole, cut, tmp_path):
     assert len(one ^ two) <= 0.05 * len(one)
 
 
-def test_two_storeys_have_two_stations_in_a_cell(tmp_path):
+def test_two_storeys_give_two_stations_in_one_cell(tmp_path):
     axis = np.arange(-8.0, 8.0, 0.2)
     x, y = (v.ravel() for v in np.meshgrid(axis, axis))
     floors = [np.column_stack([x, y, np.full_like(x, z)]) for z in (0.0, 3.5, 7.0)]  # the last is the roof
@@ -112,7 +112,7 @@ def test_two_storeys_have_two_stations_in_a_cell(tmp_path):
     assert len(np.unique(cells, axis=0)) == len(flat)
 
 
-def test_a_built_map_survives_its_file(whole, tmp_path):
+def test_built_map_round_trips_through_its_file(whole, tmp_path):
     path = tmp_path / "site.coview"
     digest = whole.save(path)
     loaded = BaseMap.load(path)
@@ -127,13 +127,13 @@ def test_a_built_map_survives_its_file(whole, tmp_path):
     assert isinstance(loaded.points, np.memmap)
 
 
-def test_the_same_source_gives_the_same_hash(cut, tmp_path):
+def test_same_source_gives_same_hash(cut, tmp_path):
     np.save(tmp_path / "site.npy", cut[::4])
     digests = {BaseMap.build(tmp_path / "site.npy", **SMALL).save(tmp_path / f"{k}.coview") for k in range(2)}
     assert len(digests) == 1
 
 
-def test_a_crop_and_the_survey(whole):
+def test_crop_and_surveyed_cells(whole):
     centre = whole.stations[len(whole) // 2].astype(float)
     points, normals = whole.crop(centre, 4.0)
     assert len(points) == len(normals) > 100
@@ -163,14 +163,14 @@ def test_surveyed_cells_reach_one_cell_beyond_the_points():
         (np.random.default_rng(0).uniform(0, 9, (5000, 2)), CloudError, "bad.npy"),
     ],
 )
-def test_absurd_input_is_refused_in_one_line(tmp_path, points, error, text):
+def test_invalid_input_is_refused_in_one_line(tmp_path, points, error, text):
     np.save(tmp_path / "bad.npy", points)
     with pytest.raises(error, match=text) as caught:
         BaseMap.build(tmp_path / "bad.npy")
     assert "\n" not in str(caught.value)
 
 
-def test_no_source_and_no_such_source(tmp_path):
+def test_missing_source_is_refused(tmp_path):
     with pytest.raises(MapError, match="no source"):
         BaseMap.build([])
     with pytest.raises(CloudError, match=r"none\.laz"):
@@ -179,7 +179,7 @@ def test_no_source_and_no_such_source(tmp_path):
         BaseMap.build(tmp_path / "none.laz", blok=3)
 
 
-def test_a_configuration_takes_the_place_of_preset_and_options(cut, tmp_path):
+def test_configuration_replaces_preset_and_options(cut, tmp_path):
     np.save(tmp_path / "site.npy", cut[::3])
     config = map_preset("slam", block=4.0, channels=("coview_strict",), **SMALL)
     built = BaseMap.build(tmp_path / "site.npy", config=config)
@@ -188,7 +188,7 @@ def test_a_configuration_takes_the_place_of_preset_and_options(cut, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["origin", "stations", "points", "surveyed", "descriptor.coview"])
-def test_a_map_that_lacks_an_array_is_refused(whole, name):
+def test_map_with_missing_array_is_refused(whole, name):
     arrays = {k: v for k, v in whole._arrays.items() if k != name}
     with pytest.raises(MapError, match=r"lacks.*build it again"):
         BaseMap(arrays, whole.parameters)
@@ -199,7 +199,7 @@ def with_option(whole, **option):
     return whole.parameters | {"config": config | {"descriptor": config["descriptor"] | option}}
 
 
-def test_a_map_of_an_earlier_version_holds_options_that_are_gone(whole):
+def test_map_of_earlier_version_with_removed_options_loads(whole):
     earlier = BaseMap(whole._arrays, with_option(whole, visibility="paper", eye=1.5))
     assert earlier.config == whole.config
     assert earlier.parameters["config"]["descriptor"]["eye"] == 1.5  # the checksum is of what was written
@@ -208,7 +208,7 @@ def test_a_map_of_an_earlier_version_holds_options_that_are_gone(whole):
 @pytest.mark.parametrize(
     "option", [{"visibility": "eye"}, {"visibility": "off"}, {"eye": 2.0}, {"channels": ["density"]}]
 )
-def test_a_map_made_with_an_option_that_is_gone_is_refused(whole, option):
+def test_map_made_with_removed_option_is_refused(whole, option):
     with pytest.raises(MapError, match=f"{next(iter(option))} is .*build it again"):
         BaseMap(whole._arrays, with_option(whole, **option))
 
@@ -223,7 +223,7 @@ def test_a_map_made_with_an_option_that_is_gone_is_refused(whole, option):
         {"sources": None},
     ],
 )
-def test_parameters_that_make_no_sense_are_refused(whole, damage):
+def test_invalid_map_parameters_are_refused(whole, damage):
     with pytest.raises(MapError, match="build it again"):
         BaseMap(whole._arrays, whole.parameters | damage)
     with pytest.raises(CoViewError):

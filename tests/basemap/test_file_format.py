@@ -44,7 +44,7 @@ def shared(tmp_path_factory):
     return path.read_bytes(), path.with_name("damaged.coview")
 
 
-def test_round_trip(path):
+def test_map_file_round_trip(path):
     loaded, parameters, digest = file_format.load(path)
     assert parameters == PARAMETERS
     assert set(loaded) == set(arrays())
@@ -72,7 +72,7 @@ def test_equal_content_has_an_equal_hash(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["points", "origin", "descriptor.coview"])
-def test_other_content_has_another_hash(path, tmp_path, name):
+def test_changed_content_changes_the_hash(path, tmp_path, name):
     changed = arrays()
     changed[name] = changed[name].copy()
     changed[name].flat[0] += 1
@@ -83,7 +83,7 @@ def test_other_content_has_another_hash(path, tmp_path, name):
     )
 
 
-def test_layout_in_memory_does_not_matter(path, tmp_path):
+def test_hash_does_not_depend_on_memory_layout(path, tmp_path):
     turned = {name: np.asfortranarray(array) for name, array in arrays().items()}
     assert file_format.save(tmp_path / "turned.coview", turned, PARAMETERS) == file_format.load(path)[2]
     np.testing.assert_array_equal(
@@ -95,7 +95,7 @@ def test_layout_in_memory_does_not_matter(path, tmp_path):
 @example(where=0.0, bit=0)
 @example(where=0.9999999, bit=7)
 @settings(max_examples=300, deadline=None)
-def test_a_flipped_bit_anywhere_is_noticed(shared, where, bit):
+def test_flipped_bit_anywhere_is_detected(shared, where, bit):
     content, target = shared
     at = int(where * len(content))
     target.write_bytes(content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :])
@@ -104,7 +104,7 @@ def test_a_flipped_bit_anywhere_is_noticed(shared, where, bit):
 
 
 @pytest.mark.parametrize("length", range(8))
-def test_any_byte_at_the_end_of_the_header_is_noticed(tmp_path, length):
+def test_changed_header_padding_is_detected(tmp_path, length):
     """Also the blanks between header and arrays, which JSON would not mind; there are 0 to 7 of them."""
     path = tmp_path / "site.coview"
     file_format.save(path, {"origin": np.arange(3.0)}, {"crs": "x" * length})
@@ -120,7 +120,7 @@ def test_any_byte_at_the_end_of_the_header_is_noticed(tmp_path, length):
 @given(share=st.floats(0, 1, exclude_max=True))
 @example(share=0.0)
 @settings(max_examples=60, deadline=None)
-def test_truncation_is_noticed(shared, share):
+def test_truncated_map_file_is_detected(shared, share):
     content, target = shared
     target.write_bytes(content[: int(share * len(content))])
     with pytest.raises(MapError, match=r"damaged\.coview"):
@@ -136,7 +136,7 @@ def rewrite_header(path, change):
     path.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + size :])
 
 
-def test_another_version_is_named(path):
+def test_unsupported_version_is_named(path):
     rewrite_header(path, lambda header: header["__metadata__"].update(version="2"))
     with pytest.raises(MapError, match=r"format 2, this program reads 1; build the map again"):
         file_format.load(path)
@@ -160,7 +160,7 @@ def test_another_version_is_named(path):
         lambda h: h.update(__metadata__=7),
     ],
 )
-def test_a_forged_header_is_refused(path, change):
+def test_forged_header_is_refused(path, change):
     rewrite_header(path, change)
     with pytest.raises(MapError, match=r"site\.coview"):
         file_format.load(path)
@@ -178,20 +178,20 @@ def test_a_forged_header_is_refused(path, change):
         b"7 text\n" * 50,
     ],
 )
-def test_what_is_not_a_map_is_refused(tmp_path, content):
+def test_file_that_is_not_a_map_is_refused(tmp_path, content):
     path = tmp_path / "other.coview"
     path.write_bytes(content)
     with pytest.raises(MapError, match=r"other\.coview: not a coview map"):
         file_format.load(path)
 
 
-def test_a_missing_file_and_a_directory(tmp_path):
+def test_missing_file_and_directory_are_refused(tmp_path):
     for path in (tmp_path / "none.coview", tmp_path):
         with pytest.raises(MapError, match="cannot read the map"):
             file_format.load(path)
 
 
-def test_a_failed_save_leaves_the_old_map_and_no_leftovers(path, monkeypatch):
+def test_failed_save_keeps_old_map_and_leaves_no_temporary_files(path, monkeypatch):
     before = path.read_bytes()
 
     def no_space(handle):
@@ -204,7 +204,7 @@ def test_a_failed_save_leaves_the_old_map_and_no_leftovers(path, monkeypatch):
     assert [p.name for p in path.parent.iterdir()] == ["site.coview"]
 
 
-def test_an_interrupted_save_leaves_the_old_map_and_no_leftovers(path, monkeypatch):
+def test_interrupted_save_keeps_old_map_and_leaves_no_temporary_files(path, monkeypatch):
     before = path.read_bytes()
 
     def interrupted(handle):
@@ -217,14 +217,14 @@ def test_an_interrupted_save_leaves_the_old_map_and_no_leftovers(path, monkeypat
     assert [p.name for p in path.parent.iterdir()] == ["site.coview"]
 
 
-def test_saving_over_a_loaded_map_leaves_the_loaded_one_readable(path):
+def test_saving_over_a_loaded_map_keeps_it_readable(path):
     loaded, _, _ = file_format.load(path)
     file_format.save(path, {"points": np.zeros((5, 3), np.float32)}, {})
     np.testing.assert_array_equal(loaded["points"], arrays()["points"])
     assert file_format.load(path)[0]["points"].shape == (5, 3)
 
 
-def test_a_directory_that_does_not_exist(tmp_path):
+def test_saving_into_missing_directory_is_refused(tmp_path):
     with pytest.raises(MapError, match=r"a directory that exists"):
         file_format.save(tmp_path / "no" / "site.coview", arrays(), PARAMETERS)
 

@@ -53,7 +53,7 @@ def scene() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_ground_of_hills_houses_and_trees(
+def test_ground_mask_of_hills_houses_and_trees(
     scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]], method: str
 ) -> None:
     points, truth = scene
@@ -64,7 +64,7 @@ def test_ground_of_hills_houses_and_trees(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_filter_is_silent_and_leaves_no_files(
+def test_ground_filter_prints_nothing_and_leaves_no_files(
     scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]],
     method: str,
     tmp_path: Path,
@@ -92,7 +92,7 @@ def test_without_the_cloth_wheel_the_morphological_filter_takes_over(
 
 
 @pytest.mark.skipif(not cloth_available(), reason="no cloth wheel here")
-def test_the_cloth_is_the_default_where_it_can_hang(
+def test_cloth_filter_is_the_default_where_available(
     scene: tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]],
 ) -> None:
     points = scene[0]
@@ -101,6 +101,7 @@ def test_the_cloth_is_the_default_where_it_can_hang(
     np.testing.assert_array_equal(ground_mask(points), ground_mask(points, GroundConfig(method="cloth")))
 
 
+@pytest.mark.slow
 def test_cloth_tiles_have_no_seams() -> None:
     xy = np.random.default_rng(6).uniform(0, 300, (120_000, 2))
     points = np.column_stack([xy, 0.1 * xy[:, 0]]).astype(np.float32)
@@ -108,7 +109,7 @@ def test_cloth_tiles_have_no_seams() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 49])
-def test_few_points_are_their_own_ground(count: int) -> None:
+def test_few_points_are_all_ground(count: int) -> None:
     points = np.random.default_rng(7).uniform(0, 1, (count, 3)).astype(np.float32) * np.float32(
         [20, 20, 0.05]
     )
@@ -116,7 +117,7 @@ def test_few_points_are_their_own_ground(count: int) -> None:
     assert ground_mask(points).all()
 
 
-def test_absurd_extent_is_refused() -> None:
+def test_too_large_extent_is_refused() -> None:
     points = np.array([[0, 0, 0], [9e7, 9e7, 0]], np.float32)
     with pytest.raises(ConfigError, match="stray points"):
         ground_mask(points)
@@ -125,19 +126,19 @@ def test_absurd_extent_is_refused() -> None:
 @pytest.mark.parametrize(
     "field", [{"cell": 0.0}, {"rigidness": 4}, {"method": "magic"}, {"class_threshold": float("nan")}]
 )
-def test_config_is_validated(field: dict[str, float]) -> None:
+def test_ground_config_out_of_range_is_refused(field: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(field))):
         GroundConfig(**field)  # type: ignore[arg-type]  # fields by name
 
 
-def test_height_is_bilinear_and_ignores_unknown_neighbours() -> None:
+def test_ground_height_is_bilinear_and_ignores_unknown_neighbours() -> None:
     raster = GroundRaster(np.array([[0, 1], [np.nan, 3]], np.float32), x0=10.0, y0=20.0, cell=2.0)
     at = np.array([[11.0, 21.0], [12.0, 21.0], [13.0, 22.0], [11.0, 23.0], [11.9, 21.9]])
     expected = [0.0, 0.5, 2.0, np.nan, (0.45 * 0.55 * 1 + 0.45 * 0.45 * 3) / (1 - 0.45 * 0.55)]
     np.testing.assert_allclose(raster.height_at(at), expected, rtol=1e-5)
 
 
-def test_push_pull_keeps_known_cells_and_stays_between_them() -> None:
+def test_push_pull_filling_keeps_known_cells_and_stays_within_their_range() -> None:
     z = np.full((37, 53), np.nan, np.float32)
     z[3, 4], z[30, 50] = 1.0, 5.0
     out = filled(z)
@@ -164,7 +165,7 @@ def storeys() -> npt.NDArray[np.float32]:
     return np.concatenate(parts).astype(np.float32)
 
 
-def test_levels_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
+def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
     levels = ground_levels(storeys, cell=2.0)
     ground, upper = levels[levels[:, 2] < 1], levels[levels[:, 2] >= 1]
     # the whole field, below the house, the bridge and the canopy too, once per square
@@ -177,7 +178,7 @@ def test_levels_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
     np.testing.assert_array_equal(np.mod(levels[:, :2], 2.0), 1.0)
 
 
-def test_levels_need_extent_and_headroom(storeys: npt.NDArray[np.float32]) -> None:
+def test_floors_need_extent_and_headroom(storeys: npt.NDArray[np.float32]) -> None:
     wide = LevelConfig(area=400.0)
     assert (ground_levels(storeys, config=wide)[:, 2] < 1).all()
     high = LevelConfig(headroom=3.5)
@@ -189,9 +190,10 @@ def test_levels_need_extent_and_headroom(storeys: npt.NDArray[np.float32]) -> No
         ground_levels(storeys, cell=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("method", METHODS)
-def test_delft_ground_error(method: str) -> None:
+def test_ground_error_on_delft_data(method: str) -> None:
     path = DATA / "airborne" / "delft_ahn3_2.laz"
     if not path.exists():
         pytest.skip("airborne/delft_ahn3_2.laz is not there; set COVIEW_DATA to the folder of real scans")

@@ -16,7 +16,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors import network
 from coview_stream.descriptors.feature_map import weights_sha256
 from coview_stream.descriptors.network import CARD, VIEW_NAMES, Network, file_sha256, weights_file
-from coview_stream.doctor.map_checks import node_memory, site_findings
+from coview_stream.doctor.map_checks import map_findings, node_memory
 from coview_stream.errors import ConfigError, CoViewError, InputError, TransportError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.recognizers import SearchIndex
@@ -37,7 +37,7 @@ def weights(tmp_path, monkeypatch):
     """A folder of weights that the package takes for its own; nothing of before is remembered."""
     for view in VIEW_NAMES:
         shutil.copy(weights_file(view), tmp_path)
-    monkeypatch.setattr(network, "shipped", lambda: tmp_path)
+    monkeypatch.setattr(network, "weights_directory", lambda: tmp_path)
     forget()
     yield tmp_path
     forget()
@@ -57,7 +57,7 @@ def other_ground(folder, patch):
 
 
 def drawn_otherwise(folder, patch):
-    patch.setattr("coview_stream.descriptors.feature_map.BIRD_VIEW_VERSION", 0)
+    patch.setattr("coview_stream.descriptors.feature_map.BIRDS_EYE_VIEW_VERSION", 0)
 
 
 def not_of_the_card(folder, patch):
@@ -99,7 +99,7 @@ def judged(base_map, text):
     assert len(warned) == 1
     assert known.learned is None
     assert known.retrieval is not None
-    findings = {f.what: f for f in site_findings(base_map, int(1e6), None)}
+    findings = {f.what: f for f in map_findings(base_map, int(1e6), None)}
     assert findings["map features"].verdict == "warn"
     assert findings["map features"].remedy == said.partition("; ")[2]
     assert findings["map features"].remedy
@@ -107,17 +107,17 @@ def judged(base_map, text):
 
 
 @pytest.mark.parametrize(("spoil", "text"), SPOILT)
-def test_what_the_installation_lacks(learned_map, weights, monkeypatch, spoil, text):
+def test_missing_or_wrong_weights_disable_learned_features(learned_map, weights, monkeypatch, spoil, text):
     spoil(weights, monkeypatch)
     judged(learned_map, text)
 
 
-def test_features_that_are_damaged(learned_map, weights):
+def test_damaged_features_disable_learned_features(learned_map, weights):
     arrays = {n: v for n, v in learned_map._arrays.items() if n != "learned.sigma"}
     judged(BaseMap(arrays, learned_map.parameters), RELEARN)
 
 
-def test_all_is_well(learned_map, world_map, weights):
+def test_usable_features_give_no_warning(learned_map, world_map, weights):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert SearchIndex.of(learned_map, LocalizerConfig()).learned is not None
@@ -125,12 +125,12 @@ def test_all_is_well(learned_map, world_map, weights):
         assert SearchIndex.of(world_map, LocalizerConfig()).learned is None
     for base_map, text in ((learned_map, "of the installed networks"), (world_map, "none")):
         assert base_map.require_features("auto") is None
-        (finding,) = [f for f in site_findings(base_map, int(1e6), None) if f.what == "map features"]
+        (finding,) = [f for f in map_findings(base_map, int(1e6), None) if f.what == "map features"]
         assert finding.verdict == "ok"
         assert text in finding.found
 
 
-def test_who_only_tracks_loads_no_network(learned_map, weights):
+def test_track_engine_loads_no_network(learned_map, weights):
     engine = TrackEngine(learned_map)
     assert engine._knowledge.learned is not None
     assert network.network.cache_info().currsize == 0
@@ -138,7 +138,7 @@ def test_who_only_tracks_loads_no_network(learned_map, weights):
     assert network.network.cache_info().currsize == 1
 
 
-def test_serve_says_so_once_and_its_engines_go_without(learned_map, tmp_path, monkeypatch, caplog):
+def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_path, monkeypatch, caplog):
     parameters = {
         **learned_map.parameters,
         "learned": {**learned_map.parameters["learned"], "weights": "0" * 64},
@@ -146,7 +146,7 @@ def test_serve_says_so_once_and_its_engines_go_without(learned_map, tmp_path, mo
     BaseMap(learned_map._arrays, parameters).save(tmp_path / "old.coview")
     relocs = []
 
-    class Lane(serve.ProcessLane):
+    class Lane(serve.EngineProcess):
         def __init__(self, *given, **named):
             super().__init__(*given, **named)
             relocs.append(self.reloc)
@@ -163,7 +163,7 @@ def test_serve_says_so_once_and_its_engines_go_without(learned_map, tmp_path, mo
     assert RELEARN in caplog.text
 
 
-def test_memory_counts_the_rectangle_around_a_map(learned_map, world_map):
+def test_node_memory_counts_bounding_rectangle_of_features(learned_map, world_map):
     """Two tiles at the ends of a diagonal of 3 km."""
     arrays = dict(learned_map._arrays)
     arrays["learned.tiles"] = arrays["learned.tiles"].copy()
@@ -174,7 +174,7 @@ def test_memory_counts_the_rectangle_around_a_map(learned_map, world_map):
     assert far - near == pytest.approx(1.08e9, rel=0.05)  # 101 x 101 tiles, 208 bytes on 4 m2, and spectra
 
 
-def test_a_network_that_is_none_of_ours(weights, monkeypatch):
+def test_foreign_network_is_refused(weights, monkeypatch):
     inputs = []
 
     class Session:
@@ -198,7 +198,7 @@ def test_a_network_that_is_none_of_ours(weights, monkeypatch):
         Network("ground", weights)
 
 
-def test_the_card_tells_views_apart(weights):
+def test_card_hashes_distinguish_views(weights):
     hashes = {f"{view}.onnx": file_sha256(weights / f"{view}.onnx") for view in VIEW_NAMES}
     (weights / CARD).write_text(json.dumps({"sha256": hashes}))
     for view in VIEW_NAMES:
@@ -208,7 +208,7 @@ def test_the_card_tells_views_apart(weights):
         Network("ground", weights)
 
 
-def test_threads_have_to_be_a_number(weights, monkeypatch):
+def test_coview_threads_must_be_a_number(weights, monkeypatch):
     monkeypatch.setenv("COVIEW_THREADS", "two")
     with pytest.raises(ConfigError, match="COVIEW_THREADS is 'two'"):
         network.network("aerial")

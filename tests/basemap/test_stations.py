@@ -9,7 +9,7 @@ from coview_stream.basemap.stations import aligned_corner, describe_stations, fi
 from coview_stream.config import DescriptorConfig
 
 
-def test_cells_hold_greatest_height_and_number_of_voxels():
+def test_raster_cells_hold_max_height_and_voxel_count():
     points = np.array(
         [[0.1, 0.1, 1.0], [0.2, 0.2, 1.1], [0.3, 0.1, 4.0], [0.9, 0.1, -2.0], [0.1, 1.6, 0.3]], np.float32
     )
@@ -23,7 +23,7 @@ def test_cells_hold_greatest_height_and_number_of_voxels():
     assert raster.top[2, 2] == 0.0
 
 
-def test_doubling_the_points_changes_nothing():
+def test_raster_counts_voxels_not_points():
     points = np.random.default_rng(0).uniform(-10, 10, (3000, 3)).astype(np.float32)
     corner = aligned_corner(points, 2.0, 0.5)
     one = rasterise(points, corner, 0.5, 0.5)
@@ -72,14 +72,14 @@ def test_no_station_where_there_is_no_ground():
     assert np.hypot(*(stations[:, :2] - [1.0, -5.0]).T).min() > 1.9
 
 
-def test_stations_do_not_depend_on_the_order_of_points():
+def test_stations_do_not_depend_on_point_order():
     points = sloping_ground()
     shuffled = points[np.random.default_rng(4).permutation(len(points))]
     one, two = (find_stations(p, 2.0) for p in (points, shuffled))
     np.testing.assert_allclose(one[np.lexsort(one.T)], two[np.lexsort(two.T)], atol=1e-5)
 
 
-def test_portions_do_not_change_the_descriptors(monkeypatch):
+def test_describing_stations_in_chunks_gives_same_descriptors(monkeypatch):
     points = np.random.default_rng(5).uniform([-15, -15, 0], [15, 15, 6], (4000, 3)).astype(np.float32)
     stations = find_stations(sloping_ground(), 2.0)
     raster = rasterise(points, aligned_corner(points, 2.0, 0.5), 0.5, 0.5, margin=4)
@@ -96,7 +96,7 @@ def test_portions_do_not_change_the_descriptors(monkeypatch):
         np.testing.assert_array_equal(whole[name], parts[name])
 
 
-def test_a_tower_is_seen_in_the_direction_and_at_the_distance_where_it_stands():
+def test_tower_appears_in_its_ring_and_sector():
     """From a station at (1, 1): 6 m east of it ring 3 of 2 m rings and the sectors around 0; never west."""
     flat = np.stack(np.meshgrid(np.arange(-12, 14, 0.5), np.arange(-12, 14, 0.5)), axis=-1).reshape(-1, 2)
     ground = np.column_stack([flat, np.zeros(len(flat))])

@@ -9,13 +9,13 @@ from coview_stream.basemap.stations import describe_storeys
 from coview_stream.config import DescriptorConfig
 
 
-def test_only_the_lower_of_two_stations_of_a_cell_lies_below_another():
+def test_only_lower_station_of_a_cell_is_below_another():
     stations = np.array([[1, 1, 0], [3, 1, 0], [1, 1, 3.2], [1, 1, 6.4]], dtype=np.float32)
     assert below_another(stations, 2.0).tolist() == [True, False, True, False]
     assert below_another(stations[:0], 2.0).tolist() == []
 
 
-def test_the_lower_storey_does_not_see_the_tower_on_the_roof():
+def test_lower_storey_descriptor_excludes_tower_on_the_roof():
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-12, 12, 0.4), np.arange(-12, 12, 0.4)))
     floors = [np.column_stack([x, y, np.full(len(x), z)]) for z in (0.0, 3.0)]
     tower = np.column_stack([np.full(60, 7.0), np.full(60, 0.2), np.linspace(3.0, 20.0, 60)])

@@ -20,7 +20,7 @@ def both():
 @pytest.mark.parametrize(
     ("channel", "share", "distance"), [("scan_context", 0.05, 0.06), ("coview", 0.07, 0.1)]
 )
-def test_bins_of_the_raster_are_nearly_those_of_the_points(both, channel, share, distance):
+def test_raster_descriptor_bins_are_close_to_exact_bins(both, channel, share, distance):
     found, exact = both[channel]
     assert (np.abs(found - exact) > 0.5).mean() < share
     found, exact = found.reshape(len(found), -1), exact.reshape(len(exact), -1)
@@ -28,7 +28,7 @@ def test_bins_of_the_raster_are_nearly_those_of_the_points(both, channel, share,
     assert (1 - cosine).mean() < distance
 
 
-def test_every_station_is_most_like_itself(both):
+def test_every_station_matches_itself_best(both):
     """The map's descriptors pick their own station out of the exact ones, and the other way round."""
     found, exact = (a.reshape(len(a), -1) for a in both["scan_context"])
     score = found @ exact.T / np.linalg.norm(found, axis=1)[:, None] / np.linalg.norm(exact, axis=1)

@@ -38,7 +38,7 @@ def test_sorting_keeps_every_point_with_its_normal(cloud, tiled):
     )
 
 
-def test_the_index_covers_the_cloud_without_gap_or_overlap(tiled):
+def test_tile_index_covers_cloud_without_gap_or_overlap(tiled):
     points, _, index = tiled
     assert index[0, 2] == 0
     assert index[-1, 3] == len(points)
@@ -51,7 +51,7 @@ def test_the_index_covers_the_cloud_without_gap_or_overlap(tiled):
 
 @pytest.mark.parametrize("centre", [(0, 0), (5, 5), (-29.9, 19.9), (12.3, -7.7), (35, 0)])
 @pytest.mark.parametrize("radius", [0.5, 5.0, 17.0, 200.0])
-def test_a_crop_is_a_circle(cloud, tiled, centre, radius):
+def test_crop_holds_exactly_the_points_within_radius(cloud, tiled, centre, radius):
     found, normals = crop(*tiled, TILE, np.array([*centre, 0.0]), radius)
     near = np.hypot(*(cloud[0][:, :2] - np.array(centre, np.float32)).T) < radius
     assert rows(found) == rows(cloud[0][near])
@@ -61,6 +61,6 @@ def test_a_crop_is_a_circle(cloud, tiled, centre, radius):
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=0.01)
 
 
-def test_a_crop_far_away_is_empty(tiled):
+def test_crop_outside_the_map_is_empty(tiled):
     found, normals = crop(*tiled, TILE, np.array([900.0, 0, 0]), 10.0)
     assert found.shape == normals.shape == (0, 3)

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench.forest.drives import poses
 
 from bench.forest import worlds as forest_worlds
-from bench.forest.drives import poses
 from bench.forest.plot import lowest, pasted, standing
 from bench.forest.query import errors, local, query_of
 from bench.forest.runs import runs_table, scored

@@ -25,7 +25,7 @@ def one_line(capsys):
     return captured.err
 
 
-def test_a_map_is_built_and_described(cloud, tmp_path, capsys):
+def test_build_writes_and_describes_a_map(cloud, tmp_path, capsys):
     target = tmp_path / "site.coview"
     assert main(["build", str(cloud), "-o", str(target), "--radius", "20", "--block-size", "3"]) == 0
     out = capsys.readouterr().out
@@ -64,14 +64,14 @@ def test_preset_channels_and_descriptor_options(cloud, tmp_path):
         (["--no-such-option"], "--no-such-option"),
     ],
 )
-def test_bad_options(cloud, tmp_path, capsys, options, text):
+def test_bad_build_options_are_refused(cloud, tmp_path, capsys, options, text):
     assert main(["build", str(cloud), "-o", str(tmp_path / "site.coview"), *options]) == 2
     assert text in one_line(capsys)
     assert [p.name for p in tmp_path.iterdir()] == ["site.ply"]
 
 
 @pytest.mark.parametrize("name", ["none.laz", "text.ply", "empty.las", "few.npy", "nan.npy"])
-def test_bad_input(tmp_path, capsys, name):
+def test_bad_cloud_files_are_refused(tmp_path, capsys, name):
     (tmp_path / "text.ply").write_text("no cloud\nat all\n")
     (tmp_path / "empty.las").write_bytes(b"")
     np.save(tmp_path / "few.npy", np.zeros((50, 3)))
@@ -83,14 +83,14 @@ def test_bad_input(tmp_path, capsys, name):
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_one_bad_tile_among_good_ones(cloud, tmp_path, capsys):
+def test_one_bad_tile_fails_the_build(cloud, tmp_path, capsys):
     (tmp_path / "bad.ply").write_text("nonsense")
     assert main(["build", str(cloud), str(tmp_path / "bad.ply"), "-o", str(tmp_path / "site.coview")]) == 2
     assert "bad.ply" in one_line(capsys)
     assert not (tmp_path / "site.coview").exists()
 
 
-def test_a_failed_build_leaves_the_old_map(cloud, tmp_path, capsys):
+def test_failed_build_keeps_the_old_map(cloud, tmp_path, capsys):
     target = tmp_path / "site.coview"
     target.write_bytes(b"the old map")
     assert main(["build", str(tmp_path / "none.las"), "-o", str(target)]) == 2
@@ -98,13 +98,13 @@ def test_a_failed_build_leaves_the_old_map(cloud, tmp_path, capsys):
     assert target.read_bytes() == b"the old map"
 
 
-def test_a_place_that_does_not_exist_is_refused_before_the_work(tmp_path, capsys):
+def test_missing_output_directory_is_refused_before_building(tmp_path, capsys):
     for target in (tmp_path / "no" / "site.coview", tmp_path):
         assert main(["build", str(tmp_path / "none.las"), "-o", str(target)]) == 2
         assert "not a place for a file" in one_line(capsys)
 
 
-def test_nothing_but_a_map_is_ever_replaced(cloud, tmp_path, capsys):
+def test_only_a_map_file_is_overwritten(cloud, tmp_path, capsys):
     before = cloud.read_bytes()
     assert main(["build", str(cloud), "-o", str(cloud)]) == 2
     assert "one of the scans" in one_line(capsys)
@@ -118,6 +118,6 @@ def test_nothing_but_a_map_is_ever_replaced(cloud, tmp_path, capsys):
     assert other.read_text() == "years of work"
 
 
-def test_a_source_given_twice_is_refused(cloud, tmp_path, capsys):
+def test_duplicate_source_is_refused(cloud, tmp_path, capsys):
     assert main(["build", str(cloud), str(cloud), "-o", str(tmp_path / "site.coview")]) == 2
     assert "given twice" in one_line(capsys)

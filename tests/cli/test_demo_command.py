@@ -21,7 +21,8 @@ def demo(tmp_path_factory):
     return main(["demo", "--offline", "--out", str(out), *SMALL]), out
 
 
-def test_live_it_runs_a_node_a_robot_and_a_watcher(tmp_path):
+@pytest.mark.slow
+def test_live_demo_runs_node_robot_and_watcher(tmp_path):
     out = tmp_path / "out"
     assert main(["demo", "--out", str(out), *SMALL]) == 0
     report = json.loads((out / "report.json").read_text())
@@ -36,7 +37,8 @@ def test_live_it_runs_a_node_a_robot_and_a_watcher(tmp_path):
     assert {log.name for log in (out / "logs").iterdir()} == {"serve.log", "replay.log", "watch.log"}
 
 
-def test_it_localises_and_says_so(demo):
+@pytest.mark.slow
+def test_demo_localizes_and_writes_report(demo):
     code, out = demo
     report = json.loads((out / "report.json").read_text())
     assert code == 0
@@ -47,7 +49,8 @@ def test_it_localises_and_says_so(demo):
     assert set(report["seconds"]) == {"simulate", "build", "locate", "report"}
 
 
-def test_it_writes_what_it_promises(demo):
+@pytest.mark.slow
+def test_demo_writes_the_promised_files(demo):
     _, out = demo
     for name in PICTURES:
         assert (out / name).read_bytes().startswith(b"\x89PNG"), name
@@ -56,7 +59,8 @@ def test_it_writes_what_it_promises(demo):
     assert json.loads((out / "result.json").read_text())["state"] == "TRACKING"
 
 
-def test_its_files_serve_the_other_commands(demo, capsys):
+@pytest.mark.slow
+def test_demo_files_work_with_other_commands(demo, capsys):
     _, out = demo
     assert main(["info", str(out / "site.coview")]) == 0
     assert "stations" in capsys.readouterr().out
@@ -66,7 +70,8 @@ def test_its_files_serve_the_other_commands(demo, capsys):
     assert {key: report[key] for key in verdict} == verdict
 
 
-def test_without_a_fix_it_exits_with_one_and_leaves_no_old_result(demo, tmp_path, capsys):
+@pytest.mark.slow
+def test_demo_without_fix_exits_with_one_and_removes_old_result(demo, tmp_path, capsys):
     out = tmp_path / "again"
     shutil.copytree(demo[1], out)
     # two metres are one keyframe, and one is not enough to be believed
@@ -82,13 +87,13 @@ def test_without_a_fix_it_exits_with_one_and_leaves_no_old_result(demo, tmp_path
 
 
 @pytest.mark.parametrize("option", ["--scene moon", "--sensor sonar", "--size 3", "--length nan", "--seed x"])
-def test_bad_options_are_one_line_and_leave_nothing(option, tmp_path, capsys):
+def test_bad_demo_options_are_one_line_and_leave_no_files(option, tmp_path, capsys):
     assert main(["demo", "--out", str(tmp_path / "out"), *option.split()]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_it_does_not_touch_other_peoples_files(tmp_path, capsys):
+def test_demo_does_not_overwrite_foreign_files(tmp_path, capsys):
     mine = tmp_path / "report.json"
     mine.write_text("mine")
     assert main(["demo", "--out", str(tmp_path)]) == 2

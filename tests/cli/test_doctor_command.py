@@ -65,7 +65,8 @@ def findings_of(capsys, *argv):
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_a_robot_over_zenoh(capsys):
+@pytest.mark.slow
+def test_healthy_robot_over_zenoh(capsys):
     with Robot() as robot:
         options = ("--robot", "r1", "--connect", robot.endpoint, "--seconds", "1.5")
         for _ in range(4):  # on a busy machine the robot itself may pause, and that is a finding
@@ -81,7 +82,8 @@ def test_a_robot_over_zenoh(capsys):
     assert [f["found"] for f in found if f["what"] == "network"] == ["connected: 1 peer"]
 
 
-def test_a_fault_is_exit_code_one(capsys):
+@pytest.mark.slow
+def test_fault_gives_exit_code_one(capsys):
     with Robot(ahead=100.0) as robot:
         code = main(["doctor", "--robot", "r1", "--connect", robot.endpoint, "--seconds", "1"])
     clocks = [line for line in capsys.readouterr().out.splitlines() if "r1 one clock" in line]
@@ -92,7 +94,8 @@ def test_a_fault_is_exit_code_one(capsys):
     assert clocks[0].endswith("(put both on one clock)")
 
 
-def test_a_wrong_name_is_told_the_right_one(capsys):
+@pytest.mark.slow
+def test_wrong_robot_name_suggests_the_right_one(capsys):
     with Robot() as robot:
         code, found = findings_of(capsys, "--robot", "rover", "--connect", robot.endpoint, "--seconds", "0.2")
     assert code == 1
@@ -100,8 +103,8 @@ def test_a_wrong_name_is_told_the_right_one(capsys):
     assert found[-2]["remedy"] == "odometry comes on coview/r1/in/odom: try --robot r1"
 
 
-def test_nobody_there(capsys, monkeypatch):
-    monkeypatch.setattr(network, "_PATIENCE", 0.2)
+def test_no_robot_on_the_network(capsys, monkeypatch):
+    monkeypatch.setattr(network, "_CONNECT_TIMEOUT", 0.2)
     endpoint = free_endpoint()
     code, found = findings_of(capsys, "--robot", "r1", "--connect", endpoint)
     assert code == 1
@@ -109,7 +112,7 @@ def test_nobody_there(capsys, monkeypatch):
     assert f"{endpoint} refuses" in found[1]["found"]
 
 
-def test_an_endpoint_in_use(capsys):
+def test_endpoint_in_use_is_reported(capsys):
     with Robot() as robot:
         code, found = findings_of(capsys, "--listen", robot.endpoint)
     assert code == 1
@@ -117,7 +120,7 @@ def test_an_endpoint_in_use(capsys):
     assert "in use" in found[-1]["found"].lower()
 
 
-def test_the_machine_alone_and_a_map(world_file, tmp_path, capsys):
+def test_doctor_without_robot_checks_machine_and_map(world_file, tmp_path, capsys):
     assert main(["doctor"]) == 0
     assert capsys.readouterr().out == "ok    machine                 fine\n"
     code, found = findings_of(capsys, str(world_file))
@@ -139,7 +142,7 @@ def test_the_machine_alone_and_a_map(world_file, tmp_path, capsys):
         ["--odometry-encoding", "xyz"],
     ],
 )
-def test_bad_usage_is_one_line_before_anything_slow(argv, capsys):
+def test_bad_doctor_usage_is_one_line_before_slow_checks(argv, capsys):
     assert main(["doctor", *argv]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

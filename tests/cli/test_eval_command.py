@@ -19,7 +19,7 @@ def truth(tmp_path):
     return path
 
 
-def test_table_and_json(truth, tmp_path, capsys):
+def test_eval_prints_table_and_json(truth, tmp_path, capsys):
     estimate = tmp_path / "est.tum"
     write_tum(estimate, 0.1 * np.arange(4, 10), [pose_from(np.eye(3), [k, 0.25, 0]) for k in range(4, 10)])
     assert main(["eval", str(estimate), str(truth)]) == 0
@@ -33,7 +33,7 @@ def test_table_and_json(truth, tmp_path, capsys):
     assert verdict["translation"]["mean"] == 0.25
 
 
-def test_an_empty_trajectory_is_not_localised(truth, tmp_path, capsys):
+def test_empty_trajectory_is_never_localized(truth, tmp_path, capsys):
     empty = tmp_path / "est.tum"
     empty.write_text("")
     assert main(["eval", str(empty), str(truth), "--plot", str(tmp_path / "errors.png")]) == 0
@@ -42,7 +42,7 @@ def test_an_empty_trajectory_is_not_localised(truth, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", ["", "1 2 3\n", "nonsense\n", None])
-def test_a_bad_truth_is_one_line(truth, tmp_path, capsys, content):
+def test_bad_ground_truth_is_one_line(truth, tmp_path, capsys, content):
     bad = tmp_path / "bad.tum"
     if content is not None:
         bad.write_text(content)

@@ -10,7 +10,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 
 
-def test_the_facts(world_file, capsys):
+def test_info_prints_map_facts(world_file, capsys):
     base_map = BaseMap.load(world_file)
     assert main(["info", str(world_file)]) == 0
     out = capsys.readouterr().out
@@ -18,7 +18,7 @@ def test_the_facts(world_file, capsys):
         assert fact in out
 
 
-def test_json(world_file, capsys):
+def test_info_prints_json(world_file, capsys):
     base_map = BaseMap.load(world_file)
     assert main(["info", str(world_file), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -30,13 +30,13 @@ def test_json(world_file, capsys):
     assert facts["sources"].keys() == {"site.ply"}
 
 
-def test_the_picture(world_file, tmp_path):
+def test_info_writes_a_picture(world_file, tmp_path):
     assert main(["info", str(world_file), "--plot", str(tmp_path / "map.png")]) == 0
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("content", [None, b"", b"nonsense" * 20, "flipped", "half"])
-def test_a_damaged_map_is_one_line(world_file, tmp_path, capsys, content):
+def test_damaged_map_is_one_line(world_file, tmp_path, capsys, content):
     path = tmp_path / "site.coview"
     whole = world_file.read_bytes()
     at = len(whole) // 2

@@ -20,7 +20,7 @@ def one_line(capsys):
     return captured.err
 
 
-def test_a_run_on_the_map(world_file, world_run, world_drive, tmp_path, capsys):
+def test_run_on_the_map_is_localized(world_file, world_run, world_drive, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["locate", str(world_file), str(world_run), "-o", str(out)]) == 0
     captured = capsys.readouterr()
@@ -38,7 +38,7 @@ def test_a_run_on_the_map(world_file, world_run, world_drive, tmp_path, capsys):
     assert (out / "trajectory.png").exists()
 
 
-def test_a_run_outside_the_map(world_file, elsewhere_run, tmp_path, capsys):
+def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["locate", str(world_file), str(elsewhere_run), "-o", str(out), "--no-pictures"]) == 1
     captured = capsys.readouterr()
@@ -53,7 +53,8 @@ def test_a_run_outside_the_map(world_file, elsewhere_run, tmp_path, capsys):
     assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
 
 
-def test_odometry_from_another_file_and_the_papers_retrieval(world_file, world_run, world_drive, tmp_path):
+@pytest.mark.slow
+def test_odometry_from_another_file_and_ring_key_retrieval(world_file, world_run, world_drive, tmp_path):
     bare = tmp_path / "run"
     shutil.copytree(world_run, bare)
     (bare / "odometry.tum").rename(tmp_path / "wheel.tum")
@@ -84,7 +85,7 @@ def damaged_odometry(run, kind):
 
 
 @pytest.mark.parametrize("kind", ["missing", "short", "unsorted", "nan", "text"])
-def test_bad_odometry(world_file, world_run, tmp_path, capsys, kind):
+def test_bad_odometry_is_one_line(world_file, world_run, tmp_path, capsys, kind):
     run = tmp_path / "run"
     shutil.copytree(world_run, run)
     damaged_odometry(run, kind)
@@ -93,7 +94,7 @@ def test_bad_odometry(world_file, world_run, tmp_path, capsys, kind):
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_paths_and_options(world_file, world_run, tmp_path, capsys):
+def test_bad_paths_and_options_are_one_line(world_file, world_run, tmp_path, capsys):
     out = ["-o", str(tmp_path / "out")]
     (tmp_path / "file").write_text("")
     wheel = tmp_path / "wheel.tum"
@@ -114,7 +115,7 @@ def test_bad_paths_and_options(world_file, world_run, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_of_damaged_frames(world_file, world_run, tmp_path, capsys):
+def test_run_of_damaged_frames_is_refused(world_file, world_run, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(world_run, run)
     for path in (run / "frames").iterdir():

@@ -20,7 +20,6 @@ def command(monkeypatch):
     def install(act):
         module = SimpleNamespace(HELP="acts", add_arguments=lambda parser: None, run=lambda args: act())
         monkeypatch.setattr(cli, "COMMANDS", ("act",))
-        monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: object())
         monkeypatch.setattr(cli.importlib, "import_module", lambda name: module)
 
     return install
@@ -60,7 +59,7 @@ def test_bad_usage_is_one_line_and_exit_two(argv, capsys):
         (KeyboardInterrupt(), 130, ""),
     ],
 )
-def test_errors_become_one_line(command, capsys, error, code, text):
+def test_errors_are_printed_as_one_line(command, capsys, error, code, text):
     command(lambda: _raise(error))
     assert cli.main(["act"]) == code
     err = capsys.readouterr().err
@@ -69,18 +68,19 @@ def test_errors_become_one_line(command, capsys, error, code, text):
     assert "Traceback" not in err
 
 
-def test_the_commands_own_exit_code_is_returned(command):
+def test_command_exit_code_is_returned(command):
     command(lambda: 1)
     assert cli.main(["act"]) == 1
 
 
-def test_a_bug_is_not_hidden(command):
+def test_unexpected_exception_keeps_its_traceback(command):
     command(lambda: _raise(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):
         cli.main(["act"])
 
 
-def test_a_closed_pipe_is_quiet():
+@pytest.mark.slow
+def test_closed_stdout_pipe_is_quiet():
     reader, writer = os.pipe()
     os.close(reader)
     # a command that prints, for argparse swallows the error while it prints its own help
@@ -98,7 +98,8 @@ def test_a_closed_pipe_is_quiet():
     assert done.stderr == ""
 
 
-def test_help_loads_nothing_heavy():
+@pytest.mark.slow
+def test_help_imports_no_heavy_library():
     script = (
         "import sys; from coview_stream.cli import main; main(['--help']);"
         "heavy = {'open3d', 'taichi', 'quadrants', 'matplotlib', 'zenoh', 'tqdm'};"

@@ -11,7 +11,7 @@ from coview_stream.errors import CoViewError
 from coview_stream.stream.node.engine_process import EngineProcess
 
 
-def test_locate_says_at_once_what_is_missing(world_file, tmp_path, monkeypatch, capsys):
+def test_locate_registration_option_names_missing_library(world_file, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
     assert main(["locate", str(world_file), str(run), "-o", str(out), "--registration", "gicp"]) == 2
@@ -21,14 +21,15 @@ def test_locate_says_at_once_what_is_missing(world_file, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize(("given", "wanted"), [([], "trimmed-icp"), (["--registration", "gicp"], "gicp")])
-def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
+def test_serve_passes_registration_option_to_engines(world_file, monkeypatch, given, wanted):
     asked = []
     monkeypatch.setattr(serve, "_serve", lambda options, stop: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
     assert [options.registration for options in asked] == [wanted]
 
 
-def test_it_travels_to_a_lanes_process(world_file):
+@pytest.mark.slow
+def test_registration_option_reaches_engine_process(world_file):
     """Which refuses what is no method."""
     wrong = {"registration": "guesswork"}
     lane = EngineProcess("track", str(world_file), "0" * 64, **wrong)

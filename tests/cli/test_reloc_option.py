@@ -18,7 +18,7 @@ from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.node.jobs import SearchJob
 
 
-def test_locate_names_the_remedy_on_a_map_without_features(world_file, tmp_path, capsys):
+def test_locate_reloc_learned_on_map_without_features_names_remedy(world_file, tmp_path, capsys):
     run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
     assert main(["locate", str(world_file), str(run), "-o", str(out), "--reloc", "learned"]) == 2
     said = capsys.readouterr().err
@@ -27,21 +27,22 @@ def test_locate_names_the_remedy_on_a_map_without_features(world_file, tmp_path,
     assert said.count("\n") == 1
 
 
-def test_serve_does_so_too_before_it_opens_anything(world_file, capsys):
+def test_serve_reloc_learned_on_map_without_features_fails_before_opening(world_file, capsys):
     given = ["serve", str(world_file), "--robot", "r1", "--reloc", "learned", "--no-state", "--quiet"]
     assert main(given) == 2
     assert "build it again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("given", "wanted"), [([], "auto"), (["--reloc", "learned"], "learned")])
-def test_serve_passes_it_on(world_file, monkeypatch, given, wanted):
+def test_serve_passes_reloc_option_to_engines(world_file, monkeypatch, given, wanted):
     asked = []
     monkeypatch.setattr(serve, "_serve", lambda options, stop: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
     assert [options.reloc for options in asked] == [wanted]
 
 
-def test_it_travels_to_a_lanes_process(world_file):
+@pytest.mark.slow
+def test_reloc_option_reaches_engine_process(world_file):
     """Which refuses what is none."""
     lane = EngineProcess("search", str(world_file), "0" * 64, reloc="guesswork")
     try:
@@ -52,10 +53,11 @@ def test_it_travels_to_a_lanes_process(world_file):
         lane.close()
 
 
-def test_a_search_in_its_own_process_uses_them(learned_file, world_drive):
+@pytest.mark.slow
+def test_search_engine_process_uses_learned_features(learned_file, world_drive):
     base_map = BaseMap.load(learned_file)
     localizer = Localizer(base_map, LocalizerConfig(reloc="learned"))
-    query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
     lane = EngineProcess("search", str(learned_file), base_map.sha256, reloc="learned")
     try:
         lane.start()
@@ -65,7 +67,7 @@ def test_a_search_in_its_own_process_uses_them(learned_file, world_drive):
         lane.close()
 
 
-def test_build_says_at_once_what_is_missing(tmp_path, monkeypatch, capsys):
+def test_build_learned_names_missing_library(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     network.cache_clear()
     scan = tmp_path / "not-even-looked-for.ply"
@@ -83,13 +85,14 @@ def learned_file(map_cloud_file, tmp_path_factory):
     return path
 
 
-def test_a_built_map_has_features_and_info_says_so(learned_file, capsys):
+@pytest.mark.slow
+def test_build_learned_stores_features_and_info_shows_them(learned_file, capsys):
     assert BaseMap.load(learned_file).learned is not None
     assert main(["info", str(learned_file)]) == 0
     assert "features of" in capsys.readouterr().out
 
 
-def test_of_other_weights_than_installed(learned_file, tmp_path, capsys):
+def test_features_of_other_weights_are_refused_or_skipped(learned_file, tmp_path, capsys):
     arrays, parameters, _ = load(learned_file)
     parameters["learned"]["weights"] = "0" * 64
     save(tmp_path / "old.coview", arrays, parameters)

@@ -60,7 +60,7 @@ def node():
     made.transport.close()
 
 
-def test_a_run_arrives_whole(node, run_folder, capsys):
+def test_replayed_run_arrives_complete(node, run_folder, capsys):
     node.subscribe()
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint]
     assert main([*command, "--rate", "20", "--odometry-rate", "60"]) == 0
@@ -74,7 +74,8 @@ def test_a_run_arrives_whole(node, run_folder, capsys):
     assert captured.err == ""
 
 
-def test_clouds_alone(node, run_folder, tmp_path, capsys):
+@pytest.mark.slow
+def test_replay_of_clouds_without_odometry(node, run_folder, tmp_path, capsys):
     bare = tmp_path / "run"
     shutil.copytree(run_folder / "frames", bare / "frames")
     node.subscribe()
@@ -91,8 +92,9 @@ def test_clouds_alone(node, run_folder, tmp_path, capsys):
     assert node.odometry() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["xyzi", "foxglove", "cdr"])
-def test_other_encodings(node, run_folder, encoding, capsys):
+def test_replay_in_other_encodings(node, run_folder, encoding, capsys):
     node.subscribe()
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "50"]
     assert main([*command, "--encoding", encoding, "--odometry-encoding", "cdr"]) == 0
@@ -100,24 +102,27 @@ def test_other_encodings(node, run_folder, encoding, capsys):
     assert all(m.points.shape == (500, 3) for m in node.clouds())
 
 
-def test_as_a_ros_bridge_would(node, run_folder, capsys):
+@pytest.mark.slow
+def test_replay_with_ros2dds_preset(node, run_folder, capsys):
     node.subscribe("r1/points", "r1/odom", "cdr")
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "50"]
     assert main([*command, "--preset", "ros2dds"]) == 0
     until(lambda: len(node.clouds()) == 6 and len(node.odometry()) == 6)
 
 
-def test_nobody_there(node, run_folder, capsys):
+@pytest.mark.slow
+def test_replay_without_subscriber_exits_with_one(node, run_folder, capsys):
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "100"]
     assert main([*command, "--wait", "0.1"]) == 1
     captured = capsys.readouterr()
-    assert "nobody subscribes to coview/r1/in/cloud" in captured.err
+    assert "nothing subscribes to coview/r1/in/cloud" in captured.err
     assert "6 frames" in captured.out
     assert captured.out.splitlines()[-1].startswith("nobody listened: ")
     assert "one odometry sample in 1.00 s is too few" in captured.err
 
 
-def test_somebody_who_came_late_has_listened(node, run_folder, capsys, monkeypatch):
+@pytest.mark.slow
+def test_replay_with_late_subscriber_exits_with_zero(node, run_folder, capsys, monkeypatch):
     def subscribe_late(*arguments):
         node.subscribe()
         return inner(*arguments)
@@ -127,12 +132,13 @@ def test_somebody_who_came_late_has_listened(node, run_folder, capsys, monkeypat
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint, "--rate", "20"]
     assert main([*command, "--wait", "0"]) == 0
     captured = capsys.readouterr()
-    assert "nobody subscribes" in captured.err
+    assert "nothing subscribes" in captured.err
     assert "nobody listened" not in captured.out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_loop_cleanly(node, run_folder, number):
+def test_signal_ends_replay_loop_cleanly(node, run_folder, number):
     node.subscribe()
     command = [sys.executable, "-m", "coview_stream", "replay", str(run_folder), "--robot", "r1"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -176,7 +182,7 @@ def test_a_signal_ends_a_loop_cleanly(node, run_folder, number):
         (["--wait", "-1"], "--wait"),
     ],
 )
-def test_bad_usage_is_one_line(run_folder, capsys, options, text):
+def test_bad_replay_usage_is_one_line(run_folder, capsys, options, text):
     endpoint = free_endpoint()
     assert main(["replay", str(run_folder), "--robot", "r1", "--listen", endpoint, *options]) == 2
     captured = capsys.readouterr()

@@ -50,7 +50,8 @@ def heard(process, text):
     return next((line for line in process.stderr if text in line), None)
 
 
-def test_a_signal_ends_it(world_file):
+@pytest.mark.slow
+def test_signal_ends_serve(world_file):
     endpoint = free_endpoint()
     process = serving(world_file, "--robot", "r1", "--listen", endpoint, "--humble", "--max-speed", "20")
     assert heard(process, "ready")
@@ -59,7 +60,8 @@ def test_a_signal_ends_it(world_file):
     assert "Traceback" not in said
 
 
-def test_a_signal_ends_what_waits_for_a_host_that_says_nothing(world_file):
+@pytest.mark.slow
+def test_signal_ends_serve_waiting_for_silent_host(world_file):
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
@@ -71,7 +73,7 @@ def test_a_signal_ends_what_waits_for_a_host_that_says_nothing(world_file):
     assert "Traceback" not in said
 
 
-def test_opening_is_given_up_when_nobody_wants_it_any_more(world_file):
+def test_cancelled_opening_stops_engines(world_file):
     keys = [robot_keys("native", "coview", "r1")]
     options = serve.ServeOptions(world_file, keys, listen=[free_endpoint()])
     with pytest.raises(CancelledError):
@@ -93,7 +95,7 @@ class Stop:
         return self.requested
 
 
-def test_a_node_that_does_not_end_is_left(monkeypatch):
+def test_node_that_does_not_close_is_abandoned(monkeypatch):
     class Stuck:
         def close(self, patience):
             return False
@@ -102,7 +104,7 @@ def test_a_node_that_does_not_end_is_left(monkeypatch):
     assert command._serve(None, Stop(True)) is False
 
 
-def test_what_goes_wrong_in_opening_is_the_callers(monkeypatch):
+def test_error_while_opening_is_raised_to_caller(monkeypatch):
     def fail(options, cancelled):
         raise ConfigError("no such thing")
 
@@ -124,12 +126,12 @@ def test_what_goes_wrong_in_opening_is_the_callers(monkeypatch):
         (["--robot", "a", "--odometry", "kiss-icp", "--odometry-key", "k"], "reads no odometry"),
     ],
 )
-def test_refused(args, message, world_file, capsys):
+def test_bad_serve_options_are_refused(args, message, world_file, capsys):
     assert main(["serve", str(world_file), *args]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_without_kiss_icp(tmp_path, monkeypatch, world_file, capsys):
+def test_serve_odometry_kiss_icp_names_missing_library(tmp_path, monkeypatch, world_file, capsys):
     (tmp_path / "kiss_icp").mkdir()
     (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -140,14 +142,14 @@ def test_without_kiss_icp(tmp_path, monkeypatch, world_file, capsys):
     assert said.count("\n") == 1
 
 
-def test_a_map_that_cannot_be_read(tmp_path, capsys):
+def test_unreadable_map_is_refused(tmp_path, capsys):
     path = tmp_path / "broken.coview"
     path.write_bytes(b"no map")
     assert main(["serve", str(path), "--robot", "r1", "--listen", free_endpoint()]) == 2
     assert "broken.coview" in capsys.readouterr().err
 
 
-def test_what_is_asked_for_arrives(monkeypatch, world_file):
+def test_serve_options_reach_node_config(monkeypatch, world_file):
     asked = []
 
     class Node:
@@ -174,7 +176,7 @@ def test_what_is_asked_for_arrives(monkeypatch, world_file):
     assert serve.make_sessions(asked[0], "")[0].lidar is lidar
 
 
-def test_another_node_of_the_same_robot_is_named(caplog):
+def test_second_node_of_same_robot_is_warned_about(caplog):
     net = FakeTransport()
     net.announce("coview/r2/alive")
     net.announce("coview/other/alive")
@@ -184,7 +186,7 @@ def test_another_node_of_the_same_robot_is_named(caplog):
     assert "coview/r2/alive" in line
 
 
-def test_the_largest_payload_reaches_the_transport(monkeypatch, world_file):
+def test_max_payload_reaches_the_transport(monkeypatch, world_file):
     def open_transport(*args):
         raise ConfigError(f"asked with {args}")
 

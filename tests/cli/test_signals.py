@@ -13,7 +13,7 @@ from coview_stream.cli.signals import Stop, stop_on_signals
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_cuts_a_wait_short_and_handlers_are_put_back(number):
+def test_signal_ends_wait_and_handlers_are_restored(number):
     before = signal.getsignal(number)
     with stop_on_signals() as stop:
         assert stop.wait(0.001) is False
@@ -25,7 +25,7 @@ def test_a_signal_cuts_a_wait_short_and_handlers_are_put_back(number):
     assert signal.getsignal(number) is before
 
 
-def test_a_second_interrupt_is_for_good():
+def test_second_interrupt_raises_keyboard_interrupt():
     with stop_on_signals() as stop:
         os.kill(os.getpid(), signal.SIGINT)
         assert stop.wait(5.0)
@@ -33,7 +33,7 @@ def test_a_second_interrupt_is_for_good():
             signal.raise_signal(signal.SIGINT)
 
 
-def test_another_thread_may_ask_too_and_use_it():
+def test_stop_can_be_requested_and_used_from_other_threads():
     stop = Stop()
     threading.Thread(target=stop.request).start()
     assert stop.wait(30.0) is True
@@ -52,7 +52,7 @@ def test_another_thread_may_ask_too_and_use_it():
     assert found == [False]
 
 
-def test_its_clock_is_steady():
+def test_stop_clock_is_monotonic():
     stop = Stop()
     before = stop.now()
     assert stop.wait(0.02) is False

@@ -22,7 +22,7 @@ def folder(*args):
     return state.state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
 
 
-def test_the_users_state_directory_unless_told_otherwise(monkeypatch, tmp_path):
+def test_state_folder_defaults_to_user_state_directory(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert folder() == tmp_path / "coview-stream"
     assert folder("--state", "here/there") == Path("here/there")
@@ -30,13 +30,13 @@ def test_the_users_state_directory_unless_told_otherwise(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_both_at_once_make_no_sense(capsys):
+def test_state_and_no_state_together_are_refused(capsys):
     with pytest.raises(SystemExit):
         folder("--state", "x", "--no-state")
     assert "not allowed with" in capsys.readouterr().err
 
 
-def test_a_service_without_a_home_keeps_nothing(monkeypatch, caplog):
+def test_without_home_directory_no_pose_is_saved(monkeypatch, caplog):
     def homeless():
         raise RuntimeError("no home")
 
@@ -51,10 +51,10 @@ def test_a_service_without_a_home_keeps_nothing(monkeypatch, caplog):
 def ready(*args):
     parser = argparse.ArgumentParser()
     serve.add_arguments(parser)
-    return state.ready_state(parser.parse_args(["site.coview", "--robot", "r1", *args]))
+    return state.writable_state_folder(parser.parse_args(["site.coview", "--robot", "r1", *args]))
 
 
-def test_the_directory_is_made_tried_and_named(tmp_path, caplog):
+def test_state_directory_is_created_tested_and_logged(tmp_path, caplog):
     caplog.set_level("INFO")
     place = tmp_path / "new" / "place"
     assert ready("--state", str(place)) == place
@@ -63,7 +63,7 @@ def test_the_directory_is_made_tried_and_named(tmp_path, caplog):
     assert ready("--no-state") is None
 
 
-def test_what_was_asked_for_and_cannot_be_used_is_refused_at_once(world_file, tmp_path, capsys):
+def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for name, text in (
         (str(tmp_path / "file"), "file"),
@@ -77,7 +77,7 @@ def test_what_was_asked_for_and_cannot_be_used_is_refused_at_once(world_file, tm
         assert said.count("\n") == 1
 
 
-def test_a_default_that_cannot_be_used_is_a_warning(monkeypatch, tmp_path, caplog):
+def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, caplog):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
     assert ready() == tmp_path / "file" / "coview-stream"
@@ -87,7 +87,7 @@ def test_a_default_that_cannot_be_used_is_a_warning(monkeypatch, tmp_path, caplo
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_the_node_runs_it_beside_its_clocks(monkeypatch, world_file, tmp_path, kept):
+def test_serve_runs_last_pose_keeper_unless_no_state(monkeypatch, world_file, tmp_path, kept):
     monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: FakeTransport())
     monkeypatch.setattr(opening, "warn_of_others", lambda *args: None)
     for name in ("start", "wait_ready", "close"):

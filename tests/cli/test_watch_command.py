@@ -74,7 +74,7 @@ def node():
 def watch(monkeypatch):
     """Run the command until it took, drew or said something so many times; 20 s at most."""
 
-    def run(endpoint, *options, after="_take", times=1):
+    def run(endpoint, *options, after="_show", times=1):
         inner, left = getattr(_Watch, after), [times]
 
         def counted(self, *arguments):
@@ -91,7 +91,7 @@ def watch(monkeypatch):
     return run
 
 
-def test_json_lines_of_all_robots(node, watch, capsys):
+def test_watch_prints_json_lines_of_all_robots(node, watch, capsys):
     assert watch(node.endpoint, "--json", times=24) == 0
     captured = capsys.readouterr()
     records = [json.loads(line) for line in captured.out.splitlines()]
@@ -108,7 +108,8 @@ def test_json_lines_of_all_robots(node, watch, capsys):
     assert captured.err == ""
 
 
-def test_lines_where_there_is_no_terminal(node, watch, capsys):
+@pytest.mark.slow
+def test_watch_prints_lines_without_terminal(node, watch, capsys):
     assert watch(node.endpoint, "--robot", "r1", after="_draw") == 0
     (line,) = capsys.readouterr().out.splitlines()
     cells = line.split()
@@ -117,7 +118,8 @@ def test_lines_where_there_is_no_terminal(node, watch, capsys):
     assert cells[8:] == ["0.90", "-/-", "3", "fine"]
 
 
-def test_a_terminal_is_redrawn_in_place(node, watch, capsys, monkeypatch):
+@pytest.mark.slow
+def test_watch_redraws_terminal_in_place(node, watch, capsys, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "60")
     assert watch(node.endpoint, after="_draw", times=2) == 0
@@ -132,7 +134,7 @@ def test_a_terminal_is_redrawn_in_place(node, watch, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["cdr", "foxglove"])
-def test_poses_in_other_formats(name, watch, capsys):
+def test_watch_reads_poses_in_other_formats(name, watch, capsys):
     node = Node(pose_format=name)
     try:
         assert watch(node.endpoint, "--json", "--robot", "r1", "r2", times=12) == 0
@@ -145,7 +147,7 @@ def test_poses_in_other_formats(name, watch, capsys):
     assert poses[0]["confidence"] is None
 
 
-def test_the_poses_of_a_preset(watch, capsys):
+def test_watch_reads_poses_of_a_preset(watch, capsys):
     node = Node(("r1",), preset="ros2dds")
     try:
         assert watch(node.endpoint, "--json", "--robot", "r1", "--preset", "ros2dds", times=6) == 0
@@ -155,7 +157,7 @@ def test_the_poses_of_a_preset(watch, capsys):
     assert keys == {"r1/coview/pose", "coview/r1/out/status"}
 
 
-def test_rubbish_is_reported_once_per_key(watch, capsys):
+def test_undecodable_messages_are_reported_once_per_key(watch, capsys):
     bad = [("coview/r1/out/pose", Encoded(b"\xff\x00")), ("coview/r1/out/status", Encoded(b"[]"))]
     node = Node((), extra=bad)
     try:
@@ -168,11 +170,11 @@ def test_rubbish_is_reported_once_per_key(watch, capsys):
     assert "coview/r1/out/pose" in captured.err
 
 
-def test_silence_is_explained(watch, capsys, monkeypatch):
-    monkeypatch.setattr("coview_stream.cli.watch._PATIENCE", 0.2)
+def test_watch_explains_missing_messages(watch, capsys, monkeypatch):
+    monkeypatch.setattr("coview_stream.cli.watch._SILENCE", 0.2)
     node = Node(())
     try:
-        assert watch(node.endpoint, "--base", "site/a", after="_say_where") == 0
+        assert watch(node.endpoint, "--base", "site/a", after="_print_silence") == 0
     finally:
         node.close()
     captured = capsys.readouterr()
@@ -193,8 +195,9 @@ def process(endpoint, *options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it(node, number):
+def test_signals_end_watch(node, number):
     running = process(node.endpoint, "--json")
     try:
         assert json.loads(running.stdout.readline())["key"].startswith("coview/r")
@@ -205,7 +208,8 @@ def test_signals_end_it(node, number):
     assert (running.returncode, err) == (0, "")
 
 
-def test_a_closed_pipe_is_no_traceback(node):
+@pytest.mark.slow
+def test_closed_pipe_prints_no_traceback(node):
     running = process(node.endpoint, "--json")
     try:
         running.stdout.readline()
@@ -216,7 +220,7 @@ def test_a_closed_pipe_is_no_traceback(node):
         running.kill()
 
 
-def test_the_viewer_gets_every_pose(node, watch, monkeypatch):
+def test_viewer_receives_every_pose(node, watch, monkeypatch):
     logged = []
     viewer = types.ModuleType("rerun")
     viewer.init = lambda name, spawn: logged.append(("init", name))
@@ -238,12 +242,12 @@ def test_the_viewer_gets_every_pose(node, watch, monkeypatch):
     assert ways[-1][0].shape == (len(bodies), 3)
 
 
-def test_it_ends_when_the_time_is_over(node, capsys):
+def test_watch_ends_after_seconds_option(node, capsys):
     assert main(["watch", "--connect", node.endpoint, "--seconds", "0.2", "--json"]) == 0
     assert capsys.readouterr().err == ""
 
 
-def test_without_the_viewer_installed(monkeypatch, capsys):
+def test_missing_viewer_library_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["watch", "--listen", free_endpoint(), "--rerun"]) == 2
     assert "--rerun: rerun is not installed; pip install 'rerun-sdk>=0.20'" in capsys.readouterr().err
@@ -261,7 +265,7 @@ def test_without_the_viewer_installed(monkeypatch, capsys):
         (["--connect", "nonsense"], "nonsense"),
     ],
 )
-def test_bad_usage_is_one_line(capsys, options, text):
+def test_bad_watch_usage_is_one_line(capsys, options, text):
     assert main(["watch", "--listen", free_endpoint(), *options]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

@@ -19,7 +19,7 @@ HEADER = "VERSION 0.7\nFIELDS {f}\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_missing_empty_directory_and_junk(tmp_path: Path, suffix: str) -> None:
+def test_missing_file_empty_file_directory_and_junk_are_refused(tmp_path: Path, suffix: str) -> None:
     for name, content in (
         ("text", b"just some words\n" * 40),
         ("html", b"<!DOCTYPE html><html>" + b" " * 43),
@@ -42,14 +42,14 @@ def test_missing_empty_directory_and_junk(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_zero_points(tmp_path: Path, suffix: str) -> None:
+def test_file_without_points_is_refused(tmp_path: Path, suffix: str) -> None:
     write_cloud(tmp_path / f"a{suffix}", np.zeros((0, 3), np.float32))
     with pytest.raises(CloudError, match=r"zero points|is empty"):
         read_cloud(tmp_path / f"a{suffix}")
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy", ".bin"])
-def test_all_nan(tmp_path: Path, suffix: str) -> None:
+def test_file_with_only_nan_points_is_refused(tmp_path: Path, suffix: str) -> None:
     write_cloud(tmp_path / f"a{suffix}", np.full((9, 3), np.nan, np.float32))
     with pytest.raises(CloudError, match="none of the 9 points"):
         read_cloud(tmp_path / f"a{suffix}")
@@ -58,7 +58,7 @@ def test_all_nan(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     ("real", "named"), [(".ply", ".pcd"), (".pcd", ".laz"), (".laz", ".ply"), (".npy", ".bin")]
 )
-def test_content_of_another_format(tmp_path: Path, real: str, named: str) -> None:
+def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: str) -> None:
     write_cloud(tmp_path / f"a{real}", POINTS[:52])
     os.rename(tmp_path / f"a{real}", tmp_path / f"a{named}")  # noqa: PTH104 - Path.rename reads worse here
     what = "LAS" if real == ".laz" else real[1:].upper()
@@ -87,7 +87,9 @@ def test_content_of_another_format(tmp_path: Path, real: str, named: str) -> Non
         ("a.bin", b"\x01\xff" * 15, "no multiple"),
     ],
 )
-def test_damaged_content(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
+def test_damaged_content_is_refused_with_reason(
+    tmp_path: Path, name: str, content: bytes, reason: str
+) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CloudError, match=reason):
         read_cloud(tmp_path / name)
@@ -96,7 +98,7 @@ def test_damaged_content(tmp_path: Path, name: str, content: bytes, reason: str)
 @pytest.mark.parametrize(
     "array", [np.zeros(9), np.zeros((4, 2)), np.array([["a"] * 3]), np.array([[None] * 3])]
 )
-def test_npy_of_another_shape_or_type(tmp_path: Path, array: np.ndarray) -> None:
+def test_npy_of_wrong_shape_or_type_is_refused(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "a.npy", array, allow_pickle=True)
     with pytest.raises(CloudError, match=r"a\.npy"):
         read_cloud(tmp_path / "a.npy")
@@ -112,7 +114,9 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(suffix=st.sampled_from(SUFFIXES), share=st.floats(0, 1, exclude_max=True))
-def test_truncated_anywhere(tmp_path: Path, originals: dict[str, bytes], suffix: str, share: float) -> None:
+def test_file_truncated_anywhere_is_refused(
+    tmp_path: Path, originals: dict[str, bytes], suffix: str, share: float
+) -> None:
     whole = originals[suffix]
     cut = int(share * len(whole))
     path = tmp_path / f"cut{suffix}"
@@ -131,7 +135,7 @@ def test_truncated_anywhere(tmp_path: Path, originals: dict[str, bytes], suffix:
     where=st.floats(0, 1, exclude_max=True),
     bit=st.integers(0, 7),
 )
-def test_flipped_bits_give_a_cloud_or_a_cloud_error(
+def test_flipped_bits_give_cloud_or_cloud_error(
     tmp_path: Path, originals: dict[str, bytes], suffix: str, where: float, bit: int
 ) -> None:
     content = bytearray(originals[suffix])
@@ -147,7 +151,7 @@ def test_flipped_bits_give_a_cloud_or_a_cloud_error(
 
 
 @pytest.mark.parametrize("damage", ["table outside", "too many chunks", "too many records"])
-def test_counts_that_would_exhaust_the_decoder(
+def test_huge_point_counts_are_refused_before_allocating(
     tmp_path: Path, originals: dict[str, bytes], damage: str
 ) -> None:
     content = bytearray(originals[".laz"])

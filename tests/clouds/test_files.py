@@ -20,7 +20,7 @@ TOLERANCE = {".las": 6e-4, ".laz": 6e-4}
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_local_round_trip(tmp_path: Path, suffix: str) -> None:
+def test_cloud_file_round_trip(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"cloud{suffix}"
     write_cloud(path, POINTS)
     cloud = read_cloud(path)
@@ -41,14 +41,14 @@ def test_utm_coordinates_keep_millimetres(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(cloud.map_points(), POINTS + UTM, rtol=0, atol=1e-3)
 
 
-def test_bin_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
+def test_bin_format_refuses_utm_coordinates(tmp_path: Path) -> None:
     with pytest.raises(CloudError, match="10 km"):
         write_cloud(tmp_path / "a.bin", POINTS, origin=UTM)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npy", ".bin"])
-def test_unusable_rows_are_dropped_and_counted(tmp_path: Path, suffix: str) -> None:
+def test_non_finite_and_huge_rows_are_dropped_and_counted(tmp_path: Path, suffix: str) -> None:
     points = POINTS.copy()
     points[3, 1], points[5, 0], points[7, 2] = np.nan, np.inf, 1e30
     write_cloud(tmp_path / f"a{suffix}", points)
@@ -76,14 +76,14 @@ def _expected(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
     return np.column_stack([rows["x"], rows["y"], rows["z"]])
 
 
-def test_pcd_binary_any_order_and_types(tmp_path: Path) -> None:
+def test_pcd_binary_with_any_field_order_and_types(tmp_path: Path) -> None:
     rows = _mixed_rows()
     path = tmp_path / "a.pcd"
     path.write_bytes(_pcd("i z n x y", "1 8 4 4 2", "U F F F I", "1 1 3 1 1", 50, "binary") + rows.tobytes())
     np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
 
 
-def test_pcd_ascii_any_order(tmp_path: Path) -> None:
+def test_pcd_ascii_with_any_field_order(tmp_path: Path) -> None:
     rows = _mixed_rows()
     body = "".join(f"{r['i']} {r['z']} 1 nan 3 {r['x']} {r['y']}\n" for r in rows)
     path = tmp_path / "a.pcd"
@@ -132,7 +132,7 @@ def test_ply_vertices_after_elements_with_lists(tmp_path: Path, order: str) -> N
     np.testing.assert_allclose(read_cloud(path).points, _expected(rows), atol=1e-6)
 
 
-def test_ply_ascii(tmp_path: Path) -> None:
+def test_ply_ascii_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     path.write_text(
         "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nelement vertex 2\n"
@@ -141,7 +141,7 @@ def test_ply_ascii(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(path).points, [[1, 2, 3], [4, 5, 6]])
 
 
-def test_las_drops_withheld_and_noise_and_keeps_classes(tmp_path: Path) -> None:
+def test_las_drops_withheld_and_noise_points_and_keeps_classes(tmp_path: Path) -> None:
     import laspy
 
     header = laspy.LasHeader(point_format=6, version="1.4")

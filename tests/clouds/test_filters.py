@@ -13,7 +13,7 @@ from coview_stream.errors import ConfigError
 RNG = np.random.default_rng(4)
 
 
-def test_outliers_go_and_the_plane_stays() -> None:
+def test_outliers_are_removed_and_plane_is_kept() -> None:
     plane = np.column_stack([RNG.uniform(0, 20, (4000, 2)), RNG.normal(0, 0.02, 4000)])
     stray = RNG.uniform([0, 0, 10], [20, 20, 60], (20, 3))
     points = np.concatenate([plane, stray]).astype(np.float32)
@@ -32,7 +32,7 @@ def test_too_few_points_for_outliers_are_kept(count: int) -> None:
 
 
 @given(st.integers(0, 2**31), st.floats(0.05, 5.0), st.integers(1, 300))
-def test_voxel_centroids_match_a_plain_grouping(seed: int, voxel: float, count: int) -> None:
+def test_voxel_centroids_match_numpy_grouping(seed: int, voxel: float, count: int) -> None:
     points = np.random.default_rng(seed).normal(0, 10, (count, 3)).astype(np.float32)
     groups: dict[tuple[int, ...], list[np.ndarray]] = {}
     for point in points.astype(np.float64):
@@ -41,7 +41,7 @@ def test_voxel_centroids_match_a_plain_grouping(seed: int, voxel: float, count: 
     np.testing.assert_allclose(voxel_grid(points, voxel), expected, atol=1e-5)
 
 
-def test_voxel_grid_limits() -> None:
+def test_voxel_grid_of_no_points_and_invalid_voxel_sizes() -> None:
     assert voxel_grid(np.zeros((0, 3), np.float32), 0.5).shape == (0, 3)
     with pytest.raises(ConfigError, match="too small"):
         voxel_grid(np.array([[0, 0, 0], [1e7, 1e7, 1e7]], np.float32), 1e-3)
@@ -59,7 +59,7 @@ def test_normals_of_a_tilted_plane_point_up() -> None:
         np.testing.assert_allclose(normals, np.tile(expected, (2000, 1)), atol=1e-3)
 
 
-def test_lonely_points_have_a_vertical_normal() -> None:
+def test_isolated_points_have_a_vertical_normal() -> None:
     normals = estimate_normals(np.array([[0, 0, 0], [50, 0, 0]], np.float32), radius=1.0)
     np.testing.assert_array_equal(normals, [[0, 0, 1], [0, 0, 1]])
     assert estimate_normals(np.zeros((0, 3), np.float32)).shape == (0, 3)

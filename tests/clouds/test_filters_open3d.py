@@ -28,7 +28,7 @@ def _fresh_cache() -> Iterator[None]:
         (ImportError("undefined symbol: xyz"), "undefined symbol: xyz.*reinstall"),
     ],
 )
-def test_message_names_library_and_remedy(
+def test_missing_open3d_library_is_named_with_remedy(
     monkeypatch: pytest.MonkeyPatch, error: ImportError, remedy: str
 ) -> None:
     def fail() -> None:
@@ -40,7 +40,7 @@ def test_message_names_library_and_remedy(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libusb is preloaded on Linux only")
-def test_libusb_is_preloaded_and_the_import_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_libusb_is_preloaded_and_open3d_import_retried(monkeypatch: pytest.MonkeyPatch) -> None:
     attempts = []
     real = open3d_loader._import_open3d
 

@@ -67,12 +67,12 @@ BAD = [
 
 
 @pytest.mark.parametrize(("kind", "name", "value"), BAD)
-def test_a_value_out_of_range_is_refused_by_name(kind, name, value):
+def test_value_out_of_range_is_refused_by_name(kind, name, value):
     with pytest.raises(ConfigError, match=rf"{name} is .*must be .*{kind.__name__}\.{name}"):
         kind(**{name: value})
 
 
-def test_defaults_are_the_papers():
+def test_defaults_are_those_of_the_paper():
     usual = MapConfig()
     assert (usual.block, usual.descriptor.radius) == (2.0, 50.0)
     assert (usual.descriptor.rings, usual.descriptor.sectors) == (20, 60)
@@ -91,7 +91,7 @@ def test_configurations_are_frozen_and_equal_by_value():
             assert type(inner)(**asdict(inner)) == inner
 
 
-def test_presets():
+def test_map_presets():
     assert map_preset("slam") == MapConfig()
     assert map_preset("tls").descriptor.radius == 100.0
     assert map_preset("tls", radius=80.0).descriptor.radius == 80.0

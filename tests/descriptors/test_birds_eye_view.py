@@ -30,7 +30,7 @@ def cell_of(x: float, y: float) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, -0.2)])
-def test_pole_stands_in_its_cell_and_layers_whatever_the_slope(slope: tuple[float, float]) -> None:
+def test_pole_fills_its_cell_and_layers_on_any_slope(slope: tuple[float, float]) -> None:
     x, y = 10.1, -4.9
     base = slope[0] * x + slope[1] * y
     image = birds_eye_view(np.concatenate([ground(slope), pole(x, y, base, 0.5, 7.0)]), CORNER, SHAPE)
@@ -43,7 +43,7 @@ def test_pole_stands_in_its_cell_and_layers_whatever_the_slope(slope: tuple[floa
     assert (image[SEEN] > 0).mean() > 0.95
 
 
-def test_how_often_a_place_was_hit_does_not_matter() -> None:
+def test_image_does_not_depend_on_point_density() -> None:
     cloud = np.concatenate([ground(), pole(3.1, 3.1, 0.0, 0.5, 9.0)])
     once, often = (
         birds_eye_view(cloud, CORNER, SHAPE),
@@ -76,7 +76,7 @@ def test_relief_rises_over_a_ridge_and_not_over_a_slope() -> None:
     assert ridge[64 + 24, middle].mean() < 128
 
 
-def test_points_outside_are_ignored_and_nothing_is_nothing() -> None:
+def test_points_outside_and_empty_clouds_give_zeros() -> None:
     empty = birds_eye_view(np.empty((0, 3), dtype=np.float32), CORNER, SHAPE)
     assert empty.shape == (LAYERS, *SHAPE)
     assert not empty[:RELIEF].any()

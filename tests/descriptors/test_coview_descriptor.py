@@ -35,7 +35,7 @@ def lattice(rng, half=20, top=5):
     ("degrees", "sector"), [(1.0, 0), (29.0, 0), (31.0, 1), (95.0, 3), (-1.0, 11), (181.0, 6)]
 )
 @pytest.mark.parametrize(("r", "ring"), [(0.5, 0), (1.9, 0), (2.1, 1), (19.9, 9)])
-def test_a_point_lies_in_its_ring_and_sector(r, ring, degrees, sector):
+def test_point_falls_in_its_ring_and_sector(r, ring, degrees, sector):
     centre = np.array([100.0, -50.0, 7.0])
     points = (polar(r, np.array([degrees]), 3.0) + centre).astype(np.float32)
     found = describe(points, centre, ALL)["scan_context"]
@@ -43,11 +43,11 @@ def test_a_point_lies_in_its_ring_and_sector(r, ring, degrees, sector):
     assert found[ring, sector] == pytest.approx(3.0, abs=1e-5)
 
 
-def test_beyond_the_radius_nothing_counts():
+def test_points_beyond_radius_are_ignored():
     assert not describe(polar(20.01, np.arange(0.0, 360, 7), 3.0), np.zeros(3), ALL)["scan_context"].any()
 
 
-def test_heights_are_the_greatest_above_the_centre_and_hollows_count_as_ground():
+def test_bins_hold_max_height_above_centre_and_depressions_are_zero():
     points = np.concatenate(
         [polar(5.0, np.array([40.0, 41.0]), z) for z in (1.0, 4.0)] + [polar(9.0, np.array([40.0]), -2.0)]
     )
@@ -68,7 +68,7 @@ def test_scan_and_map_describe_the_same_cloud_alike():
         assert np.count_nonzero(local[name]) > 10
 
 
-def test_the_ground_is_the_common_zero():
+def test_keyframe_and_station_heights_share_the_ground_as_zero():
     """A keyframe at sensor height and a station on the ground describe one cloud alike."""
     points = lattice(np.random.default_rng(5))
     points[:, 2] += 41.0
@@ -105,7 +105,7 @@ def test_ground_below_with_clutter():
     assert ground_below(points, np.array([0.0, 0.0, 1.8])) == pytest.approx(0.0, abs=0.1)
 
 
-def test_ground_below_looks_near_the_robot_only():
+def test_ground_below_uses_points_near_the_robot_only():
     near = polar(4.0, np.arange(0.0, 360, 5), 0.0)
     far = polar(7.0, np.arange(0.0, 360, 1), -30.0)
     shift = np.array([300, -200, 50], np.float32)
@@ -114,13 +114,13 @@ def test_ground_below_looks_near_the_robot_only():
     ) == pytest.approx(50.0)
 
 
-def test_without_ground_the_sensors_height_serves():
+def test_without_ground_points_sensor_height_is_returned():
     sensor = np.array([0.0, 0.0, 2.0])
     assert ground_below(np.empty((0, 3), np.float32), sensor) == 2.0
     assert ground_below(polar(3.0, np.arange(0.0, 360, 5), 5.0), sensor) == 2.0
 
 
-def test_ring_key_is_the_share_of_occupied_sectors_whatever_the_heading():
+def test_ring_key_is_occupied_share_and_rotation_invariant():
     descriptor = np.zeros((4, 12), np.float32)
     descriptor[0] = 2.0
     descriptor[1, :3] = 7.0

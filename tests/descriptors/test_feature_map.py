@@ -54,7 +54,7 @@ def by_place(arrays):
     return {name: values[places if ".place" in name else tiles] for name, values in arrays.items()}
 
 
-def test_bytes_hold_vectors_and_sigmas():
+def test_quantized_vectors_and_sigmas_round_trip():
     vectors = np.linspace(-1.0, 1.0, 501, dtype=np.float32)
     assert np.abs(dequantized(quantized(vectors)) - vectors).max() <= 0.5 / 127 + 1e-6
     sigma = np.geomspace(0.02, 50.0, 300).astype(np.float32)
@@ -79,8 +79,9 @@ def differing(one, other, name):
     return (np.abs(one[name].astype(np.float64) - other[name]) > 1).mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoder", ["aerial", "far-sighted"])
-def test_windows_leave_no_trace(points, monkeypatch, encoder):
+def test_feature_windows_leave_no_seams(points, monkeypatch, encoder):
     """Many windows make of a map what one does: drawing and network see enough around each."""
     encode = network("aerial") if encoder == "aerial" else far_sighted
     monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: encode)
@@ -89,7 +90,8 @@ def test_windows_leave_no_trace(points, monkeypatch, encoder):
         assert differing(one, many, name) < 1e-3, name
 
 
-def test_what_lies_beside_a_window_matters(points, monkeypatch):
+@pytest.mark.slow
+def test_window_margin_is_needed(points, monkeypatch):
     """Or the test above could not fail."""
     monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: far_sighted)
     whole = by_place(feature_arrays(points)[0])
@@ -98,7 +100,7 @@ def test_what_lies_beside_a_window_matters(points, monkeypatch):
         assert differing(whole, by_place(feature_arrays(points, window=64)[0]), name) > 0.01
 
 
-def test_tiles_lie_on_a_fixed_grid_and_only_where_the_map_has_points(points, built):
+def test_feature_tiles_lie_on_fixed_grid_where_map_has_points(points, built):
     tiles = {tuple(t) for t in built[0]["learned.tiles"].tolist()}
     own = {tuple(t) for t in np.floor(points[:, :2] / TILE).astype(int).tolist()}
     assert own <= tiles
@@ -107,7 +109,7 @@ def test_tiles_lie_on_a_fixed_grid_and_only_where_the_map_has_points(points, bui
         assert ((np.add(tile, 1) * TILE > low) & (np.multiply(tile, TILE) < high)).all()
 
 
-def test_features_follow_the_map_when_it_is_moved_by_a_tile(points, features):
+def test_features_are_shift_equivariant_by_a_tile(points, features):
     moved = FeatureMap(*feature_arrays(points + np.float32([TILE, -2 * TILE, 0.0])))
     here, there = features.patch(np.array([5.0, -20.0]), 12.0), moved.patch(np.array([37.0, -84.0]), 12.0)
     np.testing.assert_allclose(there.corner - here.corner, [TILE, -2 * TILE])
@@ -115,7 +117,7 @@ def test_features_follow_the_map_when_it_is_moved_by_a_tile(points, features):
     assert np.abs(here.local - there.local).max() <= 1.01 / 127
 
 
-def test_a_patch_is_of_unit_vectors_or_nothing(points, features):
+def test_patch_holds_unit_vectors_or_zeros(points, features):
     patch = features.patch(np.array([60.0, 10.0]), 40.0)  # beyond a corner of the map
     assert patch.local.shape == (features.channels, 80, 80)
     assert patch.sigma.shape == (80, 80)
@@ -129,7 +131,7 @@ def test_a_patch_is_of_unit_vectors_or_nothing(points, features):
     assert not known[(x > high[0] + 5.0) | (y > high[1] + 5.0)].any()
 
 
-def test_a_patch_far_away_is_empty(features):
+def test_patch_outside_the_map_is_empty(features):
     patch = features.patch(np.array([5e3, 5e3]), 10.0)
     assert patch.local.shape == (features.channels, 20, 20)
     assert not patch.local.any()
@@ -146,14 +148,14 @@ def test_coarse_cells_are_means(features, cell):
     np.testing.assert_allclose(coarse[:, row : row + side, column : column + side], expected, atol=1e-6)
 
 
-def test_places_are_of_unit_norm_and_lie_in_the_map(points, features):
+def test_place_vectors_have_unit_norm_and_lie_in_the_map(points, features):
     assert np.abs(np.linalg.norm(dequantized(features.place), axis=1) - 1.0).max() < 0.05
     assert len(features.place) == len(np.unique(features.place_at, axis=0))
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     assert ((features.place_at > low - 8.0) & (features.place_at < high + 8.0)).all()
 
 
-def test_it_is_small(features):
+def test_feature_map_size_is_bounded(features):
     assert features.bytes / (len(features.index.tiles) * TILE**2) * 1e6 < 0.6 * MOST_BYTES_PER_KM2
     assert features.area == pytest.approx(118.0 * 98.0, rel=0.03)  # the map and four metres around it
 
@@ -163,7 +165,7 @@ def with_features(base_map, built):
     return BaseMap({**base_map._arrays, **arrays}, {**base_map.parameters, "learned": parameters})
 
 
-def test_a_map_file_keeps_them(world_map, built, tmp_path):
+def test_map_file_keeps_features(world_map, built, tmp_path):
     with_features(world_map, built).save(tmp_path / "site.coview")
     again = BaseMap.load(tmp_path / "site.coview").learned
     here, there = FeatureMap(*built).patch(np.zeros(2), 30.0), again.patch(np.zeros(2), 30.0)
@@ -172,11 +174,11 @@ def test_a_map_file_keeps_them(world_map, built, tmp_path):
     assert again.weights == built[1]["weights"] != ""
 
 
-def test_a_map_without_them_has_none(world_map):
+def test_map_without_features_has_no_feature_map(world_map):
     assert world_map.learned is None
 
 
-def test_maps_from_before_can_still_be_read(world_map):
+def test_maps_of_earlier_version_can_be_read(world_map):
     before = {n: v for n, v in world_map.parameters.items() if n != "learned"}
     before["config"] = {n: v for n, v in before["config"].items() if n != "learned"}
     old = BaseMap(dict(world_map._arrays), before)
@@ -184,7 +186,7 @@ def test_maps_from_before_can_still_be_read(world_map):
     assert old.config.learned is False
 
 
-def test_those_of_other_weights_are_refused(built):
+def test_features_of_other_weights_are_refused(built):
     arrays, parameters = built
     FeatureMap(arrays, parameters).check()
     with pytest.raises(MapError, match=r"other weights .* build it again"):
@@ -192,7 +194,7 @@ def test_those_of_other_weights_are_refused(built):
 
 
 @pytest.mark.parametrize("name", ["local", "sigma", "tiles", "place", "place_at"])
-def test_incomplete_ones_are_refused(world_map, built, name):
+def test_incomplete_features_are_refused(world_map, built, name):
     arrays = {n: v for n, v in built[0].items() if n != f"learned.{name}"}
     with pytest.raises(MapError, match="build it again"):
         _ = with_features(world_map, (arrays, built[1])).learned

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.doctor.capture import Heard, see_cloud, see_odometry
+from coview_stream.doctor.capture import RobotCapture, capture_cloud, capture_odometry
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
@@ -31,12 +31,12 @@ def odometry(seconds, T=None, codec="json"):
     return Sample(KEYS.odometry, encoded.payload, encoded.encoding, encoded.attachment)
 
 
-def heard(clouds=(), odometry=(), seconds=3.0, **more):
+def capture(clouds=(), odometry=(), seconds=3.0, **more):
     """What came at the given local times: pairs (time, sample)."""
-    return Heard(
+    return RobotCapture(
         KEYS,
-        [see_cloud(sample, at) for at, sample in clouds],
-        [see_odometry(sample, at) for at, sample in odometry],
+        [capture_cloud(sample, at) for at, sample in clouds],
+        [capture_odometry(sample, at) for at, sample in odometry],
         ended=seconds,
         **more,
     )
@@ -48,7 +48,7 @@ def steps(rate, seconds=3.0):
 
 def usual(cloud_shift=0.0, odometry_shift=0.0, **fields):
     """10 Hz of clouds and 50 Hz of odometry for 3 s, stamps shifted by so many seconds."""
-    return heard(
+    return capture(
         [(t + 0.05, cloud(t + cloud_shift, **fields)) for t in steps(10)],
         [(t, odometry(t + odometry_shift)) for t in steps(50)],
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from captured_robot import KEYS, SWEEP, cloud, heard, ns, odometry, steps, usual
+from captured_robot import KEYS, SWEEP, capture, cloud, ns, odometry, steps, usual
 from scipy.spatial.transform import Rotation
 
 from coview_stream.doctor.channel_checks import cloud_findings, odometry_findings
@@ -13,15 +13,15 @@ from coview_stream.messages.types import Sample
 
 
 def clouds_of(samples, elsewhere="", period=0.1):
-    received = heard([(k * period, sample) for k, sample in enumerate(samples)])
+    received = capture([(k * period, sample) for k, sample in enumerate(samples)])
     return {f.what: f for f in cloud_findings(received, elsewhere)}
 
 
 def odometry_of(pairs, seconds=3.0):
-    return {f.what: f for f in odometry_findings(heard(odometry=pairs, seconds=seconds), "")}
+    return {f.what: f for f in odometry_findings(capture(odometry=pairs, seconds=seconds), "")}
 
 
-def test_a_usual_robot_is_in_order():
+def test_healthy_robot_is_ok():
     robot = usual(times=np.linspace(0.0, 0.1, len(SWEEP)))
     findings = [*cloud_findings(robot, ""), *odometry_findings(robot, "")]
     assert [(f.verdict, f.what) for f in findings] == [
@@ -40,7 +40,7 @@ def test_a_usual_robot_is_in_order():
     assert "moved 6.0 m" in findings[2].found
 
 
-def test_nothing_says_where_else():
+def test_silent_channel_suggests_other_keys():
     found = clouds_of([], "clouds come on x: try y")
     assert found.keys() == {"clouds"}
     assert found["clouds"].verdict == "FAIL"
@@ -49,14 +49,14 @@ def test_nothing_says_where_else():
     assert clouds_of([])["clouds"].remedy
 
 
-def test_odometry_that_the_node_makes_is_not_missed():
-    silent = heard(odometry=[])
+def test_missing_odometry_is_ok_when_node_computes_it():
+    silent = capture(odometry=[])
     (missing,) = odometry_findings(silent, "")
     assert missing.remedy.endswith("`serve --odometry kiss-icp`")
     silent.status = {"odometry": "kiss-icp"}
     (made,) = odometry_findings(silent, "odometry comes on x: try y")
     assert (made.verdict, made.what) == ("ok", "odometry")
-    speaking = heard(odometry=[(t, odometry(t)) for t in steps(50)], status={"odometry": "kiss-icp"})
+    speaking = capture(odometry=[(t, odometry(t)) for t in steps(50)], status={"odometry": "kiss-icp"})
     (ignored,) = odometry_findings(speaking, "")
     assert ignored.verdict == "warn"
     assert "ignores the 150 samples" in ignored.found
@@ -87,7 +87,7 @@ def test_odometry_that_the_node_makes_is_not_missed():
         (Sample(KEYS.cloud, bytes(17 << 20)), "bytes", "--max-payload"),
     ],
 )
-def test_what_nobody_reads(sample, reason, remedy):
+def test_unreadable_messages_fail_with_reason_and_remedy(sample, reason, remedy):
     found = clouds_of([sample] * 3)
     assert found.keys() == {"clouds"}
     assert found["clouds"].verdict == "FAIL"
@@ -96,10 +96,10 @@ def test_what_nobody_reads(sample, reason, remedy):
     assert remedy in found["clouds"].remedy
 
 
-def test_a_few_bad_ones_are_a_warning_beside_the_good_ones():
+def test_few_bad_messages_among_good_ones_are_a_warning():
     samples = [cloud(t) for t in steps(10)]
     samples[4] = Sample(KEYS.cloud, b"rubbish", "application/cdr")
-    received = heard([(k / 10, sample) for k, sample in enumerate(samples)])
+    received = capture([(k / 10, sample) for k, sample in enumerate(samples)])
     verdicts = [(f.verdict, f.what) for f in cloud_findings(received, "")]
     assert verdicts == [("warn", "clouds"), ("ok", "clouds"), ("ok", "cloud stamps")]
 
@@ -113,14 +113,14 @@ def test_a_few_bad_ones_are_a_warning_beside_the_good_ones():
         (np.full_like(SWEEP, np.nan), "FAIL", "no finite points"),
     ],
 )
-def test_points_that_are_no_lidars(points, verdict, part):
+def test_implausible_point_clouds_are_reported(points, verdict, part):
     found = clouds_of([cloud(t, points) for t in steps(10)])["clouds"]
     assert found.verdict == verdict
     assert part in found.remedy
 
 
 @pytest.mark.parametrize(("period", "part"), [(1.0, "few frames"), (0.01, "drops the rest")])
-def test_clouds_too_rarely_and_too_often(period, part):
+def test_cloud_rate_too_low_or_too_high_is_reported(period, part):
     found = clouds_of([cloud(k * period) for k in range(30)], period=period)["clouds"]
     assert found.verdict == "warn"
     assert part in found.remedy
@@ -137,14 +137,14 @@ def test_clouds_too_rarely_and_too_often(period, part):
         ([1e-4 * k for k in range(30)], "FAIL", "run 0.001 times as fast"),  # microseconds for nanoseconds
     ],
 )
-def test_stamps(stamps, verdict, part):
+def test_stamp_checks(stamps, verdict, part):
     found = clouds_of([cloud(t) for t in stamps])["cloud stamps"]
     assert found.verdict == verdict
     assert part in found.found
     assert found.remedy
 
 
-def test_odometry_with_a_pause_and_too_rare():
+def test_odometry_with_a_gap_or_low_rate_is_reported():
     pairs = [(t, odometry(t)) for t in steps(50)]
     assert odometry_of([p for p in pairs if not 1.0 < p[0] < 1.8])["odometry"].verdict == "FAIL"
     ended = odometry_of([p for p in pairs if p[0] < 2.0])["odometry"]
@@ -157,8 +157,8 @@ def test_odometry_with_a_pause_and_too_rare():
     ("clouds", "samples", "verdict"),
     [(10, 10, "ok"), (5, 5, "ok"), (20, 10, "warn"), (10, 9.8, "ok"), (2, 4, "warn"), (0, 8, "ok")],
 )
-def test_odometry_with_every_frame_is_enough(clouds, samples, verdict):
-    robot = heard(
+def test_one_odometry_sample_per_frame_is_enough(clouds, samples, verdict):
+    robot = capture(
         [(t + 0.05, cloud(t)) for t in steps(clouds)] if clouds else [],
         [(t, odometry(t)) for t in steps(samples)],
     )
@@ -176,7 +176,7 @@ def test_odometry_with_every_frame_is_enough(clouds, samples, verdict):
         (0, "ok", "no roll and pitch"),
     ],
 )
-def test_gravity(degrees, verdict, part):
+def test_odometry_tilt_against_gravity_is_reported(degrees, verdict, part):
     T = pose_from(Rotation.from_euler("x", degrees, degrees=True).as_matrix(), [0.0, 0.0, 0.0])
     found = odometry_of([(t, odometry(t, T)) for t in steps(50)])["gravity"]
     assert found.verdict == verdict

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from captured_robot import SWEEP, cloud, heard, ns, odometry, steps, usual
+from captured_robot import SWEEP, capture, cloud, ns, odometry, steps, usual
 
 from coview_stream import __version__
-from coview_stream.doctor.cross_checks import node_finding, together_findings
+from coview_stream.doctor.cross_checks import cross_findings, node_finding
 from coview_stream.geometry.transforms import pose_from
 
 SHA = "ab" * 32
@@ -22,18 +22,18 @@ STATUS = {
 
 
 def found_of(robot):
-    return {f.what: f for f in together_findings(robot)}
+    return {f.what: f for f in cross_findings(robot)}
 
 
-def test_one_clock_and_all_paired():
+def test_same_clock_and_all_frames_paired_is_ok():
     found = found_of(usual(times=np.linspace(0.0, 0.1, len(SWEEP))))
     assert [f.verdict for f in found.values()] == ["ok", "ok"]
     assert "27 of 27" in found["pairing"].found
 
 
-def test_nothing_to_compare():
-    assert found_of(heard()) == {}
-    assert found_of(heard(clouds=[(0.0, cloud(0.0))])) == {}
+def test_no_cross_checks_without_clouds_or_odometry():
+    assert found_of(capture()) == {}
+    assert found_of(capture(clouds=[(0.0, cloud(0.0))])) == {}
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_nothing_to_compare():
         ((1.0, 0.0), "0.95 s behind", "one clock"),
     ],
 )
-def test_two_clocks(shifts, part, remedy):
+def test_different_clocks_are_reported(shifts, part, remedy):
     found = found_of(usual(*shifts))
     assert found.keys() == {"one clock"}  # pairing could only repeat it
     assert found["one clock"].verdict == "FAIL"
@@ -55,29 +55,29 @@ def test_two_clocks(shifts, part, remedy):
     assert remedy in found["one clock"].remedy
 
 
-def test_a_slow_driver_is_a_warning_and_pairs_all_the_same():
+def test_slow_driver_is_a_warning_but_frames_are_paired():
     found = found_of(usual(cloud_shift=-1.5))
     assert found["one clock"].verdict == "warn"
     assert found["pairing"].verdict == "ok"
 
 
-def test_sparse_odometry_pairs_with_nothing():
-    robot = heard([(t, cloud(t)) for t in steps(10)], [(t, odometry(t)) for t in (0.0, 0.9, 1.8, 2.7)])
+def test_sparse_odometry_pairs_no_frames():
+    robot = capture([(t, cloud(t)) for t in steps(10)], [(t, odometry(t)) for t in (0.0, 0.9, 1.8, 2.7)])
     found = found_of(robot)["pairing"]
     assert found.verdict == "FAIL"
     assert "no_odometry" in found.found
 
 
-def test_odometry_that_jumps():
+def test_odometry_jumps_are_reported():
     places = [pose_from(np.eye(3), [40.0 * (k % 10 == 9), 0.0, 0.0]) for k in range(150)]
     pairs = [(k / 50, odometry(k / 50, T)) for k, T in enumerate(places)]
-    found = found_of(heard([(t, cloud(t)) for t in steps(10)], pairs))["pairing"]
+    found = found_of(capture([(t, cloud(t)) for t in steps(10)], pairs))["pairing"]
     assert found.verdict == "FAIL"
     assert "jumps" in found.found
 
 
-def test_too_short_to_say():
-    found = found_of(heard([(2.9, cloud(2.9))], [(t, odometry(t)) for t in steps(50)]))["pairing"]
+def test_too_short_capture_gives_no_cross_checks():
+    found = found_of(capture([(2.9, cloud(2.9))], [(t, odometry(t)) for t in steps(50)]))["pairing"]
     assert found.verdict == "warn"
     assert "--seconds" in found.remedy
 
@@ -92,11 +92,11 @@ def test_too_short_to_say():
         (STATUS | {"map_sha256": "cd" * 32}, True, "FAIL", "not abababababab"),
         (STATUS | {"version": "9.9"}, True, "warn", f"here {__version__}"),
         (STATUS | {"stamp_ns": ns(-60)}, True, "warn", "60.00 s old"),
-        (STATUS | {"errors": ["bad", "worse"]}, True, "warn", "complains: worse"),
+        (STATUS | {"errors": ["bad", "worse"]}, True, "warn", "reports: worse"),
         ({"state": 7, "errors": "x"}, True, "FAIL", "7: no reason given"),
     ],
 )
-def test_the_node(status, alive, verdict, part):
-    found = node_finding(heard(status=status, alive=alive), SHA, ns(0))
+def test_node_status_finding(status, alive, verdict, part):
+    found = node_finding(capture(status=status, alive=alive), SHA, ns(0))
     assert found.verdict == verdict
     assert part in found.found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.doctor.discovery import Offer, from_key, from_token, look, suggestion
+from coview_stream.doctor.discovery import Candidate, discover, from_key, from_token, suggestion
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import FakeTransport
@@ -26,40 +26,40 @@ ODOM = "nav_msgs::msg::dds_::Odometry_"
         ("coview/@v0/ship/pubsub/frame_transform/odometry/x", "odometry", "--preset keelson --robot ship"),
     ],
 )
-def test_keys(key, channel, options):
-    offer = from_key(key)
-    assert (offer.channel, offer.options) == (channel, options)
+def test_known_keys_are_recognised(key, channel, options):
+    candidate = from_key(key)
+    assert (candidate.channel, candidate.options) == (channel, options)
 
 
 @pytest.mark.parametrize(
     "key", ["", "in", "r1/out/pose", "a/b/in/image", "points", "@v0/x", "a/@v0/b", "b/?/in/cloud"]
 )
-def test_other_keys(key):
+def test_unknown_keys_are_ignored(key):
     assert from_key(key) is None
 
 
-def test_presets_own_keys_lead_back_to_them():
+def test_preset_keys_are_recognised_as_their_preset():
     for preset in ("native", "ros2dds", "rmw_zenoh", "keelson"):
         keys = robot_keys(preset, "coview", "r9")
         for channel, key in (("cloud", keys.cloud), ("odometry", keys.odometry)):
-            offer = from_key(key.replace("/**", "/s").replace("/*", "/h"))
-            assert offer is not None
-            assert offer.channel == channel
-            assert "--robot r9" in offer.options
-            assert (preset == "native") == ("--preset" not in offer.options)
+            candidate = from_key(key.replace("/**", "/s").replace("/*", "/h"))
+            assert candidate is not None
+            assert candidate.channel == channel
+            assert "--robot r9" in candidate.options
+            assert (preset == "native") == ("--preset" not in candidate.options)
 
 
-def test_tokens():
+def test_liveliness_tokens_are_recognised():
     token = publisher_token(f"3/r2/points/{PC2}/RIHS01_9198", "ab12", "driver", 5)
-    assert from_token(token) == Offer("cloud", "/r2/points", "--preset rmw_zenoh --robot r2 --domain 3")
+    assert from_token(token) == Candidate("cloud", "/r2/points", "--preset rmw_zenoh --robot r2 --domain 3")
     token = publisher_token(f"0/livox/lidar/{PC2}/x", "ab12", "driver", 5)
     assert from_token(token).options == f"--preset rmw_zenoh --cloud-key '{{domain}}/livox/lidar/{PC2}/*'"
     bridge = "@/ab12/@ros2_lv/MP/bot1\xa7lidar\xa7points/sensor_msgs\xa7msg\xa7PointCloud2/:1:"
-    assert from_token(bridge) == Offer(
+    assert from_token(bridge) == Candidate(
         "cloud", "/bot1/lidar/points", "--preset ros2dds --cloud-key 'bot1/lidar/points'"
     )
     bridge = "@/ab12/@ros2_lv/MP/r2\xa7odom/nav_msgs\xa7msg\xa7Odometry/:1:"
-    assert from_token(bridge) == Offer("odometry", "/r2/odom", "--preset ros2dds --robot r2")
+    assert from_token(bridge) == Candidate("odometry", "/r2/odom", "--preset ros2dds --robot r2")
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_tokens():
         "",
     ],
 )
-def test_other_tokens(token):
+def test_unknown_tokens_are_ignored(token):
     assert from_token(token) is None
 
 
-def test_look_takes_keys_and_tokens():
+def test_discovery_uses_keys_and_tokens():
     net = FakeTransport()
     net.announce(publisher_token(f"0/r3/odom/{ODOM}/x", "ab12", "driver", 5))
     net.announce("@/ab12/@ros2_lv/MP/r4\xa7points/sensor_msgs\xa7msg\xa7PointCloud2/:1:")
@@ -89,19 +89,21 @@ def test_look_takes_keys_and_tokens():
             net.publish(Sample("coview/r2/in/cloud", b"x"))
         net.publish(Sample("hq/@v0/ship/pubsub/point_cloud/os", b"x"))
 
-    offers = look(net, wait=wait)
-    assert [o.where for o in offers] == [
+    candidates = discover(net, wait=wait)
+    assert [o.where for o in candidates] == [
         "/r4/points",
         "coview/r2/in/cloud",
         "hq/@v0/ship/pubsub/point_cloud/os",
         "/r3/odom",
     ]
-    assert suggestion(offers, "odometry") == "odometry comes on /r3/odom: try --preset rmw_zenoh --robot r3"
-    assert suggestion(offers, "cloud").count(": try ") == 3
+    assert (
+        suggestion(candidates, "odometry") == "odometry comes on /r3/odom: try --preset rmw_zenoh --robot r3"
+    )
+    assert suggestion(candidates, "cloud").count(": try ") == 3
     assert net.raised == []
 
 
-def test_suggestions_stay_short():
-    offers = [Offer("cloud", f"k{n}", f"--robot r{n}") for n in range(9)]
-    assert suggestion(offers, "cloud").endswith("; and 6 more")
-    assert suggestion(offers, "odometry") == ""
+def test_suggested_options_stay_short():
+    candidates = [Candidate("cloud", f"k{n}", f"--robot r{n}") for n in range(9)]
+    assert suggestion(candidates, "cloud").endswith("; and 6 more")
+    assert suggestion(candidates, "odometry") == ""

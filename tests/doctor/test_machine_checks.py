@@ -13,7 +13,7 @@ from coview_kernels import reference
 from coview_stream.doctor import machine_checks as machine
 from coview_stream.doctor import probes
 from coview_stream.doctor.finding import Finding, failed, from_error
-from coview_stream.doctor.map_checks import node_memory, open_site, site_findings
+from coview_stream.doctor.map_checks import map_findings, node_memory, open_map
 from coview_stream.errors import MapError
 
 GOOD = {
@@ -25,7 +25,7 @@ GOOD = {
 }
 
 
-def test_a_good_machine(monkeypatch):
+def test_healthy_machine_has_no_failures(monkeypatch):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     found = list(machine.machine_findings(lambda name: GOOD[name]))
     assert not failed(found)
@@ -60,24 +60,25 @@ def test_a_good_machine(monkeypatch):
         (machine.matplotlib_finding({"error": "ImportError"}), "warn", "install matplotlib"),
     ],
 )
-def test_what_is_wrong_has_a_remedy(finding, verdict, part):
+def test_machine_faults_have_a_remedy(finding, verdict, part):
     assert finding.verdict == verdict
     assert part in finding.remedy
 
 
-def test_memory_of_this_machine():
+def test_available_memory_is_read():
     total, available = machine.memory()
     assert total is None or 0 <= available <= total
 
 
-def test_probe_of_the_kernels():
+@pytest.mark.slow
+def test_kernel_probe_runs_in_a_process():
     found = probes.probe("kernels")
     assert found["differing"] == []
     assert found["backend"] in ("taichi", "quadrants", "numpy")
     assert found["seconds"] >= 0
 
 
-def test_a_wrong_kernel_is_named():
+def test_wrong_kernel_result_is_named():
     def half(*args):
         grid, dropped = reference.polar_bin(*args)
         return tuple(np.asarray(part) // 2 for part in grid), dropped
@@ -98,21 +99,21 @@ def test_a_wrong_kernel_is_named():
         (0, "banner only\n", "", "it said nothing"),
     ],
 )
-def test_processes_that_fail(code, out, err, part):
+def test_failing_probe_process_is_reported(code, out, err, part):
     assert part in probes._answer(code, out, err)["error"]
 
 
-def test_banners_are_skipped():
+def test_probe_output_skips_library_banners():
     assert probes._answer(0, 'hello\n{"a": 1}\n', "") == {"a": 1}
 
 
-def test_what_a_probe_raises_is_its_answer(monkeypatch, capsys):
+def test_probe_exception_is_reported(monkeypatch, capsys):
     monkeypatch.setitem(probes.PROBES, "open3d", lambda: Path("/no/such/file").stat())
     probes.main("open3d")
     assert "FileNotFoundError" in probes._answer(0, capsys.readouterr().out, "")["error"]
 
 
-def test_lines():
+def test_finding_lines_are_formatted():
     finding = Finding("warn", "clouds", "evil\x1b[2Jtext\n", "do that", "r1")
     assert finding.line() == "warn  r1 clouds               evil [2Jtext   (do that)"
     assert from_error("map", MapError("f: damaged; build it again")) == Finding(
@@ -120,12 +121,12 @@ def test_lines():
     )
 
 
-def test_a_map(world_file, world_map, tmp_path):
-    base_map, finding = open_site(world_file)
+def test_map_findings(world_file, world_map, tmp_path):
+    base_map, finding = open_map(world_file)
     assert finding.verdict == "ok"
     assert f"{len(world_map)} stations" in finding.found
     verdicts = {
-        available: [f.verdict for f in site_findings(base_map, int(1e8), available)]
+        available: [f.verdict for f in map_findings(base_map, int(1e8), available)]
         for available in (None, int(1e6), int(node_memory(base_map) + 1e6), int(64e9))
     }
     assert list(verdicts.values()) == [
@@ -134,4 +135,4 @@ def test_a_map(world_file, world_map, tmp_path):
         ["ok", "ok", "warn"],
         ["ok", "ok", "ok"],
     ]
-    assert open_site(tmp_path / "none.coview")[1].verdict == "FAIL"
+    assert open_map(tmp_path / "none.coview")[1].verdict == "FAIL"

@@ -7,7 +7,7 @@ import socket
 
 from captured_robot import KEYS, cloud, odometry, steps
 
-from coview_stream.doctor.network_checks import knock, reach_finding, robots_findings
+from coview_stream.doctor.network_checks import connection_finding, robots_findings, try_tcp
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import FakeTransport
@@ -40,7 +40,7 @@ def findings(net, messages, keys=(KEYS,), seconds=3.0, **more):
 DRIVE = [*((t, odometry(t)) for t in steps(50)), *((t + 0.05, cloud(t)) for t in steps(10))]
 
 
-def test_a_robot_and_its_node():
+def test_findings_of_a_robot_and_its_node():
     net = FakeTransport()
     net.announce(KEYS.alive)
     status = {"state": "SEARCHING", "reason": "too few keyframes", "map_sha256": "ab"}
@@ -64,7 +64,7 @@ def test_a_robot_and_its_node():
     assert set(net.subscribed) == {KEYS.cloud, KEYS.odometry, KEYS.status}  # nobody else's are asked for
 
 
-def test_what_comes_after_listening_is_not_counted():
+def test_messages_after_the_capture_are_not_counted():
     # clouds alone, so that it goes on to look for others while they still come
     found = findings(FakeTransport(), [(t / 2, cloud(t / 2)) for t in range(10)], seconds=2.0)
     assert found[0].found.startswith("2.0 Hz")
@@ -72,7 +72,7 @@ def test_what_comes_after_listening_is_not_counted():
     assert "on coview/r1/in/odom" in found[2].found
 
 
-def test_a_silent_robot_is_told_who_speaks():
+def test_silent_robot_is_told_keys_of_other_robots():
     other = robot_keys("native", "coview", "r2")
     found = findings(FakeTransport(), [(3.5, Sample(KEYS.cloud, b"x"))], keys=[other])
     assert [(f.verdict, f.what) for f in found] == [
@@ -84,7 +84,7 @@ def test_a_silent_robot_is_told_who_speaks():
     assert "does the robot publish" in found[1].remedy
 
 
-def test_without_a_robot_it_names_those_there_are():
+def test_robots_on_the_network_are_listed_without_robot_option():
     found = findings(FakeTransport(), [(0.5, cloud(0.0))], keys=[])
     assert [(f.verdict, f.found) for f in found] == [
         ("ok", "clouds come on coview/r1/in/cloud: try --robot r1")
@@ -92,27 +92,27 @@ def test_without_a_robot_it_names_those_there_are():
     assert [f.verdict for f in findings(FakeTransport(), [], keys=[])] == ["warn"]
 
 
-def test_a_fault_of_one_robot_is_its_own():
+def test_fault_of_one_robot_does_not_affect_another():
     other = robot_keys("native", "coview", "r2")
     found = findings(FakeTransport(), DRIVE, keys=[KEYS, other])
     assert {f.robot for f in found if f.verdict == "FAIL"} == {"r2"}
 
 
-def test_reach():
+def test_connection_finding_explains_unreachable_endpoint():
     net = FakeTransport()
-    assert reach_finding(net, []).found == "connected: 1 router"
+    assert connection_finding(net, []).found == "connected: 1 router"
     net.go_away()
     with socket.socket() as shut:
         shut.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{shut.getsockname()[1]}"
-        found = reach_finding(net, [endpoint], lambda seconds: None)
+        found = connection_finding(net, [endpoint], lambda seconds: None)
         assert found.verdict == "FAIL"
         assert f"{endpoint} refuses" in found.found
         shut.listen()
-        assert "TLS" in reach_finding(net, [endpoint], lambda seconds: None).remedy
-    assert "nobody has connected" in reach_finding(net, [], lambda seconds: None).found
+        assert "TLS" in connection_finding(net, [endpoint], lambda seconds: None).remedy
+    assert "nothing has connected" in connection_finding(net, [], lambda seconds: None).found
 
 
-def test_knocking_elsewhere():
-    assert "no host" in knock("tcp/no-such-host.invalid:7447")
-    assert knock("udp/127.0.0.1:7447") == "does not answer"
+def test_tcp_probe_of_unknown_host_and_other_protocol():
+    assert "no host" in try_tcp("tcp/no-such-host.invalid:7447")
+    assert try_tcp("udp/127.0.0.1:7447") == "does not answer"

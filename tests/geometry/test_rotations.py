@@ -26,13 +26,13 @@ VECTORS = np.concatenate(
 )
 
 
-def test_exponential_is_scipys():
+def test_exp_so3_matches_scipy():
     np.testing.assert_allclose(exp_so3(VECTORS), Rotation.from_rotvec(VECTORS).as_matrix(), atol=1e-15)
     for vector in VECTORS[-12:]:
         np.testing.assert_allclose(exp_so3(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
 
 
-def test_quaternions_and_back():
+def test_quaternion_round_trip():
     R = Rotation.from_rotvec(VECTORS).as_matrix()
     q = matrix_to_quat(R)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-15)
@@ -45,13 +45,13 @@ def test_quaternions_and_back():
     assert quat_to_matrix(np.empty((0, 4))).shape == (0, 3, 3)
 
 
-def test_the_logarithm_is_scipys():
+def test_log_so3_matches_scipy():
     R = Rotation.random(200, random_state=5)
     np.testing.assert_allclose(log_so3(R.as_matrix()), R.as_rotvec(), atol=1e-9)
     np.testing.assert_array_equal(log_so3(np.eye(3)), np.zeros(3))
 
 
-def test_the_way_between_is_slerp():
+def test_slerp_matches_scipy():
     R = Rotation.from_rotvec(VECTORS[:270]).as_matrix()
     start, end, share = R[:-1], R[1:], RNG.random(len(R) - 1)
     found = slerp(start, end, share)
@@ -64,7 +64,7 @@ def test_the_way_between_is_slerp():
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-3])
-def test_the_nearest_rotation_is_one(noise):
+def test_nearest_rotation_is_a_rotation(noise):
     R = Rotation.from_rotvec(VECTORS).as_matrix()
     found = nearest_rotation(R + RNG.normal(size=R.shape) * noise)
     np.testing.assert_allclose(

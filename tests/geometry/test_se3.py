@@ -37,7 +37,7 @@ def exp_of(xi):
     return M
 
 
-def test_a_covariance_along_the_bodys_axes_is_that_of_the_same_motions():
+def test_body_axes_covariance_matches_sampled_motions():
     """Samples drawn in the body's tangent scatter along the map's axes as the converted covariance says."""
     body = random_covariance()
     draws = np.random.default_rng(1).multivariate_normal(np.zeros(6), body, 20_000)
@@ -49,13 +49,13 @@ def test_a_covariance_along_the_bodys_axes_is_that_of_the_same_motions():
     )
 
 
-def test_converting_forth_and_back_changes_nothing():
+def test_body_and_map_axes_conversions_are_inverse():
     C = random_covariance(3)
     np.testing.assert_allclose(along_body(along_map(C, T), T), C, atol=1e-16)
     assert np.abs(along_map(C, T) - C).max() > 1e-5
 
 
-def test_gtsams_tangent_is_the_bodys():
+def test_gtsam_tangent_is_the_body_tangent():
     import gtsam
 
     xi = np.array([0.02, -0.01, 0.03, 0.1, 0.2, -0.1])
@@ -66,18 +66,18 @@ def test_gtsams_tangent_is_the_bodys():
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 2.5, np.pi - 1e-6])
-def test_difference_and_shift_undo_each_other(angle):
+def test_boxplus_and_boxminus_are_inverse(angle):
     step = np.array([0.0, 0.6 * angle, -0.8 * angle, 1.0, 2.0, -3.0])
     np.testing.assert_allclose(boxminus(boxplus(T, step), T), step, atol=1e-9)
 
 
-def test_the_adjoint_moves_an_increment_to_the_other_side():
+def test_adjoint_moves_increment_to_the_other_side():
     xi = np.array([0.1, -0.05, 0.2, 0.5, 0.3, -0.4])
     np.testing.assert_allclose(T @ exp_of(xi), exp_of(adjoint(T) @ xi) @ T, atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1])])
-def test_what_is_no_pose_is_refused_by_name(bad):
+def test_invalid_pose_is_refused_by_name(bad):
     with pytest.raises(InputError, match="T_here"):
         check_rigid(bad, "T_here")
 
@@ -86,10 +86,10 @@ def test_what_is_no_pose_is_refused_by_name(bad):
     "bad",
     [np.eye(5), np.full((6, 6), np.inf), np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, -1]), np.ones((6, 6))],
 )
-def test_what_is_no_covariance_is_refused_by_name(bad):
+def test_invalid_covariance_is_refused_by_name(bad):
     with pytest.raises(InputError, match="spread"):
         check_covariance(bad, "spread")
 
 
-def test_sigmas_of_very_different_size_are_a_covariance():
+def test_covariance_with_sigmas_of_very_different_size_is_valid():
     check_covariance(np.diag([1e-12, 1e-12, 1e-12, 1e4, 1e4, 1e4]), "spread")

@@ -17,7 +17,7 @@ twist = st.tuples(angle, st.floats(-1.5, 1.5), angle, metre, metre, metre).map(n
 
 @given(twist)
 @settings(max_examples=50, deadline=None)
-def test_inverse_undoes(xi):
+def test_inverse_composes_to_identity(xi):
     T = exp_se3(xi)
     np.testing.assert_allclose(g.inverse(T) @ T, np.eye(4), atol=1e-9)
     np.testing.assert_allclose(g.inverse(T), np.linalg.inv(T), atol=1e-8)
@@ -25,7 +25,7 @@ def test_inverse_undoes(xi):
 
 @given(twist)
 @settings(max_examples=50, deadline=None)
-def test_tum_round_trip(xi):
+def test_tum_pose_round_trip(xi):
     T = exp_se3(xi)
     row = g.pose_to_tum(T)
     np.testing.assert_allclose(row[:3], xi[3:])
@@ -44,7 +44,7 @@ def test_tum_quaternion_order_is_x_y_z_w():
     np.testing.assert_allclose(np.abs(row), [1, 2, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
 
 
-def test_transform_maps_source_into_target_in_the_points_precision():
+def test_transform_maps_source_to_target_in_dtype_of_points():
     T_map_body = g.pose_from(g.rot_z(np.pi / 2), [10, 20, 30])
     for dtype in (np.float32, np.float64):
         moved = g.transform(T_map_body, np.array([[1, 0, 0], [0, 2, 1]], dtype))
@@ -53,13 +53,13 @@ def test_transform_maps_source_into_target_in_the_points_precision():
     assert g.transform(T_map_body, np.empty((0, 3), np.float32)).shape == (0, 3)
 
 
-def test_increment_rotates_first_and_shifts_then():
+def test_exp_se3_rotates_then_translates():
     T = exp_se3(np.array([0, 0, np.pi / 2, 1, 0, 0]))
     np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 1, 0, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 1e-4, 1.0, np.pi / 2, 3.0, np.pi])
-def test_rotation_angle_is_exact_where_the_cosine_is_not(turn):
+def test_rotation_angle_is_exact_near_zero_and_pi(turn):
     assert g.rotation_angle(g.pose_from(g.rot_z(turn), [9, 9, 9])) == pytest.approx(turn, rel=1e-6, abs=1e-12)
 
 
@@ -71,7 +71,7 @@ def test_wrap_angle(given_, wrapped):
     assert g.wrap_angle(given_) == pytest.approx(wrapped)
 
 
-def test_orthonormal_takes_out_the_drift_of_products():
+def test_orthonormalize_removes_accumulated_rounding():
     T = exp_se3(np.array([0.1, 0.2, 0.3, 1, 2, 3]))
     tired = T.copy()
     tired[:3, :3] += 1e-4 * np.random.default_rng(0).normal(size=(3, 3))
@@ -80,7 +80,7 @@ def test_orthonormal_takes_out_the_drift_of_products():
     np.testing.assert_allclose(fresh, T, atol=1e-3)
 
 
-def test_what_is_a_pose():
+def test_is_pose_accepts_only_rigid_transforms():
     good = exp_se3(np.array([0.1, 0.2, 0.3, 1, 2, 3]))
     assert g.is_pose(good)
     mirrored, scaled, infinite = good @ np.diag([1.0, 1, -1, 1]), good.copy(), good.copy()
@@ -91,7 +91,7 @@ def test_what_is_a_pose():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_lengths_are_those_of_numpy_and_leave_the_points_alone(dtype):
+def test_norms_equal_numpy_and_keep_the_input(dtype):
     points = np.random.default_rng(1).normal(0, 30, (500, 3)).astype(dtype)
     before, origin = points.copy(), np.array([3.0, -2.0, 1.0], dtype)
     found = g.norms(points), g.norms(points, origin)

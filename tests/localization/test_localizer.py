@@ -14,7 +14,7 @@ from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import prepare_scan
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking import tracker as tracking
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -32,7 +32,7 @@ def moved_map(base_map: BaseMap, origin) -> BaseMap:
     return BaseMap({**base_map._arrays, "origin": np.asarray(origin) + base_map.origin}, base_map.parameters)
 
 
-def test_the_first_fix_and_every_pose_after_it_are_right(world_fixes, world_drive):
+def test_first_fix_and_later_poses_are_correct(world_fixes, world_drive):
     posed = [k for k, fix in enumerate(world_fixes) if fix.T_map_body is not None]
     assert posed
     assert posed[0] <= 5  # 12 m
@@ -53,12 +53,12 @@ def test_no_pose_unless_tracking(world_fixes):
         assert fix.evidence is not None
 
 
-def test_the_first_keyframe_alone_is_not_believed(world_fixes):
+def test_single_keyframe_is_not_accepted(world_fixes):
     assert world_fixes[0].T_map_body is None
     assert world_fixes[0].confidence == 0.0
 
 
-def test_the_correction_explains_the_pose(world_fixes, world_drive):
+def test_T_map_odom_explains_the_pose(world_fixes, world_drive):
     for fix, T_odom_body in zip(world_fixes, world_drive.T_odom_body, strict=True):
         if fix.T_map_body is not None:
             np.testing.assert_allclose(fix.T_map_odom @ T_odom_body, fix.T_map_body, atol=1e-6)
@@ -66,7 +66,7 @@ def test_the_correction_explains_the_pose(world_fixes, world_drive):
             np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
 
 
-def test_covariance_is_symmetric_positive_and_ordered(world_fixes):
+def test_covariance_is_symmetric_positive_and_translation_first(world_fixes):
     covariance = world_fixes[-1].covariance
     assert covariance.shape == (6, 6)
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-6, atol=1e-12)
@@ -81,12 +81,12 @@ def test_covariance_is_symmetric_positive_and_ordered(world_fixes):
     assert (sigma[3:] > shared.shared_yaw).all()
 
 
-def test_confidence_is_a_share(world_fixes):
+def test_confidence_is_between_zero_and_one(world_fixes):
     assert all(0.0 <= fix.confidence <= 1.0 for fix in world_fixes)
     assert world_fixes[-1].confidence > 0.3
 
 
-def test_utm_map_and_utm_odometry_lose_no_millimetre(world_map, world_drive, world_fixes):
+def test_utm_map_and_utm_odometry_keep_millimetres(world_map, world_drive, world_fixes):
     odometry = small_world.pose_from(small_world.ODOM_FAR[:3, :3], [443_000.4, 5_900_000.8, -60.0])
     far = world_drive.seen_from(odometry)
     fixes = follow(Localizer(moved_map(world_map, UTM)), far, 8)
@@ -101,7 +101,7 @@ def test_utm_map_and_utm_odometry_lose_no_millimetre(world_map, world_drive, wor
     assert posed >= 2
 
 
-def test_lost_when_the_world_no_longer_fits(world_map, world_drive):
+def test_state_is_lost_when_scans_no_longer_fit(world_map, world_drive):
     localizer = Localizer(world_map)
     assert follow(localizer, world_drive, 7)[-1].state is State.TRACKING
     states = []
@@ -113,13 +113,13 @@ def test_lost_when_the_world_no_longer_fits(world_map, world_drive):
     assert states[-1] is State.LOST
 
 
-def test_never_a_pose_outside_the_map(world_map, elsewhere):
+def test_no_pose_outside_the_map(world_map, elsewhere):
     for fix in follow(Localizer(world_map), elsewhere):
         assert fix.state in (State.SEARCHING, State.AMBIGUOUS)
         assert fix.T_map_body is None
 
 
-def test_bad_frames_raise_and_change_nothing(world_map, world_drive, world_fixes):
+def test_invalid_frames_raise_and_change_nothing(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     cloud, T = world_drive.clouds[0], world_drive.T_odom_body[0]
     scaled = T.copy()
@@ -150,7 +150,7 @@ def test_bad_frames_raise_and_change_nothing(world_map, world_drive, world_fixes
             np.testing.assert_allclose(fix.T_map_body, undisturbed.T_map_body, atol=1e-9)
 
 
-def test_rows_with_nan_are_dropped(world_map, world_drive):
+def test_nan_rows_are_dropped(world_map, world_drive):
     cloud = np.full((len(world_drive.clouds[0]) + 500, 3), np.nan, np.float32)
     cloud[250:-250] = world_drive.clouds[0]
     one, other = Localizer(world_map), Localizer(world_map)
@@ -159,14 +159,14 @@ def test_rows_with_nan_are_dropped(world_map, world_drive):
     assert with_nan.evidence.score == pytest.approx(without.evidence.score)
 
 
-def test_the_callers_arrays_stay_as_they_are(world_map, world_drive):
+def test_input_arrays_are_not_modified(world_map, world_drive):
     cloud, T = world_drive.clouds[0].copy(), world_drive.T_odom_body[0].copy()
     Localizer(world_map).step(cloud, T, 0.0)
     np.testing.assert_array_equal(cloud, world_drive.clouds[0])
     np.testing.assert_array_equal(T, world_drive.T_odom_body[0])
 
 
-def test_reset_forgets_all_but_the_map(world_map, world_drive, world_fixes):
+def test_reset_clears_all_but_the_map(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     follow(localizer, world_drive, 2)
     assert localizer.last_query
@@ -187,10 +187,10 @@ def verdicts(world_map, world_drive):
     """What the searches of the drive say, up to the one that accepts a place; good for every fresh localizer."""
     localizer, said = Localizer(world_map), []
     for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
-        said.append(localizer._search.update(localizer.take(cloud, T, 0.5 * k)))
+        said.append(localizer._search.update(localizer.add_frame(cloud, T, 0.5 * k)))
         if said[-1].accepted is not None:
             return said
-        localizer.adopt(said[-1])
+        localizer.apply_search_result(said[-1])
     raise AssertionError("no place was accepted")
 
 
@@ -198,19 +198,19 @@ def searched(world_map, drive, verdicts):
     """A localizer that has taken every frame up to the decisive one; its verdict is not adopted yet."""
     localizer = Localizer(world_map)
     for k, verdict in enumerate(verdicts):
-        localizer.take(drive.clouds[k], drive.T_odom_body[k], 0.5 * k)
+        localizer.add_frame(drive.clouds[k], drive.T_odom_body[k], 0.5 * k)
         if verdict.accepted is None:
-            localizer.adopt(verdict)
+            localizer.apply_search_result(verdict)
     return localizer, verdicts[-1], len(verdicts) - 1
 
 
-def test_take_and_adopt_are_a_step(world_map, world_drive, world_fixes, verdicts):
+def test_add_frame_and_apply_search_result_equal_step(world_map, world_drive, world_fixes, verdicts):
     localizer = Localizer(world_map)
     for k, reference in enumerate(world_fixes[:7]):
-        query = localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        query = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
         assert (query is not None) == (k < len(verdicts))  # tracking asks for nothing
         if query is not None:
-            localizer.adopt(verdicts[k])
+            localizer.apply_search_result(verdicts[k])
         fix = localizer.fix()
         assert fix.state is reference.state
         assert fix.evidence == reference.evidence
@@ -219,48 +219,48 @@ def test_take_and_adopt_are_a_step(world_map, world_drive, world_fixes, verdicts
             np.testing.assert_allclose(fix.covariance, reference.covariance, atol=1e-12)
 
 
-def test_no_fix_before_the_first_frame(world_map):
+def test_fix_before_first_frame_raises(world_map):
     with pytest.raises(RuntimeError, match="no frame"):
         Localizer(world_map).fix()
 
 
-def test_a_verdict_of_another_life_is_ignored(world_map, world_drive, verdicts):
+def test_search_result_of_old_epoch_is_ignored(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
     localizer.reset()
-    localizer.adopt(verdict)  # before any frame
-    localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)  # before any frame
+    localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    localizer.apply_search_result(verdict)
     assert localizer.state is State.SEARCHING
     assert localizer.fix().T_map_body is None
     assert localizer.fix().evidence is None
 
 
-def test_a_verdict_from_before_a_loss_is_ignored(world_map, world_drive, verdicts):
+def test_search_result_from_before_a_loss_is_ignored(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)
     for n in range(1, 4):
-        localizer.take(garbage(n), world_drive.T_odom_body[k + n], 0.5 * (k + n))
+        localizer.add_frame(garbage(n), world_drive.T_odom_body[k + n], 0.5 * (k + n))
     assert localizer.state is State.LOST
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)
     assert localizer.state is State.LOST
     assert localizer.fix().T_map_body is None
 
 
-def test_a_verdict_while_tracking_is_ignored(world_map, world_drive, verdicts):
+def test_search_result_while_tracking_is_ignored(world_map, world_drive, verdicts):
     localizer, verdict, _ = searched(world_map, world_drive, verdicts)
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)
     before = localizer.fix()
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)
     np.testing.assert_array_equal(localizer.fix().T_map_body, before.T_map_body)
     np.testing.assert_array_equal(localizer.fix().covariance, before.covariance)
 
 
-def test_a_late_verdict_is_right_where_the_robot_is_now(world_map, world_drive, verdicts):
+def test_late_search_result_gives_the_current_pose(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
     for n in (k + 1, k + 2):
-        localizer.take(world_drive.clouds[n], world_drive.T_odom_body[n], 0.5 * n)
+        localizer.add_frame(world_drive.clouds[n], world_drive.T_odom_body[n], 0.5 * n)
     assert localizer.fix().T_map_body is None
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)
     fix = localizer.fix()
     assert fix.state is State.TRACKING
     metres, degrees = pose_error(fix.T_map_body, world_drive.T_map_body[k + 2])
@@ -268,24 +268,24 @@ def test_a_late_verdict_is_right_where_the_robot_is_now(world_map, world_drive, 
     assert degrees < 0.3
 
 
-def test_a_late_verdict_that_the_newest_frame_does_not_fit_gives_no_pose(world_map, world_drive, verdicts):
+def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
     for n in (k + 1, k + 2):
-        localizer.take(garbage(n), world_drive.T_odom_body[n], 0.5 * n)
-    localizer.adopt(verdict)
+        localizer.add_frame(garbage(n), world_drive.T_odom_body[n], 0.5 * n)
+    localizer.apply_search_result(verdict)
     fix = localizer.fix()
     assert fix.state is State.AMBIGUOUS
     assert fix.T_map_body is None
     # and what follows decides
-    localizer.take(world_drive.clouds[k + 3], world_drive.T_odom_body[k + 3], 0.5 * (k + 3))
+    localizer.add_frame(world_drive.clouds[k + 3], world_drive.T_odom_body[k + 3], 0.5 * (k + 3))
     assert localizer.fix().state is State.TRACKING
 
 
-def test_suspicion_takes_the_pose_until_a_frame_has_verified_it(world_map, world_drive, verdicts):
+def test_require_verification_withholds_pose_until_verified(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
-    localizer.adopt(verdict)
+    localizer.apply_search_result(verdict)
     assert localizer.fix().state is State.TRACKING
-    localizer.suspect()
+    localizer.require_verification()
     assert localizer.fix().state is State.AMBIGUOUS
     assert localizer.fix().T_map_body is None
     # the robot stands still: nothing is due, and yet it is verified
@@ -295,21 +295,21 @@ def test_suspicion_takes_the_pose_until_a_frame_has_verified_it(world_map, world
     assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
 
 
-def test_what_was_found_before_a_suspicion_waits_for_a_frame_after_it(world_map, world_drive, verdicts):
+def test_search_result_waits_for_required_verification(world_map, world_drive, verdicts):
     localizer, verdict, k = searched(world_map, world_drive, verdicts)
-    localizer.suspect()
-    localizer.adopt(verdict)
+    localizer.require_verification()
+    localizer.apply_search_result(verdict)
     assert localizer.fix().T_map_body is None
     fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
     assert fix.state is State.TRACKING
 
 
-def test_a_frame_is_thinned_once_and_kept_apart_from_the_callers_array(world_map, world_drive, monkeypatch):
+def test_frame_is_voxelized_once_and_copied(world_map, world_drive, monkeypatch):
     """A driver may reuse its array for the next frame; adopting a verdict later still looks at the newest one."""
     monkeypatch.setattr(tracking, "thinned", None)
     localizer = Localizer(world_map)
     array = world_drive.clouds[0].copy()
-    localizer.take(array, world_drive.T_odom_body[0], 0.0)
+    localizer.add_frame(array, world_drive.T_odom_body[0], 0.0)
     array[:] = 0.0
     np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
     T = pose_from(world_drive.T_odom_body[0][:3, :3], np.zeros(3))
@@ -330,7 +330,8 @@ def tracking_localizer(world_map, world_drive, frames=6):
     return localizer, 0.5 * frames
 
 
-def test_a_robot_that_stands_still_stays_found_and_grows_no_surer(world_map, world_drive):
+@pytest.mark.slow
+def test_standing_robot_keeps_tracking_without_shrinking_covariance(world_map, world_drive):
     localizer, now = tracking_localizer(world_map, world_drive)
     fixes = standing(localizer, world_drive.clouds[5], world_drive.T_odom_body[5], 20.0, now)
     assert all(fix.state is State.TRACKING for fix in fixes)

@@ -11,7 +11,7 @@ from trackers import garbage
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 
 RULE = AcceptanceConfig()
@@ -41,7 +41,7 @@ def carried(drive, frm, to):
 # ---- doubt
 
 
-def test_while_the_newest_registration_is_doubtful_there_is_no_pose(found, world_drive):
+def test_rejected_registration_gives_doubted_state_without_pose(found, world_drive):
     doubtful = found.step(garbage(), world_drive.T_odom_body[5], 2.5)
     assert doubtful.state is State.AMBIGUOUS
     assert doubtful.T_map_body is None
@@ -60,7 +60,7 @@ def test_while_the_newest_registration_is_doubtful_there_is_no_pose(found, world
     assert right(known, world_drive.T_map_body[6])
 
 
-def test_doubt_is_looked_into_without_driving_on(found, world_drive):
+def test_doubted_state_is_rechecked_while_standing(found, world_drive):
     """A covered sensor takes the pose away at once; uncovered again it is back at once, and nothing was lost."""
     covered = [found.step(garbage(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
     assert [fix.state for fix in covered] == [State.AMBIGUOUS] * 6
@@ -71,7 +71,7 @@ def test_doubt_is_looked_into_without_driving_on(found, world_drive):
     assert right(again, world_drive.T_map_body[5])
 
 
-def test_what_a_registration_says_is_told(found, world_drive):
+def test_evidence_reports_cause_reason_and_innovation(found, world_drive):
     fix = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 2.5)
     assert fix.evidence.cause is RejectionReason.VERIFIED
     assert fix.evidence.reason == "verified"
@@ -83,7 +83,7 @@ def test_what_a_registration_says_is_told(found, world_drive):
     assert doubtful.evidence.reason != "verified"
 
 
-def test_a_search_has_no_cause_and_no_innovation(world_fixes):
+def test_search_evidence_has_no_cause_or_innovation(world_fixes):
     assert world_fixes[0].evidence.cause is None
     assert world_fixes[0].evidence.innovation is None
 
@@ -91,7 +91,8 @@ def test_a_search_has_no_cause_and_no_innovation(world_fixes):
 # ---- carried to another place
 
 
-def test_after_a_loss_the_search_starts_from_nothing(found, world_drive):
+@pytest.mark.slow
+def test_search_after_loss_starts_from_scratch(found, world_drive):
     """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
     anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
     lost = follow(found, anew, range(RULE.max_rejections), 2.5)
@@ -108,7 +109,8 @@ def found_frame(drive):
     return drive.T_odom_body[0] @ inverse(drive.T_map_body[0])
 
 
-def test_odometry_that_starts_anew_far_away_is_lost_and_found(found, world_drive):
+@pytest.mark.slow
+def test_restarted_odometry_far_away_is_lost_and_relocalized(found, world_drive):
     """There is no map there, which might be the map's edge: patience decides."""
     anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
     fixes = [found.step(anew.clouds[0], anew.T_odom_body[0], 3.0 + k) for k in range(12)]
@@ -121,8 +123,9 @@ def test_odometry_that_starts_anew_far_away_is_lost_and_found(found, world_drive
     assert right(again[-1], anew.T_map_body[4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", [0, 1])
-def test_carried_between_two_frames_there_is_no_wrong_pose_at_all(world_map, world_drive, to):
+def test_kidnapped_robot_gets_no_wrong_pose(world_map, world_drive, to):
     """Odometry says that it stands; the very first frame of the other place takes the pose away."""
     localizer = Localizer(world_map)
     assert follow(localizer, world_drive, range(9))[-1].state is State.TRACKING
@@ -145,7 +148,8 @@ def test_carried_between_two_frames_there_is_no_wrong_pose_at_all(world_map, wor
     assert went[-1].state is State.TRACKING
 
 
-def test_carried_while_odometry_hangs_it_is_found_out(found, world_drive):
+@pytest.mark.slow
+def test_kidnapping_with_frozen_odometry_is_detected(found, world_drive):
     elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
     fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
     assert all(fix.T_map_body is None for fix in fixes)
@@ -156,8 +160,9 @@ def test_carried_while_odometry_hangs_it_is_found_out(found, world_drive):
 # ---- carried with open eyes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begin", [12, 20])
-def test_wheels_stand_while_the_robot_moves_and_no_pose_is_far_off(world_map, slow_drive, begin):
+def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive, begin):
     """A ferry, a lift truck, ice: 0.2 m at every frame, of which odometry feels nothing."""
     localizer = Localizer(world_map)
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
@@ -188,7 +193,8 @@ def covered(seed):
     return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
 
 
-def test_a_covered_sensor_costs_the_pose_and_in_the_end_the_place_which_is_found_again(found, world_drive):
+@pytest.mark.slow
+def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive):
     """As soon as any place could be: the first keyframe that sees anything counts already."""
     seconds = np.arange(2.5, 2.5 + RULE.max_blind_s + 2.0, 1.0)
     fixes = [found.step(covered(k), world_drive.T_odom_body[5], t) for k, t in enumerate(seconds)]
@@ -204,7 +210,10 @@ def test_a_covered_sensor_costs_the_pose_and_in_the_end_the_place_which_is_found
         assert right(again[k], world_drive.T_map_body[6 + k])
 
 
-def test_after_a_short_cover_the_pose_is_back_at_once_and_after_a_long_one_with_proof(world_map, world_drive):
+@pytest.mark.slow
+def test_pose_returns_at_once_after_short_cover_and_with_confirmations_after_long_cover(
+    world_map, world_drive
+):
     """Meanwhile it may have been carried: one frame could fit by chance."""
     waits = []
     for seconds in (0.5 * RULE.max_doubt_s, 2.0 * RULE.max_doubt_s):
@@ -220,7 +229,7 @@ def test_after_a_short_cover_the_pose_is_back_at_once_and_after_a_long_one_with_
     assert waits == [0, RULE.confirmations - 1]
 
 
-def test_driving_on_with_a_covered_sensor_is_no_tracking(found, world_drive):
+def test_driving_with_covered_sensor_is_doubted(found, world_drive):
     """What was seen before is no evidence of where the robot is now."""
     first = found.step(covered(0), world_drive.T_odom_body[5], 2.5)
     assert first.state is State.AMBIGUOUS
@@ -230,7 +239,8 @@ def test_driving_on_with_a_covered_sensor_is_no_tracking(found, world_drive):
     assert right(known, world_drive.T_map_body[7])
 
 
-def test_beyond_the_edge_of_the_map_there_is_no_pose_and_back_on_it_there_is(world_map, scene):
+@pytest.mark.slow
+def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene):
     """Straight over the edge and back again; no pose is wrong, and none is given where there is no map."""
     way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (-14.0, 90.0)]
     out = small_world.record_along(scene, way, 2.6)
@@ -247,14 +257,14 @@ def test_beyond_the_edge_of_the_map_there_is_no_pose_and_back_on_it_there_is(wor
     assert fixes[-1].state is State.TRACKING
 
 
-def test_after_a_pause_the_first_frame_decides(world_map, world_drive):
+def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
     """What came before the pause is no doubt that has lasted: one good frame is enough, one bad one is not too much."""
     for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.AMBIGUOUS)):
         localizer = Localizer(world_map)
         for k in range(5):
             fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
         assert fix.state is State.TRACKING
-        localizer.suspect()
+        localizer.require_verification()
         fix = localizer.step(cloud, world_drive.T_odom_body[5], 60.0)
         assert fix.state is expected
         assert fix.evidence.state is expected

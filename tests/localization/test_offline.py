@@ -16,7 +16,8 @@ from coview_stream.config import AcceptanceConfig, LocalizerConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.offline import RunResult, locate, summary, write
-from coview_stream.localization.result import Fix, State
+from coview_stream.localization.result import Fix
+from coview_stream.localization.state import State
 from coview_stream.recordings.open_run import open_run
 
 
@@ -28,7 +29,7 @@ def located(world_map, world_run):
     return found
 
 
-def test_every_frame_is_answered_and_the_answers_are_right(located, world_drive, world_fixes):
+def test_every_frame_has_a_correct_fix(located, world_drive, world_fixes):
     assert located.frames == len(located.fixes) == len(located.seconds) == 7
     assert not located.skipped
     assert [f.state for f in located.fixes] == [f.state for f in world_fixes[:7]]
@@ -40,7 +41,7 @@ def test_every_frame_is_answered_and_the_answers_are_right(located, world_drive,
         assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
 
 
-def test_the_evidence_of_every_keyframe_is_kept_once(located):
+def test_evidence_of_each_keyframe_is_stored_once(located):
     stamps = [e.stamp for e in located.keyframes]
     assert stamps == sorted(set(stamps))
     assert located.winner.state is State.TRACKING
@@ -48,7 +49,7 @@ def test_the_evidence_of_every_keyframe_is_kept_once(located):
     assert located.query
 
 
-def test_what_is_written_is_what_was_said(located, world_map, tmp_path):
+def test_written_files_match_the_fixes(located, world_map, tmp_path):
     write(located, world_map, tmp_path / "deep" / "out")
     out = tmp_path / "deep" / "out"
     assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
@@ -67,7 +68,7 @@ def test_what_is_written_is_what_was_said(located, world_map, tmp_path):
     assert all(0 <= k["score"] <= 1 for k in result["keyframes"])
 
 
-def test_the_summary_says_state_place_and_time(located):
+def test_summary_has_state_place_and_time(located):
     text = summary(located)
     assert "TRACKING" in text
     assert f"{len(located.posed)} of 7 frames" in text
@@ -77,7 +78,7 @@ def test_the_summary_says_state_place_and_time(located):
     assert "000001.ply: empty" in summary(nothing)
 
 
-def test_damaged_frames_are_skipped_and_named(world_map, world_run, world_drive, tmp_path):
+def test_damaged_frames_are_skipped_and_listed(world_map, world_run, world_drive, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(world_run, run)
     (run / "frames" / "000000.ply").write_bytes(b"nonsense")
@@ -91,7 +92,7 @@ def test_damaged_frames_are_skipped_and_named(world_map, world_run, world_drive,
         assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
 
 
-def test_a_skipped_frame_is_named_by_its_file(world_map, world_drive, tmp_path):
+def test_skipped_frame_is_listed_by_its_file_name(world_map, world_drive, tmp_path):
     run = small_world.write_run(tmp_path / "run", world_drive, 3)
     write_cloud(run / "frames" / "000001.ply", world_drive.clouds[1][:5])
     calls = []
@@ -102,7 +103,7 @@ def test_a_skipped_frame_is_named_by_its_file(world_map, world_drive, tmp_path):
     assert calls[1][2] is None
 
 
-def test_a_run_without_one_usable_frame_is_an_error(world_map, world_drive, tmp_path):
+def test_run_without_usable_frame_is_an_error(world_map, world_drive, tmp_path):
     run = small_world.write_run(tmp_path / "run", world_drive, 3)
     for path in (run / "frames").iterdir():
         path.write_bytes(b"nonsense")
@@ -110,7 +111,7 @@ def test_a_run_without_one_usable_frame_is_an_error(world_map, world_drive, tmp_
         locate(world_map, open_run(run))
 
 
-def test_a_single_scan_takes_the_stationary_path(world_map, world_drive, tmp_path):
+def test_single_scan_uses_stationary_mode(world_map, world_drive, tmp_path):
     """One frame may be enough for a fix, but only there; a scan stored far from its zero keeps its own frame."""
     away = np.array([30_000.0, -20_000.0, 100.0])
     write_cloud(tmp_path / "scan.ply", world_drive.clouds[3].astype(np.float64), away)
@@ -124,13 +125,14 @@ def test_a_single_scan_takes_the_stationary_path(world_map, world_drive, tmp_pat
     np.testing.assert_allclose((fix.T_map_body @ seen)[:3], (truth @ seen)[:3], atol=0.1)
 
 
-def test_results_that_cannot_be_written_are_an_error(located, world_map, tmp_path):
+def test_unwritable_results_are_an_error(located, world_map, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write the results"):
         write(located, world_map, tmp_path / "file" / "out")
 
 
-def test_pictures_of_an_earlier_run_do_not_stay(located, world_map, tmp_path):
+@pytest.mark.slow
+def test_pictures_of_an_earlier_run_are_removed(located, world_map, tmp_path):
     for name in ("trajectory.png", "descriptors.png"):
         (tmp_path / name).write_bytes(b"old")
     write(located, world_map, tmp_path)

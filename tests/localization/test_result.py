@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from coview_stream.localization.result import KeyframeEvidence, State
+from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 
 
 @pytest.mark.parametrize("cause", [None, *RejectionReason])
-def test_evidence_is_read_back_as_it_was_written(world_fixes, cause):
+def test_evidence_json_round_trip(world_fixes, cause):
     known = world_fixes[-1].evidence
     rounded = replace(
         known,
@@ -37,7 +38,7 @@ def test_evidence_of_an_earlier_version_can_be_read(world_fixes):
     assert KeyframeEvidence.from_json(short | {"station": None, "shift": None}) == blind
 
 
-def test_evidence_has_the_same_keys_whatever_is_known(world_fixes):
+def test_evidence_json_always_has_the_same_keys(world_fixes):
     known = world_fixes[-1].evidence.to_json()
     blind = KeyframeEvidence(1.5, State.SEARCHING, "too few points").to_json()
     assert list(blind) == list(known)

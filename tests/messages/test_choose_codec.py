@@ -43,7 +43,7 @@ def odometry_codec(payload=b"?", encoding="", key="coview/r1/in/odom", option=No
         ("application/protobuf;core.Envelope", "keelson"),
     ],
 )
-def test_encodings_of_clouds_as_the_wild_writes_them(encoding, name):
+def test_common_spellings_of_cloud_encodings(encoding, name):
     assert cloud_codec(encoding=encoding) == name
 
 
@@ -57,7 +57,7 @@ def test_encodings_of_clouds_as_the_wild_writes_them(encoding, name):
         ("application/protobuf;foxglove.FrameTransform", "foxglove"),
     ],
 )
-def test_encodings_of_odometry(encoding, name):
+def test_common_spellings_of_odometry_encodings(encoding, name):
     assert odometry_codec(encoding=encoding) == name
 
 
@@ -74,7 +74,7 @@ def test_encodings_of_odometry(encoding, name):
         ("application/cdr;" + 300 * "x", "application/cdr;xxx"),
     ],
 )
-def test_an_encoding_of_no_use_for_clouds_is_named(encoding, named):
+def test_encoding_not_usable_for_clouds_is_named(encoding, named):
     with pytest.raises(EncodingError) as caught:
         cloud_codec(encoding=encoding)
     assert named in str(caught.value)
@@ -95,7 +95,7 @@ def test_option_beats_encoding_beats_key_beats_hint_beats_magic():
 @pytest.mark.parametrize(
     "mute", ["", "zenoh/bytes", "zenoh/string", "application/octet-stream", " Zenoh/Bytes "]
 )
-def test_encodings_that_say_nothing_go_on_to_key_hint_and_magic(mute):
+def test_generic_encodings_fall_back_to_key_hint_and_magic(mute):
     assert cloud_codec(b"?", mute, RMW) == "cdr"
     assert cloud_codec(b"?", mute, NATIVE, hint="xyz") == "xyz"
     assert cloud_codec(b"\0\0\0\0", mute) == "cdr"
@@ -104,7 +104,7 @@ def test_encodings_that_say_nothing_go_on_to_key_hint_and_magic(mute):
         cloud_codec(b"\1\2\3\4", mute)
 
 
-def test_bare_protobuf_is_whatever_key_or_hint_make_of_it():
+def test_bare_protobuf_is_decided_by_key_or_hint():
     assert cloud_codec(encoding="application/protobuf", key=KEELSON, hint="foxglove") == "keelson"
     assert cloud_codec(encoding="application/protobuf", hint="keelson") == "keelson"
     assert cloud_codec(encoding="application/protobuf", hint="cdr") == "foxglove"
@@ -118,32 +118,32 @@ def test_bare_protobuf_is_whatever_key_or_hint_make_of_it():
         KEELSON.replace("point_cloud", "frame_transform"),
     ],
 )
-def test_a_key_whose_type_is_no_cloud_is_an_error_that_names_it(key):
+def test_key_with_non_cloud_type_is_an_error_naming_it(key):
     with pytest.raises(EncodingError, match=r"cannot carry|no codec knows") as caught:
         cloud_codec(b"\0\1\0\0", "", key)
     assert key in str(caught.value)
 
 
-def test_odometry_by_key():
+def test_odometry_codec_from_key():
     assert odometry_codec(b"?", "", RMW_ODOM) == "cdr"
     assert odometry_codec(b"?", "", KEELSON.replace("point_cloud", "frame_transform")) == "keelson"
 
 
-def test_json_magic_does_not_make_a_cloud():
+def test_json_magic_is_not_a_cloud():
     with pytest.raises(EncodingError):
         cloud_codec(b"{}")
 
 
 @pytest.mark.parametrize("where", ["option", "hint"])
 @pytest.mark.parametrize("name", ["pcd", "json", ""])
-def test_an_option_or_hint_that_is_no_codec_of_the_channel(where, name):
+def test_option_or_hint_of_wrong_channel_is_refused(where, name):
     with pytest.raises(ConfigError, match=r"xyz, xyzi, foxglove, cdr, keelson"):
         cloud_codec(**{where: name})
     with pytest.raises(ConfigError):
         codecs.encode_pose(None, "xyz")
 
 
-def test_whole_samples_pass_through_dispatch():
+def test_samples_are_decoded_through_dispatch():
     rows = POINTS.tobytes()
     stamp = STAMP.to_bytes(8, "little")
     assert len(codecs.decode_cloud(Sample(RMW, cdr_cloud(rows, XYZ, 12, 2))).points) == 2
@@ -162,7 +162,7 @@ def test_an_rmw_attachment_gives_stamp_and_sequence():
     assert codecs.decode_cloud(cdr).sequence is None
 
 
-def test_oversized_is_told_apart_and_names_the_key(monkeypatch):
+def test_oversized_payload_raises_its_own_error_naming_the_key(monkeypatch):
     monkeypatch.setattr(checks, "MAX_POINTS", 1)
     with pytest.raises(OversizedError, match=f"{NATIVE}: a cloud of 2 points"):
         codecs.decode_cloud(Sample(NATIVE, cdr_cloud(POINTS.tobytes(), XYZ, 12, 2)))

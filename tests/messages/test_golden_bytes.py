@@ -74,13 +74,13 @@ POSES = {
 }
 
 
-def test_the_literals_and_the_composed_bytes_agree():
+def test_literal_and_composed_bytes_agree():
     assert cdr_cloud(POINTS.tobytes(), XYZ, 12, 2).hex() == CDR_CLOUD
     assert pb_cloud(POINTS.tobytes(), XYZ, 12).hex() == FOXGLOVE_CLOUD
     assert pb_in_frame().hex() == FOXGLOVE_ODOMETRY
 
 
-def test_every_codec_has_its_golden_bytes():
+def test_every_codec_has_golden_bytes():
     assert (set(CLOUDS), set(ODOMETRY), set(POSES)) == (
         set(codecs.CLOUD_CODECS),
         set(codecs.ODOMETRY_CODECS),
@@ -89,7 +89,7 @@ def test_every_codec_has_its_golden_bytes():
 
 
 @pytest.mark.parametrize("name", CLOUDS)
-def test_cloud(name):
+def test_cloud_golden_bytes(name):
     encoding, payload = CLOUDS[name]
     attachment = ATTACHMENT if name.startswith("xyz") else None
     written = codecs.encode_cloud(CloudMessage(STAMP, POINTS), name)
@@ -103,7 +103,7 @@ def test_cloud(name):
 
 
 @pytest.mark.parametrize("name", ODOMETRY)
-def test_odometry(name):
+def test_odometry_golden_bytes(name):
     encoding, payload = ODOMETRY[name]
     written = codecs.encode_odometry(OdometryMessage(STAMP, T_TURN), name)
     assert (written.payload, written.encoding, written.attachment) == (payload, encoding, None)
@@ -113,7 +113,7 @@ def test_odometry(name):
 
 
 @pytest.mark.parametrize("name", POSES)
-def test_pose(name):
+def test_pose_golden_bytes(name):
     encoding, payload = POSES[name]
     message = PoseMessage(STAMP, "r1", "TRACKING", T_TURN, COVARIANCE, 0.75, "ab", 0.1)
     written = codecs.encode_pose(message, name)
@@ -132,7 +132,7 @@ def test_pose(name):
         assert np.isnan([read.confidence, read.age]).all()
 
 
-def test_a_pose_in_json_has_the_fields_of_the_contract():
+def test_json_pose_has_the_documented_fields():
     message = PoseMessage(STAMP, "r1", "TRACKING", T_TURN, COVARIANCE, 0.75, "ab", 0.1, "utm")
     fields = json.loads(codecs.encode_pose(message, "json").payload)
     assert list(fields) == [
@@ -144,13 +144,14 @@ def test_a_pose_in_json_has_the_fields_of_the_contract():
 
 
 @pytest.mark.parametrize("name", ["xyz", "foxglove", "cdr", "keelson"])
-def test_packed_points_are_a_view_on_the_payload(name):
+def test_packed_points_are_a_view_of_the_payload(name):
     encoding, payload = CLOUDS[name]
     read = codecs.decode_cloud(Sample("k", payload, encoding, ATTACHMENT))
     assert np.shares_memory(read.points, np.frombuffer(payload, np.uint8))
     assert not read.points.flags.writeable
 
 
+@pytest.mark.slow
 def test_importing_the_codecs_imports_neither_rosbags_nor_protobuf():
     import subprocess
     import sys

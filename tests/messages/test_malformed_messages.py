@@ -68,7 +68,7 @@ def refused(decode, payload, name, attachment=bytes(8)):
         (ROWS[:-1], bytes(8), "no whole number"),
     ],
 )
-def test_raw(payload, attachment, reason):
+def test_malformed_raw_clouds_are_refused(payload, attachment, reason):
     assert reason in refused(codecs.decode_cloud, payload, "xyz", attachment)
 
 
@@ -97,7 +97,7 @@ def test_raw(payload, attachment, reason):
         (Cdr().put("i", 1).put("I", 1, 2**32 - 1).done(), "PointCloud2|truncated"),
     ],
 )
-def test_point_cloud_2(payload, reason):
+def test_malformed_point_cloud_2_is_refused(payload, reason):
     message = refused(codecs.decode_cloud, payload, "cdr")
     assert any(part in message for part in reason.split("|"))
 
@@ -123,12 +123,12 @@ def test_point_cloud_2(payload, reason):
         (pb_cloud(ROWS, XYZ, 12, pose=sized(1, doubles(np.nan, 0, 0))), "not finite"),
     ],
 )
-def test_foxglove_clouds(payload, reason):
+def test_malformed_foxglove_clouds_are_refused(payload, reason):
     assert reason in refused(codecs.decode_cloud, payload, "foxglove")
     assert reason in refused(codecs.decode_cloud, envelope(payload), "keelson")
 
 
-def test_an_envelope_around_nothing():
+def test_empty_keelson_envelope_is_refused():
     assert "no payload" in refused(codecs.decode_cloud, stamp(), "keelson")
 
 
@@ -142,7 +142,7 @@ def test_an_envelope_around_nothing():
         ((0, 0, 0), (0, 0, 0, 1.02), "norm 1.02"),
     ],
 )
-def test_odometry_that_is_no_pose(position, quaternion, reason):
+def test_odometry_with_invalid_pose_is_refused(position, quaternion, reason):
     pose = {"position": position, "quaternion": quaternion}
     assert reason in refused(codecs.decode_odometry, cdr_odometry(**pose), "cdr")
     assert reason in refused(codecs.decode_odometry, pb_in_frame(**pose), "foxglove")
@@ -151,12 +151,12 @@ def test_odometry_that_is_no_pose(position, quaternion, reason):
         assert reason in refused(codecs.decode_odometry, text.encode(), "json")
 
 
-def test_a_quaternion_in_float32_is_normalised():
+def test_float32_quaternion_is_normalized():
     read = codecs.decode_odometry(Sample("k", cdr_odometry(quaternion=(0.501, 0.501, 0.501, 0.501))))
     np.testing.assert_allclose(read.T_odom_body, T_TURN, atol=1e-12)
 
 
-def test_general_rotations_are_right():
+def test_quaternions_match_scipy():
     from scipy.spatial.transform import Rotation
 
     for rotation in Rotation.random(20, random_state=1):
@@ -193,11 +193,11 @@ def odometry_json(**changes):
         (odometry_json().replace(b'"stamp_ns": 1', b'"stamp_ns": ' + b"[" * 400 + b"]" * 400), "type list"),
     ],
 )
-def test_json_odometry(payload, reason):
+def test_malformed_json_odometry_is_refused(payload, reason):
     assert reason in refused(codecs.decode_odometry, payload, "json")
 
 
-def test_json_of_more_than_64_kib_is_oversized_and_extra_fields_are_not_looked_at():
+def test_json_over_64_kib_is_oversized_and_extra_fields_are_ignored():
     assert codecs.decode_odometry(Sample("k", odometry_json(twist=[1, None], note="x"))).stamp_ns == 1
     with pytest.raises(OversizedError):
         codecs.decode_odometry(Sample("k", odometry_json(note=65536 * "x")))
@@ -214,7 +214,7 @@ def test_json_of_more_than_64_kib_is_oversized_and_extra_fields_are_not_looked_a
         {"map_sha256": "\ud800"},
     ],
 )
-def test_json_poses(changes):
+def test_malformed_json_poses_are_refused(changes):
     message = PoseMessage(STAMP, "r1", "TRACKING", T_TURN, np.eye(6), 0.75, "ab")
     fields = json.loads(codecs.encode_pose(message, "json").payload)
     for name, value in changes.items():
@@ -222,7 +222,7 @@ def test_json_poses(changes):
         assert name in refused(codecs.decode_pose, json.dumps(fields).encode(), "json")
 
 
-def test_what_an_encoding_cannot_say_is_refused_when_writing():
+def test_encoding_refuses_unrepresentable_messages():
     lost = np.full((4, 4), np.nan)
     lost[:3, :3] = np.eye(3)
     with pytest.raises(MessageError, match="NaN"):
@@ -232,7 +232,7 @@ def test_what_an_encoding_cannot_say_is_refused_when_writing():
 
 
 @pytest.mark.parametrize("name", ["cdr", "foxglove", "keelson"])
-def test_millions_of_announced_fields_take_no_memory(name):
+def test_huge_field_counts_allocate_no_memory(name):
     many = 300_000
     field = struct.pack("<I", 1) + bytes(4) + bytes(4) + b"\7\0\0\0" + bytes(4)
     payload = {
@@ -261,15 +261,16 @@ def complaint(decode, sample, **choice):
 @settings(max_examples=40, deadline=None)
 @given(payload=st.binary(max_size=400), attachment=st.none() | st.binary(max_size=40))
 @pytest.mark.parametrize(("decode", "name"), DECODERS)
-def test_random_bytes(decode, name, payload, attachment):
+def test_random_bytes_raise_message_error(decode, name, payload, attachment):
     said = complaint(decode, Sample("some/key", payload, "", attachment), option=name)
     assert said is None or said.startswith("some/key: ")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 @pytest.mark.parametrize(("decode", "name"), DECODERS)
-def test_valid_messages_with_some_bytes_changed_or_cut(decode, name, data):
+def test_mutated_messages_raise_only_message_error(decode, name, data):
     payload = bytearray(data.draw(st.sampled_from([*VALID.values(), *OTHER_VALID])))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(
@@ -281,10 +282,11 @@ def test_valid_messages_with_some_bytes_changed_or_cut(decode, name, data):
     assert said is None or said.startswith("some/key: ")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(payload=st.binary(max_size=60), encoding=st.text(max_size=40), key=st.text(max_size=40))
 @pytest.mark.parametrize("decode", [codecs.decode_cloud, codecs.decode_odometry, codecs.decode_pose])
-def test_random_encodings_and_keys(decode, payload, encoding, key):
+def test_random_encodings_and_keys_raise_only_message_error(decode, payload, encoding, key):
     for said in (encoding, "application/cdr;" + encoding, "application/octet-stream;" + encoding):
         problem = complaint(decode, Sample(key, payload, said))
         assert problem is None or key in problem

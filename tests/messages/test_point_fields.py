@@ -46,7 +46,7 @@ def read_foxglove(rows, **extra):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("frame", ["", "os", "velodyne"])
-def test_both_byte_orders_of_cdr_and_any_frame_name(order, frame):
+def test_cdr_of_both_byte_orders_and_any_frame_name(order, frame):
     payload = cdr_cloud(POINTS.tobytes(), XYZ, 12, 2, order=order, frame=frame)
     for padding in range(4):
         read = codecs.decode_cloud(Sample("k", payload + bytes(padding)))
@@ -55,7 +55,7 @@ def test_both_byte_orders_of_cdr_and_any_frame_name(order, frame):
 
 
 @pytest.mark.parametrize("cdr_order", ["<", ">"])
-def test_big_endian_rows(cdr_order):
+def test_big_endian_point_data(cdr_order):
     rows = rows_of(
         [("x", ">f4"), ("y", ">f4"), ("z", ">f4"), ("t", ">u4"), ("ring", ">u2")], t=[5, 10], ring=[1, 300]
     )
@@ -96,7 +96,7 @@ def test_whole_number_coordinates(kind):
     np.testing.assert_array_equal(read_foxglove(rows).points, np.trunc(POINTS))
 
 
-def test_an_organised_cloud_with_padded_rows():
+def test_organised_cloud_with_padded_rows():
     grid = np.arange(18, dtype="<f4").reshape(2, 3, 3)
     data = b"".join(row.tobytes() + b"\xff" * 5 for row in grid)[:-5]
     payload = cdr_cloud(data, XYZ, 12, 3, height=2, row_step=41)
@@ -104,12 +104,12 @@ def test_an_organised_cloud_with_padded_rows():
 
 
 @pytest.mark.parametrize("row_step", [0, 1, 2**32 - 1])  # some drivers get it wrong
-def test_the_row_step_of_a_single_row_does_not_matter(row_step):
+def test_row_step_of_a_single_row_is_ignored(row_step):
     payload = cdr_cloud(POINTS.tobytes(), XYZ, 12, 2, row_step=row_step)
     np.testing.assert_array_equal(codecs.decode_cloud(Sample("k", payload)).points, POINTS)
 
 
-def test_points_that_are_not_finite_stay_and_float64_beyond_float32_is_infinite():
+def test_non_finite_points_are_kept_and_float64_overflow_is_infinite():
     rows = rows_of([("x", "<f8"), ("y", "<f8"), ("z", "<f8")], x=[1e300, np.nan])
     points = read_ros(rows, dense=False).points
     assert np.isposinf(points[0, 0])
@@ -132,7 +132,7 @@ def test_signalling_nan_and_infinity_raise_no_warnings():
 
 
 @pytest.mark.parametrize("codec", ["xyz", "xyzi", "foxglove", "cdr", "keelson"])
-def test_an_empty_cloud(codec):
+def test_empty_cloud_is_decoded(codec):
     written = codecs.encode_cloud(CloudMessage(STAMP, np.zeros((0, 3), np.float32)), codec)
     read = codecs.decode_cloud(Sample("k", written.payload, written.encoding, written.attachment))
     assert read.points.shape == (0, 3)
@@ -154,13 +154,13 @@ TIMES = np.array([0.0, 0.0625])
         ("time_offset", "<f8", TIMES),
     ],
 )
-def test_times_by_type_and_magnitude(read, name, kind, values):
+def test_point_times_by_type_and_magnitude(read, name, kind, values):
     message = read(rows_of([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: values}))
     assert message.times.dtype == np.float64
     np.testing.assert_allclose(message.times, TIMES, atol=5e-7)  # a float64 of seconds resolves 0.24 us
 
 
-def test_stamps_at_the_end_of_a_sweep_give_negative_times():
+def test_stamp_at_end_of_sweep_gives_negative_point_times():
     rows = rows_of(
         [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")], timestamp=STAMP / SECOND - TIMES
     )
@@ -178,13 +178,13 @@ def test_stamps_at_the_end_of_a_sweep_give_negative_times():
         ("time", "<u2", [0, 1]),  # no driver writes that
     ],
 )
-def test_times_that_make_no_sense_are_none(name, kind, values):
+def test_implausible_point_times_are_none(name, kind, values):
     message = read_ros(rows_of([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: values}))
     assert message.times is None
     np.testing.assert_array_equal(message.points, POINTS)
 
 
-def test_times_of_points_that_are_not_finite_do_not_count():
+def test_times_of_non_finite_points_are_ignored():
     dtype = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")]
     rows = rows_of(dtype, y=[np.nan, 1.0], timestamp=[0.0, STAMP / SECOND + 0.0625])
     np.testing.assert_allclose(read_ros(rows).times, [0.0, 0.0625], atol=5e-7)
@@ -193,7 +193,7 @@ def test_times_of_points_that_are_not_finite_do_not_count():
 
 @pytest.mark.parametrize("name", ["ring", "line", "channel"])
 @pytest.mark.parametrize("kind", ["u1", "<u2", "<i4", "<f4"])
-def test_rings(name, kind):
+def test_ring_field_is_decoded(name, kind):
     rows = rows_of([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, kind)], **{name: [3, 63]})
     rings = read_ros(rows).rings
     assert rings.dtype == np.uint16
@@ -203,12 +203,12 @@ def test_rings(name, kind):
 @pytest.mark.parametrize(
     ("kind", "values"), [("<f4", [0.5, 1]), ("<f4", [np.nan, 1]), ("<i4", [-1, 1]), ("<u4", [70000, 1])]
 )
-def test_rings_that_make_no_sense_are_none(kind, values):
+def test_implausible_rings_are_none(kind, values):
     rows = rows_of([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("ring", kind)], ring=values)
     assert read_ros(rows).rings is None
 
 
-def test_the_pose_of_a_foxglove_cloud_is_applied():
+def test_foxglove_cloud_pose_is_applied():
     rows = rows_of([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     moved = read_foxglove(rows, pose=pb_pose((1, 2, 3), TURN)).points
     np.testing.assert_allclose(moved, POINTS[:, [2, 0, 1]] + [1, 2, 3], atol=1e-6)  # x to y, y to z, z to x
@@ -228,7 +228,7 @@ def test_the_pose_of_a_foxglove_cloud_is_applied():
     stamp=st.integers(-(2**31), 2**31 - 1),
 )
 @pytest.mark.parametrize("codec", ["foxglove", "cdr", "keelson"])
-def test_clouds_with_times_and_rings_come_back(codec, count, timed, ringed, seed, stamp):
+def test_clouds_with_times_and_rings_round_trip(codec, count, timed, ringed, seed, stamp):
     random = np.random.default_rng(seed)
     message = CloudMessage(
         stamp * SECOND + 7,

@@ -49,7 +49,7 @@ def apart(a, b):
 
 @pytest.mark.parametrize("motion", [straight, turning])
 @pytest.mark.parametrize(("begin", "end"), [(0.0, 0.1), (-0.1, 0.0), (-0.05, 0.05)])
-def test_a_sweep_is_as_if_measured_at_once(motion, begin, end):
+def test_deskewed_sweep_equals_instant_scan(motion, begin, end):
     world = wall()
     times = np.random.default_rng(1).uniform(begin, end, len(world))
     swept = measured(world, motion, times)
@@ -61,7 +61,7 @@ def test_a_sweep_is_as_if_measured_at_once(motion, begin, end):
     assert apart(moved, at_once) < 0.03  # half a step of the sweep's 64 is 6 mm of road, and 0.5 mrad at 36 m
 
 
-def test_the_points_given_stay_as_they_are():
+def test_input_points_are_not_modified():
     world = wall(20)
     times = np.linspace(0.0, 0.1, len(world))
     swept = measured(world, turning, times)
@@ -71,7 +71,7 @@ def test_the_points_given_stay_as_they_are():
     np.testing.assert_array_equal(swept, before)
 
 
-def test_times_beyond_the_odometry_take_its_nearest_end():
+def test_times_beyond_odometry_use_its_nearest_pose():
     points = np.tile(np.array([[5.0, 1.0, 0.5]], np.float32), (3, 1))
     times = np.array([-1.0, 0.0, 1.0])
     moved = deskew(points, times, segment(straight, [-0.1, 0.0, 0.2]), ns(0.0), straight(0.0))
@@ -80,7 +80,7 @@ def test_times_beyond_the_odometry_take_its_nearest_end():
     np.testing.assert_allclose(moved, expected, atol=0.5 * 0.3 * SPEED / 63 + 1e-3)
 
 
-def test_a_time_that_is_nan_means_the_stamp():
+def test_nan_time_means_the_stamp():
     points = np.tile(np.array([[5.0, 1.0, 0.5]], np.float32), (3, 1))
     times = np.array([-0.1, np.nan, 0.1])
     moved = deskew(points, times, segment(straight, [-0.1, 0.0, 0.1]), ns(0.0), straight(0.0))
@@ -88,7 +88,7 @@ def test_a_time_that_is_nan_means_the_stamp():
     np.testing.assert_allclose(moved[:, 0], [4.2, 5.0, 5.8], atol=0.02)
 
 
-def test_a_point_that_is_nan_spoils_no_other():
+def test_nan_point_does_not_affect_others():
     points = np.tile(np.array([[5.0, 1.0, 0.5]], np.float32), (3, 1))
     points[1] = np.nan
     moved = deskew(points, np.array([-0.1, 0.0, 0.1]), segment(straight, [-0.1, 0.1]), ns(0.0), straight(0.0))
@@ -97,20 +97,20 @@ def test_a_point_that_is_nan_spoils_no_other():
 
 
 @pytest.mark.parametrize("samples", [[], [0.0]])
-def test_nothing_moves_without_two_samples(samples):
+def test_fewer_than_two_samples_move_nothing(samples):
     points = measured(wall(20), straight, np.zeros(40))
     around = Segment(np.array([ns(t) for t in samples], np.int64), np.zeros((len(samples), 4, 4)) + np.eye(4))
     same = deskew(points, np.linspace(0, 0.1, 40), around, ns(0.0), straight(0.0))
     np.testing.assert_array_equal(same, points)
 
 
-def test_nothing_to_move():
+def test_empty_cloud_is_returned():
     empty = np.zeros((0, 3), np.float32)
     moved = deskew(empty, NO_TIMES, segment(straight, [0.0, 0.1]), ns(0.0), straight(0.0))
     assert moved.shape == (0, 3)
 
 
-def test_all_at_the_stamp_moves_nothing():
+def test_points_at_the_stamp_are_not_moved():
     points = measured(wall(20), straight, np.zeros(40))
     same = deskew(points, np.zeros(40), segment(straight, [0.0, 0.1]), ns(0.0), straight(0.0))
     np.testing.assert_array_equal(same, points)

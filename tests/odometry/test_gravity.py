@@ -12,7 +12,7 @@ from coview_stream.odometry.gravity import find_ground, level_rotation
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.2), (-0.3, 0.15)])
-def test_the_ground_tells_up_and_the_sensors_height(scene, tilt):
+def test_ground_plane_gives_up_direction_and_sensor_height(scene, tilt):
     cloud, up = frame(scene, tilt)
     found = find_ground(cloud)
     assert not isinstance(found, str)
@@ -42,21 +42,21 @@ def few():
 
 
 @pytest.mark.parametrize("cloud", [wall, noise, table_top, few, lambda: np.empty((0, 3))])
-def test_no_ground_is_said_in_words(cloud):
+def test_missing_ground_is_explained(cloud):
     assert isinstance(find_ground(cloud()), str)
 
 
-def test_a_ceiling_is_no_ground(scene):
+def test_ceiling_is_not_taken_for_ground(scene):
     cloud, _ = frame(scene)
     assert isinstance(find_ground(cloud * [1, 1, -1]), str)
 
 
-def test_a_plane_at_the_sensors_own_height_is_no_ground(scene):
+def test_plane_at_sensor_height_is_not_taken_for_ground(scene):
     cloud, _ = frame(scene)
     assert isinstance(find_ground(np.abs(cloud)), str)  # walls end there
 
 
-def test_equal_clouds_have_equal_grounds(scene):
+def test_ground_fit_is_deterministic(scene):
     cloud, _ = frame(scene, (0.1, 0.1))
     assert (find_ground(cloud).up == find_ground(cloud).up).all()
 
@@ -72,7 +72,7 @@ def test_alignment_turns_up_to_z_and_keeps_the_heading():
     assert forward[0] > 0
 
 
-def test_words_for_gravity():
+def test_gravity_option_keywords():
     assert parse_gravity("ground") == "ground"
     assert parse_gravity("level") == "level"
     assert parse_gravity("0.5,0,-9.8") == parse_gravity("0.5, 0, -9.8") == (0.5, 0.0, -9.8)
@@ -85,12 +85,12 @@ def test_words_for_gravity():
     "text",
     ["", "up", "0 0 -1", "1,2", "0,0,0", "0,0,nan", "1,0,0", "0,0,x", "0,0,-1,", "0,0,0,0"],
 )
-def test_what_is_no_gravity(text):
+def test_invalid_gravity_is_refused(text):
     with pytest.raises(ConfigError, match="gravity"):
         parse_gravity(text)
 
 
-def test_an_accelerometers_sign_is_explained():
+def test_accelerometer_sign_is_explained():
     with pytest.raises(ConfigError, match="accelerometer"):
         LidarOdometryConfig(gravity=(0.0, 0.0, 9.81))
 
@@ -99,6 +99,6 @@ def test_an_accelerometers_sign_is_explained():
     "wrong",
     [{"voxel": 0.0}, {"max_gap": np.nan}, {"max_range": 0.5}, {"gravity": "moon"}, {"gravity": (1.0, 2.0)}],
 )
-def test_configurations_out_of_range(wrong):
+def test_lidar_odometry_config_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError):
         LidarOdometryConfig(**wrong)

@@ -42,7 +42,7 @@ def test_one_wall_corrects_across_it_and_leaves_the_rest():
     assert abs(up[1] - GROUND[1]) < 0.01
 
 
-def test_without_walls_nothing_changes():
+def test_without_walls_gravity_is_unchanged():
     flat = np.random.default_rng(0).uniform([-20, -20, -1.7], [20, 20, -1.69], (5000, 3))
     up, count = gravity_from_walls(flat, GROUND)
     assert np.allclose(up, GROUND)
@@ -50,7 +50,7 @@ def test_without_walls_nothing_changes():
     assert np.allclose(gravity_from_walls(np.empty((0, 3)), GROUND)[0], GROUND)
 
 
-def test_what_leans_is_outvoted():
+def test_leaning_surfaces_are_outvoted_by_walls():
     cloud = [wall(np.array([1.0, 0, 0]), 8.0), wall(np.array([0, 1.0, 0]), -9.0)]
     cloud.append(wall(np.array([1.0, 0, 0.2]), -8.0)[:600] @ _turn(10.0))
     up, _ = gravity_from_walls(np.concatenate(cloud), GROUND)

@@ -41,7 +41,7 @@ def errors(odometry, drive, clouds):
     return small_world.pose_error(inverse(poses[0]) @ poses[-1], truth)
 
 
-def test_a_drive_is_followed(drive):
+def test_kiss_icp_follows_a_drive(drive):
     odometry = LidarOdometry()
     metres, degrees = errors(odometry, drive, [(cloud, None) for cloud in drive[1]])
     assert metres < 0.15
@@ -49,7 +49,7 @@ def test_a_drive_is_followed(drive):
     assert odometry.restarts == 0
 
 
-def test_deskewing_makes_up_for_the_motion_during_a_sweep(drive):
+def test_deskewing_compensates_motion_during_a_sweep(drive):
     poses, clouds = drive
     sweeps = [(clouds[0], None)]
     sweeps += [swept(c, inverse(a) @ b) for a, b, c in zip(poses, poses[1:], clouds[1:], strict=False)]
@@ -107,12 +107,14 @@ def said(program):
     return done.returncode, done.stdout.strip(), done.stderr
 
 
-def test_no_input_ends_the_process():
+@pytest.mark.slow
+def test_no_input_aborts_the_process():
     code, out, error = said(HOSTILE)
     assert (code, out) == (0, "alive"), error
 
 
-def test_the_guard_is_still_needed():
+@pytest.mark.slow
+def test_kiss_icp_still_aborts_without_the_input_check():
     """If kiss-icp no longer aborts, the module docstring of odometry/kiss.py is to be rewritten."""
     code, out, _ = said(ABORTS)
     if (code, out) == (0, "alive"):
@@ -120,7 +122,7 @@ def test_the_guard_is_still_needed():
     assert code < 0
 
 
-def test_settings_reach_it():
+def test_settings_reach_kiss_icp():
     from coview_stream.odometry.kiss_icp import KissRegistration
 
     icp = KissRegistration(LidarOdometryConfig(voxel=0.7, min_range=2.0, max_range=55.0, threads=2))._icp

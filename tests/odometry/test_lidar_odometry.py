@@ -26,7 +26,7 @@ def moved(x, yaw=0.0):
     return pose_from(rot_z(yaw), [x, 0.0, 0.0])
 
 
-def test_the_odometry_frame_is_level_though_the_sensor_leans(scene):
+def test_odometry_frame_is_level_with_tilted_sensor(scene):
     cloud, up = frame(scene, (0.15, -0.1))
     odometry = LidarOdometry(registration=Told())
     T = odometry.step(cloud, None, 5.0)
@@ -35,7 +35,7 @@ def test_the_odometry_frame_is_level_though_the_sensor_leans(scene):
     assert odometry.ground is not None
 
 
-def test_gravity_that_is_given_is_taken(cloud):
+def test_given_gravity_is_used(cloud):
     g = np.array([0.1, -0.2, -0.97])
     odometry = LidarOdometry(LidarOdometryConfig(gravity=tuple(g)), Told())
     T = odometry.step(cloud, None, 5.0)
@@ -43,7 +43,7 @@ def test_gravity_that_is_given_is_taken(cloud):
     assert odometry.ground is None
 
 
-def test_without_ground_nothing_begins_and_later_frames_may(cloud):
+def test_odometry_starts_at_first_frame_with_ground(cloud):
     odometry = LidarOdometry(registration=Told())
     wall = np.random.default_rng(0).uniform([8, -15, -1], [8.1, 15, 9], (5000, 3)).astype(np.float32)
     with pytest.raises(CloudError, match="--gravity level"):
@@ -51,7 +51,7 @@ def test_without_ground_nothing_begins_and_later_frames_may(cloud):
     assert tilt_of(odometry.step(cloud, None, 5.1)) < 0.01
 
 
-def test_the_last_motion_predicts_the_next_over_the_time_between(cloud):
+def test_constant_velocity_prediction_scales_with_time(cloud):
     told = Told(np.eye(4), moved(1.0, 0.1), moved(2.0, 0.2))
     odometry = LidarOdometry(LEVEL, told)
     for stamp in (0.0, 0.1, 0.2):
@@ -63,7 +63,7 @@ def test_the_last_motion_predicts_the_next_over_the_time_between(cloud):
     assert np.arctan2(guess[1, 0], guess[0, 0]) == pytest.approx(0.3)
 
 
-def test_a_sweep_is_deskewed_by_the_motion_before_it(cloud):
+def test_sweep_is_deskewed_by_previous_motion(cloud):
     step = moved(1.0, 0.05)
     told = Told(np.eye(4), step)
     odometry = LidarOdometry(LEVEL, told)
@@ -77,7 +77,7 @@ def test_a_sweep_is_deskewed_by_the_motion_before_it(cloud):
 
 
 @pytest.mark.parametrize("times", [0.0, 7.0, np.nan, np.inf, 1.6e9])
-def test_times_that_say_nothing_deskew_nothing(cloud, times):
+def test_constant_point_times_deskew_nothing(cloud, times):
     told = Told(np.eye(4), moved(1.0))
     odometry = LidarOdometry(LEVEL, told)
     for k in range(3):
@@ -85,7 +85,7 @@ def test_times_that_say_nothing_deskew_nothing(cloud, times):
     assert (told.frames[2] == cloud).all()
 
 
-def test_one_bad_time_leaves_its_point_where_it_is(cloud):
+def test_point_with_bad_time_is_not_moved(cloud):
     told = Told(np.eye(4), moved(1.0))
     odometry = LidarOdometry(LEVEL, told)
     times = np.linspace(-0.1, 0.0, len(cloud))
@@ -116,7 +116,7 @@ def covered(cloud):
     ],
     ids=["empty", "few", "nan", "inf", "far", "absurd", "flat", "text", "covered"],
 )
-def test_a_bad_frame_is_refused_and_changes_nothing(cloud, bad):
+def test_bad_frame_is_refused_and_changes_nothing(cloud, bad):
     told = Told(np.eye(4), moved(0.1))
     odometry = LidarOdometry(LEVEL, told)
     odometry.step(cloud, None, 0.0)
@@ -128,7 +128,7 @@ def test_a_bad_frame_is_refused_and_changes_nothing(cloud, bad):
     assert odometry.restarts == 0
 
 
-def test_rows_with_nan_go_and_their_times_too(cloud):
+def test_nan_rows_are_dropped_with_their_times(cloud):
     told = Told()
     odometry = LidarOdometry(LEVEL, told)
     holes = cloud.copy()
@@ -140,7 +140,7 @@ def test_rows_with_nan_go_and_their_times_too(cloud):
 
 
 @pytest.mark.parametrize("stamp", [0.0, -1.0, np.nan, np.inf])
-def test_stamps_must_go_on(cloud, stamp):
+def test_stamps_must_increase(cloud, stamp):
     odometry = LidarOdometry(LEVEL, Told())
     odometry.step(cloud, None, 0.0)
     with pytest.raises(RunError, match="stamp"):
@@ -148,7 +148,7 @@ def test_stamps_must_go_on(cloud, stamp):
     assert is_pose(odometry.step(cloud, None, 0.1))
 
 
-def test_after_a_gap_the_local_map_begins_anew_where_the_robot_was(cloud):
+def test_gap_restarts_local_map_at_last_pose(cloud):
     told = Told(np.eye(4), moved(1.0), moved(2.0))
     odometry = LidarOdometry(LEVEL, told)
     for k in range(3):
@@ -160,7 +160,7 @@ def test_after_a_gap_the_local_map_begins_anew_where_the_robot_was(cloud):
 
 
 @pytest.mark.parametrize("wild", [moved(40.0), moved(0.0, 2.5), np.full((4, 4), np.nan)])
-def test_an_impossible_motion_is_refused(cloud, wild):
+def test_implausible_motion_is_refused(cloud, wild):
     told = Told(np.eye(4), moved(1.0), wild)
     odometry = LidarOdometry(LEVEL, told)
     odometry.step(cloud, None, 0.0)
@@ -171,7 +171,7 @@ def test_an_impossible_motion_is_refused(cloud, wild):
     assert np.allclose(odometry.step(cloud, None, 0.3), moved(1.0))
 
 
-def test_a_frame_may_be_reused_by_the_caller(cloud):
+def test_caller_may_reuse_its_frame_array(cloud):
     told = Told()
     odometry = LidarOdometry(LEVEL, told)
     buffer = cloud.copy()
@@ -181,7 +181,7 @@ def test_a_frame_may_be_reused_by_the_caller(cloud):
     assert is_pose(odometry.step(cloud, None, 0.1))
 
 
-def test_reset_begins_another_odometry_frame(cloud):
+def test_reset_starts_a_new_odometry_frame(cloud):
     odometry = LidarOdometry(LEVEL, Told(np.eye(4), moved(1.0)))
     odometry.step(cloud, None, 10.0)
     odometry.step(cloud, None, 10.1)
@@ -189,7 +189,7 @@ def test_reset_begins_another_odometry_frame(cloud):
     assert np.allclose(odometry.step(cloud, None, 3.0), np.eye(4))
 
 
-def test_walls_undo_a_tilt_that_drifts(cloud):
+def test_walls_correct_drifting_tilt(cloud):
     tilt = np.eye(4)
     tilt[:3, :3] = [[np.cos(0.002), 0, np.sin(0.002)], [0, 1, 0], [-np.sin(0.002), 0, np.cos(0.002)]]
     lean = [np.linalg.matrix_power(tilt, k) for k in range(25)]  # the robot stands, and registration tilts it
@@ -204,7 +204,8 @@ def test_walls_undo_a_tilt_that_drifts(cloud):
     assert ends[True] < 0.3
 
 
-def test_a_localizer_goes_by_it(world_map, world_drive):
+@pytest.mark.slow
+def test_localizer_tracks_on_lidar_odometry(world_map, world_drive):
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.state import State
 
@@ -217,7 +218,7 @@ def test_a_localizer_goes_by_it(world_map, world_drive):
     assert small_world.pose_error(fix.T_map_body, world_drive.T_map_body[-1])[0] < 0.1
 
 
-def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
+def test_missing_kiss_icp_is_named_with_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
     with pytest.raises(DependencyError, match="pip install 'kiss-icp>=") as caught:

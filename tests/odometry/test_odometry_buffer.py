@@ -32,7 +32,7 @@ def steady(odometry, begin, end, rate=20.0, **place):
     return [odometry.add(message(t, **place), t) for t in times]
 
 
-def test_a_pose_between_samples_is_interpolated():
+def test_pose_between_samples_is_interpolated():
     turn = Rotation.from_rotvec([0.1, -0.2, 0.3])
     before = pose_from(Rotation.from_rotvec([0.0, 0.4, 0.0]).as_matrix(), [1.0, 2.0, 3.0])
     after = pose_from(before[:3, :3] @ turn.as_matrix(), [1.4, 1.8, 3.1])
@@ -46,18 +46,18 @@ def test_a_pose_between_samples_is_interpolated():
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 
 
-def test_a_turn_across_half_a_circle_goes_the_short_way():
+def test_rotation_is_interpolated_the_short_way():
     odometry = buffer((0.0, 0.0, 0.0, np.pi - 0.1), (0.1, 0.0, 0.0, -np.pi + 0.1))
     np.testing.assert_allclose(odometry.at(ns(0.05)), pose(yaw=np.pi), atol=1e-9)
 
 
-def test_a_sample_is_its_own_pose():
+def test_pose_at_a_sample_is_the_sample():
     odometry = buffer((0.0, 1.0), (0.1, 1.1), (0.2, 1.2))
     for seconds, x in ((0.0, 1.0), (0.1, 1.1), (0.2, 1.2)):
         np.testing.assert_array_equal(odometry.at(ns(seconds)), pose(x))
 
 
-def test_what_the_buffer_covers():
+def test_covered_time_span():
     empty = buffer()
     assert empty.covers(ns(0.0)) == 1
     assert empty.at(ns(0.0)) is None
@@ -83,7 +83,7 @@ def test_steady_samples_continue():
     assert odometry.turned == pytest.approx(0.0)
 
 
-def test_turns_add_up_whatever_their_sense():
+def test_turns_add_up_in_both_directions():
     odometry = buffer((0.0, 0, 0, 0.0), (0.1, 0, 0, 0.2), (0.2, 0, 0, -0.1))
     assert odometry.turned == pytest.approx(0.5)
     assert odometry.travelled == 0.0
@@ -99,26 +99,26 @@ def test_turns_add_up_whatever_their_sense():
         (4.9, SampleKind.OUTAGE),
     ],
 )
-def test_a_pause_of_the_stamps_is_a_gap(pause, intake):
+def test_stamp_pause_is_a_gap(pause, intake):
     odometry = buffer((1.0, 0.0))
     assert odometry.add(message(1.0 + pause, 0.0), 1.0 + pause) is intake
     assert odometry.newest.stamp_ns == ns(1.0 + pause)
 
 
-def test_a_long_pause_in_both_clocks_is_an_outage():
+def test_long_pause_in_both_clocks_is_an_outage():
     odometry = buffer((1.0, 0.0))
     assert odometry.add(message(601.0, 0.0), 601.0) is SampleKind.OUTAGE
     assert odometry.covers(ns(1.0)) == -1
 
 
-def test_a_duplicate_leaves_no_trace():
+def test_duplicate_sample_is_ignored():
     odometry = buffer((0.0, 0.0), (0.1, 0.1))
     assert odometry.add(message(0.1, 0.7), 0.4) is SampleKind.DUPLICATE
     assert odometry.arrived == 0.1
     np.testing.assert_array_equal(odometry.at(ns(0.1)), pose(0.1))
 
 
-def test_an_older_sample_leaves_no_trace():
+def test_older_sample_is_ignored():
     odometry = buffer((0.0, 0.0), (0.2, 0.2))
     assert odometry.add(message(0.1, 0.7), 0.25) is SampleKind.OUT_OF_ORDER
     assert odometry.arrived == 0.2
@@ -141,12 +141,12 @@ def test_an_older_sample_leaves_no_trace():
         (0.0, np.radians(19), SampleKind.CONTINUES),
     ],
 )
-def test_farther_than_the_robot_can_have_come_is_a_jump(x, yaw, intake):
+def test_motion_beyond_max_speed_is_a_jump(x, yaw, intake):
     odometry = buffer((0.0, 0.0), (0.01, 0.0))
     assert odometry.add(message(0.02, x, 0.0, yaw), 0.02) is intake
 
 
-def test_what_is_possible_grows_with_time():
+def test_jump_limit_grows_with_time():
     assert buffer((0.0, 0.0)).add(message(0.1, 5.4), 0.1) is SampleKind.CONTINUES
     assert buffer((0.0, 0.0)).add(message(0.1, 5.6), 0.1) is SampleKind.JUMP
     assert buffer((0.0, 0.0)).add(message(0.1, 0.0, 0.0, 1.9), 0.1) is SampleKind.CONTINUES
@@ -154,7 +154,7 @@ def test_what_is_possible_grows_with_time():
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.5, 10.0, 30.0])
-def test_what_is_possible_depends_on_what_the_robot_does(speed):
+def test_jump_limit_depends_on_recent_speed(speed):
     """Half a metre, and three times its speed of the last seconds and three metres per second more."""
     most = 0.5 + 0.1 * (3.0 * speed + 3.0)
     for off, intake in ((-0.05, SampleKind.CONTINUES), (0.05, SampleKind.JUMP)):
@@ -163,7 +163,7 @@ def test_what_is_possible_depends_on_what_the_robot_does(speed):
         assert odometry.add(message(1.1, speed + fast + off), 1.1) is intake
 
 
-def test_a_jump_forgets_what_was_before():
+def test_jump_clears_the_buffer():
     odometry = buffer((0.0, 0.0), (0.1, 0.5))
     assert odometry.add(message(0.2, 500.0), 0.2) is SampleKind.JUMP
     assert odometry.covers(ns(0.1)) == -1
@@ -173,14 +173,14 @@ def test_a_jump_forgets_what_was_before():
 
 
 @pytest.mark.parametrize("stray", [3600.0, 1e9, -3600.0, -1e9, 8.0])
-def test_one_stray_stamp_does_not_shut_out_what_follows(stray):
+def test_stray_stamp_does_not_block_later_samples(stray):
     odometry = buffer()
     steady(odometry, 0.0, 1.0)
     assert odometry.add(message(stray, 2.0), 1.01) in STRAYS
     assert set(steady(odometry, 1.05, 3.0)) == {SampleKind.CONTINUES}
 
 
-def test_strays_that_come_again_and_again_are_no_clock_of_their_own():
+def test_repeated_strays_are_not_a_clock_restart():
     """Another sender, an hour behind, on the same key: between them come ours."""
     odometry = buffer()
     for k in range(100):
@@ -189,7 +189,7 @@ def test_strays_that_come_again_and_again_are_no_clock_of_their_own():
         assert odometry.add(message(t - 3600.0, 7.0), t + 0.01) is not SampleKind.RESTART
 
 
-def test_a_clock_that_started_anew_is_believed_once_it_has_run_on():
+def test_restarted_clock_is_accepted_after_running_on():
     odometry = buffer()
     steady(odometry, 100.0, 101.0)
     verdicts = []
@@ -203,13 +203,13 @@ def test_a_clock_that_started_anew_is_believed_once_it_has_run_on():
     assert odometry.newest.stamp_ns == ns(2.2)
 
 
-def test_a_slow_clock_needs_five_samples():
+def test_restarted_slow_clock_needs_five_samples():
     odometry = buffer((100.0, 0.0))
     verdicts = [odometry.add(message(float(k), 0.0), 101.0 + k) for k in range(6)]
     assert verdicts == [SampleKind.OUT_OF_ORDER] * 4 + [SampleKind.RESTART, SampleKind.GAP]
 
 
-def test_a_clock_set_forward_is_an_outage_once_it_has_run_on():
+def test_clock_set_forward_is_an_outage_after_running_on():
     odometry = buffer()
     steady(odometry, 0.0, 1.0)
     verdicts = [odometry.add(message(3600.0 + 0.05 * k, 2.0), 1.05 + 0.05 * k) for k in range(23)]
@@ -219,7 +219,7 @@ def test_a_clock_set_forward_is_an_outage_once_it_has_run_on():
     assert set(verdicts[at + 1 :]) == {SampleKind.CONTINUES}
 
 
-def test_stamps_that_run_backwards_for_ever_are_no_restart():
+def test_backward_stamps_are_not_a_clock_restart():
     odometry = buffer()
     steady(odometry, 100.0, 101.0)
     for k in range(200):
@@ -228,14 +228,14 @@ def test_stamps_that_run_backwards_for_ever_are_no_restart():
     assert odometry.arrived == 101.0
 
 
-def test_only_the_horizon_is_remembered():
+def test_history_is_bounded_in_time():
     odometry = buffer(odometry_history=2.0)
     steady(odometry, 0.0, 10.0)
     assert odometry.covers(ns(7.99)) == -1
     assert odometry.covers(ns(8.0)) == 0
 
 
-def test_the_samples_around_a_sweep():
+def test_segment_around_a_sweep():
     odometry = buffer((0.0, 0.0), (0.1, 0.1), (0.2, 0.2), (0.3, 0.3), (0.4, 0.4))
 
     def stamps(begin, end):
@@ -252,7 +252,7 @@ def test_the_samples_around_a_sweep():
     assert stamps(-1.0, 9.0) == [0.0, 0.1, 0.2, 0.3, 0.4]
 
 
-def test_an_empty_buffer_has_nothing_around():
+def test_empty_buffer_has_no_segment():
     segment = buffer().around(ns(0.0), ns(1.0))
     assert segment.stamps.shape == (0,)
     assert segment.poses.shape == (0, 4, 4)
@@ -267,7 +267,7 @@ stamps = st.one_of(
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.lists(st.tuples(stamps, st.floats(0.0, 0.7), st.floats(-3.0, 3.0)), max_size=60))
-def test_whatever_stamps_come_the_buffer_stays_in_order(samples):
+def test_buffer_stays_sorted_for_random_stamps(samples):
     odometry, now, travelled = OdometryBuffer(NodeConfig()), 0.0, 0.0
     for seconds, later, x in samples:
         now += later
@@ -299,6 +299,6 @@ def test_whatever_stamps_come_the_buffer_stays_in_order(samples):
         {"pose_rate": 201.0},
     ],
 )
-def test_limits_that_make_no_sense_are_refused(wrong):
+def test_odometry_limits_out_of_range_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         NodeConfig(**wrong)

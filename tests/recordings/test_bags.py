@@ -59,7 +59,7 @@ def only_file(folder: Path) -> Path:
         ("ros1.bag", "", "", False),
     ],
 )
-def test_every_storage(tmp_path, name, storage, compression, single):
+def test_every_bag_storage_is_read(tmp_path, name, storage, compression, single):
     bag = write_bag(tmp_path / name, {"/points": clouds(), "/odom": driven()}, storage, compression)
     if single:
         (bag / "metadata.yaml").unlink()
@@ -86,7 +86,7 @@ def test_poses_between_samples_are_interpolated(tmp_path):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(("begin", "end"), [(0.0, 0.1), (-0.1, 0.0)])
-def test_a_sweep_is_as_if_measured_at_once(tmp_path, order, begin, end):
+def test_sweep_is_deskewed(tmp_path, order, begin, end):
     rng = np.random.default_rng(2)
     stamp = START + 400_000_000
     world = transform(T_at(stamp), rng.uniform(-25, 25, (300, 3)))
@@ -105,7 +105,7 @@ def test_a_sweep_is_as_if_measured_at_once(tmp_path, order, begin, end):
     assert np.linalg.norm(frame.points - at_once[kept], axis=1).max() < 0.01
 
 
-def test_a_recording_is_read_once_in_order_and_not_held(tmp_path, monkeypatch):
+def test_bag_is_read_once_in_order_without_holding_it(tmp_path, monkeypatch):
     bag = write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()})
     begun, ask = [], BagReader.messages
     monkeypatch.setattr(BagReader, "messages", lambda self, *a: begun.append(a) or ask(self, *a))
@@ -119,7 +119,7 @@ def test_a_recording_is_read_once_in_order_and_not_held(tmp_path, monkeypatch):
     assert begun[2][1] > LATE
 
 
-def test_another_thread_may_read(tmp_path):
+def test_bag_can_be_read_from_another_thread(tmp_path):
     run = open_run(write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()}, "sqlite3"))
     seen = []
     reader = threading.Thread(target=lambda: seen.extend(frame.points[0, 0] for frame in run))
@@ -128,7 +128,7 @@ def test_another_thread_may_read(tmp_path):
     assert seen == [POINTS[0, 0] + np.float32(k) for k in range(COUNT)]
 
 
-def test_several_topics_need_a_choice(tmp_path):
+def test_several_cloud_topics_need_topic_option(tmp_path):
     topics = {
         "/rear": clouds(CLOUD_NS[:3]),
         "/front": clouds(),
@@ -149,7 +149,7 @@ def test_several_topics_need_a_choice(tmp_path):
     assert len(open_run(bag, cloud_topic="/rear", odometry_topic="/wheel")) == 3
 
 
-def test_frames_without_odometry_are_left_out_and_counted(tmp_path):
+def test_frames_without_odometry_are_skipped_and_counted(tmp_path):
     far = pose_from(np.eye(3), (500.0, 0.0, 0.0))
     gap = [ns for ns in ODOMETRY_NS if ns < START + 300_000_000]
     track = driven(gap) + [odometry(ns, T_at(ns)) for ns in (START + 900_000_000, START + 920_000_000)]
@@ -165,7 +165,7 @@ def test_frames_without_odometry_are_left_out_and_counted(tmp_path):
     assert "4 of 9 clouds left out: 3 without odometry around their stamps, 1 with a stamp" in run.notes[0]
 
 
-def test_a_sweep_is_not_moved_across_a_jump():
+def test_odometry_segment_of_a_sweep_stops_at_a_jump():
     stamps = np.array([0, 20, 40, 60, 80], np.int64) * 1_000_000
     poses = np.stack([pose_from(np.eye(3), (0.1 * k + 90.0 * (k > 2), 0.0, 0.0)) for k in range(5)])
     track = Track(stamps, poses)
@@ -175,7 +175,7 @@ def test_a_sweep_is_not_moved_across_a_jump():
     np.testing.assert_array_equal(track.at(stamps + 10_000_000)[1], [True, True, False, True, False])
 
 
-def test_late_and_damaged_messages(tmp_path):
+def test_out_of_order_and_damaged_bag_messages(tmp_path):
     messages = clouds()
     messages[2], messages[3] = messages[3], messages[2]
     messages[5] = messages[5].__class__(**{**vars(messages[5]), "width": 5000})
@@ -190,7 +190,7 @@ def test_late_and_damaged_messages(tmp_path):
     assert run.read(6).points[0, 0] == POINTS[0, 0] + 6
 
 
-def test_odometry_from_a_file_and_a_lone_scan(tmp_path):
+def test_bag_with_odometry_file_and_bag_with_single_scan(tmp_path):
     bag = write_bag(tmp_path / "bag", {"/points": clouds()})
     write_tum(tmp_path / "a.tum", [1e-9 * ns for ns in CLOUD_NS[2:]], [T_at(ns) for ns in CLOUD_NS[2:]])
     run = open_run(bag, tmp_path / "a.tum")
@@ -203,7 +203,7 @@ def test_odometry_from_a_file_and_a_lone_scan(tmp_path):
     np.testing.assert_array_equal(lone.read(0).T_odom_body, np.eye(4))
 
 
-def test_a_lidar_away_from_the_odometrys_body_is_said(tmp_path):
+def test_different_lidar_and_odometry_frames_are_noted(tmp_path):
     messages = [cloud(ns, POINTS, frame="velodyne") for ns in CLOUD_NS]
     run = open_run(write_bag(tmp_path / "bag", {"/points": messages, "/odom": driven()}))
     assert len(run.notes) == 1
@@ -261,7 +261,7 @@ def _without(bag):
         ("mcap", "", _without, "missing.*repair it"),
     ],
 )
-def test_recordings_that_cannot_be_read(tmp_path, storage, compression, harm, reason):
+def test_unreadable_bags_are_refused_with_reason(tmp_path, storage, compression, harm, reason):
     bag = write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()}, storage, compression)
     with pytest.raises(RunError, match=reason) as caught:
         open_run(harm(bag))
@@ -287,12 +287,12 @@ def test_recordings_that_cannot_be_read(tmp_path, storage, compression, harm, re
         ),
     ],
 )
-def test_recordings_without_a_run(tmp_path, topics, reason):
+def test_bags_without_usable_topics_are_refused(tmp_path, topics, reason):
     with pytest.raises(RunError, match=reason):
         open_run(write_bag(tmp_path / "bag", topics))
 
 
-def test_directories_of_recordings(tmp_path):
+def test_directory_of_bags(tmp_path):
     bag = write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()})
     (bag / "metadata.yaml").unlink()
     assert len(open_run(bag)) == COUNT
@@ -301,7 +301,8 @@ def test_directories_of_recordings(tmp_path):
         open_run(bag)
 
 
-def test_locate_finds_its_way_in_a_recording(world_file, world_drive, tmp_path, capsys):
+@pytest.mark.slow
+def test_locate_command_on_a_bag(world_file, world_drive, tmp_path, capsys):
     stamps = [START + k * 500_000_000 for k in range(7)]
     messages = [cloud(ns, c, frame="lidar") for ns, c in zip(stamps, world_drive.clouds, strict=False)]
     samples = [odometry(ns, T) for ns, T in zip(stamps, world_drive.T_odom_body, strict=False)]
@@ -314,7 +315,7 @@ def test_locate_finds_its_way_in_a_recording(world_file, world_drive, tmp_path, 
     assert "--cloud-topic may be /points (7 messages)" in capsys.readouterr().err
 
 
-def test_files_have_no_topics(tmp_path):
+def test_topic_options_are_refused_for_files(tmp_path):
     write_bag(tmp_path / "bag", {"/points": clouds(), "/odom": driven()})
     (tmp_path / "frames").mkdir()
     with pytest.raises(RunError, match="has no topics"):

@@ -47,7 +47,7 @@ def sweep(k):
     return cloud(STAMPS[k], points.astype(np.float32), times.astype(np.float32))
 
 
-def test_poses_and_deskewed_clouds(tmp_path):
+def test_bag_without_odometry_gets_lidar_odometry_and_deskewed_clouds(tmp_path):
     bag = write_bag(tmp_path / "bag", {"/points": [sweep(k) for k in range(6)]})
     run = open_run(bag, "kiss-icp", lidar=lidar())
     assert np.allclose(run.stamps, np.array(STAMPS) / 1e9)
@@ -58,7 +58,7 @@ def test_poses_and_deskewed_clouds(tmp_path):
             assert np.abs(frame.points - truth).max() < 0.02
 
 
-def test_odometry_in_the_recording_is_not_looked_at(tmp_path):
+def test_odometry_topic_is_ignored_with_lidar_odometry(tmp_path):
     elsewhere = [odometry(ns, pose_from(np.eye(3), [500.0, 0, 0])) for ns in STAMPS]
     bag = write_bag(tmp_path / "bag", {"/points": [sweep(k) for k in range(6)], "/odom": elsewhere})
     assert np.abs(open_run(bag, "kiss-icp", lidar=lidar()).poses[:, :3, 3]).max() < 10
@@ -66,7 +66,7 @@ def test_odometry_in_the_recording_is_not_looked_at(tmp_path):
         open_run(bag, "kiss-icp", odometry_topic="/odom", lidar=lidar())
 
 
-def test_a_covered_sensor_leaves_its_frames_out(tmp_path):
+def test_frames_of_covered_sensor_are_skipped(tmp_path):
     dark = cloud(STAMPS[5], np.full((50, 3), 0.1, np.float32))
     bag = write_bag(tmp_path / "bag", {"/points": [*(sweep(k) for k in range(5)), dark]})
     run = open_run(bag, "kiss-icp", lidar=lidar())

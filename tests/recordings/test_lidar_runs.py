@@ -36,7 +36,7 @@ def times(run, stamps):
     (run / "times.txt").write_text("\n".join(map(str, stamps)) + "\n")
 
 
-def test_a_run_gets_poses_and_notes(bare, world_drive):
+def test_run_without_odometry_gets_poses_and_notes(bare, world_drive):
     done = []
     times(bare, 100.0 + 0.5 * np.arange(7))
     run = open_run(bare, "kiss-icp", lidar=truthful(world_drive), progress=lambda *at: done.append(at))
@@ -49,19 +49,19 @@ def test_a_run_gets_poses_and_notes(bare, world_drive):
     assert "down is taken from the ground" in run.notes[0]
 
 
-def test_frames_without_stamps_are_taken_for_ten_a_second(bare, world_drive):
+def test_frames_without_stamps_are_taken_at_10_hz(bare, world_drive):
     run = open_run(bare, "kiss-icp", lidar=truthful(world_drive))
     assert np.allclose(run.stamps, 0.1 * np.arange(7))
     assert "no times.txt" in run.notes[0]
 
 
-def test_stamps_of_odometry_that_is_not_wanted(world_run, world_drive):
+def test_stamps_come_from_ignored_odometry_file(world_run, world_drive):
     run = open_run(world_run, "kiss-icp", lidar=truthful(world_drive))
     assert np.allclose(run.stamps, 100.0 + 0.5 * np.arange(7))
     assert np.abs(run.poses[:, :3, 3]).max() < 30  # not those of the file, kilometres away
 
 
-def test_frames_that_cannot_be_placed_are_left_out(bare, world_drive):
+def test_frames_without_lidar_odometry_are_skipped(bare, world_drive):
     (bare / "frames" / "000006.ply").write_bytes(b"")
     run = open_run(bare, "kiss-icp", lidar=truthful(world_drive))
     assert len(run) == 6
@@ -69,14 +69,14 @@ def test_frames_that_cannot_be_placed_are_left_out(bare, world_drive):
     assert "000006.ply" in run.notes[-1]
 
 
-def test_nothing_that_can_be_placed(bare, world_drive):
+def test_run_without_any_placeable_frame_is_an_error(bare, world_drive):
     for path in (bare / "frames").iterdir():
         path.write_bytes(b"")
     with pytest.raises(RunError, match="not one of 7 frames"):
         open_run(bare, "kiss-icp", lidar=truthful(world_drive))
 
 
-def test_times_that_do_not_fit(bare, world_drive):
+def test_mismatched_times_and_topic_options_are_refused(bare, world_drive):
     times(bare, [1.0, 2.0])
     with pytest.raises(RunError, match="too short"):
         open_run(bare, "kiss-icp", lidar=truthful(world_drive))
@@ -86,12 +86,13 @@ def test_times_that_do_not_fit(bare, world_drive):
         open_run(bare, "kiss-icp", cloud_topic="/points")
 
 
-def test_one_frame_needs_none(bare):
+def test_single_frame_needs_no_lidar_odometry(bare):
     only = bare / "frames" / "000000.ply"
     assert len(open_run(only, "kiss-icp")) == 1
 
 
-def test_locate_by_it(world_file, bare, world_drive, tmp_path, monkeypatch, capsys):
+@pytest.mark.slow
+def test_locate_command_with_lidar_odometry(world_file, bare, world_drive, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(module, "KissRegistration", lambda config: Truth(world_drive.T_map_body))
     times(bare, 100.0 + 0.5 * np.arange(7))
     out = tmp_path / "out"
@@ -117,7 +118,7 @@ def test_locate_by_it(world_file, bare, world_drive, tmp_path, monkeypatch, caps
 
 
 @pytest.mark.parametrize("gravity", [["--gravity", "level"], ["--gravity=-1e-3,0,-9.81"]])
-def test_gravity_takes_one_value_and_leaves_the_rest(gravity):
+def test_gravity_option_takes_one_value(gravity):
     for command in ("locate", "serve"):
         end = ["site.coview", "run", "-o", "out"] if command == "locate" else ["site.coview", "--robot", "a"]
         args = build_parser().parse_args([command, "--odometry", "kiss-icp", *gravity, *end])
@@ -132,7 +133,7 @@ def complaint(capsys):
     return captured.err
 
 
-def test_a_missing_package_is_one_line(world_file, world_run, tmp_path, monkeypatch, capsys):
+def test_missing_kiss_icp_is_one_line(world_file, world_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
     command = [
@@ -158,6 +159,6 @@ def test_a_missing_package_is_one_line(world_file, world_run, tmp_path, monkeypa
         (["--odometry", "kiss-icp", "--gravity="], "ground, level, or three numbers"),
     ],
 )
-def test_wrong_options(world_file, world_run, tmp_path, capsys, options, text):
+def test_invalid_gravity_options_are_refused(world_file, world_run, tmp_path, capsys, options, text):
     assert main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), *options]) == 2
     assert text in complaint(capsys)

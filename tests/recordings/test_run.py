@@ -55,7 +55,7 @@ def test_frames_are_sorted_by_number(run: Path) -> None:
     assert [path.name for path in open_run(run).frames_paths] == ["8.pcd", "9.pcd", "10.pcd", "11.pcd"]
 
 
-def test_one_damaged_frame_fails_alone(run: Path) -> None:
+def test_damaged_frame_fails_alone(run: Path) -> None:
     (run / "frames" / "000002.pcd").write_bytes(b"")
     opened = open_run(run)
     assert len(opened.read(3).points) == 30
@@ -71,7 +71,7 @@ def test_frames_of_a_run_must_be_in_the_body_frame(run: Path) -> None:
         open_run(run).read(1)
 
 
-def test_single_cloud_keeps_its_origin(tmp_path: Path) -> None:
+def test_single_cloud_run_keeps_its_origin(tmp_path: Path) -> None:
     origin = np.array([500_000.25, 4_000_000.5, 30.0])
     write_cloud(tmp_path / "scan.laz", POINTS, origin=origin)
     opened = open_run(tmp_path / "scan.laz")
@@ -98,7 +98,7 @@ def test_odometry_from_another_file(run: Path) -> None:
         open_run(run, run / "missing.tum")
 
 
-def test_kitti_layout(tmp_path: Path) -> None:
+def test_kitti_layout_is_read(tmp_path: Path) -> None:
     opened = open_run(_kitti(tmp_path, POSES))
     np.testing.assert_allclose(opened.poses, POSES, atol=1e-9)
     np.testing.assert_allclose(opened.stamps, np.arange(COUNT) * 0.1)
@@ -146,14 +146,14 @@ def test_kitti_times_must_fit(tmp_path: Path) -> None:
         (["1 0 0 0 1 0 0 0 1 0 0 0"] * 4, "times"),
     ],
 )
-def test_odometry_that_does_not_fit(run: Path, lines: list[str], reason: str) -> None:
+def test_odometry_not_matching_the_frames_is_refused(run: Path, lines: list[str], reason: str) -> None:
     (run / "odometry.tum").write_text("\n".join(lines))
     with pytest.raises(RunError, match=reason) as caught:
         open_run(run)
     assert "\n" not in str(caught.value)
 
 
-def test_odometry_that_is_no_text(run: Path) -> None:
+def test_binary_odometry_file_is_refused(run: Path) -> None:
     (run / "odometry.tum").write_bytes(bytes(range(256)))
     with pytest.raises(RunError, match="is no text"):
         open_run(run)
@@ -171,12 +171,12 @@ def test_odometry_that_is_no_text(run: Path) -> None:
         (lambda d: (d / "a.txt").touch() or d / "a.txt", "neither a run nor a cloud"),
     ],
 )
-def test_no_run_at_all(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
+def test_path_without_a_run_is_refused(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
     with pytest.raises(RunError, match=reason):
         open_run(make(tmp_path))
 
 
-def test_frames_must_be_files_and_differ(run: Path) -> None:
+def test_duplicate_frames_and_broken_links_are_refused(run: Path) -> None:
     write_cloud(run / "frames" / "000001.ply", POINTS)
     with pytest.raises(RunError, match="same frame"):
         open_run(run)
@@ -186,7 +186,7 @@ def test_frames_must_be_files_and_differ(run: Path) -> None:
         open_run(run)
 
 
-def test_trajectory_round_trip_and_quaternions_of_any_length(tmp_path: Path) -> None:
+def test_tum_trajectory_round_trip_normalizes_quaternions(tmp_path: Path) -> None:
     write_tum(tmp_path / "a.tum", STAMPS, POSES)
     stamps, poses = read_tum(tmp_path / "a.tum")
     np.testing.assert_allclose(stamps, STAMPS, atol=1e-6)
@@ -195,7 +195,7 @@ def test_trajectory_round_trip_and_quaternions_of_any_length(tmp_path: Path) -> 
     np.testing.assert_allclose(read_tum(tmp_path / "b.tum")[1][0, :3, :3], rot_z(np.pi / 2), atol=1e-12)
 
 
-def test_empty_trajectory(tmp_path: Path) -> None:
+def test_empty_trajectory_round_trip(tmp_path: Path) -> None:
     write_tum(tmp_path / "a.tum", [], [])
     stamps, poses = read_tum(tmp_path / "a.tum")
     assert stamps.shape == (0,)
@@ -203,7 +203,7 @@ def test_empty_trajectory(tmp_path: Path) -> None:
     assert (tmp_path / "a.tum").read_bytes() == b""
 
 
-def test_trajectory_that_cannot_be_written(tmp_path: Path) -> None:
+def test_unwritable_or_mismatched_trajectory_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         write_tum(tmp_path / "nowhere" / "a.tum", STAMPS, POSES)
     with pytest.raises(InputError, match="3 stamps for 4 poses"):

@@ -30,7 +30,7 @@ def shifted(t=(0.0, 0.0, 0.0), yaw_deg=0.0, first=0):
 NOTHING = (np.zeros(0), np.zeros((0, 4, 4)))
 
 
-def test_a_perfect_trajectory():
+def test_perfect_trajectory_has_zero_error():
     verdict = evaluate(straight_truth(), straight_truth())
     assert verdict.success
     assert (verdict.frames, verdict.posed, verdict.false_frames) == (20, 20, 0)
@@ -68,14 +68,14 @@ def test_statistics_differ_where_errors_do():
         ({"yaw_deg": -5.01}, False),
     ],
 )
-def test_the_thresholds_of_success(error, right):
+def test_success_thresholds(error, right):
     verdict = evaluate(shifted(**error), straight_truth())
     assert verdict.success is right
     assert verdict.false_frames == (0 if right else 20)
     assert verdict.share_localised == (1.0 if right else 0.0)
 
 
-def test_nothing_estimated_is_not_localised():
+def test_no_estimates_is_not_localized():
     verdict = evaluate(NOTHING, straight_truth())
     assert not verdict.success
     assert (verdict.posed, verdict.false_frames, verdict.share_localised) == (0, 0, 0.0)
@@ -84,14 +84,14 @@ def test_nothing_estimated_is_not_localised():
     assert json.loads(verdict.to_json())["first_fix_m"] is None
 
 
-def test_distance_before_the_first_pose():
+def test_distance_driven_before_first_pose():
     verdict = evaluate(shifted(first=6), straight_truth())
     assert verdict.first_fix_m == pytest.approx(12.0)
     assert verdict.share_localised == pytest.approx(14 / 20)
     assert verdict.success
 
 
-def test_a_false_first_pose_is_no_success():
+def test_false_first_pose_is_not_a_success():
     long = (STAMPS[0] + 0.1 * np.arange(200), np.tile(np.eye(4), (200, 1, 1)))
     estimate = (long[0], long[1].copy())
     estimate[1][0, 0, 3] = 50.0
@@ -104,7 +104,7 @@ def test_a_false_first_pose_is_no_success():
     assert evaluate(estimate, long).success
 
 
-def test_more_than_95_percent_must_be_right():
+def test_success_needs_more_than_95_percent_correct():
     stamps, poses = straight_truth()
     poses = poses.copy()
     poses[7, 0, 3] += 10.0  # 95 % of 20 are right: not more than that

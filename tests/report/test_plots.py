@@ -35,7 +35,7 @@ def has_colour(picture, name):
     return bool((np.abs(picture[:, :, :3] - to_rgb(name)).max(axis=2) < 0.02).any())
 
 
-def test_map_shows_the_base_in_grey_and_the_stations(base, tmp_path):
+def test_map_plot_shows_base_map_and_stations(base, tmp_path):
     plots.plot_map(base, base[::100], tmp_path / "map.png")
     picture = pixels(tmp_path / "map.png")
     assert has_colour(picture, style.STATE_COLOURS["TRACKING"])
@@ -56,7 +56,7 @@ def test_trajectory_is_coloured_by_state(base, tmp_path):
     assert not has_colour(picture, style.STATE_COLOURS["LOST"])
 
 
-def test_a_trajectory_without_poses_says_so(base, tmp_path, monkeypatch):
+def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(plots, "say", lambda axes, text: said.append(text))
     plots.plot_trajectory(base, np.full((3, 3), np.nan), ["SEARCHING"] * 3, tmp_path / "none.png")
@@ -66,13 +66,14 @@ def test_a_trajectory_without_poses_says_so(base, tmp_path, monkeypatch):
     pixels(tmp_path / "empty.png")
 
 
-def test_states_and_positions_must_fit(base, tmp_path):
+def test_states_and_positions_of_different_length_are_refused(base, tmp_path):
     with pytest.raises(InputError, match="2 states for 3 positions"):
         plots.plot_trajectory(base, np.zeros((3, 3)), ["LOST"] * 2, tmp_path / "t.png")
     assert not (tmp_path / "t.png").exists()
 
 
-def test_false_poses_stand_out(tmp_path):
+@pytest.mark.slow
+def test_false_poses_are_highlighted(tmp_path):
     distance, e_r = np.arange(50.0), np.full(50, 0.01)
     e_t = np.full(50, 0.05)
     plots.plot_errors(distance, e_t, e_r, tmp_path / "right.png")
@@ -82,7 +83,7 @@ def test_false_poses_stand_out(tmp_path):
     assert has_colour(pixels(tmp_path / "false.png"), style.STATE_COLOURS["LOST"])
 
 
-def test_errors_of_nothing_say_so(tmp_path, monkeypatch):
+def test_error_plot_without_errors_shows_a_note(tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(plots, "say", lambda axes, text: said.append(text))
     plots.plot_errors(np.zeros(0), np.zeros(0), np.zeros(0), tmp_path / "none.png")
@@ -90,7 +91,8 @@ def test_errors_of_nothing_say_so(tmp_path, monkeypatch):
     pixels(tmp_path / "none.png")
 
 
-def test_equal_descriptors_look_equal_after_the_shift(tmp_path):
+@pytest.mark.slow
+def test_equal_descriptors_are_drawn_equal_after_shift(tmp_path):
     query = np.random.default_rng(3).random((6, 12))
     query[:, 4] = np.nan
     plots.plot_descriptor_pair(query, np.roll(query, -3, axis=1), 3, tmp_path / "turned.png")
@@ -107,12 +109,12 @@ def test_descriptors_of_different_shape_are_refused(tmp_path):
         plots.plot_descriptor_pair(np.zeros((6, 12)), np.zeros((6, 10)), 0, tmp_path / "d.png")
 
 
-def test_far_coordinates_are_shifted_for_the_reader(base):
+def test_utm_coordinates_get_a_rounded_plot_offset(base):
     assert not style.base_shift(base).any()
     shift = style.base_shift(base + np.array([412_345.0, 5_318_765.0, 240.0]))
     assert shift.tolist() == [412_300.0, 5_318_800.0, 0.0]
 
 
-def test_a_picture_that_cannot_be_written_names_its_file(tmp_path):
+def test_unwritable_plot_names_its_file(tmp_path):
     with pytest.raises(InputError, match=r"missing/map\.png"):
         plots.plot_map(NO_POINTS, NO_POINTS, tmp_path / "missing" / "map.png")

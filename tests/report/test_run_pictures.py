@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from coview_stream.localization.offline import locate
-from coview_stream.localization.result import Fix, State
+from coview_stream.localization.result import Fix
+from coview_stream.localization.state import State
 from coview_stream.recordings import open_run
 from coview_stream.report.run_pictures import draw_run
 

@@ -22,7 +22,7 @@ def circle(count=400, step=0.25):
     return np.stack(poses)
 
 
-def test_without_drift_one_transform_about_z_explains_all():
+def test_without_drift_one_yaw_transform_explains_all_poses():
     truth = circle()
     odometry = drifting_odometry(truth, PERFECT, np.random.default_rng(1))
     T_odom_map = odometry[0] @ inverse(truth[0])
@@ -31,7 +31,7 @@ def test_without_drift_one_transform_about_z_explains_all():
     assert np.abs(T_odom_map[:2, 3]).max() > 1.0
 
 
-def test_drift_has_the_promised_size():
+def test_drift_has_the_configured_size():
     truth = circle()
     config = OdometryConfig()
     yaw, ratio = [], []
@@ -46,7 +46,7 @@ def test_drift_has_the_promised_size():
     assert max(abs(r - 1) for r in ratio) < 2.5 * config.scale_error
 
 
-def test_gravity_stays_known():
+def test_odometry_stays_gravity_aligned():
     truth = circle()
     odometry = drifting_odometry(truth, OdometryConfig(), np.random.default_rng(3))
     up = np.einsum("nj,nj->n", odometry[:, 2, :3], truth[:, 2, :3])
@@ -54,12 +54,12 @@ def test_gravity_stays_known():
     np.testing.assert_allclose(np.linalg.det(odometry[:, :3, :3]), 1.0)
 
 
-def test_one_frame_is_odometry_too():
+def test_odometry_of_one_frame():
     assert drifting_odometry(circle(1), OdometryConfig(), np.random.default_rng(0)).shape == (1, 4, 4)
 
 
 @pytest.mark.parametrize("field", ["yaw_walk", "scale_error", "position_walk", "tilt_noise", "offset"])
 @pytest.mark.parametrize("value", [-0.1, float("nan"), 1e9])
-def test_ranges(field, value):
+def test_odometry_config_out_of_range_is_refused(field, value):
     with pytest.raises(ConfigError, match=field):
         OdometryConfig(**{field: value})

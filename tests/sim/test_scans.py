@@ -37,7 +37,8 @@ def around_buildings(scene, points):
     return np.concatenate(heights)
 
 
-def test_points_lie_on_surfaces(scene, base, run):
+@pytest.mark.slow
+def test_scan_points_lie_on_surfaces(scene, base, run):
     for points, noise in ((base, 0.025), (run[1], 0.02)):
         sample = points[RNG.choice(len(points), 1500, replace=False)]
         off = distance_to_surfaces(scene, sample)
@@ -45,14 +46,16 @@ def test_points_lie_on_surfaces(scene, base, run):
         assert (off < 5 * noise).mean() > 0.9  # the rest lies in foliage
 
 
-def test_the_base_map_covers_its_square_at_the_asked_density(base):
+@pytest.mark.slow
+def test_base_map_covers_its_square_at_configured_density(base):
     assert np.abs(base[:, :2]).max() < 60.0
     assert len(base) / 120.0**2 == pytest.approx(6.0, rel=0.15)
     filled, _, _ = np.histogram2d(base[:, 0], base[:, 1], bins=24, range=[[-60, 60], [-60, 60]])
     assert (filled > 0).mean() > 0.99
 
 
-def test_the_aircraft_sees_roofs_and_the_robot_facades(scene, base, run):
+@pytest.mark.slow
+def test_aerial_scan_has_roofs_and_robot_scan_has_facades(scene, base, run):
     airborne, ground = around_buildings(scene, base), around_buildings(scene, run[1])
     assert len(airborne) > 500
     assert len(ground) > 500
@@ -61,6 +64,7 @@ def test_the_aircraft_sees_roofs_and_the_robot_facades(scene, base, run):
     assert np.median(airborne) > 2.0
 
 
+@pytest.mark.slow
 def test_the_robot_stands_on_the_road(scene, run):
     truth, _ = run
     position = truth[:, :3, 3]
@@ -71,7 +75,7 @@ def test_the_robot_stands_on_the_road(scene, run):
 
 
 @pytest.mark.parametrize("name", sorted(SENSORS))
-def test_beams_are_unit_vectors_and_repeat_only_where_they_should(name):
+def test_beam_directions_are_unit_vectors_and_repeat_as_specified(name):
     sensor = SENSORS[name]()
     first, second = sensor.beams(0), sensor.beams(1)
     assert np.linalg.norm(first, axis=1) == pytest.approx(1.0)
@@ -90,7 +94,7 @@ def cast_down(epoch, porosity, count=4000):
     return Caster(epoch).cast(origins, rays, np.random.default_rng(1), porosity)
 
 
-def test_foliage_lets_its_share_of_rays_pass():
+def test_foliage_transmits_configured_share_of_rays():
     ground, leaves = box(20, 20, 1), placed(box(10, 10, 1), 0, 0, 8.0)
     upper = cast_down(Epoch(ground, leaves), 0.5).distance < 13
     assert upper.mean() == pytest.approx(0.75, abs=0.03)  # two surfaces, each stops half of what comes
@@ -100,14 +104,14 @@ def test_foliage_lets_its_share_of_rays_pass():
     np.testing.assert_allclose(solid.incidence, 1.0, atol=1e-4)
 
 
-def test_rays_into_the_sky_meet_nothing():
+def test_rays_into_the_sky_return_nothing():
     hits = Caster(Epoch(box(2, 2, 1), EMPTY)).cast(
         np.array([[0, 0, 5]], np.float32), np.array([[0, 0, 1]], np.float32), RNG, 0.0
     )
     assert np.isinf(hits.distance).all()
 
 
-def test_a_far_and_grazed_wall_returns_less():
+def test_far_wall_at_grazing_angle_returns_fewer_points():
     corners = np.array([[10.0, -500, -50], [10, 500, -50], [10, 500, 50], [10, -500, 50]])
     wall = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     sensor = SENSORS["vlp16"]()

@@ -16,7 +16,7 @@ def any_scene(request):
     return build_scene(request.param, 3, 140.0)
 
 
-def test_the_route_is_a_smooth_loop_inside_the_map(any_scene):
+def test_route_is_a_smooth_loop_inside_the_map(any_scene):
     route = any_scene.route
     assert np.abs(route).max() < any_scene.size / 2
     assert np.hypot(*(route[0] - route[-1])) < 0.5
@@ -44,14 +44,14 @@ def test_nothing_solid_blocks_the_robot(any_scene):
     assert nearest > 0.9
 
 
-def test_triangles_are_valid(any_scene):
+def test_scene_triangles_are_valid(any_scene):
     for mesh in (*any_scene.mapped.__dict__.values(), *any_scene.now.__dict__.values()):
         assert np.isfinite(mesh.vertices).all()
         assert mesh.triangles.min() >= 0
         assert mesh.triangles.max() < len(mesh.vertices)
 
 
-def test_a_change_leaves_the_map_and_moves_the_share():
+def test_scene_change_keeps_the_map_and_replaces_configured_share():
     before, after = build_scene("village", 3, 140.0), build_scene("village", 3, 140.0, changed=0.3)
     for name in ("solid", "foliage"):
         np.testing.assert_array_equal(
@@ -65,7 +65,7 @@ def test_a_change_leaves_the_map_and_moves_the_share():
     assert before.now is before.mapped
 
 
-def test_seeds_and_kinds_give_other_scenes():
+def test_seed_and_kind_change_the_scene():
     a, b = build_scene("town", 1, 100.0), build_scene("town", 2, 100.0)
     assert [f.x for f in a.footprints] != [f.x for f in b.footprints]
 

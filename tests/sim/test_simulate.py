@@ -27,7 +27,7 @@ def world(tmp_path_factory):
     return out
 
 
-def test_the_layout_of_the_contract(world):
+def test_simulated_files_follow_the_run_layout(world):
     facts = json.loads((world / "world.json").read_text())
     stamps, truth = read_tum(world / "truth.tum")
     odometry_stamps, _ = read_tum(world / "run" / "odometry.tum")
@@ -52,12 +52,12 @@ def test_equal_seeds_give_equal_bytes(world, tmp_path):
             assert ours.read_bytes() == theirs.read_bytes(), name
 
 
-def test_another_seed_gives_another_world(world, tmp_path):
+def test_different_seed_gives_different_world(world, tmp_path):
     simulate(tmp_path / "c", replace(TINY, seed=6))
     assert (tmp_path / "c" / "truth.tum").read_bytes() != (world / "truth.tum").read_bytes()
 
 
-def test_an_origin_moves_map_and_truth_and_nothing_else(world, tmp_path, capsys):
+def test_origin_moves_only_map_and_ground_truth(world, tmp_path, capsys):
     argv = ["simulate", str(tmp_path / "u"), "--scene", "village", "--seed", "5", "--size", "80"]
     assert main([*argv, "--length", "0.5", "--density", "2", "--utm"]) == 0
     assert "map points, 4 frames" in capsys.readouterr().out
@@ -69,14 +69,14 @@ def test_an_origin_moves_map_and_truth_and_nothing_else(world, tmp_path, capsys)
         assert (tmp_path / "u" / name).read_bytes() == (world / name).read_bytes()
 
 
-def test_nothing_of_the_users_is_overwritten(tmp_path):
+def test_foreign_files_are_not_overwritten(tmp_path):
     (tmp_path / "thesis.txt").write_text("all of it")
     with pytest.raises(InputError, match="not empty"):
         simulate(tmp_path, TINY, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
+def test_failed_simulation_leaves_no_files(tmp_path, monkeypatch):
     module = sys.modules[simulate.__module__]  # the package's attribute of that name is the function
 
     def broken(*_):
@@ -89,7 +89,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_only_an_earlier_world_is_replaced(world, tmp_path):
+def test_only_an_earlier_simulated_world_is_replaced(world, tmp_path):
     copy = tmp_path / "w"
     shutil.copytree(world, copy)
     with pytest.raises(InputError, match="--overwrite"):
@@ -114,7 +114,7 @@ def test_only_an_earlier_world_is_replaced(world, tmp_path):
         ("origin", (1.0, 2.0)),
     ],
 )
-def test_the_configuration_is_checked(field, value):
+def test_invalid_simulation_config_is_refused(field, value):
     with pytest.raises(ConfigError, match=field):
         SimulationConfig(**{field: value})
 
@@ -129,7 +129,7 @@ def test_the_configuration_is_checked(field, value):
         ["--seed", "x"],
     ],
 )
-def test_bad_options_are_one_line_and_write_nothing(options, tmp_path, capsys):
+def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, capsys):
     assert main(["simulate", str(tmp_path / "w"), *options]) == 2
     err = capsys.readouterr().err
     assert err.startswith("coview-stream: error: ")

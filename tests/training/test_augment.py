@@ -37,7 +37,7 @@ def changed(before: Image, after: Image) -> list[int]:
 
 @pytest.mark.parametrize("aerial", [True, False])
 @pytest.mark.parametrize("seed", range(12))
-def test_shape_type_and_the_original_stay(image: Image, aerial: bool, seed: int) -> None:
+def test_augmentation_keeps_shape_type_and_original(image: Image, aerial: bool, seed: int) -> None:
     kept = image.copy()
     spoilt = augmented(image, aerial, np.random.default_rng(seed))
     assert spoilt.shape == SHAPE
@@ -47,11 +47,11 @@ def test_shape_type_and_the_original_stay(image: Image, aerial: bool, seed: int)
     np.testing.assert_array_equal(spoilt, augmented(image, aerial, np.random.default_rng(seed)))
 
 
-def test_nothing_changes_where_nothing_is_drawn(image: Image) -> None:
+def test_augmentation_with_zero_probabilities_changes_nothing(image: Image) -> None:
     np.testing.assert_array_equal(augmented(image, True, Draws(0, 1, 1, 1, 1, 1)), image)
 
 
-def test_fallen_trees_leave_disks_and_the_ground(image: Image) -> None:
+def test_fallen_trees_clear_disks_in_height_layers(image: Image) -> None:
     counts = []
     for seed in range(40):
         felled = augmented(image, True, Draws(seed, 0, 1, 1, 1, 1))
@@ -78,7 +78,7 @@ def test_one_fallen_tree_is_round(monkeypatch) -> None:
     assert (image[SEEN:] == 9).all()
 
 
-def test_thinning_loses_cells_of_each_layer_apart(image: Image) -> None:
+def test_thinning_drops_cells_of_each_layer_independently(image: Image) -> None:
     shares = []
     for seed in range(20):
         thin = augmented(image, True, Draws(seed, 1, 0, 1, 1, 1))
@@ -91,14 +91,14 @@ def test_thinning_loses_cells_of_each_layer_apart(image: Image) -> None:
     assert max(shares) <= 0.51
 
 
-def test_from_above_the_lowest_layers_are_hidden(image: Image) -> None:
+def test_occlusion_from_above_hides_lowest_layers(image: Image) -> None:
     for seed in range(20):
         hidden = changed(image, augmented(image, True, Draws(seed, 1, 1, 0, 1, 1)))
         assert hidden == list(range(len(hidden)))
         assert 1 <= len(hidden) <= 3
 
 
-def test_from_below_all_above_some_height_is_hidden(image: Image) -> None:
+def test_occlusion_from_below_hides_upper_layers(image: Image) -> None:
     for seed in range(20):
         low = augmented(image, False, Draws(seed, 1, 1, 0, 1, 1))
         hidden = [k for k in range(LAYERS - 3) if not low[k].any()]
@@ -110,7 +110,7 @@ def test_from_below_all_above_some_height_is_hidden(image: Image) -> None:
         np.testing.assert_array_equal(low[SEEN:], image[SEEN:])
 
 
-def test_other_densities_keep_order_and_both_ends(image: Image) -> None:
+def test_density_change_keeps_order_and_both_ends(image: Image) -> None:
     image[0, 0, :2] = 0, 255
     directions = set()
     for seed in range(20):
@@ -123,7 +123,7 @@ def test_other_densities_keep_order_and_both_ends(image: Image) -> None:
     assert directions == {True, False}
 
 
-def test_relief_alone_is_weakened_strengthened_or_lost(image: Image) -> None:
+def test_relief_layer_is_scaled_or_dropped_alone(image: Image) -> None:
     spreads = []
     for seed in range(40):
         other = augmented(image, True, Draws(seed, 1, 1, 1, 1, 0))

@@ -37,7 +37,7 @@ def scene(seed: int) -> tuple[tuple, tuple, object, object]:
 
 
 @pytest.mark.parametrize("error", [(6.0, 0.0, 0.0), (0.0, -6.0, 0.0), (0.0, 0.0, 0.5)])
-def test_true_poses_cost_least(error: tuple[float, float, float]) -> None:
+def test_losses_are_lowest_at_true_poses(error: tuple[float, float, float]) -> None:
     query, piece, piece_of, poses = scene(0)
     wrong_yaws = poses[:, 2:] + 2.0
     shifted = poses + torch.tensor(error)
@@ -49,14 +49,14 @@ def test_true_poses_cost_least(error: tuple[float, float, float]) -> None:
     assert local_loss(query, piece, piece_of, poses, SEEN) < local_loss(query, piece, piece_of, shifted, SEEN)
 
 
-def test_other_map_costs_more() -> None:
+def test_losses_are_higher_on_another_map() -> None:
     query, piece, piece_of, poses = scene(1)
     other = 1 - piece_of
     assert place_loss(query, piece, piece_of, poses) < place_loss(query, piece, other, poses)
     assert local_loss(query, piece, piece_of, poses, SEEN) < local_loss(query, piece, other, poses, SEEN)
 
 
-def test_what_was_not_seen_costs_nothing() -> None:
+def test_unseen_cells_add_no_loss() -> None:
     query, piece, piece_of, poses = scene(2)
     local = query[0].clone()
     local[..., : QUERY // 2] = 0.0
@@ -71,7 +71,7 @@ def test_what_was_not_seen_costs_nothing() -> None:
     assert float(local_loss(query, piece, piece_of, poses, (nothing, SEEN[1]))) == 0.0
 
 
-def test_turning_is_counter_clockwise_from_columns_to_rows() -> None:
+def test_rotation_is_counter_clockwise_from_columns_to_rows() -> None:
     image = torch.zeros(1, 1, 9, 9)
     image[0, 0, 4, 8] = 1.0  # on the x axis
     turned = turn(image, torch.tensor([np.pi / 2], dtype=torch.float32))

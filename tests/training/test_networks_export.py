@@ -18,7 +18,7 @@ from coview_stream.errors import InputError
 from coview_stream.training.networks import PlaceNet, encoder, export
 
 
-def test_the_card_names_the_files(tmp_path: Path) -> None:
+def test_exported_card_names_each_weights_file(tmp_path: Path) -> None:
     net = PlaceNet(width=4).eval()
     card = {"steps": 7}
     written = export(net, tmp_path, card)

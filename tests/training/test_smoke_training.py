@@ -18,6 +18,7 @@ from coview_stream.errors import InputError
 from coview_stream.training.train import SMOKE, train_session
 
 
+@pytest.mark.slow
 def test_smoke_training_learns_to_find_places(tmp_path: Path) -> None:
     card = train_session(tmp_path, SMOKE)
     assert card["loss"]["last"] < 0.6 * card["loss"]["first"]
@@ -30,7 +31,7 @@ def test_smoke_training_learns_to_find_places(tmp_path: Path) -> None:
         assert (features.sigma > 0).all()
 
 
-def test_what_is_there_of_another_training_is_refused(tmp_path: Path) -> None:
+def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
     """Where a training of one step has been, another seed, width or recipe does not go on with it."""
     short = replace(SMOKE, worlds=1, most=2, training=replace(SMOKE.training, steps=1, pieces=1))
     train_session(tmp_path, short)
@@ -45,7 +46,7 @@ def test_what_is_there_of_another_training_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "options", [["--first-world", "18999"], ["--first-world", "20000"], ["--first-world", "-5"]]
 )
-def test_worlds_held_out_cannot_be_trained_on(
+def test_held_out_worlds_are_refused_for_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:
     assert main(["train", str(tmp_path), "--smoke", *options]) == 2
@@ -54,7 +55,7 @@ def test_worlds_held_out_cannot_be_trained_on(
 
 
 @pytest.mark.parametrize("options", [["--worlds", "0"], ["--steps", "0"], ["--seed", "-1"]])
-def test_numbers_that_make_no_training_are_refused_at_once(
+def test_invalid_training_settings_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:
     assert main(["train", str(tmp_path), "--smoke", *options]) == 2

@@ -48,7 +48,7 @@ def in_one_go(rng, recipe, caster, ground, path, sensor, porosity):
     return voxel_grid(cloud, VOXEL), np.array([*T[-1, :2, 3], yaw])
 
 
-def test_submaps_are_bit_identical_to_those_made_in_one_go() -> None:
+def test_submaps_from_frames_equal_submaps_cast_at_once() -> None:
     world = draw_world(SEED, TINY)
     rng = np.random.default_rng([SEED, 2])
     caster = Caster(world.now, threads=1, leaf_depth=TINY.draw(rng, "leaf_depth"))
@@ -99,7 +99,7 @@ class Pool:
         self.shut.append(how)
 
 
-def test_ctrl_c_makes_no_more_worlds(tmp_path, monkeypatch) -> None:
+def test_interrupt_ends_dataset_writing(tmp_path, monkeypatch) -> None:
     pool = Pool()
     monkeypatch.setattr(dataset, "ProcessPoolExecutor", pool)
     with pytest.raises(KeyboardInterrupt):

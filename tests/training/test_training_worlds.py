@@ -54,13 +54,15 @@ def stand(mortality: float) -> Stand:
     return draw_stand(np.random.default_rng(5), recipe, 50.0)
 
 
-def test_views_follow_from_the_seed() -> None:
+@pytest.mark.slow
+def test_views_are_reproducible_from_the_seed() -> None:
     again, other = world_views(3, SMALL), world_views(4, replace(SMALL, submaps=1))
     for name in ("aerial", "queries", "poses", "travelled", "sensor"):
         np.testing.assert_array_equal(getattr(again, name), getattr(small_views(), name))
     assert not np.array_equal(other.aerial, again.aerial)
 
 
+@pytest.mark.slow
 def test_every_sensor_sees_the_forest() -> None:
     views = small_views()
     assert sorted(views.sensor) == sorted(SMALL.sensors)
@@ -73,8 +75,9 @@ def test_every_sensor_sees_the_forest() -> None:
     assert (np.abs(views.poses[:, :2]) <= 20.0 + 1e-6).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", BARE.sensors)
-def test_label_lays_the_query_stems_on_the_trees(sensor: str) -> None:
+def test_label_pose_aligns_query_stems_with_map_trees(sensor: str) -> None:
     recipe, seed = replace(BARE, sensors=(sensor,), submaps=2), 11
     trees = draw_stand_of(seed, recipe).trees
     world = draw_world(seed, recipe)
@@ -100,7 +103,7 @@ def draw_stand_of(seed: int, recipe: Recipe) -> Stand:
     return draw_stand(rng, recipe, recipe.size[0] / 2 + 8.0)
 
 
-def test_mortality_makes_the_epochs_differ() -> None:
+def test_tree_mortality_makes_epochs_differ() -> None:
     alike, different = stand(0.0), stand(0.3)
     np.testing.assert_array_equal(alike.mapped.solid.vertices, alike.now.solid.vertices)
     mapped, now = (len(epoch.foliage.triangles) for epoch in (different.mapped, different.now))
@@ -112,14 +115,14 @@ def test_mortality_makes_the_epochs_differ() -> None:
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_patterns_have_the_density_that_was_asked_for(pattern: str) -> None:
+def test_stem_patterns_have_the_requested_density(pattern: str) -> None:
     counts = [len(draw_stems(np.random.default_rng(k), pattern, 500.0, 60.0)) for k in range(4)]
     assert 0.5 * 720 < np.mean(counts) < 1.1 * 720
     xy = draw_stems(np.random.default_rng(0), pattern, 500.0, 60.0)
     assert np.abs(xy).max() <= 60.0
 
 
-def test_paths_keep_off_the_trees() -> None:
+def test_paths_keep_clearance_from_trees() -> None:
     rng = np.random.default_rng(0)
     obstacles = np.column_stack([rng.uniform(-60, 60, (500, 2)), rng.uniform(0.1, 1.5, 500)])
     for k in range(5):
@@ -131,7 +134,7 @@ def test_paths_keep_off_the_trees() -> None:
     assert len(between_trees(rng, np.zeros((0, 3)), 30.0, 15.0)) == 151
 
 
-def test_inclined_sensor_turns() -> None:
+def test_inclined_sensor_rotates() -> None:
     sensor = trained_sensor("vlp16-inclined")
     first, half = sensor.beams(0), sensor.beams(10)  # half a turn later
     np.testing.assert_allclose(half, first * (-1, -1, 1), atol=1e-9)
@@ -144,7 +147,8 @@ def test_inclined_sensor_turns() -> None:
     assert set.union(*columns) == set(map(tuple, trained_sensor("vlp16").beams(0)))
 
 
-def test_files_hold_what_was_drawn(tmp_path) -> None:
+@pytest.mark.slow
+def test_world_files_round_trip(tmp_path) -> None:
     recipe = replace(SMALL, submaps=1)
     told = []
     paths = write_dataset(tmp_path / "views", [3], recipe, 1, lambda seed, seconds: told.append(seed))
@@ -160,7 +164,8 @@ def test_files_hold_what_was_drawn(tmp_path) -> None:
     assert not list((tmp_path / "views").glob("*.part"))
 
 
-def test_built_worlds_are_driven_along_streets(tmp_path) -> None:
+@pytest.mark.slow
+def test_urban_worlds_are_driven_along_streets(tmp_path) -> None:
     recipe = replace(SMALL, built=1.0, kinds=("village",), submaps=1)
     write_world(tmp_path / "village.npz", 1, recipe)
     views = read_world(tmp_path / "village.npz")
@@ -168,7 +173,7 @@ def test_built_worlds_are_driven_along_streets(tmp_path) -> None:
     assert (views.queries[0, :-3] > 0).any()
 
 
-def test_other_files_are_refused(tmp_path) -> None:
+def test_files_of_other_kinds_are_refused(tmp_path) -> None:
     np.savez(tmp_path / "other.npz", aerial=np.zeros(3))
     for name in ("other.npz", "missing.npz"):
         with pytest.raises(InputError, match=name):
@@ -187,6 +192,6 @@ def test_other_files_are_refused(tmp_path) -> None:
         {"submaps": 0},
     ],
 )
-def test_recipes_are_validated(wrong: dict) -> None:
+def test_invalid_recipes_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         Recipe(**wrong)

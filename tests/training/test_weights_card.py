@@ -5,25 +5,25 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 
-from coview_stream.descriptors.network import CARD, VIEW_NAMES, file_sha256, shipped, weights_name
+from coview_stream.descriptors.network import CARD, VIEW_NAMES, file_sha256, weights_directory, weights_name
 from coview_stream.training.train import USUAL
 
-CARD_TEXT = json.loads((shipped() / CARD).read_text())
+CARD_TEXT = json.loads((weights_directory() / CARD).read_text())
 
 
-def test_weights_are_those_of_the_card_and_take_five_megabytes_at_most() -> None:
-    files = [shipped() / weights_name(view) for view in VIEW_NAMES]
+def test_weights_match_card_hashes_and_size_limit() -> None:
+    files = [weights_directory() / weights_name(view) for view in VIEW_NAMES]
     assert {path.name: file_sha256(path) for path in files} == CARD_TEXT["sha256"]
     assert sum(path.stat().st_size for path in files) <= 5_000_000
 
 
-def test_the_card_says_what_the_command_would_do() -> None:
+def test_card_recipe_matches_train_command() -> None:
     assert CARD_TEXT["plan"] == json.loads(json.dumps(asdict(USUAL)))
     assert CARD_TEXT["command"].startswith("coview-stream train")
     assert CARD_TEXT["data_sha256"]
 
 
-def test_the_card_tells_how_well_they_did_on_worlds_held_out() -> None:
+def test_card_reports_recall_on_held_out_worlds() -> None:
     judged = CARD_TEXT["validation"]
     assert judged["worlds"] == USUAL.validation
     assert judged["queries"] == USUAL.validation * USUAL.most

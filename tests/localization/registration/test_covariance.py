@@ -29,13 +29,13 @@ FLOOR = np.array([CONFIG.sigma_floor_angle] * 3 + [CONFIG.sigma_floor] * 3)
 # ---- orders and motions
 
 
-def test_the_reports_order_is_the_same_covariance():
+def test_swap_rotation_translation_reorders_the_same_covariance():
     C = np.arange(36.0).reshape(6, 6)
     np.testing.assert_array_equal(swap_rotation_translation(swap_rotation_translation(C)), C)
     assert swap_rotation_translation(C)[0, 3] == C[3, 0]
 
 
-def test_an_error_in_heading_becomes_one_in_place_further_on():
+def test_propagated_heading_error_becomes_position_error():
     """Each of many poses drawn from a covariance drives 10 m ahead: their spread is the covariance carried along."""
     sigma = np.radians([0.1, 0.2, 1.0])
     C = np.diag([*sigma**2, 0.02**2, 0.03**2, 0.01**2])
@@ -69,18 +69,18 @@ def widened(sigma):
     return sigma * np.hypot(1.0, sigma / CONFIG.weak_from)
 
 
-def test_what_the_map_shows_well_is_inflated_and_floored():
+def test_well_observed_directions_are_inflated_and_floored():
     sigma = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
     found = registration_covariance(information_of(sigma), CONFIG)
     np.testing.assert_allclose(found, np.diag(sigma**2 + FLOOR**2), rtol=5e-3)
 
 
-def test_no_certainty_is_below_the_floor():
+def test_covariance_is_never_below_the_floor():
     found = registration_covariance(1e14 * np.eye(6), CONFIG)
     np.testing.assert_allclose(np.sqrt(np.diag(found)), FLOOR, rtol=1e-3)
 
 
-def test_a_weak_direction_is_wide_and_its_neighbours_are_not():
+def test_weak_direction_is_widened_alone():
     """Along a tunnel that runs diagonally: the Hessian claims 0.3 m there, which noise in the normals can feign."""
     along = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)
     strong = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
@@ -93,7 +93,7 @@ def test_a_weak_direction_is_wide_and_its_neighbours_are_not():
     assert np.sqrt(found[2, 2]) < 1.5e-3
 
 
-def test_an_angle_is_weak_by_what_it_moves_at_the_lever():
+def test_angle_is_weak_by_displacement_at_the_lever_arm():
     """A degree moves 0.17 m at 10 m, which is weak; a twentieth of that hardly matters."""
     sigma = np.full(6, 0.001)
     sigma[2], sigma[0] = np.radians(1.0), np.radians(0.05)
@@ -105,7 +105,7 @@ def test_an_angle_is_weak_by_what_it_moves_at_the_lever():
 
 
 @pytest.mark.parametrize("weakest", [0.0, -1e-3, 1e-9])
-def test_no_information_is_the_widest_sigma(weakest):
+def test_zero_information_gives_the_max_sigma(weakest):
     """Also where a subtraction has left a little less than nothing."""
     information = information_of([1e-3, 1e-3, 1e-3, 0.01, 0.01, 0.01])
     information[4, 4] = weakest
@@ -114,7 +114,7 @@ def test_no_information_is_the_widest_sigma(weakest):
     assert np.sqrt(found[4, 4]) == pytest.approx(CONFIG.weak_sigma, rel=1e-3)
 
 
-def test_the_less_information_the_wider_without_a_jump():
+def test_sigma_grows_continuously_as_information_falls():
     sigmas = np.geomspace(0.01, 30.0, 60)
     found = [
         np.sqrt(registration_covariance(information_of([1e-3] * 3 + [s, 0.01, 0.01]), CONFIG)[3, 3])
@@ -127,13 +127,13 @@ def test_the_less_information_the_wider_without_a_jump():
 
 
 @pytest.mark.parametrize("bad", [np.eye(5), np.full((6, 6), np.nan)])
-def test_what_is_no_information_is_refused(bad):
+def test_invalid_information_matrix_is_refused(bad):
     with pytest.raises(InputError, match="information"):
         registration_covariance(bad, CONFIG)
 
 
 @pytest.mark.parametrize("name", ["weak_lever", "weak_from", "weak_sigma"])
-def test_settings_are_positive(name):
+def test_covariance_settings_must_be_positive(name):
     with pytest.raises(ConfigError, match=name):
         RegistrationConfig(**{name: 0.0})
 
@@ -155,7 +155,7 @@ def scan(target):
 
 
 @pytest.mark.parametrize("tight", [1.0, 0.1])
-def test_a_registration_without_its_prior_is_the_one_that_had_none(target, scan, tight):
+def test_remove_prior_equals_registration_without_prior(target, scan, tight):
     """The prior is off by centimetres and, at its tightest, knows more than the pairs do."""
     config = RegistrationConfig(inflation=8.0)
     sigma = tight * np.array([0.003, 0.003, 0.005, 0.05, 0.05, 0.05])
@@ -177,7 +177,7 @@ def test_a_registration_without_its_prior_is_the_one_that_had_none(target, scan,
         assert (ratio > 0.1).all()
 
 
-def test_fusing_the_measurement_with_its_prior_gives_the_registration_back():
+def test_remove_prior_is_undone_by_fusing_the_prior():
     """The subtraction is exact where nothing is weak."""
     rng = np.random.default_rng(3)
     A, B = (m @ m.T + 50 * np.eye(6) for m in rng.standard_normal((2, 6, 6)) * 10)
@@ -193,7 +193,7 @@ def test_fusing_the_measurement_with_its_prior_gives_the_registration_back():
     assert np.abs(boxminus(found.T_map_body, measured)).max() < slack
 
 
-def test_where_the_map_says_nothing_the_measurement_says_nothing():
+def test_unobserved_directions_stay_unobserved_after_remove_prior():
     """A bare floor: heading and place come from the prior alone, and must not come back as measured."""
     side = np.arange(-15, 15, 0.25)
     floor = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)

@@ -74,7 +74,7 @@ def pairs(seed=3, count=40):
     return rng.uniform(-5, 5, (count, 3)), rng.uniform(-5, 5, (count, 3)), rng.standard_normal((count, 3))
 
 
-def test_hessian_and_gradient_are_of_our_tangent():
+def test_hessian_and_gradient_match_numerical_derivatives():
     """Against numerical derivatives of the cost, by steps as everyone else here takes them."""
     p, q, n = pairs()
 
@@ -95,7 +95,7 @@ def test_hessian_and_gradient_are_of_our_tangent():
     np.testing.assert_allclose(b, ours.T @ r, rtol=1e-6, atol=1e-6 * np.abs(b).max())
 
 
-def test_the_pull_of_pairs_is_that_of_their_gaps():
+def test_point_to_point_system_matches_its_residuals():
     p, q, _ = pairs()
 
     def gaps(T):
@@ -110,7 +110,7 @@ def test_the_pull_of_pairs_is_that_of_their_gaps():
     np.testing.assert_allclose(b, slope.T @ gaps(TILTED), rtol=1e-6, atol=1e-5)
 
 
-def test_a_move_turns_about_the_pivot_and_shifts_it_along_the_maps_axes():
+def test_retract_rotates_about_the_pivot_and_translates_along_map_axes():
     step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
     there = pivot.retract(TILTED, step, PIVOT)
     gap = transform(there, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
@@ -135,7 +135,7 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
         np.testing.assert_allclose(boxminus(found, TILTED)[:3], wanted[:3], atol=1e-7)
 
 
-def test_without_a_prior_the_step_is_the_pairs():
+def test_step_without_prior_is_that_of_the_pairs():
     A = np.diag([4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
     step, information = pivot.fused_step(A, np.ones(6), TILTED, PIVOT, None)
     np.testing.assert_allclose(step, -1.0 / np.diag(A), rtol=1e-6)
@@ -146,7 +146,7 @@ def test_without_a_prior_the_step_is_the_pairs():
 
 
 @pytest.mark.parametrize("centre", [None, np.zeros(3), np.array([8.0, -5.0, 1.0])])
-def test_a_metre_and_five_degrees_off_both_methods_find_the_same_pose(target, centre):
+def test_gicp_and_trimmed_icp_agree_from_one_metre_and_five_degrees(target, centre):
     scan = scan_of(target)
     start = TRUTH @ exp_se3(np.array([0.01, -0.01, np.radians(5.0), 0.8, -0.6, 0.1]))
     found, other = (
@@ -163,7 +163,7 @@ def test_a_metre_and_five_degrees_off_both_methods_find_the_same_pose(target, ce
     assert np.linalg.eigvalsh(found.information).min() > 1
 
 
-def test_what_the_map_does_not_have_is_trimmed(target):
+def test_points_without_map_counterpart_are_trimmed(target):
     """A quarter of the scan stands in the air, half of that within reach of the walls."""
     scan, rng = scan_of(target), np.random.default_rng(5)
     air = rng.uniform([-12, -12, 0.6], [12, 12, 5], (500, 3)).astype(np.float32)
@@ -179,7 +179,7 @@ def test_what_the_map_does_not_have_is_trimmed(target):
     assert pose_error(found.T_map_source, TRUTH)[0] < 0.03
 
 
-def test_rows_without_numbers_change_nothing(target):
+def test_non_finite_rows_change_nothing(target):
     scan = scan_of(target)
     hole = np.full((7, 3), np.nan, np.float32)
     holed = RegistrationCloud(
@@ -201,7 +201,7 @@ def test_too_few_points_are_refused(target, count):
     assert register(scan, TRUTH, tiny, CONFIG, CONFIG.track) is None
 
 
-def test_a_pose_that_is_none_is_refused(target):
+def test_invalid_initial_pose_is_refused(target):
     with pytest.raises(ValueError, match="finite"):
         register(scan_of(target), np.full((4, 4), np.nan), target, CONFIG, CONFIG.track)
 
@@ -237,7 +237,7 @@ def test_along_a_corridor_the_prior_decides(corridor):
     assert np.abs(gap[[0, 1, 2, 4, 5]]).max() < 0.01
 
 
-def test_what_a_corridor_does_not_show_is_not_measured(corridor):
+def test_corridor_direction_has_no_information(corridor):
     prior = Prior(np.eye(4), np.diag(np.array([0.02, 0.02, 0.02, 0.1, 0.3, 0.3]) ** -2))
     fused = register(inside(corridor), np.eye(4), corridor, CONFIG, (0.4,), prior, np.zeros(3))
     found = remove_prior(fused.T_map_source, fused.information, np.eye(4), prior.information, CONFIG)
@@ -246,7 +246,7 @@ def test_what_a_corridor_does_not_show_is_not_measured(corridor):
     assert sigma[4] < 0.02
 
 
-def test_without_its_prior_a_registration_is_the_one_that_had_none(target):
+def test_remove_prior_equals_gicp_without_prior(target):
     """The prior is off by centimetres and knows as much as the pairs."""
     scan = scan_of(target, TILTED, noise=0.01)
     mean = boxplus(TILTED, np.array([0.001, -0.001, 0.002, 0.03, -0.02, 0.015]))
@@ -265,12 +265,12 @@ def test_without_its_prior_a_registration_is_the_one_that_had_none(target):
 # ---- where it is asked for
 
 
-def test_the_method_is_one_of_two():
+def test_unknown_registration_method_is_refused():
     with pytest.raises(ConfigError, match="trimmed-icp, gicp"):
         RegistrationConfig(method="icp")
 
 
-def test_a_missing_library_is_named(monkeypatch, world_file):
+def test_missing_small_gicp_is_named(monkeypatch, world_file):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     target = local_map(*courtyard())
     with pytest.raises(DependencyError, match=r"small-gicp .*pip install 'small-gicp>="):
@@ -279,7 +279,7 @@ def test_a_missing_library_is_named(monkeypatch, world_file):
         open_engine("track", world_file, "0" * 64, LocalizerConfig(registration=CONFIG))
 
 
-def test_a_crop_is_prepared_for_the_method_that_asks(stand_in):
+def test_local_map_is_prepared_for_the_requested_method(stand_in):
     target = local_map(*courtyard())
     target.prepare()
     assert "surfaces" not in vars(target)
@@ -287,14 +287,14 @@ def test_a_crop_is_prepared_for_the_method_that_asks(stand_in):
     assert vars(target)["surfaces"] is target.surfaces
 
 
-def test_the_search_keeps_to_trimmed_icp(world_map):
+def test_global_search_uses_trimmed_icp(world_map):
     config = LocalizerConfig(registration=replace(CONFIG, keep=0.8))
     search = GlobalSearch(world_map, config, LocalMaps(world_map, 50.0))
     assert search.config.registration == replace(TRIMMED, keep=0.8)
     assert replace(search.config, registration=config.registration) == config
 
 
-def test_a_drive_is_tracked(world_map, world_drive, monkeypatch):
+def test_drive_is_tracked_with_gicp(world_map, world_drive, monkeypatch):
     pytest.importorskip("small_gicp", reason="small_gicp is not installed: pip install 'small-gicp>=1.0.1'")
     inner, calls = gicp.register_surfaces, []
     monkeypatch.setattr(gicp, "register_surfaces", lambda *a, **k: calls.append(1) or inner(*a, **k))

@@ -20,12 +20,12 @@ def test_a_wall_below_the_edge_of_a_roof_is_covered():
     assert edges.covers(wall).all()
 
 
-def test_what_rises_above_the_roof_or_stands_elsewhere_is_not():
+def test_wall_above_roof_or_elsewhere_is_not_covered():
     edges = roof_edges(roof_and_ground())
     others = np.array([[5.0, 0.0, 7.0], [12.0, 0.0, 1.0], [0.0, 0.0, 3.0], [500.0, 0.0, 1.0]])
     # above the roof; in the open; in the middle of the house, where no wall is known; off the crop
     assert not edges.covers(others).any()
 
 
-def test_a_low_kerb_is_no_edge():
+def test_low_kerb_is_not_a_roof_edge():
     assert not roof_edges(roof_and_ground(1.5)).covers(np.array([[5.0, 0.0, 0.5]])).any()

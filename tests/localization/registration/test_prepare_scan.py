@@ -19,7 +19,7 @@ def wall(z=5.0):
     return np.column_stack([np.full(y.size, 10.2), y.ravel(), z + h.ravel()]).astype(np.float32)
 
 
-def test_walls_stand_above_and_the_ground_does_not():
+def test_walls_are_above_ground_and_ground_is_not():
     points = np.concatenate([ground(), wall()])
     height = height_above_lowest(points)
     np.testing.assert_allclose(height[: len(ground())], 0.0, atol=1e-5)
@@ -30,17 +30,17 @@ def test_walls_stand_above_and_the_ground_does_not():
     assert np.abs(source.points[source.above][:, 0] - 10.2).max() < 0.3
 
 
-def test_a_gentle_slope_is_ground():
+def test_gentle_slope_is_ground():
     assert (height_above_lowest(ground(slope=0.08)) < 0.5).all()
 
 
-def test_a_facade_without_ground_below_takes_its_neighbours():
+def test_facade_without_ground_uses_neighbouring_ground():
     floating = wall()[wall()[:, 2] > 7.0]
     height = height_above_lowest(np.concatenate([floating, ground()]))
     np.testing.assert_allclose(height[: len(floating)], floating[:, 2] - 5.0, atol=1e-5)
 
 
-def test_range_and_number_are_limited_and_the_choice_repeats():
+def test_range_and_count_are_limited_deterministically():
     points = ground(half=60.0)
     settings = RegistrationConfig(source_range=20.0, source_points=700, source_voxel=0.5)
     position = np.array([10.0, -5.0, 6.0])
@@ -60,7 +60,7 @@ def test_one_point_per_voxel():
 
 
 @pytest.mark.parametrize("points", [np.empty((0, 3), np.float32), np.full((1, 3), 900, np.float32)])
-def test_nothing_near_is_an_empty_source(points):
+def test_no_near_points_give_empty_registration_cloud(points):
     source = prepare_scan(points, np.zeros(3), RegistrationConfig())
     assert source.points.shape == (0, 3)
     assert len(source.above) == len(source.height) == 0

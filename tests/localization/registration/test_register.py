@@ -54,7 +54,7 @@ def with_outliers(scan, share):
         [-0.03, 0.03, 0.05, 0.3, 1.3, 0.4],
     ],
 )
-def test_a_known_offset_in_six_degrees_of_freedom_is_found(target, scan, offset):
+def test_known_six_dof_offset_is_found(target, scan, offset):
     start = TRUTH @ exp_se3(np.array(offset, float))
     found = register(scan, start, target, CONFIG, CONFIG.search)
     metres, degrees = errors(found.T_map_source)
@@ -66,7 +66,7 @@ def test_a_known_offset_in_six_degrees_of_freedom_is_found(target, scan, offset)
     assert 0 < found.iterations <= CONFIG.iterations * len(CONFIG.search)
 
 
-def test_forty_percent_outliers(target, scan):
+def test_registration_with_forty_percent_outliers(target, scan):
     start = TRUTH @ exp_se3(np.array([0.01, 0.0, 0.06, 0.8, -0.7, 0.1]))
     metres, degrees = errors(
         register(with_outliers(scan, 0.4), start, target, CONFIG, CONFIG.search).T_map_source
@@ -75,14 +75,14 @@ def test_forty_percent_outliers(target, scan):
     assert degrees < 0.15
 
 
-def test_the_pivot_does_not_change_the_answer(target, scan):
+def test_pivot_does_not_change_the_result(target, scan):
     start = TRUTH @ exp_se3(np.array([0.0, 0.0, 0.05, 0.5, -0.5, 0.1]))
     for centre in (None, np.zeros(3), np.array([8.0, -5.0, 1.0])):
         found = register(scan, start, target, CONFIG, CONFIG.search, centre=centre)
         assert errors(found.T_map_source)[0] < 0.01
 
 
-def test_information_is_symmetric_and_says_where_the_pose_is_sure(target, scan):
+def test_information_is_symmetric_and_reflects_observability(target, scan):
     corner = register(scan, TRUTH, target, CONFIG, (0.4,))
     np.testing.assert_allclose(corner.information, corner.information.T, rtol=1e-4, atol=1e-2)
     assert np.linalg.eigvalsh(corner.information).min() > 1
@@ -92,13 +92,13 @@ def test_information_is_symmetric_and_says_where_the_pose_is_sure(target, scan):
     assert floor.information[[0, 1, 5], [0, 1, 5]].min() > 1e4 * floor.information[[2, 3, 4], [2, 3, 4]].max()
 
 
-def test_empty_surroundings_are_refused(target, scan):
+def test_empty_local_map_gives_no_registration(target, scan):
     assert register(scan, pose_from(np.eye(3), [500, 0, 0]), target, CONFIG, (1.0,)) is None
     few = RegistrationCloud(scan.points[:20], scan.above[:20], scan.height[:20])
     assert register(few, TRUTH, target, CONFIG, (1.0,)) is None
 
 
-def test_a_prior_decides_where_the_map_cannot():
+def test_prior_decides_unobserved_directions():
     """On a bare plane heading and place are free: alone they stay, a prior pulls them."""
     flat = local_map(*parts(plane([-15, -15, 0], [30, 0, 0], [0, 30, 0])))
     scan = source_of(flat.points[::7], np.eye(4))
@@ -114,14 +114,14 @@ def test_a_prior_decides_where_the_map_cannot():
     assert rotation_angle(pulled.T_map_source) < 1e-3
 
 
-def test_a_weak_prior_does_not_outweigh_the_map(target, scan):
+def test_weak_prior_does_not_outweigh_the_map(target, scan):
     wrong = TRUTH @ exp_se3(np.array([0, 0, 0.02, 0.3, 0.3, 0]))
     weak = Prior(wrong, np.diag(np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]) ** -2))
     found = register(scan, wrong, target, CONFIG, CONFIG.search, weak)
     assert errors(found.T_map_source)[0] < 0.02
 
 
-def test_every_nth_keeps_both_kinds(scan):
+def test_thinning_keeps_ground_and_structure_points(scan):
     thin = scan.every(3)
     assert len(thin.points) == -(-len(scan.points) // 3)
     assert thin.above.mean() == pytest.approx(scan.above.mean(), abs=0.01)
@@ -140,7 +140,7 @@ class FakeMap:
         return self.cloud[0][near], self.cloud[1][near]
 
 
-def test_local_maps_hold_all_within_the_radius_and_are_kept(target):
+def test_local_maps_hold_all_points_within_radius_and_are_cached(target):
     fake = FakeMap(target.points, target.normals)
     maps = LocalMaps(fake, radius=6.0)
     for position in np.random.default_rng(3).uniform(-12, 12, (30, 3)):
@@ -152,7 +152,7 @@ def test_local_maps_hold_all_within_the_radius_and_are_kept(target):
     assert len(fake.asked) == len({centre for centre, _ in fake.asked}) <= 9
 
 
-def test_local_maps_forget_the_oldest(target):
+def test_local_map_cache_drops_the_oldest(target):
     fake = FakeMap(target.points, target.normals)
     maps = LocalMaps(fake, radius=6.0)
     for x in range(0, 16 * 40, 16):
@@ -162,13 +162,13 @@ def test_local_maps_forget_the_oldest(target):
     assert len(fake.asked) == 41
 
 
-def test_nothing_around_is_none(target):
+def test_local_map_without_points_is_none(target):
     maps = LocalMaps(FakeMap(target.points, target.normals), radius=6.0)
     assert maps.around(np.array([900.0, 0.0, 0.0])) is None
     assert maps.around(np.array([901.0, 0.0, 0.0])) is None
 
 
-def test_points_move_with_the_pose(target, scan):
+def test_T_map_source_maps_scan_points_into_map(target, scan):
     """The scan's points, moved by the truth, are map points: the convention of T_map_source."""
     distance, _ = kernels.nearest(target.grid, transform(TRUTH, scan.points), 1.0)
     assert distance.max() < 1e-3

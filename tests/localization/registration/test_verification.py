@@ -44,7 +44,7 @@ def seen(world_map, world_drive):
     return evidence
 
 
-def test_the_right_pose_scores_high(seen):
+def test_true_pose_scores_high(seen):
     right = seen()
     assert right.score > 0.7
     assert right.near > 0.9
@@ -56,11 +56,11 @@ def test_the_right_pose_scores_high(seen):
 @pytest.mark.parametrize(
     "offset", [(3, 0, 0), (-2, -2, 0), (0, 5, 0), (0, 0, 15), (0, 0, 180), (0, 0, -90), (9, 7, 40)]
 )
-def test_a_wrong_pose_scores_low(seen, offset):
+def test_wrong_pose_scores_low(seen, offset):
     assert seen(*offset).score < 0.6 * seen().score
 
 
-def test_all_evidence_is_a_share(seen):
+def test_all_evidence_is_between_zero_and_one(seen):
     for offset in ((0, 0, 0), (4, 4, 90), (25, 0, 0)):
         found = seen(*offset)
         assert all(0.0 <= value <= 1.0 for value in vars(found).values())
@@ -87,28 +87,28 @@ WALL = parts(plane([10, -2, 1], [0, 4, 0], [0, 0, 1.5]))[0]
 BODY = pose_from(np.eye(3), [0, 0, 1.5])
 
 
-def test_rays_that_end_at_the_wall_met_it():
+def test_rays_ending_at_the_wall_hit_it():
     met, passed = free_space(RangeImage.of(fan(10.2)), BODY, WALL)
     assert passed == 0
     assert met > 0.9 * len(WALL)
 
 
-def test_rays_that_end_behind_the_wall_passed_through_it():
+def test_rays_ending_behind_the_wall_pass_through_it():
     met, passed = free_space(RangeImage.of(fan(25.0)), BODY, WALL)
     assert met == 0
     assert passed > 0.5 * len(WALL)
 
 
-def test_a_wall_behind_the_returns_is_hidden():
+def test_wall_behind_returns_is_occluded():
     assert free_space(RangeImage.of(fan(4.0)), BODY, WALL) == (0, 0)
 
 
-def test_where_no_ray_went_nothing_is_said():
+def test_directions_without_rays_give_no_evidence():
     assert free_space(RangeImage.of(fan(25.0)), pose_from(rot_z(np.pi), [0, 0, 1.5]), WALL) == (0, 0)
     assert free_space(RangeImage.of(fan(25.0)), pose_from(np.eye(3), [-40, 0, 1.5]), WALL) == (0, 0)
 
 
-def test_the_heading_of_the_robot_counts():
+def test_free_space_uses_robot_heading():
     """Body x ahead: a robot that looks along +y meets a wall that stands at +y."""
     turned = transform(pose_from(rot_z(np.pi / 2), [0, 0, 0]), WALL)
     met, passed = free_space(RangeImage.of(fan(10.2)), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
@@ -120,7 +120,7 @@ def test_the_heading_of_the_robot_counts():
     )
 
 
-def test_little_structure_proves_nothing():
+def test_little_structure_scores_low():
     field = parts(
         plane([-20, -20, 0], [40, 0, 0], [0, 40, 0], 0.5), plane([5, 0, 0], [0, 1, 0], [0, 0, 2], 0.5)
     )
@@ -134,7 +134,7 @@ def test_little_structure_proves_nothing():
     assert sparse.score == 0.0
 
 
-def test_points_off_the_survey_do_not_count(seen):
+def test_points_outside_surveyed_cells_are_ignored(seen):
     target = local_map(
         *parts(plane([-20, -20, 0], [40, 0, 0], [0, 40, 0]), plane([9, -9, 0], [0, 18, 0], [0, 0, 4]))
     )
@@ -149,7 +149,7 @@ def test_points_off_the_survey_do_not_count(seen):
     assert found.inside == 0.5
 
 
-def test_a_dense_frame_is_judged_by_a_part_of_it(monkeypatch):
+def test_dense_frame_is_verified_by_a_sample(monkeypatch):
     cloud = np.repeat(fan(10.2), 9, axis=0)
     whole = free_space(RangeImage.of(cloud), BODY, WALL)
     monkeypatch.setattr(rays, "_MAX_RAYS", len(fan(10.2)) * 3)
@@ -158,5 +158,5 @@ def test_a_dense_frame_is_judged_by_a_part_of_it(monkeypatch):
     assert free_space(part, BODY, WALL) == whole
 
 
-def test_a_frame_without_points_has_no_rays():
+def test_empty_frame_has_no_rays():
     assert free_space(RangeImage.of(np.empty((0, 3), np.float32)), BODY, WALL) == (0, 0)

@@ -11,11 +11,11 @@ from coview_stream.config import AcceptanceConfig, LocalizerConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.result import State
 from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.refinement import Candidate
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), dtype=np.float32)
@@ -41,7 +41,7 @@ def keyframes_needed(*candidates: Candidate) -> int | None:
     return None
 
 
-def test_a_place_that_features_favour_needs_less_proof_but_all_confirmations() -> None:
+def test_learned_support_lowers_evidence_sum_but_not_confirmations() -> None:
     alone = keyframes_needed(candidate(WEAK))
     favoured = keyframes_needed(candidate(WEAK, lead=1.0))
     assert alone is not None
@@ -50,7 +50,7 @@ def test_a_place_that_features_favour_needs_less_proof_but_all_confirmations() -
     assert keyframes_needed(candidate(0.9, lead=100.0)) == RULE.confirmations
 
 
-def test_what_lies_off_the_map_proves_nothing() -> None:
+def test_candidate_partly_off_the_map_needs_more_keyframes() -> None:
     """At the map's edge a few points may fit anywhere: the fewer lie on it, the more keyframes are needed."""
     shares = [RULE.full_overlap, 0.75 * RULE.full_overlap, RULE.min_overlap]
     needed = [keyframes_needed(candidate(0.45, inside=share)) for share in shares]
@@ -60,27 +60,27 @@ def test_what_lies_off_the_map_proves_nothing() -> None:
 
 
 @pytest.mark.parametrize("lead", [0.0, -1.0])
-def test_votes_that_do_not_lead_add_nothing(lead: float) -> None:
+def test_learned_votes_without_lead_add_no_support(lead: float) -> None:
     assert keyframes_needed(candidate(WEAK, lead=lead)) == keyframes_needed(candidate(WEAK))
 
 
-def test_votes_for_another_place_add_nothing() -> None:
+def test_learned_votes_for_another_place_add_no_support() -> None:
     other = candidate(0.1, ELSEWHERE, lead=1.0)
     assert keyframes_needed(candidate(WEAK), other) == keyframes_needed(candidate(WEAK))
 
 
-def test_votes_for_this_place_count_whoever_named_it_first() -> None:
+def test_learned_votes_count_for_place_named_by_coview() -> None:
     twin = candidate(WEAK - 0.01, lead=1.0)
     assert keyframes_needed(candidate(WEAK), twin) == keyframes_needed(candidate(WEAK, lead=1.0))
 
 
-def test_votes_never_make_a_place_true_that_does_not_fit() -> None:
+def test_learned_votes_do_not_accept_a_poor_fit() -> None:
     assert keyframes_needed(candidate(RULE.learned_score - 0.02, lead=100.0)) is None
     assert keyframes_needed(candidate(WEAK, lead=100.0), candidate(WEAK - 0.05, ELSEWHERE)) is None
     assert keyframes_needed(candidate(WEAK, lead=100.0, inside=RULE.min_overlap - 0.02)) is None
 
 
-def test_a_lower_score_is_enough_only_where_features_favour_the_place_clearly() -> None:
+def test_lower_score_is_accepted_only_with_clear_learned_lead() -> None:
     low = RULE.score - 0.03
     assert keyframes_needed(candidate(low)) is None
     assert keyframes_needed(candidate(low, lead=0.9 * RULE.learned_lead)) is None
@@ -89,7 +89,7 @@ def test_a_lower_score_is_enough_only_where_features_favour_the_place_clearly() 
     assert needed > RULE.confirmations
 
 
-def test_one_scan_alone_gains_nothing_by_votes() -> None:
+def test_single_scan_gets_no_learned_support() -> None:
     decision = AcceptanceTest(replace(LocalizerConfig(), stationary=True))
     verdict = decision.judge([candidate(RULE.single_score - 0.02, lead=100.0)], QUERY, 1)
     assert verdict.evidence.state is State.SEARCHING

@@ -68,7 +68,7 @@ def test_consensus_is_right_where_every_single_minimum_is_wrong(voted):
     assert consensus.scores()[visited[-1], SHIFT] == pytest.approx(best.score, rel=1e-3)
 
 
-def test_the_single_minimum_is_wrong_there(voted):
+def test_single_minimum_mode_returns_the_wrong_minimum_there(voted):
     consensus, visited = voted
     single = Consensus(consensus.stations, BLOCK, ConsensusConfig(mode="single"))
     for k, (station, centre) in enumerate(zip(visited, centres(single.stations, visited), strict=True)):
@@ -77,7 +77,7 @@ def test_the_single_minimum_is_wrong_there(voted):
     assert (only.station, only.shift) in [(11 + 17 * k, 5 + k) for k in range(5)]
 
 
-def test_the_single_minimum_needs_no_more_than_the_nearest_stations(voted):
+def test_single_minimum_mode_uses_nearest_stations_only(voted):
     consensus, visited = voted
     config = ConsensusConfig(mode="single")
     by_volume, by_nearest = (Consensus(consensus.stations, BLOCK, config) for _ in range(2))
@@ -92,26 +92,26 @@ def test_the_single_minimum_needs_no_more_than_the_nearest_stations(voted):
     np.testing.assert_array_equal(found.T_map_odom, expected.T_map_odom)
 
 
-def test_the_hypothesis_is_T_map_odom_however_far_the_odometry_is(voted):
+def test_hypothesis_is_T_map_odom_for_any_odometry_origin(voted):
     """Eq. 12, mended: the yaw turns about the keyframe, not about the odometry's origin."""
     consensus, _ = voted
     np.testing.assert_allclose(consensus.hypotheses()[0].T_map_odom, T_MAP_ODOM, atol=1e-3)
 
 
-def test_a_turn_the_other_way_is_not_confirmed(voted):
+def test_turn_of_opposite_sign_gets_no_consensus(voted):
     """With the yaw's sign swapped the keyframes' votes would miss each other."""
     consensus, visited = voted
     scores = consensus.scores()
     assert scores[visited[-1], SHIFT] < scores[visited[-1], S - SHIFT] - 3.0
 
 
-def test_yaw_of_shift():
+def test_yaw_of_shift_matches_equation_9():
     assert yaw_of_shift(0, 60) == 0.0
     assert yaw_of_shift(15, 60) == pytest.approx(-np.pi / 2)
     np.testing.assert_allclose(yaw_of_shift(np.array([1, 2]), 12), [-np.pi / 6, -np.pi / 3])
 
 
-def test_a_missing_station_has_no_opinion():
+def test_missing_station_gets_neutral_score():
     whole = grid_stations()
     visited = [station_at(whole, (-5 + 2 * k, 3)) for k in range(4)]
     where = centres(whole, visited)
@@ -133,7 +133,7 @@ def test_a_missing_station_has_no_opinion():
     )
 
 
-def test_the_map_does_not_wrap_around_its_edges():
+def test_votes_do_not_wrap_around_map_edges():
     stations = grid_stations()
     grid = StationGrid(stations, BLOCK)
     for step in ([3, 0], [0, 3], [-4, 0], [0, -5], [2, -1], [-50, 0], [0, 1000], [0, 0]):
@@ -144,7 +144,7 @@ def test_the_map_does_not_wrap_around_its_edges():
             assert found[m] == (there[0] if len(there) else -1)
 
 
-def test_values_are_added_a_step_farther_on_in_either_layout():
+def test_grid_and_lookup_layouts_give_the_same_shifted_sum():
     """Stations of a ragged site; a layout on cells and a look-up each are the same sum."""
     rng = np.random.default_rng(5)
     stations = grid_stations(9)[rng.permutation(81)[:60]]
@@ -176,7 +176,7 @@ def test_few_stations_on_a_wide_grid_are_no_raster(kind):
 
 @pytest.mark.parametrize("count", [1, 7, 4000, 9999, 10_000, 20_000])
 @pytest.mark.parametrize("kind", ["normal", "ties", "few", "rising"])
-def test_smallest_is_a_stable_sort(kind, count, monkeypatch):
+def test_argsmallest_equals_stable_sort(kind, count, monkeypatch):
     monkeypatch.setattr("coview_stream.localization.search.consensus._SAMPLE", 100)
     rng = np.random.default_rng(6)
     values = {
@@ -188,7 +188,7 @@ def test_smallest_is_a_stable_sort(kind, count, monkeypatch):
     np.testing.assert_array_equal(argsmallest(values, count), np.argsort(values, kind="stable")[:count])
 
 
-def test_storeys_are_told_apart_by_the_height_gained():
+def test_storeys_are_distinguished_by_height_gained():
     low, high = grid_stations(4), grid_stations(4, z=4.0)
     stations = np.concatenate([low, high[:8]])
     grid = StationGrid(stations, BLOCK)
@@ -225,7 +225,7 @@ def test_headings_are_compared_around_the_circle():
     assert [(h.station, h.shift) for h in consensus.hypotheses()] == [(here, 0), (far, 6)]
 
 
-def test_the_window_and_clear(voted):
+def test_consensus_window_is_bounded_and_clear_empties_it(voted):
     consensus, visited = voted
     assert len(consensus) == 5
     for k in range(20):
@@ -236,7 +236,7 @@ def test_the_window_and_clear(voted):
     assert consensus.hypotheses() == []
 
 
-def test_channels_count_alike_whatever_their_spread():
+def test_channels_have_equal_weight_for_any_spread():
     stations = grid_stations()
     consensus = Consensus(stations, BLOCK, CONFIG)
     rng = np.random.default_rng(3)
@@ -248,7 +248,7 @@ def test_channels_count_alike_whatever_their_spread():
     assert (best.station, best.shift) == (40, 6)
 
 
-def test_standardised_is_robust():
+def test_robust_zscore_ignores_outliers():
     values = np.random.default_rng(1).normal(5.0, 2.0, (300, 60)).astype(np.float32)
     values[0] = -500.0
     z = robust_zscore(values)[1:]

@@ -23,12 +23,12 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.result import State
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 from coview_stream.localization.search.refinement import Candidate, gravity_information
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
+from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
 KEYFRAME = Keyframe(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), np.empty((0, 3), np.float32))
@@ -72,21 +72,21 @@ def judged(search, *keyframes):
 
 
 @pytest.mark.parametrize("share", SHARES)
-def test_every_share_can_contradict_a_pose(share):
+def test_every_evidence_share_lowers_the_score(share):
     perfect = Evidence(1.0, 1.0, 1.0, 1.0, 1.0)
     assert perfect.score == 1.0
     assert replace(perfect, **{share: 0.25}).score == pytest.approx(0.5)
     assert replace(perfect, **{share: 0.0}).score == 0.0
 
 
-def test_to_lie_inside_the_survey_is_no_merit():
+def test_inside_share_does_not_raise_the_score():
     assert Evidence(0.5, 0.5, 1.0, 1.0, 0.1).score == Evidence(0.5, 0.5, 1.0, 1.0, 1.0).score
 
 
 # ---- the judge
 
 
-def test_a_place_that_stands_alone_is_believed_after_enough_keyframes(search):
+def test_unrivalled_place_is_accepted_after_enough_confirmations(search):
     best = candidate(0.7)
     verdicts = judged(search, *[[best, candidate(0.2, moved(20))]] * RULE.confirmations)
     states = [v.evidence.state for v in verdicts]
@@ -113,7 +113,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refused_however_often_it_is_seen(search, case):
+def test_weak_or_rivalled_candidate_is_never_accepted(search, case):
     candidates, state = REFUSED[case]
     for verdict in judged(search, *[candidates] * 3 * RULE.confirmations):
         assert verdict.accepted is None
@@ -130,7 +130,7 @@ ACCEPTED = {
 
 
 @pytest.mark.parametrize("case", ACCEPTED)
-def test_accepted(search, case):
+def test_good_candidate_is_accepted_after_enough_evidence(search, case):
     best = ACCEPTED[case][0]
     proof = int(np.ceil(RULE.evidence_sum / (best.evidence.score - RULE.evidence_floor)))
     accepted = [v.accepted for v in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))]
@@ -144,14 +144,14 @@ def test_accepted(search, case):
     [moved(2 * RULE.agree_distance), moved(0, 2 * np.degrees(RULE.agree_angle)), moved(-30, 90)],
     ids=["elsewhere", "turned", "far"],
 )
-def test_keyframes_that_disagree_confirm_nothing(search, other):
+def test_disagreeing_keyframes_give_no_confirmation(search, other):
     for verdict in judged(search, *[[candidate(0.7, T)] for T in [HERE, other] * RULE.confirmations]):
         assert verdict.accepted is None
         assert verdict.evidence.state is State.AMBIGUOUS
         assert "confirmed by 1 keyframes" in verdict.evidence.reason
 
 
-def test_keyframes_agree_about_the_robot_not_about_the_odometrys_origin(search):
+def test_agreement_is_measured_at_the_robot_not_at_the_odometry_origin(search):
     """Turned about the robot, which is 47 m from the odometry's origin: the origin moves more than is allowed."""
     turned = moved(0.3 * RULE.agree_distance, 0.9 * np.degrees(RULE.agree_angle))
     assert np.linalg.norm((turned - HERE)[:3, 3]) > RULE.agree_distance
@@ -170,14 +170,14 @@ DOUBTFUL = {
 
 
 @pytest.mark.parametrize("case", DOUBTFUL)
-def test_a_doubtful_keyframe_confirms_nothing(search, case):
+def test_weak_keyframe_gives_no_confirmation(search, case):
     good = [candidate(0.7)]
     verdicts = judged(search, *[good] * (RULE.confirmations - 1), *[DOUBTFUL[case]] * RULE.confirmations)
     assert [v.accepted for v in verdicts] == [None] * len(verdicts)
 
 
 @pytest.mark.parametrize("between", [[], [candidate(0.7, moved(20))]], ids=["nothing", "elsewhere"])
-def test_a_keyframe_that_contradicts_starts_the_count_anew(search, between):
+def test_contradicting_keyframe_resets_confirmations(search, between):
     good = [candidate(0.7)]
     count = RULE.confirmations - 1
     verdicts = judged(search, *[good] * count, between, *[good] * count, good)
@@ -185,21 +185,21 @@ def test_a_keyframe_that_contradicts_starts_the_count_anew(search, between):
     assert verdicts[-1].accepted is good[0]
 
 
-def test_clear_forgets_confirmations(search):
+def test_clear_resets_confirmations(search):
     good = [candidate(0.7)]
     judged(search, *[good] * (RULE.confirmations - 1))
     search.clear()
     assert judged(search, good)[0].accepted is None
 
 
-def test_no_candidate_at_all(search):
+def test_no_candidate_means_searching(search):
     (verdict,) = judged(search, [])
     assert verdict.accepted is None
     assert verdict.evidence.state is State.SEARCHING
     assert verdict.evidence.score == 0.0
 
 
-def test_one_scan_alone_must_lead_by_more(stationary):
+def test_single_scan_needs_a_larger_lead(stationary):
     """The default of one frame alone: accepted at once, but only far ahead of every rival."""
     assert RULE.single_lead >= 0.2
     assert judged(stationary, [candidate(0.7)])[0].accepted is not None
@@ -225,7 +225,8 @@ def twin_map(map_points, tmp_path_factory):
     return BaseMap.build(path, radius=30.0)
 
 
-def test_one_scan_alone_is_refused_where_two_places_are_equal(world_map, twin_map, world_drive):
+@pytest.mark.slow
+def test_single_scan_is_refused_between_two_equal_places(world_map, twin_map, world_drive):
     config = LocalizerConfig(stationary=True)
     scan = world_drive.clouds[2], world_drive.T_odom_body[2], 0.0
     alone = Localizer(world_map, config).step(*scan)
@@ -246,7 +247,7 @@ def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM):
         yield SearchRequest.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, RequestSpec(descriptor))
 
 
-def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive, monkeypatch):
+def test_good_candidate_is_tried_again_without_votes(search, world_drive, monkeypatch):
     frames = run_of(world_drive, 3)
     assert search.update(next(frames)).evidence.score > 0.8
     monkeypatch.setattr(search.coview.consensus, "hypotheses", list)
@@ -257,14 +258,14 @@ def test_what_was_good_is_tried_again_whatever_the_votes_say(search, world_drive
     assert search.update(next(frames)).evidence.score == 0.0
 
 
-def test_the_papers_rule_asks_for_the_nearest_stations_only(search, world_drive, monkeypatch):
+def test_single_minimum_mode_uses_nearest_stations_only(search, world_drive, monkeypatch):
     single = replace(search.config, consensus=ConsensusConfig(mode="single"))
     paper = GlobalSearch(search.base_map, single, search.local_maps)
     monkeypatch.setattr(paper.coview.retrieval, "distances", None)
     assert paper.update(next(run_of(world_drive, 1))).evidence.score > 0.8
 
 
-def test_what_was_bad_is_not_tried_again(search, world_drive, monkeypatch):
+def test_bad_candidate_is_not_tried_again(search, world_drive, monkeypatch):
     frames = run_of(world_drive, 2)
     wrong = Hypothesis(T_MAP_ODOM @ pose_from(rot_z(2.0), [9.0, -14.0, 0.0]), 0, 0, 0.0)
     monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [wrong])
@@ -295,7 +296,7 @@ def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, ma
     return search.update(next(run_of(world_drive, 1, leaning)))
 
 
-def test_gravity_holds_the_search_upright(world_map, world_drive, monkeypatch):
+def test_gravity_prior_keeps_candidates_upright(world_map, world_drive, monkeypatch):
     def found(sigma_degrees):
         verdict = with_leaning_odometry(world_map, world_drive, monkeypatch, np.radians(sigma_degrees), 1.0)
         return tilt_of(verdict.accepted.T_map_odom)
@@ -304,12 +305,12 @@ def test_gravity_holds_the_search_upright(world_map, world_drive, monkeypatch):
     assert found(0.01) < 0.3 * TILT
 
 
-def test_gravity_says_nothing_of_heading_and_place():
+def test_gravity_prior_has_no_heading_or_position_information():
     np.testing.assert_allclose(gravity_information(0.02), np.diag([2500.0, 2500.0, 0, 0, 0, 0]))
 
 
 @pytest.mark.parametrize("limit", [2.0, 0.5])
-def test_what_tilts_more_than_the_limit_is_no_candidate(world_map, world_drive, monkeypatch, limit):
+def test_candidate_tilted_beyond_limit_is_dropped(world_map, world_drive, monkeypatch, limit):
     verdict = with_leaning_odometry(world_map, world_drive, monkeypatch, np.radians(30.0), limit * TILT)
     assert (verdict.evidence.score > 0.5) == (limit > 1)
     assert (verdict.accepted is not None) == (limit > 1)

@@ -15,27 +15,29 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.result import State
 from coview_stream.localization.search import pose_hints as suggestions
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.pose_hints import HintSchedule, PoseHints
 from coview_stream.localization.search.request import same_place
+from coview_stream.localization.state import State
 
 # ---- what a localizer keeps
 
 
-def test_kept_until_a_place_is_accepted_or_reset(world_map, world_drive):
+def test_hint_is_kept_until_accepted_or_reset(world_map, world_drive):
     localizer = Localizer(world_map)
-    localizer.suggest(world_drive.T_map_body[0])
-    queries = [localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)]
-    assert [len(q.suggested) for q in queries] == [1, 1]
-    np.testing.assert_array_equal(queries[0].suggested, queries[1].suggested)
+    localizer.hint_pose(world_drive.T_map_body[0])
+    queries = [
+        localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)
+    ]
+    assert [len(q.hints) for q in queries] == [1, 1]
+    np.testing.assert_array_equal(queries[0].hints, queries[1].hints)
     localizer.reset()
-    assert localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0).suggested == ()
-    localizer.suggest(world_drive.T_map_body[0] @ BESIDE)
+    assert localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0).hints == ()
+    localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
     assert follow(localizer, world_drive, 4, 1)[-1].state is State.TRACKING
     assert localizer._suggested(np.eye(4)) == ()
-    localizer.suggest(world_drive.T_map_body[0])  # now it knows better
+    localizer.hint_pose(world_drive.T_map_body[0])  # now it knows better
     assert localizer._suggested(np.eye(4)) == ()
 
 
@@ -52,16 +54,17 @@ def lost(world_map, world_drive):
     return localizer, k
 
 
-def test_after_a_loss_the_odometry_that_went_on_suggests_the_place(world_map, world_drive):
+def test_continuous_odometry_hints_the_place_after_loss(world_map, world_drive):
     localizer, k = lost(world_map, world_drive)
-    query = localizer.take(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    (T_map_odom,) = query.suggested
+    query = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    (T_map_odom,) = query.hints
     metres, degrees = pose_error(T_map_odom @ query.T_odom_body, world_drive.T_map_body[k])
     assert metres < 0.3
     assert degrees < 0.5
 
 
-def test_after_a_loss_an_odometry_that_jumped_suggests_nothing_that_is_believed(world_map, world_drive):
+@pytest.mark.slow
+def test_jumped_odometry_hint_is_not_accepted_after_loss(world_map, world_drive):
     localizer, k = lost(world_map, world_drive)
     jump = pose_from(rot_z(0.7), [12.0, -5.0, 0.0])
     for fix, truth in zip(
@@ -75,12 +78,12 @@ def test_after_a_loss_an_odometry_that_jumped_suggests_nothing_that_is_believed(
         assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
 
 
-def test_a_loss_keeps_the_odometrys_frame_whatever_the_anchor():
+def test_odometry_frame_hint_is_kept_across_anchors():
     rng = np.random.default_rng(3)
     T_map_odom, T_odom_body = (exp_se3(rng.uniform(-1, 1, 6) * [0, 0, 3, 50, 50, 3]) for _ in range(2))
     first, second = rng.uniform(-1e3, 1e3, (2, 3))
     kept = PoseHints()
-    kept.frames_were(T_map_odom, first)
+    kept.odometry_continues(T_map_odom, first)
     (again,) = kept.about(second, np.eye(4))
     moved = pose_from(np.eye(3), first - second) @ T_odom_body  # the same pose about the second anchor
     np.testing.assert_allclose(again @ moved, T_map_odom @ T_odom_body, atol=1e-9)
@@ -90,7 +93,7 @@ def test_a_loss_keeps_the_odometrys_frame_whatever_the_anchor():
 # ---- what a search tries
 
 
-def test_tried_at_once_then_now_and_then():
+def test_hint_is_tried_at_once_then_periodically():
     trials = HintSchedule()
     tried = []
     for _ in range(100):
@@ -103,7 +106,7 @@ def test_tried_at_once_then_now_and_then():
     assert set(gaps) == {suggestions._PAUSE + 1}
 
 
-def test_one_keyframe_that_does_not_speak_against_it_starts_the_count_anew():
+def test_unrefuted_keyframe_resets_hint_tries():
     trials = HintSchedule()
     for refuted in [*[True] * (suggestions._TRIES - 1), False] * 3:
         assert trials.due((np.eye(4),))
@@ -111,7 +114,7 @@ def test_one_keyframe_that_does_not_speak_against_it_starts_the_count_anew():
     assert trials.due((np.eye(4),))
 
 
-def test_another_suggestion_is_tried_at_once():
+def test_new_hint_is_tried_at_once():
     trials = HintSchedule()
     for _ in range(suggestions._TRIES):
         trials.due((np.eye(4),))
@@ -133,26 +136,26 @@ def counted(localizer, monkeypatch):
     return made
 
 
-def test_a_refuted_one_is_hardly_tried_again(world_map, world_drive, monkeypatch):
+def test_refuted_hint_is_rarely_tried_again(world_map, world_drive, monkeypatch):
     localizer = voteless(Localizer(world_map), monkeypatch)
     made = counted(localizer, monkeypatch)
-    localizer.suggest(world_drive.T_map_body[0] @ BESIDE)
+    localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
     follow(localizer, world_drive, 10)
     assert made == [1] * suggestions._TRIES + [0] * 4 + [1]
 
 
-def test_where_the_map_knows_nothing_it_is_not_refuted(world_map, world_drive, monkeypatch):
+def test_hint_outside_the_map_is_not_refuted(world_map, world_drive, monkeypatch):
     localizer = voteless(Localizer(world_map), monkeypatch)
     made = counted(localizer, monkeypatch)
-    localizer.suggest(world_drive.T_map_body[0] @ pose_from(np.eye(3), [500.0, 0, 0]))
+    localizer.hint_pose(world_drive.T_map_body[0] @ pose_from(np.eye(3), [500.0, 0, 0]))
     follow(localizer, world_drive, 10)
     assert made == [1] * 10
 
 
-def test_what_is_remembered_is_not_registered_twice(world_map, world_drive, monkeypatch):
+def test_remembered_hint_is_registered_once_per_keyframe(world_map, world_drive, monkeypatch):
     localizer = voteless(Localizer(world_map), monkeypatch)
     made = counted(localizer, monkeypatch)
-    localizer.suggest(world_drive.T_map_body[0] @ NEAR)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
     follow(localizer, world_drive, 4)
     assert made == [1] * 4
 
@@ -161,7 +164,7 @@ def test_what_is_remembered_is_not_registered_twice(world_map, world_drive, monk
 
 
 @pytest.mark.parametrize("votes", [0, 1, RULE.confirmations - 1, RULE.confirmations])
-def test_the_judge_wants_rivals_before_it_believes_a_suggestion(world_map, votes):
+def test_hint_is_accepted_only_after_rivals_had_votes(world_map, votes):
     search = GlobalSearch(world_map, LocalizerConfig(), LocalMaps(world_map, 50.0))
     for _ in range(votes):
         search.coview.consensus._votes.append(None)
@@ -177,7 +180,7 @@ def test_the_judge_wants_rivals_before_it_believes_a_suggestion(world_map, votes
     assert [v.accepted is not None for v in judged(search, *[both] * 3)] == [False, False, True]
 
 
-def test_one_scan_alone_never_believes_a_suggestion_that_no_vote_supports(world_map):
+def test_single_scan_never_accepts_hint_without_votes(world_map):
     search = GlobalSearch(world_map, LocalizerConfig(stationary=True), LocalMaps(world_map, 50.0))
     best = candidate(0.9)
     alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
@@ -186,7 +189,7 @@ def test_one_scan_alone_never_believes_a_suggestion_that_no_vote_supports(world_
     assert supported.accepted is not None
 
 
-def test_inverse_of_a_suggestion_is_where_odometry_began():
+def test_hint_places_the_robot_for_any_odometry_pose():
     """The robot at the suggested place, whatever odometry says where it is."""
     kept = PoseHints()
     T_map_body, T_odom_body = pose_from(rot_z(2.5), [40, -7, 3]), pose_from(rot_z(-1.0), [5, 6, 0.2])

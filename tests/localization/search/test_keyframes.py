@@ -22,7 +22,7 @@ def cloud(seed, count=200):
     return np.random.default_rng(seed).uniform([2, -9, -1], [9, 9, 3], (count, 3)).astype(np.float32)
 
 
-def test_a_keyframe_every_distance():
+def test_keyframe_every_configured_distance():
     buffer = KeyframeBuffer(CONFIG)
     made = [buffer.add(cloud(k), at(0.5 * k), 0.1 * k) is not None for k in range(10)]
     assert np.flatnonzero(made).tolist() == [0, 4, 8]
@@ -30,7 +30,7 @@ def test_a_keyframe_every_distance():
     assert [k.stamp for k in buffer.keyframes] == pytest.approx([0.0, 0.4, 0.8])
 
 
-def test_points_lie_in_the_odometry_frame():
+def test_keyframe_points_are_in_the_odometry_frame():
     buffer = KeyframeBuffer(CONFIG)
     corner = np.array([[3.0, 1.0, 0.5]] * 3, np.float32)
     keyframe = buffer.add(corner, at(10.0, np.pi / 2), 0.0)
@@ -38,7 +38,7 @@ def test_points_lie_in_the_odometry_frame():
     np.testing.assert_allclose(keyframe.position, [10.0, 0.0, 1.5])
 
 
-def test_frames_between_keyframes_are_in_the_next_one():
+def test_points_between_keyframes_go_into_the_next_one():
     buffer = KeyframeBuffer(CONFIG)
     buffer.add(cloud(0), at(0.0), 0.0)
     assert buffer.add(np.array([[5.0, 5, 5]], np.float32), at(1.0), 0.1) is None
@@ -49,7 +49,7 @@ def test_frames_between_keyframes_are_in_the_next_one():
     assert len(keyframe.points) == 2
 
 
-def test_the_ring_holds_its_capacity():
+def test_keyframe_buffer_keeps_its_capacity():
     buffer = KeyframeBuffer(CONFIG)
     for k in range(9):
         buffer.add(cloud(k), at(2.0 * k), float(k))
@@ -57,13 +57,13 @@ def test_the_ring_holds_its_capacity():
     assert len(buffer.recent(2)) == sum(len(k.points) for k in list(buffer.keyframes)[-2:])
 
 
-def test_too_near_returns_are_the_robot_itself():
+def test_returns_below_min_range_are_dropped():
     buffer = KeyframeBuffer(KeyframeConfig(range_min=1.0))
     keyframe = buffer.add(np.array([[0.3, 0, 0], [3, 0, 0]], np.float32), at(0.0), 0.0)
     np.testing.assert_allclose(keyframe.points, [[3, 0, 1.5]], atol=1e-6)
 
 
-def test_standing_still_needs_no_more_memory(monkeypatch):
+def test_standing_still_uses_bounded_memory(monkeypatch):
     monkeypatch.setattr(keyframes, "_PENDING_POINTS", 1000)
     buffer = KeyframeBuffer(CONFIG)
     for k in range(60):
@@ -71,7 +71,7 @@ def test_standing_still_needs_no_more_memory(monkeypatch):
     assert len(buffer.recent(1)) < 1000 + 2 * 200 + 200
 
 
-def test_a_virtual_scan_gathers_what_lies_around():
+def test_virtual_scan_gathers_points_around_keyframe():
     buffer = KeyframeBuffer(CONFIG)
     for k in range(4):
         buffer.add(cloud(k), at(5.0 * k), float(k))
@@ -84,7 +84,7 @@ def test_a_virtual_scan_gathers_what_lies_around():
     assert np.hypot(*(scan[:, :2] - centre[:2]).T).max() < 8.0
 
 
-def test_clear_forgets_all():
+def test_clear_drops_all_keyframes():
     buffer = KeyframeBuffer(CONFIG)
     buffer.add(cloud(0), at(0.0), 0.0)
     buffer.add(cloud(1), at(1.0), 0.1)
@@ -94,14 +94,14 @@ def test_clear_forgets_all():
     assert buffer.add(cloud(2), at(1.0), 0.2) is not None
 
 
-def test_the_newest_frame_is_at_hand_as_it_was_thinned():
+def test_newest_voxelized_frame_is_kept():
     buffer = KeyframeBuffer(CONFIG)
     for k in range(3):
         buffer.add(np.repeat(cloud(k), 2, axis=0), at(0.5 * k), float(k))
         np.testing.assert_array_equal(buffer.newest, prepare_scan.voxelized(cloud(k), at(0.5 * k), CONFIG))
 
 
-def test_what_was_taken_in_stays_as_it_was():
+def test_stored_points_survive_buffer_reuse():
     """Frames go through buffers that are used again."""
     buffer = KeyframeBuffer(CONFIG)
     buffer.add(cloud(0), at(0.0), 0.0)

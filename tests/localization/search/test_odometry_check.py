@@ -24,14 +24,14 @@ def frames(slow_drive):
     return list(frames_of(slow_drive))
 
 
-def test_a_drive_goes_on(frames, world_drive):
+def test_continuous_drive_does_not_contradict_odometry(frames, world_drive):
     check = OdometryCheck()
     assert not any(check.contradicts(*frame) for frame in frames)
     wide = OdometryCheck()
     assert not any(wide.contradicts(*frame) for frame in frames_of(world_drive))
 
 
-def test_another_place_is_noticed_after_a_few_frames_and_once(frames, elsewhere):
+def test_relocated_robot_is_reported_once_after_a_few_frames(frames, elsewhere):
     check = OdometryCheck()
     for frame in frames[:10]:
         check.contradicts(*frame)
@@ -43,7 +43,7 @@ def test_another_place_is_noticed_after_a_few_frames_and_once(frames, elsewhere)
     assert told == [k == _PATIENCE - 1 for k in range(6)]
 
 
-def test_one_strange_frame_is_dust(frames):
+def test_single_deviating_frame_is_ignored(frames):
     check = OdometryCheck()
     rng = np.random.default_rng(0)
     dust = rng.uniform(-3.0, 3.0, (4000, 3)).astype(np.float32) + np.float32([0.0, 0.0, 20.0])
@@ -53,7 +53,7 @@ def test_one_strange_frame_is_dust(frames):
             assert not check.contradicts(dust, frame[1])
 
 
-def test_a_handful_of_points_says_nothing(frames):
+def test_too_few_points_are_not_compared(frames):
     check = OdometryCheck()
     assert not check.contradicts(frames[0][0][:5], frames[0][1])
     for frame in frames[:3]:
@@ -62,7 +62,7 @@ def test_a_handful_of_points_says_nothing(frames):
     assert not any(check.contradicts(far, frames[2][1]) for _ in range(9))
 
 
-def test_a_jump_of_odometry_is_noticed_and_can_be_forgotten(frames):
+def test_odometry_jump_is_reported_and_can_be_cleared(frames):
     jump = np.float32([40.0, 0.0, 0.0])
     jumped = [(points + jump, place + jump) for points, place in frames]
     check = OdometryCheck()

@@ -14,8 +14,8 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.errors import RunError
 from coview_stream.geometry.transforms import pose_from, rot_z, tilt_of
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.result import State
 from coview_stream.localization.search.pose_hints import FROM_THERE
+from coview_stream.localization.state import State
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
@@ -23,17 +23,17 @@ UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 # ---- right ones
 
 
-def test_a_right_one_needs_the_proof_that_any_place_needs(world_map, world_drive, world_fixes):
+def test_correct_hint_needs_the_usual_confirmations(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
-    localizer.suggest(world_drive.T_map_body[0] @ NEAR)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
     fixes = follow(localizer, world_drive, 4)
     assert first_fix(fixes) == first_fix(world_fixes) == RULE.confirmations - 1
     assert [f.evidence.state for f in fixes] == [f.evidence.state for f in world_fixes[:4]]
 
 
-def test_a_right_one_alone_is_found_but_waits_for_rivals(world_map, world_drive, monkeypatch):
+def test_correct_hint_without_votes_waits_for_rivals(world_map, world_drive, monkeypatch):
     localizer = voteless(Localizer(world_map), monkeypatch)
-    localizer.suggest(world_drive.T_map_body[0] @ NEAR)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
     fixes = follow(localizer, world_drive, 6)
     posed = first_fix(fixes)
     # the first keyframes had voted too little for a rival to be seen
@@ -48,34 +48,34 @@ def test_a_right_one_alone_is_found_but_waits_for_rivals(world_map, world_drive,
     assert degrees < 0.3
 
 
-def test_without_it_there_would_be_nothing(world_map, world_drive, monkeypatch):
+def test_without_hint_and_votes_search_finds_nothing(world_map, world_drive, monkeypatch):
     fixes = follow(voteless(Localizer(world_map), monkeypatch), world_drive, 6)
     assert {fix.state for fix in fixes} == {State.SEARCHING}
 
 
-def test_in_the_frame_of_the_maps_sources(world_map, world_drive, monkeypatch):
+def test_hint_is_given_in_map_source_coordinates(world_map, world_drive, monkeypatch):
     """A map far from zero, odometry far from zero, and a robot that leans otherwise than when it was saved."""
     far = BaseMap({**world_map._arrays, "origin": UTM + world_map.origin}, world_map.parameters)
     localizer = voteless(Localizer(far), monkeypatch)
     leaning = exp_se3(np.array([0.05, -0.04, 0.0, *UTM])) @ pose_from(np.eye(3), -UTM)
     there = pose_from(np.eye(3), UTM) @ world_drive.T_map_body[0] @ NEAR
-    localizer.suggest(leaning @ there)
+    localizer.hint_pose(leaning @ there)
     fixes = follow(localizer, world_drive, 5)
     assert fixes[-1].state is State.TRACKING
     moved = pose_from(np.eye(3), -UTM) @ fixes[-1].T_map_body
     assert pose_error(moved, world_drive.T_map_body[4])[0] < 0.1
 
 
-def test_it_is_of_the_next_frame_whether_that_is_a_keyframe_or_not(world_map, world_drive, monkeypatch):
+def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
     localizer = Localizer(world_map)
     follow(localizer, world_drive, 1)
     voteless(localizer, monkeypatch)
     localizer._search.clear()
     T = world_drive.T_odom_body[0] @ pose_from(np.eye(3), [0.1, 0.0, 0.0])
-    localizer.suggest(world_drive.T_map_body[0])
-    assert localizer.take(world_drive.clouds[0], T, 0.1) is None  # no keyframe: it has hardly moved
-    query = localizer.take(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
-    (T_map_odom,) = query.suggested
+    localizer.hint_pose(world_drive.T_map_body[0])
+    assert localizer.add_frame(world_drive.clouds[0], T, 0.1) is None  # no keyframe: it has hardly moved
+    query = localizer.add_frame(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
+    (T_map_odom,) = query.hints
     metres, degrees = pose_error(T_map_odom @ query.T_odom_body, world_drive.T_map_body[1])
     assert metres == pytest.approx(0.1, abs=1e-6)
     assert degrees < 1e-3
@@ -88,9 +88,9 @@ def test_it_is_of_the_next_frame_whether_that_is_a_keyframe_or_not(world_map, wo
 @pytest.mark.parametrize(
     "off", [BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])]
 )
-def test_a_wrong_one_costs_no_fix(world_map, world_drive, world_fixes, off):
+def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, off):
     localizer = Localizer(world_map)
-    localizer.suggest(world_drive.T_map_body[0] @ off)
+    localizer.hint_pose(world_drive.T_map_body[0] @ off)
     fixes = follow(localizer, world_drive, 4)
     assert first_fix(fixes) == first_fix(world_fixes)
     for fix, usual in zip(fixes, world_fixes, strict=False):
@@ -100,17 +100,16 @@ def test_a_wrong_one_costs_no_fix(world_map, world_drive, world_fixes, off):
 
 
 @pytest.mark.parametrize("share", [(12, -4), (-14, 9)])
-def test_a_wrong_one_is_not_believed_though_nothing_else_is_offered(
-    world_map, world_drive, monkeypatch, share
-):
+def test_wrong_hint_is_not_accepted_without_other_candidates(world_map, world_drive, monkeypatch, share):
     localizer = voteless(Localizer(world_map), monkeypatch)
-    localizer.suggest(pose_from(rot_z(0.4), [*share, small_world.SENSOR_HEIGHT]))
+    localizer.hint_pose(pose_from(rot_z(0.4), [*share, small_world.SENSOR_HEIGHT]))
     assert first_fix(follow(localizer, world_drive, 8)) is None
 
 
-def test_never_a_pose_for_a_robot_that_has_left_the_map(world_map, world_drive, elsewhere):
+@pytest.mark.slow
+def test_hint_gives_no_pose_off_the_map(world_map, world_drive, elsewhere):
     localizer = Localizer(world_map)
-    localizer.suggest(world_drive.T_map_body[0])
+    localizer.hint_pose(world_drive.T_map_body[0])
     for fix in follow(localizer, elsewhere, 4):
         assert fix.T_map_body is None
 
@@ -125,10 +124,11 @@ def lookalike_map(map_points, tmp_path_factory):
     return BaseMap.build(path, radius=30.0)
 
 
-def test_the_last_place_looks_like_the_one_that_the_robot_was_moved_to(lookalike_map, world_drive):
+@pytest.mark.slow
+def test_hint_of_lookalike_place_is_not_accepted(lookalike_map, world_drive):
     plain = follow(Localizer(lookalike_map), world_drive, 8)
     localizer = Localizer(lookalike_map)
-    localizer.suggest(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
+    localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
     fixes = follow(localizer, world_drive, 8)
     assert first_fix(plain) is not None
     assert first_fix(fixes) == first_fix(plain)
@@ -136,9 +136,8 @@ def test_the_last_place_looks_like_the_one_that_the_robot_was_moved_to(lookalike
         assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
 
 
-def test_a_lookalike_is_not_believed_before_the_votes_can_name_the_right_place(
-    lookalike_map, world_drive, monkeypatch
-):
+@pytest.mark.slow
+def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_drive, monkeypatch):
     """The right place comes up with the fourth keyframe's votes; by itself the wrong one would have won before."""
     localizer = Localizer(lookalike_map)
     consensus = localizer._search.coview.consensus
@@ -146,7 +145,7 @@ def test_a_lookalike_is_not_believed_before_the_votes_can_name_the_right_place(
     monkeypatch.setattr(
         consensus, "hypotheses", lambda: found() if len(consensus) > RULE.confirmations else []
     )
-    localizer.suggest(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
+    localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
     fixes = follow(localizer, world_drive, 8)
     assert all(f.evidence.score > RULE.score for f in fixes[:3])  # the wrong one, and it was alone
     posed = first_fix(fixes)
@@ -168,12 +167,12 @@ def test_a_lookalike_is_not_believed_before_the_votes_can_name_the_right_place(
     ],
     ids=str,
 )
-def test_what_is_no_pose_is_refused(world_map, bad):
+def test_invalid_hint_pose_is_refused(world_map, bad):
     with pytest.raises(RunError, match="T_map_body"):
         Localizer(world_map).suggest(bad)
 
 
-def test_the_farthest_that_is_taken_harms_nothing(world_map, world_drive, world_fixes):
+def test_farthest_accepted_hint_does_no_harm(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
-    localizer.suggest(pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6]))
+    localizer.hint_pose(pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6]))
     assert first_fix(follow(localizer, world_drive, 4)) == first_fix(world_fixes)

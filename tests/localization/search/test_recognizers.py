@@ -13,10 +13,10 @@ from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.transforms import inverse, pose_from, transform, yaw_of
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.result import State
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.state import State
 from coview_stream.stream.node.engines import SearchEngine
 from coview_stream.stream.node.jobs import SearchJob
 
@@ -43,7 +43,7 @@ def knowing(monkeypatch, world_drive):
         return found
 
     monkeypatch.setattr(FeatureMatcher, "distances", distances)
-    monkeypatch.setattr(FeatureMatcher, "sharpened", lambda self, hypotheses, view: hypotheses)
+    monkeypatch.setattr(FeatureMatcher, "refine", lambda self, hypotheses, view: hypotheses)
 
 
 def follow(localizer, drive):
@@ -60,31 +60,31 @@ def right(fixes, drive):
 # ---- which are asked
 
 
-def test_auto_asks_both_where_the_map_has_features(world_map, learned_map):
+def test_auto_uses_both_recognizers_on_map_with_features(world_map, learned_map):
     both, coview_only = search_of(learned_map), search_of(world_map)
     assert both.coview is not None
     assert both.learned is not None
-    assert (both.needs.descriptor, both.needs.reach) == (learned_map.descriptor_config, 30.0)
+    assert (both.spec.descriptor, both.spec.reach) == (learned_map.descriptor_config, 30.0)
     assert coview_only.learned is None
-    assert coview_only.needs.reach is None
+    assert coview_only.spec.reach is None
 
 
-def test_each_can_be_asked_alone(learned_map):
+def test_each_recognizer_can_be_used_alone(learned_map):
     assert search_of(learned_map, "coview").learned is None
     alone = search_of(learned_map, "learned")
     assert alone.coview is None
-    assert alone.needs.descriptor is None
+    assert alone.spec.descriptor is None
     assert alone.last_query == {}
 
 
-def test_a_map_without_features_is_refused_where_they_are_asked_for(world_map):
+def test_learned_recognizer_refuses_map_without_features(world_map):
     with pytest.raises(MapError, match=r"build it again.*--reloc coview"):
         Localizer(world_map, LocalizerConfig(reloc="learned"))
     with pytest.raises(ConfigError, match="reloc is 'guesswork'"):
         LocalizerConfig(reloc="guesswork")
 
 
-def test_together_they_name_no_more_than_their_share(learned_map):
+def test_recognizers_share_the_hypothesis_limit(learned_map):
     assert search_of(learned_map, peaks=2).coview.consensus.config.peaks == 2
     assert search_of(learned_map, peaks=2).learned.consensus.config.peaks == 2
     usual = LocalizerConfig().consensus.peaks
@@ -94,7 +94,7 @@ def test_together_they_name_no_more_than_their_share(learned_map):
 # ---- what they name
 
 
-def test_features_alone_find_the_way(learned_map, world_drive, knowing):
+def test_learned_recognizer_alone_localizes(learned_map, world_drive, knowing):
     localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
     fixes = follow(localizer, world_drive)
     assert right(fixes, world_drive)
@@ -105,13 +105,15 @@ def test_features_alone_find_the_way(learned_map, world_drive, knowing):
     assert localizer.last_query == {}
 
 
-def test_what_the_descriptors_miss_features_find(learned_map, world_drive, knowing, monkeypatch):
+@pytest.mark.slow
+def test_learned_recognizer_finds_what_coview_misses(learned_map, world_drive, knowing, monkeypatch):
     localizer = Localizer(learned_map)
     monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
     assert right(follow(localizer, world_drive), world_drive)
 
 
-def test_what_features_miss_the_descriptors_find(learned_map, world_drive, world_fixes, monkeypatch):
+@pytest.mark.slow
+def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, world_fixes, monkeypatch):
     """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
     named = []
 
@@ -131,10 +133,10 @@ def test_what_features_miss_the_descriptors_find(learned_map, world_drive, world
     assert states.index(State.TRACKING) <= [f.state for f in world_fixes].index(State.TRACKING) + 2
 
 
-def test_what_both_name_is_registered_once(learned_map, world_drive, knowing, monkeypatch):
+def test_hypothesis_of_both_recognizers_is_registered_once(learned_map, world_drive, knowing, monkeypatch):
     localizer = Localizer(learned_map)
     search = localizer._search
-    query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
     search.update(query)
     rough = search.learned.hypotheses()[0]
     exact = replace(rough, exact=True)
@@ -145,14 +147,14 @@ def test_what_both_name_is_registered_once(learned_map, world_drive, knowing, mo
     assert search._voted(query) == [rough, rough]  # neither is better, so neither makes way
 
 
-def test_too_few_points_are_no_vote(learned_map, world_drive):
+def test_too_few_points_cast_no_vote(learned_map, world_drive):
     localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
     fix = localizer.step(world_drive.clouds[0][:40], world_drive.T_odom_body[0], 0.0)
     assert fix.evidence.reason == "too few points to search with"
     assert len(localizer._search.learned) == 0
 
 
-def test_without_features_queries_carry_nothing_more(world_map, learned_map, world_drive):
+def test_search_request_holds_only_needed_clouds(world_map, learned_map, world_drive):
     first = world_drive.clouds[0], world_drive.T_odom_body[0], 0.0
     usual = Localizer(world_map).take(*first)
     assert len(usual.surroundings) == 0
@@ -164,11 +166,11 @@ def test_without_features_queries_carry_nothing_more(world_map, learned_map, wor
     assert len(Localizer(learned_map, LocalizerConfig(reloc="learned")).take(*first).scan) == 0
 
 
-def test_robots_of_a_node_share_what_is_known_of_the_map(learned_map, world_drive):
+def test_robots_share_the_search_index_of_the_map(learned_map, world_drive):
     engine = SearchEngine(learned_map, LocalizerConfig(reloc="learned"))
     engine.prepare()
     localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
-    query = localizer.take(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
     for robot in ("one", "other"):
         assert engine.run(SearchJob(robot, 1, query)).evidence.stamp == 0.0
     searches = [search for _, search in engine._robots.values()]

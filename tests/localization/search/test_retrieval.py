@@ -60,7 +60,7 @@ def brute(q, c):
     return volume
 
 
-def test_exhaustive_is_brute_force(stations, query):
+def test_exhaustive_retrieval_equals_brute_force(stations, query):
     found = Retrieval(stations, RetrievalConfig()).distances(query)
     assert list(found) == list(query)
     for name, volume in found.items():
@@ -70,7 +70,7 @@ def test_exhaustive_is_brute_force(stations, query):
 
 
 @pytest.mark.parametrize("block", [1, 7, M, 100])
-def test_blocks_equal_the_cache(stations, query, monkeypatch, block):
+def test_blockwise_retrieval_equals_cached(stations, query, monkeypatch, block):
     cached = Retrieval(stations, RetrievalConfig())
     expected = cached.distances(query)
     monkeypatch.setattr(retrieval, "_CACHE_BYTES", 0)
@@ -82,7 +82,7 @@ def test_blocks_equal_the_cache(stations, query, monkeypatch, block):
     assert set(cached._spectra) == set(query)
 
 
-def test_prepared_spectra_are_not_made_again(stations, query, monkeypatch):
+def test_prepared_spectra_are_reused(stations, query, monkeypatch):
     expected = Retrieval(stations, RetrievalConfig()).distances(query)
     prepared = Retrieval(stations, RetrievalConfig())
     prepared.prepare()
@@ -91,14 +91,14 @@ def test_prepared_spectra_are_not_made_again(stations, query, monkeypatch):
         np.testing.assert_array_equal(volume, expected[name])
 
 
-def test_what_does_not_fit_or_is_not_needed_is_not_prepared(stations, monkeypatch):
+def test_spectra_are_not_prepared_when_too_large_or_unused(stations, monkeypatch):
     monkeypatch.delattr(retrieval.kernels, "column_spectra")
     Retrieval(stations, RetrievalConfig(mode="ring_key")).prepare()
     monkeypatch.setattr(retrieval, "_CACHE_BYTES", 10)
     Retrieval(stations, RetrievalConfig()).prepare()
 
 
-def test_ring_key_scores_its_candidates_only(stations, query):
+def test_ring_key_retrieval_scores_only_its_candidates(stations, query):
     exhaustive = Retrieval(stations, RetrievalConfig()).distances(query)
     found = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=6)).distances(query)
     for name, volume in found.items():
@@ -119,7 +119,7 @@ def test_ring_key_with_more_candidates_than_stations_is_exhaustive(stations, que
 
 
 @pytest.mark.parametrize("turn", [0, 1, 5, 11])
-def test_a_robot_turned_left_is_found_at_its_heading(turn):
+def test_robot_turned_left_is_found_at_its_heading(turn):
     """Eq. 9: shift n means that the robot's x axis points at yaw -2 pi n / S in the map."""
     rng = np.random.default_rng(12)
     config = DescriptorConfig(radius=20.0, rings=R, sectors=S, channels=("scan_context",))
@@ -146,7 +146,7 @@ def test_a_robot_turned_left_is_found_at_its_heading(turn):
 
 @pytest.mark.parametrize("mode", ["exhaustive", "ring_key"])
 @pytest.mark.parametrize("k", [1, 5, M + 1])
-def test_the_best_are_those_of_all_distances(stations, query, mode, k):
+def test_best_stations_equal_sorted_distances(stations, query, mode, k):
     one = Retrieval(stations, RetrievalConfig(mode=mode, candidates=9))
     found, volumes = one.best(query, k), one.distances(query)
     for name, volume in volumes.items():
@@ -157,7 +157,7 @@ def test_the_best_are_those_of_all_distances(stations, query, mode, k):
         np.testing.assert_allclose(volume[found[name].station, found[name].shift], expected, atol=1e-6)
 
 
-def test_the_best_without_kernels_are_the_same(stations, query, monkeypatch):
+def test_best_stations_are_the_same_without_kernels(stations, query, monkeypatch):
     expected = Retrieval(stations, RetrievalConfig()).best(query, 4)
     monkeypatch.setattr(retrieval.kernels, "backend", lambda: "numpy")
     for name, found in Retrieval(stations, RetrievalConfig()).best(query, 4).items():

@@ -34,11 +34,11 @@ def shares(target, T, count=5):
     return [share_on_map(yard(seed), HERE, T, target) for seed in range(count)]
 
 
-def test_what_is_where_the_map_has_it_counts(target):
+def test_share_on_map_is_one_at_the_true_pose(target):
     assert min(shares(target, T_MAP_ODOM)) > 0.98
 
 
-def test_the_further_off_the_less_of_it(target):
+def test_share_on_map_falls_with_displacement(target):
     off = [
         np.mean(shares(target, boxplus(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0]))))
         for x in (0.0, 0.6, 5.3)
@@ -48,7 +48,7 @@ def test_the_further_off_the_less_of_it(target):
     assert off[2] < 0.5
 
 
-def test_the_ground_and_what_lies_beyond_reach_do_not_count(target):
+def test_ground_and_far_points_are_ignored(target):
     """Both are as one likes; the points between are where the map has them."""
     frame = yard()
     height = transform(T_MAP_ODOM, frame)[:, 2]
@@ -58,7 +58,7 @@ def test_the_ground_and_what_lies_beyond_reach_do_not_count(target):
     assert share_on_map(mixed, HERE, T_MAP_ODOM, target) > 0.98
 
 
-def test_a_handful_of_points_says_nothing(target):
+def test_too_few_points_give_no_share(target):
     frame = yard()
     assert share_on_map(frame[:0], HERE, T_MAP_ODOM, target) is None
     assert share_on_map(frame[:50], HERE, T_MAP_ODOM, target) is None
@@ -69,7 +69,7 @@ def test_a_handful_of_points_says_nothing(target):
     usual = glance.usual
     glance.learn(flat, HERE, T_MAP_ODOM, target)
     assert glance.usual == usual
-    assert not glance.alarming(flat, HERE, ELSEWHERE, target)
+    assert not glance.is_displaced(flat, HERE, ELSEWHERE, target)
 
 
 def used_to(target, frames=5):
@@ -80,18 +80,18 @@ def used_to(target, frames=5):
     return glance
 
 
-def test_a_frame_that_is_elsewhere_alarms_and_teaches_nothing(target):
+def test_displaced_frame_is_detected_and_not_learned(target):
     glance = used_to(target)
     usual = glance.usual
-    assert not any(glance.alarming(yard(k), HERE, T_MAP_ODOM, target) for k in range(5))
-    assert all(glance.alarming(yard(k), HERE, ELSEWHERE, target) for k in range(5, 30))
+    assert not any(glance.is_displaced(yard(k), HERE, T_MAP_ODOM, target) for k in range(5))
+    assert all(glance.is_displaced(yard(k), HERE, ELSEWHERE, target) for k in range(5, 30))
     assert glance.usual == usual
-    assert not glance.alarming(yard(40), HERE, T_MAP_ODOM, target)
+    assert not glance.is_displaced(yard(40), HERE, T_MAP_ODOM, target)
 
 
-def test_where_nothing_has_been_learnt_there_is_nothing_to_compare_with(target):
+def test_no_displacement_without_a_baseline(target):
     glance = DisplacementCheck()
-    assert not glance.alarming(yard(), HERE, ELSEWHERE, target)
+    assert not glance.is_displaced(yard(), HERE, ELSEWHERE, target)
     assert glance.usual is None
 
 
@@ -104,34 +104,34 @@ def cluttered(share, seed):
     return frame
 
 
-def test_what_changes_slowly_becomes_usual_and_what_changes_at_once_alarms(target):
+def test_slow_change_updates_baseline_and_sudden_change_is_detected(target):
     glance, alarms = DisplacementCheck(), []
     for k, share in enumerate(np.linspace(0.0, 0.6, 40)):
         frame = cluttered(share, k)
-        alarms.append(glance.alarming(frame, HERE, T_MAP_ODOM, target))
+        alarms.append(glance.is_displaced(frame, HERE, T_MAP_ODOM, target))
         glance.learn(frame, HERE, T_MAP_ODOM, target)
     assert not any(alarms)
     assert glance.usual < 0.6
-    assert used_to(target).alarming(cluttered(0.6, 9), HERE, T_MAP_ODOM, target)
+    assert used_to(target).is_displaced(cluttered(0.6, 9), HERE, T_MAP_ODOM, target)
 
 
-def test_one_frame_that_fits_badly_does_not_become_usual(target):
+def test_one_badly_fitting_frame_does_not_become_the_baseline(target):
     """The registration may have been believed by a hair."""
     glance = used_to(target)
     before = glance.usual
     glance.learn(cluttered(0.6, 1), HERE, T_MAP_ODOM, target)
     assert before - 0.3 < glance.usual < before
-    assert glance.alarming(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
+    assert glance.is_displaced(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
 
 
-def test_what_was_usual_can_be_forgotten(target):
+def test_baseline_can_be_cleared(target):
     glance = used_to(target)
     glance.clear()
     assert glance.usual is None
-    assert not glance.alarming(yard(), HERE, ELSEWHERE, target)
+    assert not glance.is_displaced(yard(), HERE, ELSEWHERE, target)
 
 
-def test_a_frame_of_another_world_alarms_on_a_real_scan(world_map, world_drive, scene):
+def test_scan_of_another_world_is_detected_as_displaced(world_map, world_drive, scene):
     T, cloud = world_drive.T_map_body[4], world_drive.clouds[4]
     around = LocalMaps(world_map, 50.0).around(T[:3, 3])
     glance, other = DisplacementCheck(), scan(boxes(seed=77), T)
@@ -142,11 +142,11 @@ def test_a_frame_of_another_world_alarms_on_a_real_scan(world_map, world_drive, 
 
     glance.learn(*arguments(cloud))
     assert glance.usual > 0.9
-    assert glance.alarming(*arguments(other))
-    assert not glance.alarming(*arguments(scan(scene, T, 5)))
+    assert glance.is_displaced(*arguments(other))
+    assert not glance.is_displaced(*arguments(scan(scene, T, 5)))
 
 
-def test_few_points_are_looked_at(target, monkeypatch):
+def test_displacement_check_samples_a_bounded_number_of_points(target, monkeypatch):
     """It has half a millisecond at every frame, whatever the lidar."""
     asked = []
     inner = module.kernels.nearest

@@ -24,7 +24,7 @@ def doubt():
     return LossMonitor(RULE, TrackingConfig(distance=2.0, seconds=5.0))
 
 
-def test_at_first_there_is_none(doubt):
+def test_loss_monitor_starts_clear(doubt):
     assert not doubt.active
     assert not doubt.hopeless
     assert doubt.note(GOOD, 0.0, 0.0) == "verified"
@@ -34,7 +34,7 @@ def test_at_first_there_is_none(doubt):
 @pytest.mark.parametrize(
     "cause", [cause for cause in RejectionReason if cause is not RejectionReason.VERIFIED]
 )
-def test_one_registration_begins_it_and_one_clears_it(doubt, cause):
+def test_one_rejection_begins_doubt_and_one_verification_clears_it(doubt, cause):
     assert doubt.note(MatchVerdict(cause, "why"), 1.0, 0.0) == "why"
     assert doubt.active
     assert not doubt.hopeless
@@ -43,7 +43,7 @@ def test_one_registration_begins_it_and_one_clears_it(doubt, cause):
 
 
 @pytest.mark.parametrize("cause", AGAINST)
-def test_driving_on_with_what_does_not_fit_is_too_much(doubt, cause):
+def test_rejections_while_driving_are_a_loss(doubt, cause):
     against = MatchVerdict(cause, "why")
     for metres in (0.0, 1.9, 2.0, 3.9):
         doubt.note(against, 0.1 * metres, metres)
@@ -53,7 +53,7 @@ def test_driving_on_with_what_does_not_fit_is_too_much(doubt, cause):
 
 
 @pytest.mark.parametrize("cause", [RejectionReason.BLIND, RejectionReason.ODOMETRY])
-def test_driving_on_adds_nothing_where_nothing_speaks_against_the_place(doubt, cause):
+def test_blind_or_odometry_rejections_are_not_counted_while_driving(doubt, cause):
     for k in range(9):
         doubt.note(MatchVerdict(cause, "why"), 1.0 * k, 5.0 * k)
     assert doubt.active
@@ -65,7 +65,7 @@ def test_driving_on_adds_nothing_where_nothing_speaks_against_the_place(doubt, c
     assert doubt.note(BAD, 9.0, 60.0) == "3 registrations rejected: nothing fits"
 
 
-def test_a_good_one_between_starts_the_count_anew(doubt):
+def test_verification_resets_the_rejection_count(doubt):
     for k in range(20):
         doubt.note(GOOD if k % 3 == 2 else BAD, 0.1 * k, 5.0 * k)
         assert not doubt.hopeless
@@ -75,7 +75,7 @@ def test_a_good_one_between_starts_the_count_anew(doubt):
     ("cause", "longest"),
     [(RejectionReason.FITNESS, 10.0), (RejectionReason.ODOMETRY, 10.0), (RejectionReason.BLIND, 60.0)],
 )
-def test_standing_still_time_is_too_much(doubt, cause, longest):
+def test_doubt_while_standing_times_out(doubt, cause, longest):
     judgement = MatchVerdict(cause, "why")
     doubt.note(judgement, 100.0, 7.0)
     doubt.note(judgement, 100.0 + longest - 0.1, 7.0)
@@ -84,7 +84,7 @@ def test_standing_still_time_is_too_much(doubt, cause, longest):
     assert doubt.hopeless
 
 
-def test_a_suspicion_is_a_doubt_that_lasts_from_the_next_registration_on(doubt):
+def test_required_verification_times_out_from_next_registration(doubt):
     doubt.begin()
     assert doubt.active
     doubt.note(BAD, 1000.0, 0.0)
@@ -97,7 +97,7 @@ def test_a_suspicion_is_a_doubt_that_lasts_from_the_next_registration_on(doubt):
     assert not doubt.hopeless
 
 
-def test_a_suspicion_is_cleared_by_the_first_registration(doubt):
+def test_required_verification_is_cleared_by_first_verification(doubt):
     doubt.begin()
     assert doubt.note(GOOD, 5000.0, 0.0) == "verified"
     assert not doubt.active
@@ -108,7 +108,7 @@ def blinded(doubt, seconds):
         doubt.note(MatchVerdict(RejectionReason.BLIND, "covered"), float(k), 0.0)
 
 
-def test_after_a_long_one_a_single_registration_is_not_enough(doubt):
+def test_long_doubt_needs_several_verifications(doubt):
     blinded(doubt, 30.0)
     told = [doubt.note(GOOD, 31.0 + k, metres) for k, metres in enumerate((0.0, 0.5, 2.0, 3.9))]
     assert told[0] == "verified 1 of 3 times after 31 s of doubt"
@@ -121,7 +121,7 @@ def test_after_a_long_one_a_single_registration_is_not_enough(doubt):
     assert not doubt.hopeless
 
 
-def test_a_robot_that_stands_still_is_believed_after_some_seconds(doubt):
+def test_standing_robot_leaves_long_doubt_after_some_seconds(doubt):
     blinded(doubt, 30.0)
     told = [doubt.note(GOOD, 31.0 + k, 0.0) for k in range(11)]
     assert told[0] == told[4] == "verified 1 of 3 times after 31 s of doubt"
@@ -130,7 +130,7 @@ def test_a_robot_that_stands_still_is_believed_after_some_seconds(doubt):
     assert not doubt.active
 
 
-def test_one_against_it_undoes_the_proof(doubt):
+def test_rejection_resets_verifications_after_long_doubt(doubt):
     blinded(doubt, 30.0)
     doubt.note(GOOD, 31.0, 0.0)
     doubt.note(GOOD, 32.0, 2.0)
@@ -139,7 +139,7 @@ def test_one_against_it_undoes_the_proof(doubt):
     assert doubt.active
 
 
-def test_after_a_short_one_a_single_registration_is(doubt):
+def test_short_doubt_is_cleared_by_one_verification(doubt):
     blinded(doubt, 8.0)
     doubt.note(GOOD, 9.9, 0.0)
     assert not doubt.active

@@ -50,7 +50,7 @@ def off(found, truth):
     return float(np.linalg.norm(boxminus(found, truth)[3:]))
 
 
-def test_the_map_alone_speaks_whatever_was_believed(world_map, world_drive, scan):
+def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
     """The belief is off by centimetres and claims to be sure; registered with it, the pose is pulled there."""
     truth = world_drive.T_map_body[4]
     believed = boxplus(truth, np.array([0.001, -0.001, 0.002, 0.05, -0.04, 0.03]))
@@ -68,14 +68,14 @@ def test_the_map_alone_speaks_whatever_was_believed(world_map, world_drive, scan
     assert off(found.T_map_body, truth) < 0.5 * off(fused, truth)
 
 
-def test_its_covariance_is_the_maps_and_not_the_beliefs(world_map, world_drive, scan):
+def test_match_covariance_does_not_depend_on_prior_covariance(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
     loose, tight = (attempted(world_map, scan, Estimate(truth, C)).covariance for C in (LOOSE, TIGHT))
     check_covariance(loose, "loose")
     np.testing.assert_allclose(np.sqrt(np.diag(tight)), np.sqrt(np.diag(loose)), rtol=0.2)
 
 
-def test_innovation_is_the_distance_from_what_the_graph_predicts(world_map, world_drive, scan):
+def test_innovation_is_measured_against_graph_prediction(world_map, world_drive, scan):
     """Which need not be what the attempt began with."""
     truth = world_drive.T_map_body[4]
     away = boxplus(truth, np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
@@ -91,7 +91,7 @@ def test_innovation_is_the_distance_from_what_the_graph_predicts(world_map, worl
     assert far.judgement.cause is RejectionReason.VERIFIED
 
 
-def test_where_there_is_nothing_to_hold_on_to_the_belief_stays(world_map, world_drive, scan):
+def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_drive, scan):
     """Ten metres above everything."""
     truth = world_drive.T_map_body[4]
     belief = Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])), TIGHT)
@@ -104,7 +104,7 @@ def test_where_there_is_nothing_to_hold_on_to_the_belief_stays(world_map, world_
 
 
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
-def test_a_belief_without_an_inverse_is_no_hold(world_map, world_drive, scan, bad):
+def test_singular_prior_covariance_is_rejected(world_map, world_drive, scan, bad):
     truth = world_drive.T_map_body[4]
     found = attempted(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
     assert_unheld(found, truth)
@@ -112,7 +112,7 @@ def test_a_belief_without_an_inverse_is_no_hold(world_map, world_drive, scan, ba
 
 
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
-def test_pairs_without_an_inverse_are_no_hold(world_map, world_drive, scan, bad, monkeypatch):
+def test_singular_registration_information_is_rejected(world_map, world_drive, scan, bad, monkeypatch):
     truth, whole = world_drive.T_map_body[4], register
     monkeypatch.setattr(attempt, "register", lambda *given: replace(whole(*given), information=bad))
     found = attempted(world_map, scan, Estimate(truth, TIGHT))
@@ -127,7 +127,7 @@ def assert_unheld(found, truth):
     np.testing.assert_array_equal(found.T_map_body, truth)
 
 
-def test_beyond_what_was_surveyed_nothing_is_held_against_the_place(world_map, world_drive, scan):
+def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
     edge = np.array([0.0, 0.0, 0.0, 60.0 - truth[0, 3], 0.0, 0.0])
     pose_graph = PoseGraph(CONFIG.graph)
@@ -141,5 +141,5 @@ def test_beyond_what_was_surveyed_nothing_is_held_against_the_place(world_map, w
     assert found.judgement.cause is RejectionReason.OFF_MAP
 
 
-def test_a_scan_is_looked_at_by_direction_once(scan):
+def test_range_image_of_a_scan_is_computed_once(scan):
     assert scan.seen is scan.seen

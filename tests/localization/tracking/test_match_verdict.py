@@ -10,7 +10,9 @@ from coview_stream.config import AcceptanceConfig
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 
-RULE = AcceptanceConfig(tracking_min_score=0.22, tracking_min_share=0.5, tracking_min_ground=0.5, min_overlap=0.3)
+RULE = AcceptanceConfig(
+    tracking_min_score=0.22, tracking_min_share=0.5, tracking_min_ground=0.5, min_overlap=0.3
+)
 GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
 
 
@@ -24,7 +26,7 @@ def used():
 
 
 @pytest.mark.parametrize("habit", ["fresh", "used"])
-def test_what_is_as_it_should_be_is_verified(habit, used):
+def test_normal_evidence_is_verified(habit, used):
     cause, reason = (used if habit == "used" else EvidenceBaseline()).judge(GOOD, RULE)
     assert cause is RejectionReason.VERIFIED
     assert reason == "verified"
@@ -40,19 +42,19 @@ def test_what_is_as_it_should_be_is_verified(habit, used):
     ],
 )
 @pytest.mark.parametrize("habit", ["fresh", "used"])
-def test_each_share_that_has_gone_is_named(changes, cause, told, habit, used):
+def test_each_failed_share_names_its_cause(changes, cause, told, habit, used):
     found, reason = (used if habit == "used" else EvidenceBaseline()).judge(replace(GOOD, **changes), RULE)
     assert found is cause
     assert told in reason
 
 
-def test_off_the_map_says_more_than_that_nothing_fits():
+def test_off_map_takes_precedence_over_poor_fit():
     """What the map does not cover is no evidence against the place."""
     cause, _ = EvidenceBaseline().judge(replace(GOOD, inside=0.1, ground=0.0, near=0.0), RULE)
     assert cause is RejectionReason.OFF_MAP
 
 
-def test_what_would_do_elsewhere_does_not_where_places_fit_better(used):
+def test_score_far_below_baseline_is_rejected(used):
     """A score of 0.3: right in a street where half of everything is hidden, wrong where 0.8 is usual."""
     poor = Evidence(near=0.3, covered=0.45, ground=0.85, free_space=0.8, inside=1.0)
     assert RULE.tracking_min_score < poor.score < RULE.tracking_min_share * used.usual.score
@@ -66,7 +68,7 @@ def test_what_would_do_elsewhere_does_not_where_places_fit_better(used):
     assert poor_habit.judge(poor, RULE)[0] is RejectionReason.VERIFIED
 
 
-def test_a_poor_habit_does_not_lower_what_is_asked_in_any_case():
+def test_poor_baseline_does_not_lower_the_absolute_threshold():
     bad = replace(GOOD, near=0.05, covered=0.5)
     assert bad.score < RULE.tracking_min_score
     habit = EvidenceBaseline()
@@ -76,7 +78,7 @@ def test_a_poor_habit_does_not_lower_what_is_asked_in_any_case():
     assert f"{RULE.tracking_min_score:.2f} needed" in reason
 
 
-def test_the_cause_is_what_has_fallen_furthest_below_what_is_usual():
+def test_cause_is_the_share_furthest_below_baseline():
     """Where hardly anything above the ground is ever on the map, rays through what it shows are the news."""
     habit, usual = (
         EvidenceBaseline(),
@@ -89,7 +91,7 @@ def test_the_cause_is_what_has_fallen_furthest_below_what_is_usual():
     assert habit.judge(replace(usual, free_space=0.8, near=0.2), tight)[0] is RejectionReason.FITNESS
 
 
-def test_a_habit_follows_slowly_and_is_forgotten_at_once(used):
+def test_baseline_follows_slowly_and_clears_at_once(used):
     worse = Evidence(near=0.4, covered=0.6, ground=0.8, free_space=0.7, inside=0.8)
     used.learn(worse)
     assert 0.7 < used.usual.near < 0.8
@@ -104,14 +106,14 @@ def test_a_habit_follows_slowly_and_is_forgotten_at_once(used):
     assert used.usual == GOOD
 
 
-def test_judging_teaches_nothing(used):
+def test_judging_does_not_change_the_baseline(used):
     before = used.usual
     used.judge(replace(GOOD, near=0.1), RULE)
     assert used.usual == before
 
 
 @pytest.mark.parametrize("cause", list(RejectionReason))
-def test_a_judgement_says_whether_it_is_for_or_against_the_place(cause):
+def test_match_verdict_has_verified_flag_and_score(cause):
     judgement = MatchVerdict(cause, "why", GOOD)
     assert judgement.verified == (cause is RejectionReason.VERIFIED)
     assert judgement.score == GOOD.score

@@ -22,7 +22,7 @@ NOISE = np.square([3e-4, 3e-4, 2e-4, 0.004, 0.004, 0.002])
 RATES = Drift(position=0.1, height=0.05, tilt=0.01, yaw=0.02, turn=0.05)
 
 
-def test_a_random_walk_with_metres_and_radians():
+def test_noise_is_a_random_walk_over_metres_and_radians():
     sigma = np.sqrt(np.diag(RATES.covariance(4.0, 0.6)))
     np.testing.assert_allclose(sigma, [0.02, 0.02, np.hypot(0.04, 0.03), 0.2, 0.2, 0.1])
     np.testing.assert_allclose(
@@ -30,7 +30,7 @@ def test_a_random_walk_with_metres_and_radians():
     )
 
 
-def test_standing_still_is_a_covariance_too():
+def test_noise_of_standing_still_is_a_valid_covariance():
     check_covariance(Drift.of(CONFIG).covariance(0.0, 0.0), "still")
 
 
@@ -44,7 +44,7 @@ def driven(true: Drift, metres=100.0, step=1.0, turned=0.0, seed=0, config=CONFI
 
 
 @pytest.mark.parametrize("factor", [0.3, 1.0, 5.0])
-def test_rates_are_found(factor):
+def test_noise_rates_are_estimated(factor):
     """Registrations must be able to show them: where odometry is good, they have to be."""
     nominal = Drift.of(CONFIG)
     true = Drift(*(factor * rate for rate in vars(nominal).values()))
@@ -53,7 +53,7 @@ def test_rates_are_found(factor):
     np.testing.assert_allclose(np.mean(found, axis=0), list(vars(true).values()), rtol=0.2)
 
 
-def test_the_noise_of_registrations_is_hardly_taken_for_drift():
+def test_registration_noise_is_hardly_taken_for_odometry_noise():
     """Clipped at zero, what is left of it adds up a little."""
     perfect, nominal = Drift(0.0, 0.0, 0.0, 0.0, 0.0), Drift.of(CONFIG)
     for scale in (0.1, 1.0, 10.0):
@@ -64,7 +64,7 @@ def test_the_noise_of_registrations_is_hardly_taken_for_drift():
         assert found.position < max(0.9 * sigma[3], 0.35 * nominal.position)
 
 
-def test_each_kind_is_found_by_itself():
+def test_each_noise_rate_is_estimated_independently():
     true = Drift(position=0.1, height=0.001, tilt=1e-4, yaw=0.01, turn=0.0)
     found = driven(true, 200.0).drift
     assert found.position == pytest.approx(0.1, rel=0.3)
@@ -73,7 +73,7 @@ def test_each_kind_is_found_by_itself():
     assert found.tilt < 0.5 * CONFIG.tilt_drift
 
 
-def test_at_first_the_configuration_is_believed():
+def test_noise_starts_at_configured_rates():
     assert DriftEstimator(CONFIG).drift == Drift.of(CONFIG)
     bad = Drift(*(10 * rate for rate in vars(Drift.of(CONFIG)).values()))
     after = [driven(bad, metres).drift.yaw / CONFIG.yaw_drift for metres in (1.0, 10.0, 100.0)]
@@ -82,7 +82,7 @@ def test_at_first_the_configuration_is_believed():
     assert after[2] == pytest.approx(10.0, rel=0.4)
 
 
-def test_what_was_long_ago_is_forgotten():
+def test_old_observations_are_forgotten():
     estimator = driven(Drift(*(5 * rate for rate in vars(Drift.of(CONFIG)).values())))
     assert estimator.drift.position > 3 * CONFIG.position_drift
     rng = np.random.default_rng(1)
@@ -91,14 +91,14 @@ def test_what_was_long_ago_is_forgotten():
     assert estimator.drift.position < 0.7 * CONFIG.position_drift
 
 
-def test_one_slip_does_not_make_odometry_useless():
+def test_one_slip_does_not_inflate_odometry_noise():
     estimator = driven(Drift.of(CONFIG))
     before = estimator.drift.position
     estimator.add(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0]), NOISE, 1.0, 0.0)  # 200 sigma
     assert before < estimator.drift.position < 1.5 * before
 
 
-def test_turning_on_the_spot_teaches_about_headings_alone():
+def test_turning_on_the_spot_updates_yaw_noise_only():
     estimator, rng = DriftEstimator(CONFIG), np.random.default_rng(2)
     for _ in range(60):
         gap = rng.normal(0.0, np.sqrt(NOISE))

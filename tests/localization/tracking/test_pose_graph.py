@@ -22,7 +22,7 @@ STEP = exp_se3(np.array([0.02, -0.01, 0.3, 2.0, 0.3, -0.1]))
 # ---- one and two keyframes, where the answer is known
 
 
-def test_the_prior_comes_back_as_it_was(graph):
+def test_prior_is_the_first_estimate(graph):
     C = START_COVARIANCE + 1e-3 * np.ones((6, 6))
     graph.start(START, C)
     T, covariance = graph.estimate
@@ -30,7 +30,7 @@ def test_the_prior_comes_back_as_it_was(graph):
     assert relative(covariance, C) < 1e-9
 
 
-def test_a_move_composes_and_carries_the_covariance_with_its_lever(graph):
+def test_move_composes_pose_and_propagates_covariance(graph):
     """A doubt in heading becomes one in place, across the way driven."""
     heading = np.diag([1e-4, 1e-4, 0.1, 1e-3, 1e-3, 1e-3]) ** 2
     graph.start(START, heading)
@@ -45,14 +45,14 @@ def test_a_move_composes_and_carries_the_covariance_with_its_lever(graph):
     )
 
 
-def test_odometrys_covariance_lies_along_the_maps_axes(graph):
+def test_odometry_covariance_is_along_map_axes(graph):
     graph.start(START, 1e-12 * np.eye(6))
     Q = np.diag([1e-3, 2e-3, 3e-3, 0.1, 0.2, 0.3]) ** 2
     graph.move(STEP, Q)
     assert relative(graph.estimate.covariance, Q) < 1e-4
 
 
-def test_a_correction_fuses_as_two_gaussians_do(graph):
+def test_correction_fuses_as_two_gaussians(graph):
     """Close to each other, so that Huber does not bite and the tangent is flat."""
     gap = np.array([0.0005, -0.0003, 0.002, 0.02, -0.01, 0.015])
     P, R = START_COVARIANCE, np.diag([0.004, 0.004, 0.01, 0.1, 0.2, 0.05]) ** 2
@@ -64,7 +64,7 @@ def test_a_correction_fuses_as_two_gaussians_do(graph):
     np.testing.assert_allclose(boxminus(T, START), expected @ np.linalg.solve(R, gap), atol=1e-5)
 
 
-def test_an_outlier_pulls_no_more_than_the_kernel_allows(graph):
+def test_huber_kernel_bounds_the_pull_of_an_outlier(graph):
     """Alone along x, the pull of k sigmas moves the mean by k P / sigma whatever the outlier's size."""
     P, R = 0.01 * np.eye(6), 1e-4 * np.eye(6)
     moved = []
@@ -86,7 +86,7 @@ def test_innovation_is_the_squared_distance_in_sigmas(graph):
     np.testing.assert_array_equal(graph.estimate.T_map_body, T)
 
 
-def test_innovations_are_chi_square_if_the_covariances_are_right():
+def test_innovations_are_chi_square_with_true_covariances():
     graph = PoseGraph(GraphConfig(window=5, restart=20))
     way = drive(400, seed=4, every=3)
     graph.start(boxplus(START, np.linalg.cholesky(START_COVARIANCE)[:, 3] * 0.5), START_COVARIANCE)
@@ -102,7 +102,7 @@ def test_innovations_are_chi_square_if_the_covariances_are_right():
 # ---- a gap, a new start, refusals
 
 
-def test_without_the_map_the_covariance_grows_and_the_map_takes_it_back(graph):
+def test_covariance_grows_on_odometry_and_shrinks_with_corrections(graph):
     way = drive(200, seed=9, every=1)
     for k in range(50, 150):
         way.seen[k] = None
@@ -116,7 +116,7 @@ def test_without_the_map_the_covariance_grows_and_the_map_takes_it_back(graph):
     assert sigma[-1] < 1.1 * sigma[49]
 
 
-def test_a_new_start_carries_nothing_over(graph):
+def test_restart_carries_nothing_over(graph):
     way, elsewhere = drive(30, seed=10), pose_from(np.eye(3), [-50.0, 0.0, 0.0])
     run(graph, way)
     graph.start(elsewhere, REGISTRATION)
@@ -129,7 +129,7 @@ def test_a_new_start_carries_nothing_over(graph):
         np.testing.assert_array_equal(a, b)
 
 
-def test_an_empty_graph_says_so(graph):
+def test_empty_graph_raises(graph):
     def ask():
         return graph.estimate
 
@@ -146,7 +146,7 @@ def test_an_empty_graph_says_so(graph):
             call()
 
 
-def test_what_cannot_be_used_is_refused_and_changes_nothing(graph):
+def test_invalid_input_is_refused_and_changes_nothing(graph):
     graph.start(START, START_COVARIANCE)
     graph.move(STEP, ODOMETRY)
     before = graph.estimate
@@ -162,7 +162,7 @@ def test_what_cannot_be_used_is_refused_and_changes_nothing(graph):
         np.testing.assert_array_equal(a, b)
 
 
-def test_changing_an_answer_does_not_change_the_graph(graph):
+def test_returned_estimate_is_a_copy(graph):
     graph.start(START, START_COVARIANCE)
     graph.estimate.T_map_body[:] = 0.0
     graph.move(STEP, ODOMETRY)
@@ -180,7 +180,7 @@ def test_poses_stay_rigid_over_hundreds_of_moves(graph):
 # ---- gtsam and the configuration
 
 
-def test_where_gtsam_is_missing_the_remedy_is_named(monkeypatch):
+def test_missing_gtsam_is_named_with_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(DependencyError, match="pip install 'gtsam"):
         PoseGraph()
@@ -190,6 +190,6 @@ def test_where_gtsam_is_missing_the_remedy_is_named(monkeypatch):
     ("name", "value"),
     [("window", 1), ("restart", GraphConfig().window), ("huber", 0.0), ("huber", np.inf)],
 )
-def test_a_setting_out_of_range_is_refused_by_name(name, value):
+def test_graph_config_out_of_range_is_refused(name, value):
     with pytest.raises(ConfigError, match=rf"GraphConfig\.{name}"):
         GraphConfig(**{name: value})

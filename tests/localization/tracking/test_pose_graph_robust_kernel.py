@@ -45,16 +45,16 @@ def worst(graph, way, registration):
 
 
 @pytest.mark.parametrize("kernel", ["GemanMcClure", "DCS"])
-def test_a_redescending_kernel_with_the_raw_hessian_locks_the_map_out(way, kernel):
+def test_redescending_kernel_with_raw_hessian_rejects_all_registrations(way, kernel):
     assert worst(graph_with(kernel), way, RAW) > 2.0
 
 
-def test_huber_with_the_raw_hessian_is_worse_but_not_locked_out(way):
+def test_huber_with_raw_hessian_is_worse_but_keeps_registrations(way):
     """The control: the covariances are as wrong as above, so that what locks out is the kernel on top of it."""
     assert worst(PoseGraph(CONFIG), way, RAW) < 0.6
 
 
-def test_huber_with_the_inflated_covariance_holds(way):
+def test_huber_with_inflated_covariance_follows_the_map(way):
     assert worst(PoseGraph(CONFIG), way, HONEST) < 0.35
 
 

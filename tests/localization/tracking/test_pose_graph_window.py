@@ -62,7 +62,7 @@ def dense(way, start=START_COVARIANCE):
     return X[-1], np.linalg.inv(H)[-6:, -6:]
 
 
-def test_the_newest_pose_is_the_dense_solutions(graph):
+def test_newest_pose_equals_dense_solution(graph):
     """With an outlier of metres among the corrections; residuals here are along the map's axes, not the body's."""
     way = drive(8, seed=2, every=2)
     way.seen[4] = boxplus(way.seen[4], np.array([0, 0, 0, 3.0, -2.0, 1.0]))
@@ -111,7 +111,8 @@ def full_isam2(way):
     return answers
 
 
-def test_two_thousand_keyframes_are_as_in_a_graph_that_never_forgets():
+@pytest.mark.slow
+def test_long_drive_equals_unbounded_graph():
     """To a hundredth of a sigma and a millimetre, and memory does not grow."""
     way = drive(2000, seed=6, every=10, outliers=0.05)
     pose_graph = PoseGraph()
@@ -126,7 +127,7 @@ def test_two_thousand_keyframes_are_as_in_a_graph_that_never_forgets():
     assert pose_graph.config.window <= len(pose_graph) <= pose_graph.config.restart
 
 
-def test_what_is_held_is_bounded():
+def test_graph_memory_is_bounded():
     config = GraphConfig(window=5, restart=9)
     graph, way = PoseGraph(config), drive(60, seed=7)
     lengths = []
@@ -140,8 +141,9 @@ def test_what_is_held_is_bounded():
     assert min(lengths[config.window :]) >= config.window
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 4, 30])
-def test_a_short_window_forgets_nothing_that_matters(every):
+def test_short_window_keeps_the_estimate(every):
     """The past meets the future in one pose; the smoothed belief there would count things twice.
 
     The kernel is out of the way: what it has weighed cannot be weighed again once it is forgotten.

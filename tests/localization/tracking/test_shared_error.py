@@ -54,19 +54,19 @@ def nees(errors, covariances):
     return np.mean([e @ np.linalg.solve(C, e) for e, C in zip(errors, covariances, strict=True)]) / 6
 
 
-def test_it_is_about_the_true_error_where_the_hessian_is_far_below():
+def test_clustered_covariance_matches_true_error_unlike_inverse_hessian():
     errors, spreads, hessians = zip(*(registered(seed, 0.03) for seed in range(40)), strict=True)
     assert 0.5 < nees(errors, spreads) < 2.5
     assert nees(errors, hessians) > 10
 
 
-def test_it_grows_with_what_the_map_is_off_by():
+def test_clustered_covariance_grows_with_map_error():
     sigma = [np.sqrt(np.diag(registered(1, off)[1])) for off in (0.01, 0.02, 0.04)]
     assert (sigma[1] > 1.3 * sigma[0]).all()
     assert (sigma[2] > 1.3 * sigma[1]).all()
 
 
-def test_too_few_places_say_nothing():
+def test_too_few_clusters_give_no_covariance():
     points, normals = courtyard()
     target = local_map(points, normals)
     few = np.abs(points[:, 0] - 3) + np.abs(points[:, 1] - 3) < 2
@@ -74,12 +74,12 @@ def test_too_few_places_say_nothing():
     assert clustered_covariance(source, np.eye(4), target, PIVOT, CONFIG) is None
 
 
-def test_where_nothing_has_a_partner_nothing_is_said():
+def test_without_pairs_there_is_no_covariance():
     source, target = street(np.random.default_rng(0), 0.0)
     assert clustered_covariance(source, pose_from(np.eye(3), [500.0, 0, 0]), target, PIVOT, CONFIG) is None
 
 
-def test_what_is_shared_is_so_many_times_what_was_seen_of_late_and_the_rest():
+def test_shared_error_is_scaled_recent_covariance_plus_floor():
     config = RegistrationConfig(
         shared=2.0, shared_position=0.03, shared_height=0.02, shared_tilt=0.002, shared_yaw=0.001
     )
@@ -98,7 +98,7 @@ def test_what_is_shared_is_so_many_times_what_was_seen_of_late_and_the_rest():
     np.testing.assert_allclose(shared.covariance, np.diag(rest))
 
 
-def test_a_scan_of_nothing_new_teaches_nothing():
+def test_scan_without_pairs_does_not_change_shared_error():
     source, target = street(np.random.default_rng(0), 0.03)
     shared = SharedErrorModel(CONFIG)
     shared.learn(source, np.eye(4), target, PIVOT)
@@ -108,7 +108,7 @@ def test_a_scan_of_nothing_new_teaches_nothing():
 
 
 @pytest.mark.parametrize("name", ["shared", "shared_position", "shared_height", "shared_tilt", "shared_yaw"])
-def test_settings_are_positive(name):
+def test_shared_error_settings_must_be_positive(name):
     from coview_stream.errors import ConfigError
 
     with pytest.raises(ConfigError, match=name):

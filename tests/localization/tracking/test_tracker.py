@@ -23,7 +23,7 @@ def ruled(**acceptance):
 # ---- one that is believed
 
 
-def test_a_good_registration_is_believed(world_map, world_drive):
+def test_good_registration_is_accepted(world_map, world_drive):
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
     ride = ride_of(world_map, world_drive)
     before = ride.tracker.predicted_covariance()
@@ -41,7 +41,8 @@ def test_a_good_registration_is_believed(world_map, world_drive):
     assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
 
 
-def test_a_drive_is_followed_longer_than_the_graph_is(world_map, slow_drive):
+@pytest.mark.slow
+def test_drive_longer_than_the_graph_window_is_tracked(world_map, slow_drive):
     config = LocalizerConfig(graph=GraphConfig(window=2, restart=6))
     ride = ride_of(world_map, slow_drive, config, 0)
     for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):
@@ -51,7 +52,7 @@ def test_a_drive_is_followed_longer_than_the_graph_is(world_map, slow_drive):
         assert degrees < 0.2
 
 
-def test_the_error_is_within_what_is_reported(world_map, slow_drive):
+def test_error_is_within_reported_covariance(world_map, slow_drive):
     """Odometry lies by 5 %, in both ways, and is corrected once a metre."""
     for scale in (0.95, 1.05):
         ride = ride_of(world_map, slow_drive, frame=0)
@@ -71,13 +72,13 @@ def test_the_error_is_within_what_is_reported(world_map, slow_drive):
         assert pose_error(ride.tracker.T_map_odom @ T, slow_drive.T_map_body[-1])[0] < 0.1
 
 
-def test_the_map_is_cropped_before_it_is_needed(world_map, world_drive, monkeypatch):
+def test_prefetch_map_crops_before_registration(world_map, world_drive, monkeypatch):
     """On a frame that registers nothing: both together would take too long."""
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
     ride = ride_of(world_map, world_drive)
-    ride.tracker.look_around(ride.odometry(truth))
+    ride.tracker.prefetch_map(ride.odometry(truth))
     monkeypatch.setattr(type(world_map), "crop", None)
-    monkeypatch.setattr("coview_stream.localization.registration.register.edge_raster", None)
+    monkeypatch.setattr("coview_stream.localization.registration.local_map.roof_edges", None)
     assert ride.update(cloud, truth).verified
 
 
@@ -86,9 +87,13 @@ def test_the_map_is_cropped_before_it_is_needed(world_map, world_drive, monkeypa
 
 @pytest.mark.parametrize(
     ("rule", "cause"),
-    [("tracking_min_score", None), ("min_overlap", RejectionReason.OFF_MAP), ("tracking_min_ground", RejectionReason.GROUND)],
+    [
+        ("tracking_min_score", None),
+        ("min_overlap", RejectionReason.OFF_MAP),
+        ("tracking_min_ground", RejectionReason.GROUND),
+    ],
 )
-def test_the_same_registration_held_to_a_higher_standard(world_map, world_drive, rule, cause):
+def test_stricter_thresholds_reject_the_same_registration(world_map, world_drive, rule, cause):
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
     judgement = refused(ride_of(world_map, world_drive, ruled(**{rule: 1.0})), cloud, truth)
     evidence = judgement.evidence
@@ -96,14 +101,14 @@ def test_the_same_registration_held_to_a_higher_standard(world_map, world_drive,
     assert judgement.cause is cause or cause is None
 
 
-def test_garbage_is_not_believed(world_map, world_drive):
+def test_random_points_are_rejected(world_map, world_drive):
     ride = ride_of(world_map, world_drive)
     judgement = refused(ride, garbage(), world_drive.T_map_body[4], alone=True)
     assert judgement.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
     assert judgement.score < RULE.tracking_min_score
 
 
-def test_another_world_does_not_fit_by_what_stands_there(world_map, world_drive, elsewhere):
+def test_scan_of_another_world_is_rejected_by_structure(world_map, world_drive, elsewhere):
     ride = ride_of(world_map, world_drive)
     assert ride.update(world_drive.clouds[4], world_drive.T_map_body[4]).verified
     judgement = refused(ride, elsewhere.clouds[2], world_drive.T_map_body[4], alone=True)
@@ -111,7 +116,7 @@ def test_another_world_does_not_fit_by_what_stands_there(world_map, world_drive,
     assert "usual here" in judgement.reason or "rays pass" in judgement.reason
 
 
-def test_rays_that_pass_through_what_the_map_shows_are_named(world_map, world_drive, scene):
+def test_free_space_violation_is_named(world_map, world_drive, scene):
     """The nearest buildings have been torn down; what is left stands where it stood."""
     truth = world_drive.T_map_body[4]
     near = sorted(scene, key=lambda box: np.hypot(*(box.centre - truth[:2, 3])))
@@ -123,7 +128,7 @@ def test_rays_that_pass_through_what_the_map_shows_are_named(world_map, world_dr
 
 
 @pytest.mark.parametrize("seen", [0, 20, 90])
-def test_a_frame_that_sees_nothing_is_blind_whatever_the_ones_before_saw(world_map, world_drive, seen):
+def test_nearly_empty_frame_is_blind_despite_earlier_frames(world_map, world_drive, seen):
     """Older frames make a scan denser; they do not say where the robot is now."""
     ride = ride_of(world_map, world_drive)
     truth = world_drive.T_map_body
@@ -136,7 +141,7 @@ def test_a_frame_that_sees_nothing_is_blind_whatever_the_ones_before_saw(world_m
     assert ride.update(world_drive.clouds[5], truth[5]).verified
 
 
-def test_off_the_map_nothing_is_compared(world_map, world_drive):
+def test_off_map_frame_is_not_compared(world_map, world_drive):
     far = pose_from(np.eye(3), [5000.0, 0.0, 1.7])
     ride = Ride.begin(world_map, None, world_drive.clouds[4], far)
     judgement = refused(ride, world_drive.clouds[4], far)
@@ -145,7 +150,7 @@ def test_off_the_map_nothing_is_compared(world_map, world_drive):
 
 
 @pytest.mark.parametrize("limit", [2.0, 0.5])
-def test_a_pose_that_leans_more_than_the_limit_is_not_believed(world_map, world_drive, limit):
+def test_pose_tilted_beyond_limit_is_rejected(world_map, world_drive, limit):
     """The odometry leans against gravity by 3 degrees: the registration is good, but cannot be true."""
     tilt, truth = np.radians(3.0), world_drive.T_map_body[4]
     leaning = exp_se3(np.array([0.0, tilt, 0.0, 0.0, 0.0, 0.0]))
@@ -168,7 +173,7 @@ def test_a_pose_that_leans_more_than_the_limit_is_not_believed(world_map, world_
         assert "leans 3 degrees" in judgement.reason
 
 
-def test_what_was_refused_does_not_spoil_the_next(world_map, slow_drive):
+def test_rejected_frames_do_not_affect_the_next(world_map, slow_drive):
     """Though the window would reach back over all of it."""
     wide = TrackingConfig(window=20.0, min_points=30_000)
     ride = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
@@ -184,7 +189,7 @@ def test_what_was_refused_does_not_spoil_the_next(world_map, slow_drive):
     assert ride.error(truth[7])[0] < 0.05
 
 
-def test_alone_means_the_newest_frame_alone(world_map, slow_drive):
+def test_newest_only_uses_the_newest_frame(world_map, slow_drive):
     wide = TrackingConfig(window=20.0, min_points=30_000)
     ride = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
@@ -200,7 +205,7 @@ def test_alone_means_the_newest_frame_alone(world_map, slow_drive):
 # ---- a new start
 
 
-def test_a_new_start_carries_nothing_of_the_old_belief_over(world_map, slow_drive, world_drive):
+def test_restart_carries_nothing_over(world_map, slow_drive, world_drive):
     ride = on_the_way(world_map, slow_drive)
     usual = ride.tracker.predicted_covariance()
     T = ride.odometry(world_drive.T_map_body[8])
@@ -211,7 +216,7 @@ def test_a_new_start_carries_nothing_of_the_old_belief_over(world_map, slow_driv
     assert ride.error(world_drive.T_map_body[8])[0] < 0.03
 
 
-def test_the_first_look_is_surer_than_its_start_but_not_than_its_registration(world_map, world_drive):
+def test_first_update_covariance_lies_between_start_and_registration(world_map, world_drive):
     ride = ride_of(world_map, world_drive)
     started = np.diag(ride.tracker.predicted_covariance())
     ride.update(world_drive.clouds[4], world_drive.T_map_body[4])

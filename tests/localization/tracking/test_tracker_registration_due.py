@@ -38,22 +38,22 @@ def turning(angles):
 # ---- when it is due
 
 
-def test_standing_still_nothing_is_due(world_map):
+def test_no_registration_is_needed_while_standing(world_map):
     assert steps_until_due(world_map, [np.eye(4)] * 20, position_drift=5.0, yaw_drift=1.0) is None
 
 
 @pytest.mark.parametrize(("patience", "metres"), [(1.0, 1.5), (3.0, 4.5)])
-def test_driving_makes_it_due_and_in_a_hurry_three_times_as_late(world_map, patience, metres):
+def test_registration_is_needed_after_distance_and_later_when_deferred(world_map, patience, metres):
     found = steps_until_due(world_map, straight(0.02, 300), patience, distance=1.5)
     assert 0.02 * found == pytest.approx(metres, abs=0.021)
 
 
-def test_driving_to_and_fro_adds_up(world_map):
+def test_back_and_forth_driving_adds_up(world_map):
     shuttle = [pose_from(np.eye(3), [0.4 * (k % 2), 0.0, 0.0]) for k in range(9)]
     assert steps_until_due(world_map, shuttle, distance=1.5) == 4
 
 
-def test_turning_makes_it_due_and_to_and_fro_adds_up(world_map):
+def test_turning_needs_registration_and_back_and_forth_adds_up(world_map):
     turn = SETTINGS.turn
     assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.4, 0.8, 1.2]))) == 3
     assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.4, 0.0, 0.4]))) == 3
@@ -70,7 +70,7 @@ def test_turning_makes_it_due_and_to_and_fro_adds_up(world_map):
         ({"position_drift": 0.01, "max_position_sigma": 0.03}, 1.0),
     ],
 )
-def test_where_odometry_is_bad_it_is_due_earlier_but_not_at_once(world_map, bad, metres):
+def test_noisy_odometry_needs_registration_earlier_but_not_at_once(world_map, bad, metres):
     settings = {"distance": 1.0, "min_distance": 0.2, **bad}
     found = steps_until_due(world_map, straight(0.01), **settings)
     assert 0.01 * found == pytest.approx(metres, abs=0.0101)
@@ -81,7 +81,7 @@ def test_where_odometry_is_bad_it_is_due_earlier_but_not_at_once(world_map, bad,
         assert 0.05 * late == pytest.approx(3 * metres, abs=0.0501)
 
 
-def test_after_an_update_it_is_not_due_at_once(world_map, world_drive):
+def test_no_registration_is_needed_right_after_an_update(world_map, world_drive):
     clouds, truth = world_drive.clouds, world_drive.T_map_body
     ride = Ride.begin(world_map, None, clouds[0], truth[0])
     ride.see(clouds[1], truth[1])
@@ -94,7 +94,7 @@ def test_after_an_update_it_is_not_due_at_once(world_map, world_drive):
     assert ride.tracker.due()
 
 
-def test_one_that_is_rejected_does_not_come_again_at_once_either(world_map, world_drive):
+def test_no_registration_is_needed_right_after_a_rejection(world_map, world_drive):
     ride = Ride.begin(world_map, None, world_drive.clouds[0], world_drive.T_map_body[0])
     assert not ride.update(NOTHING, world_drive.T_map_body[1]).verified
     assert not ride.tracker.due()
@@ -103,7 +103,7 @@ def test_one_that_is_rejected_does_not_come_again_at_once_either(world_map, worl
 # ---- from what
 
 
-def test_the_window_is_the_last_metres_more_for_few_points_less_for_many(world_map):
+def test_scan_buffer_window_adapts_to_point_count(world_map):
     def window(points, **settings):
         config = LocalizerConfig(tracking=TrackingConfig(min_points=2500, max_points=50_000, **settings))
         tracker = tracker_of(world_map, config)
@@ -119,7 +119,7 @@ def test_the_window_is_the_last_metres_more_for_few_points_less_for_many(world_m
     assert window(1000, window=0.01) == [5, 6, 7]
 
 
-def test_frames_that_lie_far_back_are_not_kept(world_map):
+def test_scan_buffer_drops_old_frames(world_map):
     """A robot that never gets its points together, on a robot that runs for weeks."""
     tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(min_points=10**6)))
     for k in range(300):
@@ -130,7 +130,7 @@ def test_frames_that_lie_far_back_are_not_kept(world_map):
 # ---- how unsure
 
 
-def test_before_a_fix_there_is_nothing_to_update(world_map, world_drive):
+def test_update_before_start_raises(world_map, world_drive):
     tracker = tracker_of(world_map)
     tracker.observe(world_drive.clouds[0], np.eye(4))
     with pytest.raises(RuntimeError, match="call start first"):
@@ -152,7 +152,7 @@ def started(world_map):
     return tracker, covariance
 
 
-def test_metres_and_radians_make_it_less_sure(started):
+def test_covariance_grows_with_metres_and_radians(started):
     tracker, covariance = started
     before = np.diag(covariance())
     turned = np.diag(covariance(pose_from(rot_z(0.5), np.zeros(3))))
@@ -164,7 +164,7 @@ def test_metres_and_radians_make_it_less_sure(started):
     np.testing.assert_allclose(grown, drift.variances(5.0, 0.5)[:4], rtol=1e-3)
 
 
-def test_a_doubt_in_heading_becomes_one_across_the_way(started):
+def test_heading_uncertainty_becomes_lateral_uncertainty(started):
     tracker, covariance = started
     before = covariance()
     there = covariance(pose_from(np.eye(3), [8.0, 0.0, 0.0]))
@@ -173,7 +173,7 @@ def test_a_doubt_in_heading_becomes_one_across_the_way(started):
     assert there[2, 4] == pytest.approx(8.0 * before[2, 2], rel=1e-3)
 
 
-def test_a_fix_that_comes_late_is_less_sure(world_map):
+def test_late_fix_has_larger_covariance(world_map):
     sigmas = []
     for found_at in (3.0, 0.0):
         tracker = tracker_of(world_map)
@@ -185,7 +185,7 @@ def test_a_fix_that_comes_late_is_less_sure(world_map):
     np.testing.assert_allclose(sigmas[1] - sigmas[0], expected, rtol=0.01)
 
 
-def test_what_is_reported_has_metres_first_and_what_registrations_share(started, world_map):
+def test_reported_covariance_is_translation_first_with_shared_error(started, world_map):
     tracker, covariance = started
     predicted = covariance(pose_from(rot_z(0.3), [2.0, 1.0, 0.0]))
     reported = tracker.reported_covariance()
@@ -195,7 +195,7 @@ def test_what_is_reported_has_metres_first_and_what_registrations_share(started,
     assert reported[0, 5] == pytest.approx(predicted[3, 2])
 
 
-def test_however_many_registrations_the_report_keeps_what_they_share(world_map, slow_drive):
+def test_reported_covariance_never_falls_below_shared_error(world_map, slow_drive):
     ride = Ride.begin(world_map, None, slow_drive.clouds[0], slow_drive.T_map_body[0])
     for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):
         assert ride.update(cloud, truth).verified
@@ -231,7 +231,8 @@ def metres_until_due(tracker, T):
     raise AssertionError("nothing is due after two metres")
 
 
-def test_bad_odometry_is_found_out_and_watched_more_closely(world_map, slow_drive):
+@pytest.mark.slow
+def test_noisy_odometry_is_estimated_and_registered_more_often(world_map, slow_drive):
     good, bad = (ridden(world_map, slow_drive, scale) for scale in (1.0, 1.08))
     known = SETTINGS.position_drift
     assert good[0].drift.position < known

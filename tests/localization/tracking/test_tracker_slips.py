@@ -29,7 +29,7 @@ SIDEWAYS = pose_from(np.eye(3), [0.0, 0.5, 0.0])
         pose_from(rot_z(np.radians(6.0)), [0.1, 0.0, 0.0]),
     ],
 )
-def test_a_slip_is_found_and_the_next_frame_is_right(world_map, slow_drive, slip):
+def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     ride, k = on_the_way(world_map, slow_drive), 8
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
     drift = ride.tracker.drift
@@ -53,7 +53,7 @@ def test_a_slip_is_found_and_the_next_frame_is_right(world_map, slow_drive, slip
     assert degrees < 0.2
 
 
-def test_a_slip_that_is_not_real_is_not_believed(world_map, slow_drive, elsewhere):
+def test_random_points_are_not_taken_for_a_slip(world_map, slow_drive, elsewhere):
     """Garbage and another world may register anywhere within reach: that is no slip."""
     ride = on_the_way(world_map, slow_drive)
     for cloud in (garbage(), *elsewhere.clouds):
@@ -62,7 +62,7 @@ def test_a_slip_that_is_not_real_is_not_believed(world_map, slow_drive, elsewher
         )
 
 
-def test_what_may_be_odometrys_drift_is_no_slip(world_map, slow_drive):
+def test_plausible_drift_is_not_a_slip(world_map, slow_drive):
     """How far odometry may be off depends on how far it has driven, and on how it has been so far."""
     small = pose_from(np.eye(3), [0.0, 0.06, 0.0])
     causes = []
@@ -76,20 +76,20 @@ def test_what_may_be_odometrys_drift_is_no_slip(world_map, slow_drive):
     assert causes == [RejectionReason.ODOMETRY, RejectionReason.VERIFIED]
 
 
-def test_a_frame_off_its_place_alarms_after_a_good_one_and_not_before(world_map, slow_drive):
+def test_displaced_frame_is_detected_only_after_a_good_one(world_map, slow_drive):
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
     away = pose_from(np.eye(3), [6.0, 3.0, 0.0])
     ride = ride_of(world_map, slow_drive, frame=0)
     ride.see(clouds[1], truth[1])
-    assert not ride.tracker.alarmed(ride.odometry(truth[1] @ away))  # nothing to compare with
+    assert not ride.tracker.looks_displaced(ride.odometry(truth[1] @ away))  # nothing to compare with
     ride = on_the_way(world_map, slow_drive)
     ride.see(clouds[8], truth[8])
-    assert not ride.tracker.alarmed(ride.odometry(truth[8]))
+    assert not ride.tracker.looks_displaced(ride.odometry(truth[8]))
     ride.slips(away, truth[8])
     ride.see(clouds[9], truth[9])
-    assert ride.tracker.alarmed(ride.odometry(truth[9]))
+    assert ride.tracker.looks_displaced(ride.odometry(truth[9]))
     ride.tracker.forget_points()
-    assert not ride.tracker.alarmed(ride.odometry(truth[9]))  # no frame to look at
+    assert not ride.tracker.looks_displaced(ride.odometry(truth[9]))  # no frame to look at
 
 
 # ---- standing still
@@ -103,7 +103,8 @@ def stood(world_map, slow_drive, looks, idle):
     return np.diag(ride.tracker.predicted_covariance())
 
 
-def test_looking_again_does_not_add_up_to_certainty(world_map, slow_drive):
+@pytest.mark.slow
+def test_repeated_registrations_while_standing_do_not_shrink_covariance(world_map, slow_drive):
     some, many = (stood(world_map, slow_drive, looks, idle=True) for looks in (5, 40))
     np.testing.assert_allclose(many, some, rtol=0.15)
     assert (
@@ -111,7 +112,7 @@ def test_looking_again_does_not_add_up_to_certainty(world_map, slow_drive):
     ).sum() >= 2  # or it could not be seen here
 
 
-def test_standing_still_only_what_was_seen_since_counts(world_map, slow_drive):
+def test_standing_still_uses_only_scans_since_last_registration(world_map, slow_drive):
     """It may have been carried meanwhile: the frames before the last look are of another place."""
     wide = LocalizerConfig(tracking=TrackingConfig(window=20.0, min_points=30_000))
     ride = on_the_way(world_map, slow_drive, wide, 4)

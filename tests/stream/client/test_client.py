@@ -43,7 +43,7 @@ def client(net):
         yield robot
 
 
-def test_a_cloud_on_the_wire_is_the_documented_layout(client, net):
+def test_sent_cloud_has_the_documented_layout(client, net):
     client.send_cloud(CLOUD, 1_700_000_000.25)
     (sample,) = net.published
     assert sample.key == "coview/r1/in/cloud"
@@ -52,7 +52,7 @@ def test_a_cloud_on_the_wire_is_the_documented_layout(client, net):
     assert sample.attachment == struct.pack("<q", 1_700_000_000_250_000_000)
 
 
-def test_other_arrays_that_mean_the_same(client, net):
+def test_equivalent_arrays_are_accepted(client, net):
     client.send_cloud(np.column_stack([CLOUD, np.ones(4)]).astype(np.float64), 1)
     client.send_cloud(np.asfortranarray(CLOUD), 1.0)
     client.send_cloud(CLOUD.tolist(), np.float32(1.0))
@@ -61,7 +61,7 @@ def test_other_arrays_that_mean_the_same(client, net):
     assert len(net.published[-1].payload) == 5 * 12
 
 
-def test_odometry_on_the_wire(client, net):
+def test_sent_odometry_has_the_documented_layout(client, net):
     client.send_odometry(T, 0.1)
     (sample,) = net.published
     assert (sample.key, sample.encoding) == ("coview/r1/in/odom", "application/json")
@@ -71,14 +71,14 @@ def test_odometry_on_the_wire(client, net):
     assert fields["orientation"] == pytest.approx([0, 0, np.sin(0.15), np.cos(0.15)])
 
 
-def test_urgency_of_what_is_sent(client, net):
+def test_publishers_have_the_right_urgency(client, net):
     assert {p.key: p.urgency for p in net.publishers} == {
         "coview/r1/in/cloud": "bulk",
         "coview/r1/in/odom": "data",
     }
 
 
-def test_times_of_points_arrive(client, net):
+def test_point_times_are_sent(client, net):
     times = np.array([0.0, 0.01, 0.02, 0.03])
     client.send_cloud(CLOUD, 3.0, times)
     message = decode_cloud(net.published[0])
@@ -112,7 +112,7 @@ def test_times_of_points_arrive(client, net):
         (lambda c: c.send_odometry(np.full((4, 4), np.nan), 1.0), "T_odom_body"),
     ],
 )
-def test_what_cannot_be_sent(client, net, call, text):
+def test_invalid_clouds_and_odometry_are_refused(client, net, call, text):
     with pytest.raises(InputError, match=text):
         call(client)
     assert net.published == []
@@ -173,7 +173,7 @@ def test_unread_poses_are_bounded(client, net):
     assert stamps == list(range(5, POSES_KEPT + 5))
 
 
-def test_other_robots_and_rubbish_are_left_out(client, net, caplog):
+def test_other_robots_and_undecodable_messages_are_ignored(client, net, caplog):
     published(net, encode_pose(pose_message(robot="r2"), "json"), "coview/r2/out/pose")
     for payload in (b"", b"\xff\x00", b"{}", b"[1]", b"[" * 50_000):
         published(net, Encoded(payload))
@@ -184,7 +184,7 @@ def test_other_robots_and_rubbish_are_left_out(client, net, caplog):
     assert net.raised == []
 
 
-def test_closing_ends_iterators_and_leaves_a_given_transport_open(net):
+def test_close_ends_iterators_and_keeps_given_transport_open(net):
     robot = RobotClient("r1", transport=net)
     published(net, encode_pose(pose_message(1), "json"))
     poses = robot.poses()
@@ -206,7 +206,7 @@ def test_closing_ends_iterators_and_leaves_a_given_transport_open(net):
         lambda c: c.wait_for_node(0.0),
     ],
 )
-def test_a_closed_client_says_so(net, call):
+def test_closed_client_raises(net, call):
     robot = RobotClient("r1", transport=net)
     robot.close()
     with pytest.raises(TransportError, match="'r1' is closed"):
@@ -219,7 +219,7 @@ def status(net, state):
 
 
 @pytest.mark.parametrize("state", ["LOST", "SEARCHING", "AMBIGUOUS"])
-def test_the_latest_pose_ends_with_tracking(client, net, state):
+def test_latest_pose_is_none_after_tracking_ends(client, net, state):
     status(net, "TRACKING")
     published(net, encode_pose(pose_message(1), "json"))
     assert client.latest_pose.stamp_ns == 1
@@ -232,14 +232,14 @@ def test_the_latest_pose_ends_with_tracking(client, net, state):
     assert client.latest_pose.stamp_ns == 3
 
 
-def test_a_pose_of_before_does_not_come_back_with_tracking(client, net):
+def test_stale_pose_does_not_return_with_tracking(client, net):
     published(net, encode_pose(pose_message(1), "json"))
     status(net, "LOST")
     status(net, "TRACKING")
     assert client.latest_pose is None
 
 
-def test_the_latest_pose_ages(client, net, monkeypatch):
+def test_latest_pose_expires(client, net, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(client_module, "monotonic", lambda: now[0])
     published(net, encode_pose(pose_message(1), "json"))
@@ -251,7 +251,7 @@ def test_the_latest_pose_ages(client, net, monkeypatch):
     assert client.latest_pose.stamp_ns == 2
 
 
-def test_questions(client, net):
+def test_reset_and_relocalize_requests(client, net):
     with pytest.raises(TransportError, match="nobody answers"):
         client.relocalize()
     net.answer("coview/r1/rpc/relocalize", lambda parameters: {"ok": True, "parameters": parameters})
@@ -276,17 +276,17 @@ def test_questions(client, net):
         {"odometry_encoding": "xyz"},
     ],
 )
-def test_bad_options(net, options):
+def test_bad_client_options_are_refused(net, options):
     with pytest.raises(ConfigError):
         RobotClient(**({"robot": "r1", "transport": net} | options))
 
 
-def test_a_malformed_endpoint():
+def test_malformed_endpoint_is_refused():
     with pytest.raises(TransportError, match="nonsense"):
         RobotClient("r1", "nonsense")
 
 
-def test_over_real_sockets():
+def test_client_over_real_sockets():
     endpoint = free_endpoint()
     clouds, odometry = [], []
     node = open_transport(listen=[endpoint])
@@ -328,7 +328,7 @@ def answers(robot):
         return False
 
 
-def test_the_last_big_frame_survives_closing():
+def test_last_large_frame_is_sent_before_close():
     """Measured: without waiting, a 1 MB frame put just before closing never arrives."""
     endpoint = free_endpoint()
     clouds = []

@@ -25,7 +25,7 @@ STATUS = {
 }
 
 
-def test_a_robot_that_tracks():
+def test_tracking_robot_shows_its_pose():
     fleet = FleetTable()
     fleet.add_status("r1", STATUS, 9.0)
     for k in range(60):
@@ -38,7 +38,7 @@ def test_a_robot_that_tracks():
     ]
 
 
-def test_a_stale_pose_is_no_longer_shown():
+def test_stale_pose_is_hidden():
     fleet = FleetTable()
     fleet.add_pose(POSE, 10.0)
     assert "412000.12" in fleet.table(10.0 + STALE - 0.1)[1]
@@ -48,7 +48,7 @@ def test_a_stale_pose_is_no_longer_shown():
     assert line.split()[:3] == ["r1", "LOST", "-"]
 
 
-def test_a_robot_that_got_lost_shows_no_pose():
+def test_lost_robot_shows_no_pose():
     fleet = FleetTable()
     fleet.add_pose(POSE, 10.0)
     fleet.add_status("r1", {"state": "LOST"}, 10.1)
@@ -57,7 +57,7 @@ def test_a_robot_that_got_lost_shows_no_pose():
     assert "412000.12" in fleet.table(10.4)[1]
 
 
-def test_a_robot_that_went_silent_says_so():
+def test_silent_robot_is_marked():
     fleet = FleetTable()
     fleet.add_status("r1", STATUS, 10.0)
     assert "TRACKING" in fleet.table(10.0 + SILENT)[1]
@@ -73,13 +73,13 @@ def test_a_robot_that_went_silent_says_so():
         {"reason": {"deep": [1]}},
     ],
 )
-def test_any_status_can_be_shown(status):
+def test_any_status_is_printable(status):
     fleet = FleetTable()
     fleet.add_status("r1", status, 1.0)
     assert fleet.table(1.5)[1].startswith("r1 ")
 
 
-def test_robots_are_sorted_and_text_from_the_network_is_harmless():
+def test_robots_are_sorted_and_network_text_is_escaped():
     fleet = FleetTable()
     fleet.add_status("zoe", {"state": "\x1b[2JSEARCHING\n", "reason": "a\tb"}, 1.0)
     fleet.add_status("ada", {}, 1.0)
@@ -97,7 +97,7 @@ def test_a_pose_without_confidence_shows_none():
 
 
 @pytest.mark.parametrize("name", ["json", "cdr", "foxglove", "keelson"])
-def test_records_have_the_same_fields_whatever_the_format(name):
+def test_pose_records_have_the_same_fields_in_every_format(name):
     encoded = encode_pose(POSE, name)
     sample = Sample("k", encoded.payload, encoded.encoding)
     record = pose_record(decode_pose(sample), sample)
@@ -110,12 +110,12 @@ def test_records_have_the_same_fields_whatever_the_format(name):
     assert (record["covariance"] is None) is (name in ("foxglove", "keelson"))
 
 
-def test_json_is_passed_on_with_fields_that_are_not_known_here():
+def test_unknown_json_fields_are_passed_on():
     payload = json.dumps({**json.loads(encode_pose(POSE, "json").payload), "new": 1}).encode()
     assert pose_record(POSE, Sample("k", payload))["new"] == 1
 
 
 @pytest.mark.parametrize("payload", [b"", b"[]", b"3", b"{", b"\xff", b'{"a": NaN}', b"[" * 100_000])
-def test_what_is_no_status(payload):
+def test_status_that_is_not_json_is_refused(payload):
     with pytest.raises(MessageError, match="the status is no JSON"):
         read_status(Sample("coview/r1/out/status", payload))

@@ -10,7 +10,7 @@ from coview_stream.errors import ConfigError
 from coview_stream.stream.client.client import LatestQueue
 
 
-def test_in_order_and_the_newest_win():
+def test_latest_queue_keeps_order_and_drops_oldest():
     box = LatestQueue[int](3)
     for k in range(5):
         box.put(k)
@@ -18,7 +18,7 @@ def test_in_order_and_the_newest_win():
     assert box.dropped == 2
 
 
-def test_closing_wakes_a_reader_and_leaves_what_is_inside():
+def test_close_wakes_reader_and_keeps_items():
     box = LatestQueue[int](3)
     found: list[int | None] = [7]
     reader = threading.Thread(target=lambda: found.append(box.get()))
@@ -34,7 +34,7 @@ def test_closing_wakes_a_reader_and_leaves_what_is_inside():
     assert [full.get(), full.get()] == [1, None]
 
 
-def test_a_reader_is_woken_by_what_arrives():
+def test_put_wakes_waiting_reader():
     box = LatestQueue[int](3)
     found: list[int | None] = []
     reader = threading.Thread(target=lambda: found.append(box.get(timeout=10)))
@@ -44,6 +44,6 @@ def test_a_reader_is_woken_by_what_arrives():
     assert found == [4]
 
 
-def test_size_is_checked():
+def test_latest_queue_size_is_validated():
     with pytest.raises(ConfigError, match="mailbox size"):
         LatestQueue[int](0)

@@ -73,7 +73,7 @@ def recorded(run, config, clock=None, **options):
     return report, sent
 
 
-def test_frames_come_as_recorded_each_after_its_odometry(run):
+def test_frames_are_sent_in_order_after_their_odometry(run):
     report, sent = recorded(run, ReplayConfig())
     assert [kind for _, kind, _ in sent] == ["odom", "cloud"] * 4
     for k, ((when, _, odom), (then, _, cloud)) in enumerate(zip(sent[::2], sent[1::2], strict=True)):
@@ -95,7 +95,7 @@ def test_frames_come_as_recorded_each_after_its_odometry(run):
         ({"rate": 2.0}, [0.0, 0.5, 1.0, 1.5]),
     ],
 )
-def test_speed_and_rate_change_the_deadlines_but_not_the_stamps(run, options, times):
+def test_speed_and_rate_change_deadlines_but_not_stamps(run, options, times):
     _, sent = recorded(run, ReplayConfig(**options))
     clouds = [(when, message) for when, kind, message in sent if kind == "cloud"]
     assert [when for when, _ in clouds] == pytest.approx(times)
@@ -116,7 +116,7 @@ def test_odometry_between_frames_is_interpolated(run):
     assert len([1 for _, kind, _ in sent if kind == "cloud"]) == 4
 
 
-def test_a_loop_goes_on_with_increasing_stamps_and_back_at_the_start(run):
+def test_loop_restarts_the_run_with_increasing_stamps(run):
     report, sent = recorded(run, ReplayConfig(loop=True, odometry_rate=40.0), TestClock(end=0.72))
     assert not report.finished
     assert "ended early" in report.text()
@@ -131,7 +131,7 @@ def test_a_loop_goes_on_with_increasing_stamps_and_back_at_the_start(run):
     assert not [when for when, kind, _ in sent if kind == "odom" and 0.36 < when < 0.44]
 
 
-def test_deadlines_are_absolute(run):
+def test_slow_send_does_not_delay_later_deadlines(run):
     """A send that takes long delays what comes next, but not what comes after that."""
     clock, net = TestClock(), FakeTransport()
     times = []
@@ -148,13 +148,13 @@ def test_deadlines_are_absolute(run):
     assert "1 frames were sent more than 20 ms late" in report.text()
 
 
-def test_it_ends_when_told(run):
+def test_replay_stops_when_cancelled(run):
     report, sent = recorded(run, ReplayConfig(), TestClock(waits=2))
     assert len(sent) == 4
     assert (report.frames, report.finished) == (2, False)
 
 
-def test_damaged_frames_are_left_out_and_counted(run_folder, tmp_path):
+def test_damaged_frames_are_skipped_and_counted(run_folder, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(run_folder, folder)
     (folder / "frames" / "000001.ply").write_bytes(b"no cloud")
@@ -169,7 +169,7 @@ def test_damaged_frames_are_left_out_and_counted(run_folder, tmp_path):
         recorded(open_run(folder), ReplayConfig())
 
 
-def test_a_frame_without_a_finite_point_ends_nothing(run, monkeypatch):
+def test_frame_without_finite_points_is_skipped(run, monkeypatch):
     inner = Run.read
 
     def read(self, index):
@@ -182,7 +182,7 @@ def test_a_frame_without_a_finite_point_ends_nothing(run, monkeypatch):
     assert "none of them finite" in report.text()
 
 
-def test_one_cloud_is_a_run_too(run_folder):
+def test_single_cloud_is_replayed(run_folder):
     single = open_run(run_folder / "frames" / "000002.ply")
     report, sent = recorded(single, ReplayConfig())
     assert [kind for _, kind, _ in sent] == ["odom", "cloud"]
@@ -194,14 +194,14 @@ def test_one_cloud_is_a_run_too(run_folder):
 
 @pytest.mark.parametrize("cloud", ["xyz", "xyzi", "foxglove", "cdr", "keelson"])
 @pytest.mark.parametrize("odometry", ["json", "cdr"])
-def test_encodings(run, cloud, odometry):
+def test_replay_encodings(run, cloud, odometry):
     report, sent = recorded(run, ReplayConfig(), cloud_encoding=cloud, odometry_encoding=odometry)
     assert report.frames == 4
     assert sent[3][2].points[:, 0] == pytest.approx(np.full(5, 2.0))
     assert sent[2][2].T_odom_body == pytest.approx(run.poses[1])
 
 
-def test_what_goes_wrong_while_reading_ahead_reaches_the_caller(run):
+def test_read_ahead_error_reaches_the_caller(run):
     crooked = replace(run, poses=np.zeros((4, 4, 4)))  # finite, but no rotations
     with pytest.raises(ValueError, match="rigid"):
         recorded(crooked, ReplayConfig())
@@ -218,17 +218,17 @@ def test_what_goes_wrong_while_reading_ahead_reaches_the_caller(run):
         ({"read_ahead": 0}, "read_ahead"),
     ],
 )
-def test_bad_options(options, text):
+def test_bad_replay_config_is_refused(options, text):
     with pytest.raises(ConfigError, match=text):
         ReplayConfig(**options)
 
 
-def test_a_schedule_without_loop_ends(run):
+def test_schedule_without_loop_ends(run):
     assert [beat.frame for beat in beats(run, ReplayConfig())] == [0, 1, 2, 3]
     assert frame_times(run, ReplayConfig(rate=10.0)) == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
-def test_how_far_apart_odometry_comes(run, run_folder):
+def test_odometry_spacing(run, run_folder):
     assert odometry_spacing(run, ReplayConfig()) == pytest.approx(0.1)
     assert odometry_spacing(run, ReplayConfig(odometry_rate=50.0)) == pytest.approx(0.02)
     assert odometry_spacing(run, ReplayConfig(speed=0.1)) == pytest.approx(1.0)

@@ -17,7 +17,9 @@ from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import FakeTransport
 
 STEP = 0.05
-PATIENT = NodeConfig(odometry_timeout=30.0, pairing_wait=30.0, dead_reckoning_timeout=30.0)  # however slow the machine is
+PATIENT = NodeConfig(
+    odometry_timeout=30.0, pairing_wait=30.0, dead_reckoning_timeout=30.0
+)  # however slow the machine is
 THREADS = ("coview-track", "coview-search", "coview-poses", "coview-status")
 
 

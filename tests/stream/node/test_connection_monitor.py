@@ -22,12 +22,12 @@ def said(caplog):
     return lambda: [(r.levelname, r.getMessage()) for r in caplog.records]
 
 
-def test_the_first_router_is_no_reconnection(said):
+def test_first_router_is_not_a_reconnection(said):
     assert looks(ConnectionMonitor(), ("", ""), ("A", ""), ("A", "")) == 0
     assert said() == [("INFO", "connected to router A")]
 
 
-def test_a_router_that_comes_back(said):
+def test_returning_router_is_a_reconnection(said):
     assert looks(ConnectionMonitor(), ("A", ""), ("", ""), ("A", ""), ("", ""), ("A", "")) == 2
     assert said()[1:3] == [
         ("WARNING", "router A is gone: nobody can hear us"),
@@ -35,28 +35,28 @@ def test_a_router_that_comes_back(said):
     ]
 
 
-def test_a_router_replaced_between_two_looks(said):
+def test_router_replaced_between_two_polls_is_a_reconnection(said):
     assert looks(ConnectionMonitor(), ("A", ""), ("B", ""), ("B", "")) == 1
     assert said()[-1] == ("INFO", "connected to router B instead of A")
 
 
-def test_a_router_replaced_after_a_while_and_another_besides():
+def test_router_replaced_after_outage_and_additional_router():
     link = ConnectionMonitor()
     assert looks(link, ("A", ""), ("", ""), ("B", "")) == 1
     assert looks(link, ("BC", "")) == 1  # nobody was missed
 
 
-def test_one_of_two_routers(said):
+def test_losing_one_of_two_routers_is_a_reconnection(said):
     link = ConnectionMonitor()
     assert looks(link, ("AB", ""), ("A", ""), ("AB", "")) == 1
     assert said()[-2:] == [("WARNING", "router B is gone"), ("INFO", "connected to router B again")]
 
 
-def test_peers_come_and_go(said):
+def test_peers_are_not_reconnections(said):
     assert looks(ConnectionMonitor(), ("", "p"), ("", ""), ("", "pq"), ("", "q")) == 0
     assert {level for level, _ in said()} == {"INFO"}
     assert said()[-1][1] == "peer p is gone"
 
 
-def test_a_peer_that_stays_hides_no_router():
+def test_connected_peer_does_not_hide_router_loss():
     assert looks(ConnectionMonitor(), ("A", "p"), ("", "p"), ("A", "p")) == 1

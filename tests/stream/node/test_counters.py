@@ -21,7 +21,7 @@ def unnumbered(*frames):
     return missing(*((k, None) for k in frames))
 
 
-def test_each_counter_counts_alone():
+def test_each_counter_counts_independently():
     counters = Counters()
     counters.count("late")
     counters.count("missing", 3)
@@ -31,12 +31,12 @@ def test_each_counter_counts_alone():
     assert json.loads(json.dumps(document)) == document
 
 
-def test_there_is_no_counter_of_that_name():
+def test_unknown_counter_is_refused():
     with pytest.raises(AttributeError):
         Counters().count("lates")
 
 
-def test_latencies_in_milliseconds():
+def test_latency_percentiles_in_milliseconds():
     latency = Latency()
     assert latency.to_json() == {"p50": None, "p95": None, "p99": None}
     for k in range(101):
@@ -44,47 +44,47 @@ def test_latencies_in_milliseconds():
     assert latency.to_json() == {"p50": 50.0, "p95": 95.0, "p99": 99.0}
 
 
-def test_old_latencies_are_forgotten():
+def test_old_latencies_are_dropped():
     latency = Latency()
     for seconds in [9.0] * 300 + [0.01] * 600:
         latency.add(seconds)
     assert latency.to_json() == {"p50": 10.0, "p95": 10.0, "p99": 10.0}
 
 
-def test_a_steady_sender_misses_nothing():
+def test_steady_stamps_count_no_missing_frames():
     assert set(unnumbered(*range(50))) == {0}
     jittered = [k + 0.2 * (-1) ** k for k in range(50)]
     assert set(unnumbered(*jittered)) == {0}
 
 
-def test_gaps_in_a_steady_sequence_of_stamps():
+def test_stamp_gaps_count_missing_frames():
     assert unnumbered(*range(10), 11, 12)[-2:] == [1, 0]
     assert unnumbered(*range(10), 14, 15)[-2:] == [4, 0]
 
 
-def test_no_estimate_before_the_rate_is_known():
+def test_no_missing_frames_before_rate_is_known():
     assert unnumbered(0, 1, 5, 6) == [0, 0, 0, 0]
 
 
-def test_a_pause_is_no_loss():
+def test_long_pause_counts_no_missing_frames():
     """A robot that was switched off for an hour has lost no frames."""
     assert unnumbered(*range(10), 36_000, 36_001)[-2:] == [0, 0]
 
 
-def test_a_changed_rate_is_learnt():
+def test_changed_rate_is_learned():
     slow = [20 + 2 * k for k in range(30)]
     assert unnumbered(*range(20), *slow)[-1] == 0
 
 
-def test_numbered_frames_are_counted_exactly():
+def test_sequence_numbers_count_missing_frames_exactly():
     assert missing((0, 7), (1, 8), (2, 11), (3, 12)) == [0, 0, 2, 0]
     assert missing((0, 7), (5, 8)) == [0, 0]  # a pause, but no number is missing
 
 
-def test_numbers_that_start_anew_are_no_loss():
+def test_restarted_sequence_numbers_count_no_missing_frames():
     assert missing((0, 900), (1, 1), (2, 2)) == [0, 0, 0]
     assert missing((0, 1), (1, 5_000_000)) == [0, 0]
 
 
-def test_stamps_that_go_back_are_no_loss():
+def test_backward_stamps_count_no_missing_frames():
     assert unnumbered(*range(10), 3, 4)[-2:] == [0, 0]

@@ -18,7 +18,7 @@ from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, CoViewError, InputError
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.stream.node import worker
 from coview_stream.stream.node.engine_process import (
     CancelledError,
@@ -52,20 +52,20 @@ class Engine:
         self.forgotten.append(robot)
 
 
-def test_a_job_done():
+def test_completed_job_returns_its_result():
     engine = Engine()
     assert InlineLane(engine).run(job()).fix.state is State.TRACKING
     assert engine.forgotten == []
 
 
-def test_a_job_rejected_costs_the_job_only():
+def test_rejected_job_keeps_the_engine_state():
     engine = Engine(CloudError("cloud has 3 finite points"))
     with pytest.raises(RejectedError, match="3 finite points"):
         InlineLane(engine).run(job())
     assert engine.forgotten == []
 
 
-def test_an_engine_that_failed_forgets_the_robot_and_says_where():
+def test_failed_engine_forgets_the_robot_and_returns_traceback():
     engine = Engine(ZeroDivisionError("by nothing"))
     with pytest.raises(FailedError) as caught:
         InlineLane(engine).run(job(robot="r7"))
@@ -84,7 +84,8 @@ def alive(pid):
     return True
 
 
-def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
+@pytest.mark.slow
+def test_killed_engine_process_is_restarted(world_file, world_drive):
     lane = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
     good = job(world_drive.clouds[0])
     try:
@@ -118,7 +119,8 @@ def test_a_process_works_is_killed_and_works_again(world_file, world_drive):
     lane.close()
 
 
-def test_a_map_that_cannot_be_opened(tmp_path):
+@pytest.mark.slow
+def test_unreadable_map_fails_wait_ready(tmp_path):
     broken = tmp_path / "broken.coview"
     broken.write_bytes(b"no map at all")
     lane = EngineProcess("search", str(broken), "0" * 64)
@@ -131,7 +133,7 @@ def test_a_map_that_cannot_be_opened(tmp_path):
     assert lane.pid is None
 
 
-def test_an_engine_that_cannot_prepare_says_why_each_time(monkeypatch):
+def test_engine_that_cannot_prepare_reports_why_each_time(monkeypatch):
     """And the child ends: the next job starts another, which may do better."""
 
     class Unprepared(Engine):
@@ -158,7 +160,8 @@ def test_an_engine_that_cannot_prepare_says_why_each_time(monkeypatch):
     lane.close()
 
 
-def test_a_map_that_was_replaced_is_named_each_time(world_file):
+@pytest.mark.slow
+def test_replaced_map_is_reported_each_time(world_file):
     lane = EngineProcess("track", str(world_file), "0" * 64)
     try:
         for _ in range(2):
@@ -170,7 +173,8 @@ def test_a_map_that_was_replaced_is_named_each_time(world_file):
         lane.close()
 
 
-def test_a_worker_that_stands_still_is_ended_even_with_a_frame_half_sent(world_file, world_drive):
+@pytest.mark.slow
+def test_hung_worker_is_killed_during_send(world_file, world_drive):
     lane = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
     good = job(world_drive.clouds[0])
     try:
@@ -197,7 +201,8 @@ def with_child(lane, program):
     lane._pipe = Connection(ours.detach())
 
 
-def test_an_answer_that_breaks_off_ends_the_worker():
+@pytest.mark.slow
+def test_truncated_answer_kills_the_worker():
     lane = EngineProcess("search", "unused", "0" * 64, patience=0.3)
     with_child(lane, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
     child = lane.pid
@@ -207,7 +212,8 @@ def test_an_answer_that_breaks_off_ends_the_worker():
     lane.close()
 
 
-def test_opening_has_a_limit_of_its_own_and_can_be_cancelled():
+@pytest.mark.slow
+def test_opening_has_its_own_timeout_and_can_be_cancelled():
     lane = EngineProcess("track", "unused", "0" * 64, patience=0.01, opening=0.3)
     with_child(lane, "time.sleep(60)")
     lane._awaited = ["ready", "prepared"]
@@ -224,7 +230,8 @@ def test_opening_has_a_limit_of_its_own_and_can_be_cancelled():
     lane.close()
 
 
-def test_closing_ends_a_job_under_way():
+@pytest.mark.slow
+def test_close_ends_a_running_job():
     lane = EngineProcess("track", "unused", "0" * 64)
     with_child(lane, "time.sleep(60)")
     timer = threading.Timer(0.2, lane.close)

@@ -13,7 +13,7 @@ def names():
     return [thread.name for thread in threading.enumerate()]
 
 
-def test_it_frees_who_is_stuck():
+def test_watchdog_acts_after_the_limit():
     freed = threading.Event()
     dog = Watchdog("coview-test-dog", freed.set)
     with dog.limit(60.0):
@@ -26,7 +26,7 @@ def test_it_frees_who_is_stuck():
     until(lambda: "coview-test-dog" not in names())
 
 
-def test_what_ends_in_time_is_left_alone_and_a_new_limit_starts_anew():
+def test_watchdog_ignores_calls_within_limit():
     calls = []
     dog = Watchdog("coview-test-dog", lambda: calls.append(1))
     for _ in range(3):

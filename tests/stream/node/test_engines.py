@@ -14,7 +14,7 @@ from coview_kernels.launch import Launch
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, MapError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine, open_engine
 from coview_stream.stream.node.jobs import FrameJob, SearchJob
@@ -111,7 +111,7 @@ def same(fix, other):
         np.testing.assert_allclose(fix.covariance, other.covariance, rtol=1e-3, atol=1e-9)
 
 
-def test_two_halves_are_a_localizer_one_frame_late(alone, world_fixes):
+def test_track_and_search_engines_equal_localizer_one_frame_late(alone, world_fixes):
     first = next(k for k, fix in enumerate(world_fixes) if fix.state is State.TRACKING)
     assert first + 1 < FRAMES
     assert alone[0].state is State.SEARCHING
@@ -122,14 +122,14 @@ def test_two_halves_are_a_localizer_one_frame_late(alone, world_fixes):
         same(alone[k], world_fixes[k])
 
 
-def test_the_poses_are_right(alone, world_drive):
+def test_engine_poses_are_correct(alone, world_drive):
     assert alone[-1].T_map_body is not None
     for fix, truth in zip(alone, world_drive.T_map_body, strict=False):
         if fix.T_map_body is not None:
             assert pose_error(fix.T_map_body, truth)[0] < 0.08
 
 
-def test_two_robots_are_as_each_alone(engines, alone, world_drive):
+def test_two_robots_give_same_results_as_each_alone(engines, alone, world_drive):
     other_drive = world_drive.seen_from(OTHER_ODOMETRY)
     one, two = Follower(*engines, "one"), Follower(*engines, "two", epoch=9)
     for k in range(FRAMES):
@@ -142,7 +142,7 @@ def test_two_robots_are_as_each_alone(engines, alone, world_drive):
             np.testing.assert_allclose(there.T_map_body, undisturbed.T_map_body, atol=0.02)
 
 
-def test_a_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_drive):
+def test_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_drive):
     follower = Follower(*engines, "careless")
     bad = (
         (np.full((50, 3), np.nan, np.float32), world_drive.T_odom_body[0], CloudError),
@@ -158,7 +158,7 @@ def test_a_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_d
         same(fix, undisturbed)
 
 
-def test_a_new_epoch_starts_anew_in_both_halves(engines, alone, world_drive):
+def test_new_epoch_resets_both_engines(engines, alone, world_drive):
     follower = Follower(*engines, "restarted")
     follower.follow(world_drive, range(2))
     follower.epoch, follower.verdict, follower.fixes = 2, None, []
@@ -168,7 +168,7 @@ def test_a_new_epoch_starts_anew_in_both_halves(engines, alone, world_drive):
     np.testing.assert_allclose(follower.fixes[-1].T_map_body, alone[-1].T_map_body, atol=0.02)
 
 
-def test_a_robot_forgotten_begins_anew(engines, alone, world_drive):
+def test_forgotten_robot_starts_from_scratch(engines, alone, world_drive):
     follower = Follower(*engines, "forgotten")
     follower.follow(world_drive, range(3))
     for engine in engines:
@@ -181,7 +181,7 @@ def test_a_robot_forgotten_begins_anew(engines, alone, world_drive):
         assert (fix.evidence and fix.evidence.reason) == (first.evidence and first.evidence.reason)
 
 
-def test_a_suspect_frame_is_verified(engines, reference, world_drive):
+def test_frame_marked_for_verification_is_verified(engines, reference, world_drive):
     follower = Follower(*engines, "suspect")
     fix = follower.follow(world_drive, range(FRAMES), reference.verdicts)[-1]
     assert fix.state is State.TRACKING
@@ -209,7 +209,7 @@ def test_points_with_times_are_deskewed(engines, world_drive):
     np.testing.assert_allclose(cloud, points, atol=0.01)
 
 
-def test_work_of_the_other_half_is_refused(engines, world_drive):
+def test_job_of_the_other_engine_is_refused(engines, world_drive):
     track, search = engines
     frame = FrameJob("r1", 1, 0, world_drive.clouds[0], world_drive.T_odom_body[0])
     with pytest.raises(TypeError, match="FrameJob"):
@@ -219,7 +219,7 @@ def test_work_of_the_other_half_is_refused(engines, world_drive):
         track.run(SearchJob("asking", 1, asked))
 
 
-def test_engines_from_a_file(world_file, tmp_path):
+def test_engines_open_from_a_map_file(world_file, tmp_path):
     sha256 = BaseMap.load(world_file).sha256
     assert isinstance(open_engine("track", world_file, sha256), TrackEngine)
     assert isinstance(open_engine("search", world_file, sha256), SearchEngine)

@@ -25,7 +25,7 @@ def same(a, b):
     np.testing.assert_array_equal(a.T_map_body, b.T_map_body)  # every bit
 
 
-def test_comes_back_as_it_was(tmp_path):
+def test_last_pose_round_trip(tmp_path):
     path = save(tmp_path / "made" / "now", LAST)
     assert path.name == "r1-0123456789abcdef.json"
     found = load(tmp_path / "made" / "now", "r1", SHA)
@@ -33,7 +33,7 @@ def test_comes_back_as_it_was(tmp_path):
     assert found.T_map_body.dtype == np.float64
 
 
-def test_the_newest_replaces_the_one_before_and_leaves_nothing_else(tmp_path):
+def test_newer_pose_replaces_older_file(tmp_path):
     save(tmp_path, LAST)
     newer = replace(LAST, stamp_ns=LAST.stamp_ns + 5, T_map_body=np.eye(4))
     save(tmp_path, newer)
@@ -41,12 +41,12 @@ def test_the_newest_replaces_the_one_before_and_leaves_nothing_else(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["r1-0123456789abcdef.json"]
 
 
-def test_nothing_saved_is_no_warning(tmp_path, caplog):
+def test_missing_file_gives_none_without_warning(tmp_path, caplog):
     assert load(tmp_path / "not there", "r1", SHA) is None
     assert not caplog.records
 
 
-def test_every_robot_and_map_has_its_own(tmp_path):
+def test_each_robot_and_map_has_its_own_file(tmp_path):
     save(tmp_path, LAST)
     save(tmp_path, replace(LAST, robot="r2"))
     save(tmp_path, replace(LAST, map_sha256="f" * 64))
@@ -71,7 +71,7 @@ NAMES = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_any_name_gives_a_file_in_the_folder(tmp_path, name):
+def test_any_robot_name_gives_a_safe_file_name(tmp_path, name):
     save(tmp_path / "state", replace(LAST, robot=name))
     assert load(tmp_path / "state", name, SHA).robot == name
     (file,) = (tmp_path / "state").iterdir()
@@ -80,7 +80,7 @@ def test_any_name_gives_a_file_in_the_folder(tmp_path, name):
     assert not set(file.name) & set('\\/:*?"<>|')
 
 
-def test_no_two_names_share_a_file_even_where_case_does_not_count(tmp_path):
+def test_file_names_are_unique_ignoring_case(tmp_path):
     names = [*NAMES, "r1", "con/", "a/b", "rué" * 91, "CON"]
     assert len({file_of(tmp_path, n, SHA).name.lower() for n in names}) == len(names)
 
@@ -119,7 +119,7 @@ USELESS = {
 
 
 @pytest.mark.parametrize("what", USELESS)
-def test_what_cannot_be_used_is_a_warning_that_names_the_file(tmp_path, caplog, what):
+def test_unusable_content_is_a_warning_naming_the_file(tmp_path, caplog, what):
     content = USELESS[what]
     path = file_of(tmp_path, "r1", SHA)
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -132,13 +132,13 @@ def test_what_cannot_be_used_is_a_warning_that_names_the_file(tmp_path, caplog, 
     assert load(tmp_path, "r1", SHA) is not None
 
 
-def test_what_cannot_be_opened_is_a_warning(tmp_path, caplog):
+def test_unreadable_file_is_a_warning(tmp_path, caplog):
     file_of(tmp_path, "r1", SHA).mkdir()
     assert load(tmp_path, "r1", SHA) is None
     assert str(file_of(tmp_path, "r1", SHA)) in caplog.text
 
 
-def test_a_failing_disk_is_the_callers_business_and_spoils_nothing(tmp_path, monkeypatch):
+def test_failed_save_raises_and_keeps_the_old_pose(tmp_path, monkeypatch):
     save(tmp_path, LAST)
 
     def full(descriptor):
@@ -153,7 +153,7 @@ def test_a_failing_disk_is_the_callers_business_and_spoils_nothing(tmp_path, mon
         save(tmp_path / "file", LAST)
 
 
-def test_forgotten(tmp_path):
+def test_forget_deletes_the_file_of_one_robot(tmp_path):
     save(tmp_path, LAST)
     save(tmp_path, replace(LAST, robot="r2"))
     for _ in range(2):
@@ -162,7 +162,7 @@ def test_forgotten(tmp_path):
     assert load(tmp_path, "r2", SHA) is not None
 
 
-def test_the_default_folder(monkeypatch, tmp_path):
+def test_default_state_folder_by_platform(monkeypatch, tmp_path):
     monkeypatch.setattr(last_pose.sys, "platform", "linux")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert default_folder() == tmp_path / "coview-stream"

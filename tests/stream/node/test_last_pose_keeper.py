@@ -38,14 +38,14 @@ def jobs_of(robot, count=3, answer=unknown, begin=0.1):
 # ---- a session
 
 
-def test_a_suggestion_goes_with_one_frame(robot):
+def test_pose_hint_goes_with_one_frame(robot):
     robot.session.suggest(BEFORE)
     first, *others = jobs_of(robot)
     assert first is BEFORE
     assert others == [None, None]
 
 
-def test_it_waits_for_the_next_frame_if_one_is_under_way(robot):
+def test_pose_hint_waits_while_a_frame_is_running(robot):
     robot.saw(0.0)
     robot.moved(0.05)
     job = robot.session.take_frame()
@@ -54,7 +54,7 @@ def test_it_waits_for_the_next_frame_if_one_is_under_way(robot):
     assert jobs_of(robot) == [BEFORE, None, None]
 
 
-def test_a_frame_of_no_use_takes_it_nowhere(robot):
+def test_pose_hint_is_kept_when_frame_is_rejected(robot):
     robot.session.suggest(BEFORE)
     robot.saw(0.0)
     robot.moved(0.05)
@@ -62,7 +62,7 @@ def test_a_frame_of_no_use_takes_it_nowhere(robot):
     assert jobs_of(robot) == [BEFORE, None, None]
 
 
-def test_a_suggestion_at_which_the_engine_fails_is_not_made_again(robot):
+def test_pose_hint_is_dropped_when_engine_fails(robot):
     robot.session.suggest(BEFORE)
     robot.saw(0.0)
     robot.moved(0.05)
@@ -70,7 +70,7 @@ def test_a_suggestion_at_which_the_engine_fails_is_not_made_again(robot):
     assert jobs_of(robot) == [None, None, None]
 
 
-def test_an_engine_that_is_started_again_hears_of_it_again(robot):
+def test_pose_hint_is_sent_again_after_engine_restart(robot):
     robot.session.suggest(BEFORE)
     jobs_of(robot, 1)
     robot.session.engine_restarted("search")
@@ -79,7 +79,7 @@ def test_an_engine_that_is_started_again_hears_of_it_again(robot):
     assert jobs_of(robot, 1, begin=0.3) == [BEFORE]
 
 
-def test_a_suggestion_comes_too_late_for_a_robot_that_is_tracked(robot):
+def test_pose_hint_is_ignored_while_tracking(robot):
     robot.localized(0.1)
     robot.session.suggest(BEFORE)
     assert jobs_of(robot, 2, tracking, 0.2) == [None, None]
@@ -87,7 +87,7 @@ def test_a_suggestion_comes_too_late_for_a_robot_that_is_tracked(robot):
     np.testing.assert_allclose(jobs_of(robot, 1, begin=0.4)[0], T_MAP_ODOM @ pose(0.6), atol=1e-9)
 
 
-def test_when_odometry_jumps_the_robot_is_where_it_was(robot):
+def test_odometry_jump_hints_the_last_pose(robot):
     robot.localized(0.1)
     place = T_MAP_ODOM @ pose(0.2)
     robot.moved(0.3, x=500.0)
@@ -99,7 +99,7 @@ def test_when_odometry_jumps_the_robot_is_where_it_was(robot):
 
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])
-def test_whoever_asks_to_forget_is_not_brought_back(robot, ask):
+def test_reset_or_relocalize_drops_pose_hints(robot, ask):
     robot.session.suggest(BEFORE)
     robot.localized(0.1)
     getattr(robot.session, ask)()
@@ -116,7 +116,7 @@ def test_whoever_asks_to_forget_is_not_brought_back(robot, ask):
     assert jobs_of(robot, 1, begin=0.9)[0] is not None
 
 
-def test_what_is_recalled_is_the_newest_pose(robot):
+def test_last_known_pose_is_the_newest(robot):
     assert robot.session.recall().T_map_body is None
     robot.frame(0.1, unknown)
     assert robot.session.recall().T_map_body is None
@@ -134,7 +134,7 @@ def test_what_is_recalled_is_the_newest_pose(robot):
 # ---- the engine
 
 
-def test_the_localizer_hears_of_it(world_map, world_drive):
+def test_pose_hint_reaches_the_localizer(world_map, world_drive):
     engine = TrackEngine(world_map)
     there = world_drive.T_map_body[0]
 
@@ -161,7 +161,7 @@ def remembering(folder, *names, **more):
     return site, LastPoseKeeper(folder, list(site.sessions.values()), **more)
 
 
-def test_saved_and_handed_over_at_the_next_start(tmp_path, caplog):
+def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     site, kept = remembering(tmp_path, "r1", "r2")
     kept.suggest()
@@ -183,7 +183,7 @@ def test_saved_and_handed_over_at_the_next_start(tmp_path, caplog):
     assert again.status("r1")["state"] == "SEARCHING"  # it is never trusted
 
 
-def test_another_map_is_another_place(tmp_path):
+def test_last_pose_of_another_map_is_ignored(tmp_path):
     save(tmp_path, LastPose("r1", "cd" * 32, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1")
     kept.suggest()
@@ -191,7 +191,7 @@ def test_another_map_is_another_place(tmp_path):
     assert site.sessions["r1"].take_frame().suggested is None
 
 
-def test_a_damaged_file_is_a_warning_and_is_replaced(tmp_path, caplog):
+def test_damaged_last_pose_file_is_a_warning_and_replaced(tmp_path, caplog):
     file_of(tmp_path, "r1", SHA).write_text("{")
     save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1", "r2")
@@ -211,7 +211,7 @@ def writes(monkeypatch):
     return made
 
 
-def test_a_robot_that_stands_is_written_once(tmp_path, monkeypatch):
+def test_standing_robot_is_saved_once(tmp_path, monkeypatch):
     made = writes(monkeypatch)
     site, kept = remembering(tmp_path, "r1")
     site.frame("r1", 0.0)
@@ -228,7 +228,7 @@ def test_a_robot_that_stands_is_written_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])
-def test_what_is_to_be_forgotten_is_deleted(tmp_path, ask):
+def test_reset_or_relocalize_deletes_saved_pose(tmp_path, ask):
     save(tmp_path, LastPose("r1", SHA, 5, BEFORE))
     save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1", "r2")
@@ -244,7 +244,7 @@ def test_what_is_to_be_forgotten_is_deleted(tmp_path, ask):
     assert load(tmp_path, "r1", SHA) is not None  # it was asked for once
 
 
-def test_a_failing_disk_is_one_warning(tmp_path, caplog, monkeypatch):
+def test_failing_disk_logs_one_warning(tmp_path, caplog, monkeypatch):
     site, kept = remembering(tmp_path / "state", "r1")
     (tmp_path / "state").write_text("a file where the directory should be")
     site.frame("r1", 0.0)
@@ -267,7 +267,7 @@ def test_a_failing_disk_is_one_warning(tmp_path, caplog, monkeypatch):
     assert len(caplog.records) == 2  # once more, for it had worked meanwhile
 
 
-def test_whatever_goes_wrong_with_one_robot_the_others_are_kept(tmp_path, monkeypatch, caplog):
+def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, caplog):
     def recall():
         raise RuntimeError("nobody thought of this")
 
@@ -286,7 +286,7 @@ def running(site, kept):
     return site
 
 
-def test_a_running_node_keeps_it_now_and_then_and_at_its_end(tmp_path):
+def test_running_node_saves_periodically_and_at_close(tmp_path):
     site = Site("r1")
     kept = LastPoseKeeper(tmp_path, list(site.sessions.values()), interval=0.05)
     running(site, kept)
@@ -301,7 +301,8 @@ def test_a_running_node_keeps_it_now_and_then_and_at_its_end(tmp_path):
     np.testing.assert_allclose(load(tmp_path, "r1", SHA).T_map_body, T_MAP_ODOM @ pose(2.0), atol=1e-9)
 
 
-def test_a_disk_that_hangs_holds_up_nobody(tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_hanging_disk_does_not_block_the_node(tmp_path, monkeypatch):
     hanging, released = threading.Event(), threading.Event()
 
     def hang(folder, last):
@@ -324,7 +325,7 @@ def test_a_disk_that_hangs_holds_up_nobody(tmp_path, monkeypatch):
         released.set()
 
 
-def test_a_disk_that_hangs_at_the_start_holds_up_nobody(tmp_path, monkeypatch):
+def test_hanging_disk_at_start_does_not_block_the_node(tmp_path, monkeypatch):
     released = threading.Event()
     monkeypatch.setattr(memory, "load", lambda *args: released.wait(30.0))
     site = Site("r1")
@@ -337,7 +338,7 @@ def test_a_disk_that_hangs_at_the_start_holds_up_nobody(tmp_path, monkeypatch):
         released.set()
 
 
-def test_an_engine_that_died_is_told_where_the_robot_was(tmp_path):
+def test_last_pose_is_hinted_after_engine_death(tmp_path):
     site, _ = remembering(tmp_path, "r1")
     site.frame("r1", 0.0)
     site.track.dead = True

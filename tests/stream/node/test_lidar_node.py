@@ -104,7 +104,7 @@ def status(node, net):
     return json.loads(net.samples(KEYS.status)[-1].payload)
 
 
-def test_the_node_listens_to_clouds_only(quiet):
+def test_lidar_node_subscribes_to_clouds_only(quiet):
     node, net, _ = quiet
     assert net.subscribed == {KEYS.cloud: "newest"}
     net.publish(odometry(0.0))
@@ -117,7 +117,7 @@ def test_the_node_listens_to_clouds_only(quiet):
     assert len(net.samples(KEYS.pose)) == 1
 
 
-def test_an_odometry_engine_that_died_costs_the_place_not_the_node(quiet):
+def test_odometry_engine_death_loses_the_place_but_not_the_node(quiet):
     node, net, lane = quiet
     node._stopping.wait = lambda seconds: None  # the pause after a death
     net.publish(cloud(0.0))
@@ -138,7 +138,7 @@ def test_an_odometry_engine_that_died_costs_the_place_not_the_node(quiet):
     assert status(node, net)["state"] == "TRACKING"
 
 
-def test_rpc_reset(quiet):
+def test_reset_request_resets_lidar_odometry(quiet):
     node, net, _ = quiet
     net.publish(cloud(0.0))
     worked(node, "odometry", "track")
@@ -148,7 +148,8 @@ def test_rpc_reset(quiet):
     assert job.generation == 2
 
 
-def test_an_engine_that_aborts_is_started_again(stand_in):
+@pytest.mark.slow
+def test_aborted_odometry_engine_is_restarted(stand_in):
     lane = EngineProcess("odometry", "unused", "")
     try:
         assert lane.run(sweep(CLOUD, 0.0)).begun
@@ -164,7 +165,8 @@ def test_an_engine_that_aborts_is_started_again(stand_in):
         lane.close()
 
 
-def test_a_node_survives_its_odometry_engine(stand_in):
+@pytest.mark.slow
+def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
     net = FakeTransport()
     config = NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0, max_outage=30.0, pose_rate=50.0)
     session = LidarSession(KEYS, SHA, config, lidar=LEVEL)
@@ -194,7 +196,8 @@ def test_a_node_survives_its_odometry_engine(stand_in):
     assert not [t for t in threading.enumerate() if t.name == "coview-odometry"]
 
 
-def test_without_kiss_icp_it_says_so_in_a_line(tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_missing_kiss_icp_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "kiss_icp").mkdir()
     (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -208,7 +211,8 @@ def test_without_kiss_icp_it_says_so_in_a_line(tmp_path, monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-def test_kiss_icp_itself(world_drive):
+@pytest.mark.slow
+def test_odometry_engine_process_with_kiss_icp(world_drive):
     pytest.importorskip("kiss_icp.kiss_icp", reason="kiss-icp is not installed")
     lane = EngineProcess("odometry", "unused", "")
     try:

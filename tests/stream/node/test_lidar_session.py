@@ -7,7 +7,7 @@ import pytest
 from fake_robot import KEYS, POINTS, SHA, cloud, counted, ends, message, ns, state, tracking
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.jobs import OdometryResult
 from coview_stream.stream.node.lidar_session import LidarSession
@@ -60,7 +60,7 @@ class Robot:
         return self
 
 
-def test_a_frame_is_paired_with_the_odometry_that_was_made_of_it():
+def test_frame_is_paired_with_its_own_lidar_odometry():
     robot = Robot()
     job = robot.frame(0.5)
     assert (job.stamp_ns, job.T_odom_body[0, 3]) == (ns(0.5), 1.0)
@@ -70,7 +70,7 @@ def test_a_frame_is_paired_with_the_odometry_that_was_made_of_it():
     assert counted(robot) == {"received": 1, "processed": 1, "odometry_received": 1, "fixes": 1, "poses": 1}
 
 
-def test_a_sweep_goes_on_deskewed():
+def test_sweep_is_forwarded_deskewed():
     robot = Robot()
     robot.saw(0.0, times=TIMES)
     assert robot.placed().times is not None
@@ -83,7 +83,7 @@ def test_a_sweep_goes_on_deskewed():
     assert np.allclose(plain.tracked().points, POINTS)
 
 
-def test_poses_go_on_at_the_steady_clock_between_clouds():
+def test_poses_are_published_between_clouds():
     robot = Robot().drive(0.0, 1.0)
     stamps = []
     for k in range(4):
@@ -92,7 +92,7 @@ def test_poses_go_on_at_the_steady_clock_between_clouds():
     assert stamps == [ns(1.0)] * 4
 
 
-def test_frames_that_odometry_has_no_time_for_make_room():
+def test_lidar_frame_queue_drops_oldest_when_odometry_is_slow():
     robot = Robot()
     robot.frame(0.0)
     for k in range(1, 8):
@@ -107,7 +107,7 @@ def test_frames_that_odometry_has_no_time_for_make_room():
     assert state(robot) is State.TRACKING
 
 
-def test_one_frame_is_under_way_at_a_time():
+def test_one_odometry_job_at_a_time():
     robot = Robot()
     robot.saw(0.0)
     robot.saw(0.1)
@@ -115,7 +115,7 @@ def test_one_frame_is_under_way_at_a_time():
     assert robot.session.take_sweep() is None
 
 
-def test_clouds_that_stop_are_told_from_clouds_of_no_use():
+def test_missing_clouds_and_rejected_clouds_have_different_reasons():
     robot = Robot().drive(0.0, 1.0)
     robot.session.tick(robot.now + 0.6)
     assert robot.session.state() == (State.LOST, "no clouds for 0.5 s")
@@ -142,7 +142,7 @@ def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
     assert robot.session.state()[1] == "1 frames were of no use; see errors"
 
 
-def test_odometry_that_began_anew_is_a_robot_that_begins_anew():
+def test_lidar_odometry_restart_restarts_search():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
     robot.placed(begun=True, x=0.0)
@@ -154,7 +154,7 @@ def test_odometry_that_began_anew_is_a_robot_that_begins_anew():
 
 
 @pytest.mark.parametrize("kind", ["failed", "restarted"])
-def test_an_engine_that_forgot(kind):
+def test_failed_or_restarted_odometry_engine_starts_new_epoch(kind):
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
     job = robot.session.take_sweep()
@@ -174,7 +174,7 @@ def test_an_engine_that_forgot(kind):
     assert ends(robot.counters) == robot.counters.received - 1
 
 
-def test_a_result_of_a_generation_that_is_over_is_dropped():
+def test_odometry_result_of_old_epoch_is_dropped():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
     job = robot.session.take_sweep()
@@ -185,7 +185,7 @@ def test_a_result_of_a_generation_that_is_over_is_dropped():
     assert robot.frame(1.2, begun=True) is not None
 
 
-def test_reset_forgets_odometry_and_what_is_under_way():
+def test_reset_drops_odometry_and_running_job():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
     job = robot.session.take_sweep()
@@ -196,7 +196,7 @@ def test_reset_forgets_odometry_and_what_is_under_way():
     assert robot.session.take_sweep().generation > job.generation
 
 
-def test_searching_again_leaves_odometry_alone():
+def test_restart_search_keeps_lidar_odometry():
     robot = Robot().drive(0.0, 1.0)
     robot.session.begin_anew("asked to search again")
     robot.saw(1.1)
@@ -204,7 +204,7 @@ def test_searching_again_leaves_odometry_alone():
     assert robot.session.odometry.newest.stamp_ns == ns(1.0)
 
 
-def test_strays_are_counted_and_a_clock_that_starts_anew_is_followed():
+def test_stray_stamps_are_counted_and_restarted_clock_is_followed():
     robot = Robot().drive(5.0, 6.0)
     robot.saw(6.0)
     robot.now += 0.1
@@ -221,14 +221,14 @@ def test_strays_are_counted_and_a_clock_that_starts_anew_is_followed():
     assert job.stamp_ns < ns(2.0)
 
 
-def test_a_long_pause_is_a_new_beginning():
+def test_long_pause_restarts_lidar_odometry():
     robot = Robot().drive(0.0, 1.0)
     robot.frame(9.0, begun=True)  # as lidar odometry says after a gap
     assert counted(robot)["losses"] == 1
     assert state(robot) is State.TRACKING
 
 
-def test_rubbish_costs_nothing():
+def test_undecodable_cloud_is_only_counted():
     robot = Robot()
     robot.session.on_cloud(Sample(KEYS.cloud, b"rubbish", "video/raw"), 1000.0)
     assert robot.session.take_sweep() is None

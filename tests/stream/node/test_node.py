@@ -32,7 +32,7 @@ def pair():
     return made
 
 
-def test_keys_and_urgencies(pair):
+def test_node_declares_keys_with_urgencies(pair):
     assert pair.net.subscribed == {
         "coview/r1/in/cloud": "newest",
         "coview/r1/in/odom": "all",
@@ -45,7 +45,7 @@ def test_keys_and_urgencies(pair):
     assert set(pair.net.announced) == {"coview/r1/alive", "coview/r2/alive"}
 
 
-def test_the_status_says_all_of_the_contract(site):
+def test_status_has_all_documented_fields(site):
     status = site.status("r1")
     assert (status["state"], status["reason"]) == ("SEARCHING", "waiting for clouds on coview/r1/in/cloud")
     assert status["pose"]["age_s"] is None
@@ -70,14 +70,14 @@ def test_the_status_says_all_of_the_contract(site):
     assert status["connection"] == {"routers": ["fake"], "peers": [], "reconnects": 0}
 
 
-def test_statuses_are_plain_json(site):
+def test_status_is_plain_json(site):
     site.status("r1")
     (sample,) = site.net.samples("coview/r1/out/status")
     assert sample.encoding == "application/json"
     json.loads(sample.payload, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
 
 
-def test_the_rate_of_poses(site):
+def test_pose_rate_in_status(site):
     site.frame("r1", 0.0)
     begin = time.monotonic()
     for k in range(1, 6):
@@ -89,7 +89,7 @@ def test_the_rate_of_poses(site):
     assert site.statuses("r1")[-1]["pose"]["rate_hz"] == 0.0
 
 
-def test_only_changes_are_told_between_regular_statuses(pair):
+def test_only_state_changes_are_published_between_regular_statuses(pair):
     now = time.monotonic()
     publish_statuses(pair.node, now)
     publish_statuses(pair.node, now, everyone=False)
@@ -101,7 +101,7 @@ def test_only_changes_are_told_between_regular_statuses(pair):
     assert len(pair.statuses("r2")) == 1
 
 
-def test_a_router_that_comes_back_is_counted(site):
+def test_router_reconnection_is_counted(site):
     assert site.status("r1")["connection"]["reconnects"] == 0
     site.frame("r1", 0.0)
     for times in (1, 2):
@@ -114,7 +114,7 @@ def test_a_router_that_comes_back_is_counted(site):
     assert status["state"] == "TRACKING"  # what was known is still known
 
 
-def test_a_router_that_comes_late_is_no_reconnection():
+def test_late_first_router_is_not_a_reconnection():
     site = Site("r1")
     site.net.go_away()
     site.node.declare()
@@ -123,7 +123,7 @@ def test_a_router_that_comes_late_is_no_reconnection():
     assert site.status("r1")["connection"]["reconnects"] == 0
 
 
-def test_relocalize(pair):
+def test_relocalize_request_restarts_one_robot(pair):
     for name in ("r1", "r2"):
         pair.frame(name, 0.0)
     reply = pair.net.query("coview/r1/rpc/relocalize")
@@ -134,7 +134,7 @@ def test_relocalize(pair):
     assert pair.status("r1")["state"] == "TRACKING"
 
 
-def test_reset(pair):
+def test_reset_request_clears_one_robot(pair):
     for name in ("r1", "r2"):
         pair.frame(name, 0.0)
     reply = pair.net.query("coview/r1/rpc/reset", {"why": "test"})
@@ -144,7 +144,7 @@ def test_reset(pair):
     json.dumps(reply)
 
 
-def test_close_says_goodbye_once(site):
+def test_close_publishes_last_status_once(site):
     site.frame("r1", 0.0)
     site.status("r1")
     site.node.close()
@@ -158,7 +158,7 @@ def test_close_says_goodbye_once(site):
     assert (len(site.net.published), site.track.closed) == (count, 1)
 
 
-def test_with_threads():
+def test_node_with_threads_end_to_end():
     site = Site("r1", "r2", config=NodeConfig(pose_rate=50.0, status_rate=0.05, odometry_timeout=0.2))
     site.node.start()
     try:
@@ -190,7 +190,8 @@ def test_with_threads():
     assert "shutting down" in site.statuses("r1")[-1]["reason"]
 
 
-def test_the_end_waits_for_no_network():
+@pytest.mark.slow
+def test_close_does_not_wait_for_stuck_network():
     site = Site("r1")
     site.node.start()
     stuck = threading.Event()
@@ -204,7 +205,7 @@ def test_the_end_waits_for_no_network():
     until(lambda: site.node.close(patience=0.0))
 
 
-def test_the_end_waits_for_no_reader_of_a_last_status():
+def test_close_does_not_wait_for_stuck_publisher():
     site = Site("r1")
     site.node.declare()
     stuck = threading.Event()
@@ -217,7 +218,7 @@ def test_the_end_waits_for_no_reader_of_a_last_status():
 
 
 @pytest.mark.parametrize(("away", "losses"), [(True, 0), (False, 1)])
-def test_a_pause_that_the_network_explains_keeps_the_place(away, losses):
+def test_pause_explained_by_network_outage_keeps_the_place(away, losses):
     site = Site("r1")
     site.node.declare()
     site.frame("r1", 0.0)

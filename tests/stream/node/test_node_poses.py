@@ -25,7 +25,7 @@ def site():
     return made
 
 
-def test_a_drive_through_the_small_world(world_map, world_drive):
+def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
     site = Site("r1", engines=(TrackEngine(world_map), SearchEngine(world_map)))
     site.node.declare()
     right = []
@@ -65,7 +65,7 @@ def test_a_drive_through_the_small_world(world_map, world_drive):
     assert 0.2 < status["evidence"]["score"] <= 1.0
 
 
-def test_poses_in_the_way_of_rmw_zenoh():
+def test_poses_follow_rmw_zenoh_conventions():
     site = Site("r1", preset="rmw_zenoh")
     site.node.declare()
     keys = site.keys["r1"]
@@ -90,7 +90,7 @@ def test_poses_in_the_way_of_rmw_zenoh():
     )
 
 
-def test_robots_of_one_ros_node_have_publishers_of_their_own():
+def test_each_robot_has_its_own_rmw_publisher():
     site = Site("r1", "r2", preset="rmw_zenoh")
     site.node.declare()
     publishers = sorted(t for t in site.net.announced if "/MP/" in t)
@@ -99,7 +99,7 @@ def test_robots_of_one_ros_node_have_publishers_of_their_own():
     assert len([t for t in site.net.announced if "/NN/" in t]) == 1
 
 
-def test_another_format_when_asked_for():
+def test_pose_encoding_option():
     site = Site("r1", pose_format="cdr")
     site.node.declare()
     site.frame("r1", 0.0)
@@ -108,7 +108,7 @@ def test_another_format_when_asked_for():
     assert sent.encoding.startswith("application/cdr;")
 
 
-def test_poses_go_on_with_odometry_between_frames(site):
+def test_poses_follow_odometry_between_frames(site):
     site.frame("r1", 0.0)
     for k in range(1, 5):
         site.moves("r1", STEP * k)
@@ -119,7 +119,7 @@ def test_poses_go_on_with_odometry_between_frames(site):
     assert len(site.poses("r1")) == 5
 
 
-def test_silence_of_odometry_ends_the_poses(site):
+def test_odometry_timeout_ends_poses(site):
     site.frame("r1", 0.0)
     count = len(site.poses("r1"))
     assert count == 1

@@ -36,7 +36,7 @@ def engine_of(*poses):
     return OdometryEngine(lambda config: Told(*poses))
 
 
-def test_robots_have_odometry_of_their_own(cloud):
+def test_each_robot_has_its_own_odometry(cloud):
     engine = engine_of(np.eye(4), moved(1.0), moved(2.0))
     one = [engine.run(job(cloud, 0.1 * k)) for k in range(3)]
     other = engine.run(job(cloud, 7.0, "r2"))
@@ -47,7 +47,7 @@ def test_robots_have_odometry_of_their_own(cloud):
 
 
 @pytest.mark.parametrize("bring_about", ["generation", "gap", "forget"])
-def test_a_new_beginning_is_said(cloud, bring_about):
+def test_odometry_restart_is_reported(cloud, bring_about):
     engine = engine_of(np.eye(4), moved(1.0), moved(2.0))
     for k in range(2):
         engine.run(job(cloud, 0.1 * k))
@@ -60,7 +60,7 @@ def test_a_new_beginning_is_said(cloud, bring_about):
     assert not engine.run(job(cloud, stamp + 0.1, generation=again[bring_about].generation)).begun
 
 
-def test_an_impossible_motion_makes_the_next_pose_a_beginning(cloud):
+def test_implausible_motion_restarts_odometry(cloud):
     engine = engine_of(np.eye(4), moved(40.0), moved(0.1), moved(0.2))
     engine.run(job(cloud, 0.0))
     with pytest.raises(CloudError, match="lost its way"):
@@ -80,7 +80,7 @@ def test_frames_come_back_deskewed(cloud):
     assert np.allclose(inverse(step @ step) @ result.T_odom_body, np.eye(4))
 
 
-def test_what_cannot_be_placed(cloud):
+def test_invalid_frames_and_jobs_are_refused(cloud):
     engine = engine_of()
     with pytest.raises(CloudError, match="is the sensor covered"):
         engine.run(job(cloud[:9], 0.0))
@@ -91,7 +91,7 @@ def test_what_cannot_be_placed(cloud):
         engine.run(FrameJob("r1", 1, 0, cloud, np.eye(4)))
 
 
-def test_it_needs_no_map_but_kiss_icp(monkeypatch):
+def test_odometry_engine_needs_kiss_icp_but_no_map(monkeypatch):
     class Kiss:
         pass
 

@@ -11,7 +11,7 @@ def beats(metronome, times):
     return [now for now in times if metronome.beat(now)]
 
 
-def test_the_first_beat_is_at_once_and_the_others_are_a_period_apart():
+def test_first_tick_is_immediate_then_periodic():
     metronome = Rate(4.0, 100.0)
     assert beats(metronome, [100.0, 100.1, 100.25, 100.3, 100.5, 100.74, 100.75]) == [
         100.0,
@@ -21,20 +21,20 @@ def test_the_first_beat_is_at_once_and_the_others_are_a_period_apart():
     ]
 
 
-def test_late_beats_do_not_delay_the_later_ones():
+def test_late_ticks_do_not_delay_later_ones():
     metronome = Rate(4.0, 0.0)
     # each 0.2 s late: due times stay multiples of a period
     assert beats(metronome, [0.2, 0.45, 0.7, 0.95]) == [0.2, 0.45, 0.7, 0.95]
     assert metronome.due == pytest.approx(1.0)
 
 
-def test_after_a_pause_of_the_machine_nothing_is_caught_up():
+def test_no_catching_up_after_a_long_pause():
     metronome = Rate(4.0, 0.0)
     assert metronome.beat(0.0)
     assert beats(metronome, [60.0, 60.01, 60.1, 60.24, 60.25]) == [60.0, 60.25]
 
 
-def test_how_long_to_wait():
+def test_remaining_time_until_next_tick():
     metronome = Rate(4.0, 0.0)
     assert metronome.remaining(0.0) == 0.0
     metronome.beat(0.0)
@@ -42,7 +42,7 @@ def test_how_long_to_wait():
     assert metronome.remaining(5.0) == 0.0
 
 
-def test_with_slack_a_late_beat_does_not_shift_the_later_ones():
+def test_slack_catches_up_late_ticks():
     clock = Rate(100.0, 0.0, slack=0.05)
     assert clock.beat(0.0)
     assert clock.beat(0.045)  # due at 0.01; the next ones are caught up

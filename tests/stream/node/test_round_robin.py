@@ -15,29 +15,29 @@ def served(turns, count, ready=lambda robot: True, urgent=lambda robot: False):
     return "".join(robot for robot, _ in found)
 
 
-def test_in_turn():
+def test_robots_are_served_in_order():
     assert served(RoundRobin(4), 8) == "abcdabcd"
 
 
-def test_who_has_nothing_to_do_keeps_his_turn():
+def test_idle_robot_keeps_its_turn():
     turns = RoundRobin(4)
     assert served(turns, 2, ready=lambda r: r in "bd") == "bd"
     assert served(turns, 4) == "acbd"
 
 
-def test_nobody_has_anything_to_do():
+def test_no_jobs_keep_the_order():
     turns = RoundRobin(4)
     assert turns.next(ROBOTS, lambda r: None) is None
     assert served(turns, 1) == "a"
 
 
-def test_the_urgent_get_half_of_the_turns_and_the_others_the_rest():
+def test_urgent_robots_get_half_of_the_turns():
     count = Counter(served(RoundRobin(4), 120, urgent=lambda r: r == "c"))
     assert count["c"] >= 60
     assert min(count.values()) >= 15
 
 
-def test_among_the_urgent_in_turn():
+def test_urgent_robots_are_served_in_order():
     order = served(RoundRobin(4), 40, urgent=lambda r: r in "bd")
     assert abs(order.count("b") - order.count("d")) <= 1
     assert "a" in order[:6]

@@ -21,7 +21,7 @@ from fake_robot import (
 )
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 
 
@@ -30,12 +30,12 @@ def robot():
     return Robot()
 
 
-def test_processed(robot):
+def test_processed_frame_is_counted(robot):
     robot.frame(0.0, unknown)
     assert counted(robot) == {"received": 1, "processed": 1, "odometry_received": 2}
 
 
-def test_rejected(robot):
+def test_rejected_frame_is_counted(robot):
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
     robot.session.frame_failed(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
@@ -45,7 +45,7 @@ def test_rejected(robot):
     ]
 
 
-def test_engine_errors_are_told_by_their_last_line(robot):
+def test_engine_error_is_reported_by_its_last_line(robot):
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
     trace = "Traceback:\n  somewhere\nValueError: boom\n"
@@ -56,7 +56,7 @@ def test_engine_errors_are_told_by_their_last_line(robot):
     ]
 
 
-def test_dropped_because_a_newer_frame_came(robot):
+def test_frame_replaced_by_a_newer_one_is_dropped(robot):
     robot.drive(0.0, 1.0)
     for t in (0.2, 0.3, 0.4):
         robot.saw(t, now=1001.0)
@@ -66,7 +66,7 @@ def test_dropped_because_a_newer_frame_came(robot):
     assert robot.session.take_frame() is None
 
 
-def test_a_frame_under_way_is_not_dropped(robot):
+def test_running_frame_is_not_dropped(robot):
     robot.drive(0.0, 1.0)
     robot.saw(0.2, now=1001.0)
     busy = robot.session.take_frame()
@@ -78,7 +78,7 @@ def test_a_frame_under_way_is_not_dropped(robot):
     assert robot.session.take_frame().stamp_ns == ns(0.4)
 
 
-def test_late(robot):
+def test_late_frame_is_counted(robot):
     robot.drive(0.0, 7.0)
     robot.saw(1.9, now=1007.0)
     assert robot.counters.late == 1
@@ -87,7 +87,7 @@ def test_late(robot):
     assert robot.session.take_frame() is not None
 
 
-def test_out_of_order_and_duplicate(robot):
+def test_out_of_order_and_duplicate_frames_are_counted(robot):
     robot.drive(0.0, 1.0)
     robot.saw(0.5, now=1001.0)
     robot.saw(0.5, now=1001.0)
@@ -97,13 +97,13 @@ def test_out_of_order_and_duplicate(robot):
     assert robot.session.take_frame().stamp_ns == ns(0.5)
 
 
-def test_duplicate_of_a_frame_that_waits(robot):
+def test_duplicate_of_a_waiting_frame_is_counted(robot):
     robot.saw(0.5)
     robot.saw(0.5)
     assert robot.counters.duplicate == 1
 
 
-def test_frames_that_wait_are_put_in_order(robot):
+def test_waiting_frames_are_sorted_by_stamp(robot):
     """The network may change their order; that alone loses nothing."""
     robot.drive(0.0, 0.1)
     for t in (0.3, 0.2):
@@ -114,7 +114,7 @@ def test_frames_that_wait_are_put_in_order(robot):
     assert counted(robot) == {"received": 2, "odometry_received": 5}
 
 
-def test_no_odometry(robot):
+def test_frame_without_odometry_is_counted(robot):
     robot.drive(0.0, 1.0)
     robot.saw(1.2)
     robot.session.tick(robot.now + 0.29)
@@ -123,14 +123,14 @@ def test_no_odometry(robot):
     assert robot.counters.no_odometry == 1
 
 
-def test_no_odometry_in_a_gap(robot):
+def test_frame_in_odometry_gap_is_counted(robot):
     robot.moved(0.0, x=0.0)
     robot.moved(0.8, x=0.0)
     robot.saw(0.4, now=1000.8)
     assert robot.counters.no_odometry == 1
 
 
-def test_malformed_oversized_and_unknown(robot):
+def test_malformed_oversized_and_unknown_clouds_are_counted(robot):
     good = cloud(0.0)
     robot.session.on_cloud(Sample(KEYS.cloud, b"12345", good.encoding, good.attachment), 0.0)
     robot.session.on_cloud(Sample(KEYS.cloud, good.payload, good.encoding, None), 0.0)
@@ -145,7 +145,7 @@ def test_malformed_oversized_and_unknown(robot):
     assert (small.counters.oversized, small.counters.received) == (1, 2)
 
 
-def test_odometry_malformed_oversized_and_unknown():
+def test_malformed_oversized_and_unknown_odometry_is_counted():
     robot = Robot(NodeConfig(max_payload=1000))
     good = odometry(0.0)
     robot.session.on_odometry(Sample(good.key, b'{"stamp_ns": 1', good.encoding), 0.0)
@@ -159,7 +159,7 @@ def test_odometry_malformed_oversized_and_unknown():
     }
 
 
-def test_odometry_that_does_not_continue(robot):
+def test_odometry_discontinuities_are_counted(robot):
     robot.drive(0.0, 1.0)
     robot.moved(1.0)
     robot.moved(0.9)
@@ -173,14 +173,14 @@ def test_odometry_that_does_not_continue(robot):
     assert robot.counters.clock_restarts == 1
 
 
-def test_missing_by_number(robot):
+def test_missing_frames_by_sequence_number_are_counted(robot):
     robot.drive(0.0, 1.0)
     for sequence, t in ((1, 0.1), (2, 0.2), (5, 0.3)):
         robot.saw(t, now=1001.0, attachment=numbered(sequence, t))
     assert robot.counters.missing == 2
 
 
-def test_searches_and_those_skipped(robot):
+def test_searches_and_skipped_searches_are_counted(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
     job = robot.session.take_search()
     assert job.query.stamp == 0.0
@@ -195,7 +195,7 @@ def test_searches_and_those_skipped(robot):
     assert robot.session.take_search() is None
 
 
-def test_fixes_poses_and_losses(robot):
+def test_fixes_poses_and_losses_are_counted(robot):
     robot.localized()
     assert (robot.counters.fixes, robot.counters.poses, robot.counters.losses) == (1, 1, 0)
     robot.frame(0.1)
@@ -210,7 +210,7 @@ def test_fixes_poses_and_losses(robot):
     assert robot.counters.fixes == 2
 
 
-def test_engine_restarts(robot):
+def test_engine_restarts_are_counted(robot):
     robot.localized()
     robot.session.engine_restarted()
     assert (robot.counters.engine_restarts, robot.counters.losses) == (1, 1)

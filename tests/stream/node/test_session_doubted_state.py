@@ -6,7 +6,8 @@ import pytest
 from fake_robot import Robot, counted, doubted, ns, reason, state, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.stream.node.status import status
 from coview_stream.stream.transport.transport import Connection
@@ -26,7 +27,7 @@ def changes(robot):
     return [(c["from"], c["to"], c["reason"]) for c in told]
 
 
-def test_a_doubt_is_told_from_a_search():
+def test_doubted_state_differs_from_ambiguous_search():
     def fix(state, cause):
         return Fix(0.0, state, evidence=KeyframeEvidence(0.0, state, "so", cause=cause))
 
@@ -38,7 +39,7 @@ def test_a_doubt_is_told_from_a_search():
     assert not Fix(0.0, State.AMBIGUOUS).doubted
 
 
-def test_a_pause_of_odometry_during_a_doubt_keeps_the_place(covered):
+def test_odometry_pause_while_doubted_keeps_the_place(covered):
     epoch = covered.frame(0.2, doubted).epoch
     covered.moved(0.9, x=0.4)
     assert covered.counters.odometry_gaps == 1
@@ -52,7 +53,7 @@ def test_a_pause_of_odometry_during_a_doubt_keeps_the_place(covered):
     assert covered.session.pose() is not None
 
 
-def test_so_does_one_that_has_been_noticed_before_it_ended(covered):
+def test_odometry_timeout_while_doubted_keeps_the_place(covered):
     epoch = covered.frame(0.2, doubted).epoch
     covered.session.tick(covered.now + 0.6)
     assert covered.session.state() == (State.LOST, "no odometry for 0.5 s")
@@ -66,7 +67,7 @@ def test_so_does_one_that_has_been_noticed_before_it_ended(covered):
     assert covered.counters.losses == 1
 
 
-def test_a_search_begins_anew_after_a_pause_all_the_same():
+def test_odometry_pause_while_searching_restarts_search():
     robot = Robot()
     epoch = robot.frame(0.0, unknown, state=State.AMBIGUOUS).epoch
     robot.moved(0.7, x=0.4)
@@ -74,7 +75,7 @@ def test_a_search_begins_anew_after_a_pause_all_the_same():
     assert robot.counters.losses == 0
 
 
-def test_what_begins_anew_during_a_doubt_is_a_loss(covered):
+def test_odometry_jump_while_doubted_is_a_loss(covered):
     covered.moved(0.15, x=900.0)
     assert covered.session.state() == (State.LOST, "odometry jumped")
     assert covered.counters.losses == 1
@@ -85,7 +86,7 @@ def test_what_begins_anew_during_a_doubt_is_a_loss(covered):
     assert covered.counters.losses == 1
 
 
-def test_silence_during_a_doubt_loses_the_place(covered):
+def test_odometry_timeout_while_doubted_is_a_loss(covered):
     covered.session.tick(covered.now + 0.4)
     assert state(covered) is State.AMBIGUOUS
     covered.session.tick(covered.now + 3600.0)
@@ -95,7 +96,7 @@ def test_silence_during_a_doubt_loses_the_place(covered):
 
 
 @pytest.mark.parametrize("answer", [tracking, doubted])
-def test_without_frames_a_place_that_waits_to_be_verified_is_lost_but_the_first_frame_may_do_it(answer):
+def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(answer):
     robot = Robot(NodeConfig(dead_reckoning_timeout=2.0)).localized(0.0)
     robot.frame(0.1, answer)
     robot.moved(0.8, x=0.3)  # after a pause
@@ -114,14 +115,14 @@ def test_without_frames_a_place_that_waits_to_be_verified_is_lost_but_the_first_
     assert state(robot) is State.TRACKING
 
 
-def test_a_doubt_is_in_no_hurry_for_a_search(covered):
+def test_doubted_state_gets_no_search_priority(covered):
     assert not covered.session.hopeful()
     searching = Robot()
     searching.frame(0.0, unknown, state=State.AMBIGUOUS)
     assert searching.session.hopeful()
 
 
-def test_a_loss_has_the_reason_of_the_newest_and_is_counted_once():
+def test_loss_has_newest_reason_and_is_counted_once():
     robot = Robot().localized(0.0)
     silent = robot.now + 0.6
     robot.session.tick(silent)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fake_robot import KEYS, Robot, counted, query, state, tracking, unknown, verdict
 
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 
 
@@ -14,7 +14,7 @@ def robot():
     return Robot()
 
 
-def test_begin_anew_searches_from_nothing(robot):
+def test_restart_search_drops_the_place(robot):
     robot.localized(0.0)
     before = robot.frame(0.1)
     robot.session.begin_anew("asked to search again")
@@ -26,14 +26,14 @@ def test_begin_anew_searches_from_nothing(robot):
     assert robot.session.pose() is None
 
 
-def test_begin_anew_before_a_fix_is_no_loss(robot):
+def test_restart_search_before_a_fix_is_not_a_loss(robot):
     robot.frame(0.0, unknown)
     robot.session.begin_anew("asked to search again")
     assert state(robot) is State.SEARCHING
     assert robot.counters.losses == 0
 
 
-def test_reset_forgets_everything(robot):
+def test_reset_clears_the_session(robot):
     epoch = robot.localized(0.0).frame(0.1).epoch
     robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
     robot.session.reset()
@@ -48,7 +48,7 @@ def test_reset_forgets_everything(robot):
 
 
 @pytest.mark.parametrize("how", ["begin_anew", "reset", "jump"])
-def test_what_was_under_way_before_is_ignored(robot, how):
+def test_results_of_old_epoch_are_ignored(robot, how):
     robot.frame(0.0, unknown, ask=query(0.0))
     searching = robot.session.take_search()
     robot.drive(0.05, 0.2)
@@ -75,7 +75,7 @@ def test_what_was_under_way_before_is_ignored(robot, how):
     assert robot.session.take_search().epoch == job.epoch
 
 
-def test_an_old_failure_does_not_end_the_frame_under_way(robot):
+def test_failure_of_old_epoch_does_not_end_running_frame(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15)
     old = robot.session.take_frame()
@@ -90,7 +90,7 @@ def test_an_old_failure_does_not_end_the_frame_under_way(robot):
     assert robot.session.pose() is not None
 
 
-def test_a_verdict_goes_with_the_next_frame_once(robot):
+def test_search_result_goes_with_the_next_frame_once(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
     said = verdict()
     robot.session.search_done(robot.session.take_search(), said)
@@ -98,7 +98,7 @@ def test_a_verdict_goes_with_the_next_frame_once(robot):
     assert robot.frame(0.2, unknown).verdict is None
 
 
-def test_a_verdict_is_not_lost_with_a_rejected_frame(robot):
+def test_search_result_is_kept_when_frame_is_rejected(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
     said = verdict()
     robot.session.search_done(robot.session.take_search(), said)
@@ -109,14 +109,14 @@ def test_a_verdict_is_not_lost_with_a_rejected_frame(robot):
     assert robot.session.take_frame().verdict is said
 
 
-def test_a_search_that_failed_costs_its_keyframe_only(robot):
+def test_failed_search_skips_only_its_keyframe(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
     robot.session.search_done(robot.session.take_search(), None)
     assert robot.frame(0.1, unknown, ask=query(0.1)).verdict is None
     assert robot.session.take_search() is not None
 
 
-def test_an_engine_that_failed_begins_anew(robot):
+def test_engine_failure_starts_new_epoch(robot):
     epoch = robot.localized(0.0).frame(0.1).epoch
     robot.drive(0.15, 0.3)
     robot.saw(0.25)

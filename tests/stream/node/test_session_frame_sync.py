@@ -7,7 +7,7 @@ import pytest
 from fake_robot import KEYS, POINTS, SHA, Robot, cloud, ends, ns, odometry, pose, reason, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.session import Session
 
@@ -17,13 +17,13 @@ def robot():
     return Robot()
 
 
-def test_a_frame_has_the_odometry_of_its_own_stamp(robot):
+def test_frame_is_paired_with_odometry_at_its_stamp(robot):
     robot.drive(0.0, 0.5, rate=10.0)
     robot.saw(0.325, now=1000.5)
     np.testing.assert_allclose(robot.session.take_frame().T_odom_body, pose(0.65), atol=1e-9)
 
 
-def test_a_frame_waits_for_the_odometry_after_it(robot):
+def test_frame_waits_for_odometry_after_its_stamp(robot):
     robot.drive(0.0, 0.1)
     robot.saw(0.12)
     assert robot.session.take_frame() is None
@@ -33,7 +33,7 @@ def test_a_frame_waits_for_the_odometry_after_it(robot):
     np.testing.assert_allclose(job.T_odom_body, pose(0.24), atol=1e-9)
 
 
-def test_a_frame_without_odometry_holds_up_no_other(robot):
+def test_frame_without_odometry_does_not_block_others(robot):
     """One cloud from the far future must not shut out those of the present."""
     robot.drive(0.0, 0.1)
     robot.saw(3600.0, now=1000.1)
@@ -46,7 +46,7 @@ def test_a_frame_without_odometry_holds_up_no_other(robot):
     assert robot.counters.out_of_order == 0
 
 
-def test_a_flood_of_clouds_without_odometry_is_bounded(robot):
+def test_waiting_clouds_are_bounded(robot):
     robot.drive(0.0, 0.1)
     for k in range(100):
         robot.saw(0.2 + 0.001 * k, now=1000.2)
@@ -55,7 +55,7 @@ def test_a_flood_of_clouds_without_odometry_is_bounded(robot):
     assert robot.session.take_frame().stamp_ns == ns(0.299)
 
 
-def test_a_sweep_waits_for_the_odometry_of_its_end(robot):
+def test_sweep_waits_for_odometry_at_its_end(robot):
     robot.drive(0.0, 0.2)
     times = np.linspace(0.0, 0.1, len(POINTS))
     robot.saw(0.15, now=1000.26, codec="foxglove", times=times)
@@ -67,7 +67,7 @@ def test_a_sweep_waits_for_the_odometry_of_its_end(robot):
     assert job.segment.stamps.tolist()[-1] >= ns(0.25)
 
 
-def test_a_sweep_does_not_wait_for_ever(robot):
+def test_sweep_wait_is_bounded(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15, now=1000.26, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
     robot.session.tick(1000.40)
@@ -76,7 +76,7 @@ def test_a_sweep_does_not_wait_for_ever(robot):
     assert robot.session.take_frame() is not None
 
 
-def test_times_before_the_stamp(robot):
+def test_sweep_with_times_before_the_stamp(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.18, codec="foxglove", times=np.linspace(-0.1, 0.0, len(POINTS)))
     job = robot.session.take_frame()
@@ -84,14 +84,14 @@ def test_times_before_the_stamp(robot):
     assert job.segment.stamps.tolist()[-1] >= ns(0.18)
 
 
-def test_no_deskew_when_asked_not_to():
+def test_deskew_option_off():
     robot = Robot(NodeConfig(deskew=False))
     robot.drive(0.0, 0.2)
     robot.saw(0.18, codec="foxglove", times=np.linspace(0.0, 0.1, len(POINTS)))
     assert robot.session.take_frame().segment is None
 
 
-def test_reasons_when_nothing_comes(robot):
+def test_reason_names_the_missing_messages(robot):
     assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
     robot.saw(0.0)
     assert reason(robot) == f"waiting for odometry on {KEYS.odometry}"
@@ -100,7 +100,7 @@ def test_reasons_when_nothing_comes(robot):
 
 
 @pytest.mark.parametrize("difference", [-3600.0, 3600.0])
-def test_reason_when_the_clocks_differ(robot, difference):
+def test_reason_names_clock_difference(robot, difference):
     for k in range(20):
         robot.moved(0.1 * k)
         robot.saw(0.1 * k + difference, now=robot.now)
@@ -109,7 +109,7 @@ def test_reason_when_the_clocks_differ(robot, difference):
     assert ends(robot.counters) >= 15
 
 
-def test_the_reason_is_the_evidences(robot):
+def test_reason_is_taken_from_evidence(robot):
     robot.frame(0.0, unknown, reason="two places fit")
     assert robot.session.state() == (State.SEARCHING, "two places fit")
     robot.frame(0.1)
@@ -118,7 +118,7 @@ def test_the_reason_is_the_evidences(robot):
     assert robot.session.state() == (State.LOST, "evidence gone, 2 times in a row")
 
 
-def test_the_same_complaint_is_kept_once_and_only_the_newest(robot):
+def test_error_log_is_deduplicated_and_bounded(robot):
     for _ in range(50):
         robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
     assert len(robot.session.complaints.texts) == 1
@@ -128,7 +128,7 @@ def test_the_same_complaint_is_kept_once_and_only_the_newest(robot):
     assert any("video/49" in text for text in robot.session.complaints.texts)
 
 
-def test_latency_is_from_the_cloud_to_its_result(robot):
+def test_latency_is_measured_from_cloud_to_result(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15, now=1000.2)
     job = robot.session.take_frame()
@@ -137,7 +137,7 @@ def test_latency_is_from_the_cloud_to_its_result(robot):
     assert robot.session.work.engine_latency.to_json()["p50"] == 10.0
 
 
-def test_the_longest_wait_is_for_the_engine_not_for_the_sender(robot):
+def test_longest_wait_excludes_sender_pauses(robot):
     robot.frame(0.0)
     robot.frame(60.0)  # a minute without clouds
     assert robot.session.work.longest_wait < 0.1
@@ -149,7 +149,7 @@ def test_the_longest_wait_is_for_the_engine_not_for_the_sender(robot):
     assert robot.session.work.longest_wait == pytest.approx(0.8, abs=0.01)
 
 
-def test_options_force_the_codecs():
+def test_codec_options_override_encoding():
     session = Session(KEYS, SHA, options=("xyz", "json"))
     sample, moved = cloud(0.0), odometry(0.0)
     session.on_cloud(Sample(sample.key, sample.payload, "video/raw", sample.attachment), 0.0)
@@ -157,7 +157,7 @@ def test_options_force_the_codecs():
     assert session.take_frame() is not None
 
 
-def test_a_frame_that_took_anothers_place_is_in_a_hurry():
+def test_frame_that_replaced_another_defers_registration():
     robot = Robot()
     robot.drive(-0.1, 0.5)
     robot.saw(0.0)

@@ -9,7 +9,7 @@ import pytest
 from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, ns, pose, reason, state, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def test_no_pose_before_the_first_fix(robot):
     assert robot.counters.poses == 0
 
 
-def test_a_pose_is_the_newest_odometry_corrected(robot):
+def test_pose_is_corrected_newest_odometry(robot):
     robot.localized(0.0)
     robot.drive(0.05, 0.4)
     sent = robot.session.pose()
@@ -39,7 +39,7 @@ def test_a_pose_is_the_newest_odometry_corrected(robot):
     assert robot.session.age() == pytest.approx(0.4)
 
 
-def test_covariance_grows_with_what_was_driven_and_turned():
+def test_pose_covariance_grows_with_distance_and_turn():
     drift = replace(DRIFT, position=0.2, height=0.2, turn=0.3)
     known = np.diag([0.01, 0.01, 0.01, 0.0, 0.0, 0.0])
     robot = Robot()
@@ -59,7 +59,7 @@ def test_covariance_grows_with_what_was_driven_and_turned():
     assert turned[0, 0] == pytest.approx(later[0, 0], rel=0.05)
 
 
-def test_an_error_of_the_heading_is_one_of_the_place_further_on():
+def test_heading_error_propagates_to_position():
     robot = Robot()
     heading = np.zeros((6, 6))
     heading[5, 5] = np.radians(1.0) ** 2
@@ -77,7 +77,7 @@ def test_an_error_of_the_heading_is_one_of_the_place_further_on():
     np.testing.assert_allclose(later.covariance, later.covariance.T)
 
 
-def test_corrections_do_not_move_the_past(robot):
+def test_correction_does_not_change_published_stamps(robot):
     robot.localized(0.0)
     stamps = []
     for k in range(1, 40):
@@ -96,7 +96,7 @@ def test_corrections_do_not_move_the_past(robot):
     assert stamps[-1] == ns(1.95)
 
 
-def test_a_correction_replaced_leaves_nothing_of_the_old(robot):
+def test_new_correction_replaces_the_old(robot):
     robot.localized(0.0)
     robot.frame(0.1, tracking, T_map_odom=T_MAP_ODOM @ pose(1.0), sigma=0.5)
     sent = robot.session.pose()
@@ -104,7 +104,7 @@ def test_a_correction_replaced_leaves_nothing_of_the_old(robot):
     assert sent.covariance[0, 0] == pytest.approx(0.25, rel=0.01)
 
 
-def test_doubt_takes_the_pose_away_at_once(robot):
+def test_doubted_state_has_no_pose(robot):
     robot.localized(0.0)
     robot.frame(0.1, unknown, state=State.AMBIGUOUS, reason="evidence gone, 1 times in a row")
     assert robot.session.pose() is None
@@ -113,7 +113,7 @@ def test_doubt_takes_the_pose_away_at_once(robot):
     assert state(robot) is State.TRACKING
 
 
-def test_without_odometry_there_is_no_pose(robot):
+def test_odometry_timeout_ends_pose(robot):
     robot.localized(0.0)
     robot.session.tick(robot.now + 0.49)
     assert robot.session.pose() is not None
@@ -124,7 +124,7 @@ def test_without_odometry_there_is_no_pose(robot):
     assert robot.counters.losses == 1
 
 
-def test_after_silence_only_a_verified_frame_brings_the_pose_back(robot):
+def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
     robot.localized(0.0)
     silent = robot.now + 0.6
     robot.session.tick(silent)
@@ -147,7 +147,7 @@ def test_after_silence_only_a_verified_frame_brings_the_pose_back(robot):
     assert not robot.session.take_frame().suspect
 
 
-def test_a_frame_from_before_the_silence_brings_nothing_back(robot):
+def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
     robot.localized(0.0)
     robot.drive(0.05, 0.3)
     robot.saw(0.25)
@@ -158,7 +158,7 @@ def test_a_frame_from_before_the_silence_brings_nothing_back(robot):
     assert state(robot) is State.LOST
 
 
-def test_duplicates_keep_nobody_alive(robot):
+def test_duplicate_odometry_does_not_prevent_timeout(robot):
     robot.localized(0.0)
     for k in range(20):
         robot.moved(0.01, now=1000.0 + 0.05 * k)
@@ -166,7 +166,7 @@ def test_duplicates_keep_nobody_alive(robot):
     assert state(robot) is State.LOST
 
 
-def test_without_frames_odometry_carries_on_for_a_while_only():
+def test_dead_reckoning_ends_after_timeout():
     robot = Robot(NodeConfig(dead_reckoning_timeout=2.0)).localized(0.0)
     for k in range(1, 39):
         robot.moved(0.05 * k)
@@ -181,7 +181,7 @@ def test_without_frames_odometry_carries_on_for_a_while_only():
     assert robot.session.take_frame().suspect
 
 
-def test_frames_that_are_rejected_do_not_count_as_seen():
+def test_rejected_frames_do_not_extend_dead_reckoning():
     robot = Robot(NodeConfig(dead_reckoning_timeout=1.0)).localized(0.0)
     for k in range(1, 30):
         robot.moved(0.05 * k)
@@ -192,7 +192,7 @@ def test_frames_that_are_rejected_do_not_count_as_seen():
     assert state(robot) is State.LOST
 
 
-def test_a_pause_of_the_stamps_takes_the_pose_until_a_frame_has_verified(robot):
+def test_odometry_gap_ends_pose_until_a_frame_is_verified(robot):
     robot.localized(0.0)
     robot.moved(0.8, x=0.0, now=1000.1)
     assert robot.counters.odometry_gaps == 1
@@ -207,7 +207,7 @@ def test_a_pause_of_the_stamps_takes_the_pose_until_a_frame_has_verified(robot):
     assert robot.session.pose() is not None
 
 
-def test_a_jump_of_odometry_begins_anew(robot):
+def test_odometry_jump_restarts_search(robot):
     first = robot.localized(0.0).frame(0.1)
     robot.moved(0.15, x=900.0)
     assert robot.session.pose() is None
@@ -220,7 +220,7 @@ def test_a_jump_of_odometry_begins_anew(robot):
     assert job.verdict is None
 
 
-def test_a_clock_that_starts_anew_may_publish_older_stamps():
+def test_restarted_sender_clock_may_publish_older_stamps():
     robot = Robot().localized(100.0)
     for k in range(30):
         robot.moved(0.05 * k, now=1100.1 + 0.05 * k)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 
 stamps = st.one_of(
@@ -132,7 +132,7 @@ def live(events):
 
 @settings(max_examples=120, deadline=None, derandomize=True)
 @given(st.lists(st.one_of(*quiet), max_size=60))
-def test_random_lives(events):
+def test_random_events_keep_invariants(events):
     live(events)
 
 
@@ -144,6 +144,6 @@ usual = st.lists(frame, max_size=3).map(lambda frames: [event for events in fram
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.lists(st.one_of(usual, usual, st.lists(st.one_of(*quiet), max_size=4)), max_size=12))
-def test_random_lives_of_a_robot_that_mostly_works(chapters):
+def test_random_events_of_a_mostly_working_robot_keep_invariants(chapters):
     """Random events alone seldom come as far as a pose."""
     live([event for chapter in chapters for event in chapter])

@@ -17,13 +17,13 @@ from test_session_random_events import live, quiet, usual
 
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
 from coview_stream.stream.node.status import PoseRate
 
 
-def test_what_was_under_way_at_a_reset_is_nobodys():
+def test_frame_result_of_before_reset_is_ignored():
     robot = Robot()
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
@@ -33,7 +33,7 @@ def test_what_was_under_way_at_a_reset_is_nobodys():
     assert robot.counters.received == robot.counters.processed == 0
 
 
-def test_a_search_under_way_at_a_reset_is_nobodys():
+def test_search_result_of_before_reset_is_ignored():
     robot = Robot()
     robot.frame(0.0, unknown, ask=query(0.0))
     job = robot.session.take_search()
@@ -45,13 +45,14 @@ def test_a_search_under_way_at_a_reset_is_nobodys():
 reset = st.tuples(st.just("reset"), st.none())
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.lists(st.one_of(usual, usual, st.lists(st.one_of(*quiet, reset), max_size=4)), max_size=12))
-def test_random_lives_with_resets(chapters):
+def test_random_events_with_resets_keep_invariants(chapters):
     live([event for chapter in chapters for event in chapter])
 
 
-def test_a_frame_from_before_a_gap_does_not_clear_its_suspicion():
+def test_frame_from_before_gap_does_not_count_as_verification():
     robot = Robot().localized(0.0)
     robot.drive(0.05, 0.3)
     robot.saw(0.2)
@@ -67,7 +68,7 @@ def test_a_frame_from_before_a_gap_does_not_clear_its_suspicion():
     assert job.suspect
 
 
-def test_a_gap_while_the_first_fix_is_under_way():
+def test_odometry_gap_during_first_fix_restarts_search():
     robot = Robot()
     robot.frame(0.0, unknown, state=State.AMBIGUOUS)
     robot.drive(0.05, 0.3)
@@ -82,7 +83,7 @@ def test_a_gap_while_the_first_fix_is_under_way():
     assert robot.session.take_frame().epoch > busy.epoch  # the search begins anew
 
 
-def test_a_long_outage_of_odometry_is_a_new_beginning():
+def test_long_odometry_outage_loses_the_place():
     robot = Robot().localized(0.0)
     robot.drive(0.05, 0.3)
     assert robot.session.pose() is not None
@@ -92,7 +93,7 @@ def test_a_long_outage_of_odometry_is_a_new_beginning():
 
 
 @pytest.mark.parametrize(("seconds", "state"), [(6.0, State.AMBIGUOUS), (12.0, State.LOST)])
-def test_an_outage_of_the_network_keeps_the_place_for_a_while(seconds, state):
+def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
     robot = Robot().localized(0.0)
     robot.drive(0.05, 0.3)
     robot.session.unreachable(robot.now + 1.0)
@@ -107,7 +108,7 @@ def test_an_outage_of_the_network_keeps_the_place_for_a_while(seconds, state):
     assert robot.session.pose() is not None
 
 
-def test_a_stamp_is_not_given_two_poses():
+def test_one_stamp_never_gets_two_poses():
     robot = Robot().localized(0.0)
     first = robot.session.pose()
     robot.saw(0.0)
@@ -123,7 +124,7 @@ def test_a_stamp_is_not_given_two_poses():
     assert abs(after.T_map_body[0, 3] - before.T_map_body[0, 3]) > 1.0
 
 
-def test_covariance_of_a_cloud_that_comes_late():
+def test_late_cloud_covariance_includes_odometry_since():
     drift = replace(DRIFT, position=0.2, height=0.2)
     known = np.diag([0.01, 0.01, 0.01, 0.0, 0.0, 0.0])
     robot = Robot()
@@ -136,7 +137,7 @@ def test_covariance_of_a_cloud_that_comes_late():
 
 
 @pytest.mark.parametrize("second", [None, verdict(1.0)])
-def test_an_accepted_verdict_is_not_replaced(second):
+def test_accepted_search_result_is_not_replaced(second):
     robot = Robot()
     robot.frame(0.0, unknown, ask=query(0.0))
     first = robot.session.take_search()
@@ -147,7 +148,7 @@ def test_an_accepted_verdict_is_not_replaced(second):
     assert robot.frame(0.2, unknown).verdict is accepted
 
 
-def test_a_frame_that_came_is_not_missing():
+def test_frame_without_odometry_is_not_counted_missing():
     robot = Robot()
     robot.moved(0.0, x=0.0)
     robot.saw(0.0, attachment=numbered(1, 0.0))
@@ -164,21 +165,22 @@ def _segment(*times):
 
 
 @pytest.mark.parametrize("times", [[0.05, 0.05], [0.3, 0.4]])
-def test_points_all_of_another_time_than_the_stamp(times):
+def test_deskew_with_all_points_off_the_stamp(times):
     points = np.array([[5.0, 1.0, 0.5], [6.0, 1.0, 0.5]], np.float32)
     moved = deskew(points, np.array(times), _segment(0.0, 0.1), ns(0.0), pose(0.0))
     expected = points + np.array([10.0 * min(times[0], 0.1), 0.0, 0.0])
     np.testing.assert_allclose(moved, expected, atol=0.02)
 
 
-def test_the_rate_of_poses_at_one_time():
+def test_pose_rate_of_simultaneous_poses():
     rate = PoseRate()
     rate.add(1.0)
     rate.add(1.0)
     assert rate.rate(1.0) >= 0.0
 
 
-def test_a_robot_that_was_carried_away_is_found_out(world_map, world_drive):
+@pytest.mark.slow
+def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(world_map, world_drive):
     """Odometry paused, the robot was moved by hand 10 m back, and odometry goes on where it was."""
     localizer = Localizer(world_map)
     for k in range(6):
@@ -198,7 +200,7 @@ def test_a_robot_that_was_carried_away_is_found_out(world_map, world_drive):
     assert not wrong, f"poses wrong by {wrong} m"
 
 
-def test_a_pose_that_cannot_be_written_is_its_robots_own():
+def test_unencodable_pose_of_one_robot_does_not_affect_others():
     site = Site("r1", "r2")
     site.node.declare()
     site.engine.answer = lambda job: tracking(job, sigma=float("nan") if job.robot == "r1" else 0.1)
@@ -208,7 +210,7 @@ def test_a_pose_that_cannot_be_written_is_its_robots_own():
     assert len(site.net.samples("coview/r2/out/pose")) == 1
 
 
-def test_an_unexpected_error_of_a_lane_does_not_end_the_work():
+def test_unexpected_engine_error_does_not_stop_the_node():
     site = Site("r1")
     run = site.track.run
     errors = [RuntimeError("nobody thought of this")]

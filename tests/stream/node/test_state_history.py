@@ -6,7 +6,8 @@ import json
 
 from fake_robot import Robot, ns, unknown
 
-from coview_stream.localization.result import KeyframeEvidence, State
+from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.stream.node.robot_state import StateHistory
 from coview_stream.stream.node.status import status
@@ -18,7 +19,7 @@ def told(robot):
     return json.loads(json.dumps(document))["transitions"]
 
 
-def test_a_robot_that_is_found_and_lost_leaves_both_behind():
+def test_fix_and_loss_are_in_the_state_history():
     robot = Robot()
     assert told(robot) == []
     robot.localized(0.0)
@@ -37,7 +38,7 @@ def test_a_robot_that_is_found_and_lost_leaves_both_behind():
     assert changes[2]["reason"] == "2 registrations rejected"
 
 
-def test_what_only_time_brings_is_told_too():
+def test_timeout_is_in_the_state_history():
     robot = Robot()
     robot.localized(0.0)
     robot.session.tick(robot.now + 60.0)
@@ -45,7 +46,7 @@ def test_what_only_time_brings_is_told_too():
     assert "no odometry" in told(robot)[-1]["reason"]
 
 
-def test_a_jump_of_odometry_is_told():
+def test_odometry_jump_is_in_the_state_history():
     robot = Robot()
     robot.localized(0.0)
     robot.moved(0.1, x=50.0)
@@ -53,7 +54,7 @@ def test_a_jump_of_odometry_is_told():
     assert told(robot)[-1]["reason"] == "odometry jumped"
 
 
-def test_the_newest_five_are_kept_and_numbers_go_on():
+def test_state_history_keeps_newest_five_with_running_numbers():
     changes = StateHistory()
     evidence = KeyframeEvidence(
         1.0, State.TRACKING, "verified", cause=RejectionReason.VERIFIED, innovation=3.25
@@ -69,7 +70,7 @@ def test_the_newest_five_are_kept_and_numbers_go_on():
     assert kept[-1]["evidence"]["innovation"] == 3.25
 
 
-def test_a_reset_forgets_them():
+def test_reset_clears_the_state_history():
     robot = Robot()
     robot.localized(0.0)
     robot.session.reset()

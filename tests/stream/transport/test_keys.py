@@ -15,7 +15,7 @@ from coview_stream.stream.transport.keys import PRESETS, robot_keys
 POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
 
 
-def test_native_keys_are_the_contract() -> None:
+def test_native_keys_are_as_documented() -> None:
     keys = robot_keys("native", "coview", "rover1")
     assert keys.cloud == "coview/rover1/in/cloud"
     assert keys.odometry == "coview/rover1/in/odom"
@@ -26,7 +26,7 @@ def test_native_keys_are_the_contract() -> None:
     assert (keys.cloud_hint, keys.pose_format, keys.rmw, keys.bare) == (None, "json", False, False)
 
 
-def test_ros2dds_uses_topic_names_and_keeps_our_own_keys() -> None:
+def test_ros2dds_uses_topic_names_and_native_service_keys() -> None:
     keys = robot_keys("ros2dds", "site/hall3", "bot1")
     assert (keys.cloud, keys.odometry, keys.pose) == ("bot1/points", "bot1/odom", "bot1/coview/pose")
     assert keys.status == "site/hall3/bot1/out/status"
@@ -83,13 +83,13 @@ def test_a_ros_pose_key_keeps_the_convention() -> None:
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "a*", "a$", "a?", "#1", "@home", "tab\t"])
-def test_bad_robot_names_name_the_option(robot: str) -> None:
+def test_bad_robot_name_names_the_option(robot: str) -> None:
     with pytest.raises(ConfigError, match="--robot"):
         robot_keys("native", "coview", robot)
 
 
 @pytest.mark.parametrize("base", ["", "/a", "a/", "a//b", "a/*", "@v0/x", "a/$*"])
-def test_bad_bases_name_the_option(base: str) -> None:
+def test_bad_base_names_the_option(base: str) -> None:
     with pytest.raises(ConfigError, match="--base"):
         robot_keys("native", base, "rover1")
 
@@ -103,12 +103,12 @@ def test_bad_bases_name_the_option(base: str) -> None:
         ({"domain": 233}, "--domain"),
     ],
 )
-def test_bad_overrides_name_the_option(options: dict[str, str], message: str) -> None:
+def test_bad_key_override_names_the_option(options: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         robot_keys("native", "coview", "rover1", **options)
 
 
-def test_an_unknown_preset_lists_the_known_ones() -> None:
+def test_unknown_preset_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="native, ros2dds, rmw_zenoh, keelson"):
         robot_keys("ros1", "coview", "rover1")
 
@@ -137,7 +137,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize("text", EXPRESSIONS + WRONG)
-def test_expressions_are_judged_as_zenoh_does(text: str) -> None:
+def test_key_expression_validity_agrees_with_zenoh(text: str) -> None:
     try:
         zenoh.KeyExpr(text)
         valid = True
@@ -151,6 +151,6 @@ def test_expressions_are_judged_as_zenoh_does(text: str) -> None:
             check_expression(text, "key")
 
 
-def test_names_pass_through() -> None:
+def test_valid_names_and_bases_are_returned_unchanged() -> None:
     assert check_chunk("rover-1", "--robot") == "rover-1"
     assert check_prefix("a/b", "--base") == "a/b"

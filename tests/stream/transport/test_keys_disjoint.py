@@ -15,11 +15,11 @@ def fleet(preset="native", names=("r1", "r2"), **given):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_keeps_robots_apart(preset):
+def test_every_preset_has_disjoint_robot_keys(preset):
     check_disjoint(fleet(preset, ("r1", "r2", "r10")))
 
 
-def test_wide_keys_of_one_robot_or_with_its_name_are_fine():
+def test_wildcard_keys_of_one_robot_are_accepted():
     check_disjoint(fleet(names=["r1"], cloud="**/cloud", odometry="*/odom"))
     check_disjoint(fleet(cloud="site/*/{robot}/**", odometry="{robot}$*/odom", pose="poses/{robot}"))
 
@@ -36,17 +36,17 @@ def test_wide_keys_of_one_robot_or_with_its_name_are_fine():
         ({"cloud": "{robot}/**", "pose": "{robot}/pose"}, "--pose-key.*robot r1.*input of r1.*--cloud-key"),
     ],
 )
-def test_refused(given, message):
+def test_overlapping_keys_are_refused(given, message):
     with pytest.raises(ConfigError, match=re.sub(r"([{}])", r"\\\1", message)):
         check_disjoint(fleet(**given))
 
 
-def test_a_pose_that_another_robot_would_read():
+def test_pose_key_read_by_another_robot_is_refused():
     first = robot_keys("native", "coview", "r1", pose="coview/r2/in/odom")
     with pytest.raises(ConfigError, match=r"poses of robot r1 .* input of r2"):
         check_disjoint([first, robot_keys("native", "coview", "r2")])
 
 
-def test_a_name_given_twice():
+def test_duplicate_robot_name_is_refused():
     with pytest.raises(ConfigError, match="each name once"):
         check_disjoint(fleet(names=("r1", "r1")))

@@ -25,7 +25,7 @@ def test_samples_reach_matching_handlers_before_publish_returns() -> None:
     assert net.subscribed == {"coview/*/in/cloud": "newest", "coview/r1/in/cloud": "all"}
 
 
-def test_publishers_are_recorded_and_heard() -> None:
+def test_published_samples_are_recorded_and_delivered() -> None:
     net = FakeTransport()
     heard: list[Sample] = []
     net.subscribe("**", heard.append, "all")
@@ -37,7 +37,7 @@ def test_publishers_are_recorded_and_heard() -> None:
     assert net.publishers[0].urgency == "realtime"
 
 
-def test_a_handler_that_raises_is_recorded_and_called_again(caplog: pytest.LogCaptureFixture) -> None:
+def test_raising_handler_is_recorded_and_called_again(caplog: pytest.LogCaptureFixture) -> None:
     net = FakeTransport()
     calls: list[bytes] = []
 
@@ -54,7 +54,7 @@ def test_a_handler_that_raises_is_recorded_and_called_again(caplog: pytest.LogCa
     assert len(caplog.records) == 1
 
 
-def test_queries_are_answered_or_say_why_not() -> None:
+def test_queries_return_answers_or_raise_the_reason() -> None:
     net = FakeTransport()
 
     def refuse(_: dict[str, str]) -> dict[str, object]:
@@ -70,7 +70,7 @@ def test_queries_are_answered_or_say_why_not() -> None:
         net.query("r2/rpc/reset")
 
 
-def test_the_network_goes_away_and_comes_back() -> None:
+def test_network_outage_and_return() -> None:
     net = FakeTransport()
     heard: list[Sample] = []
     net.subscribe("a", heard.append, "all")
@@ -91,7 +91,7 @@ def test_the_network_goes_away_and_comes_back() -> None:
     assert (net.connection().routers, net.announced, net.query("q")) == (("fake",), ("alive",), {})
 
 
-def test_close_ends_everything_and_may_be_called_twice() -> None:
+def test_close_is_complete_and_idempotent() -> None:
     transport: Transport = (net := FakeTransport())  # mypy: it is one
     heard: list[Sample] = []
     transport.subscribe("a", heard.append, "all")
@@ -102,14 +102,14 @@ def test_close_ends_everything_and_may_be_called_twice() -> None:
     assert (heard, net.announced, net.closed, transport.connection().routers) == ([], (), True, ())
 
 
-def test_a_key_that_zenoh_would_refuse_is_refused() -> None:
+def test_invalid_zenoh_key_is_refused() -> None:
     with pytest.raises(ConfigError):
         FakeTransport().subscribe("a//b", print, "all")
     with pytest.raises(ConfigError):
         FakeTransport().publisher("a/*", "data")
 
 
-def test_guard_counts_what_it_does_not_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_rate_limited_errors_count_suppressed_messages(caplog: pytest.LogCaptureFixture) -> None:
     now = [0.0]
     guard = RateLimitedErrors(logging.getLogger("guard"), interval=10.0, clock=lambda: now[0])
 
@@ -127,7 +127,7 @@ def test_guard_counts_what_it_does_not_log(caplog: pytest.LogCaptureFixture) -> 
     ]
 
 
-def test_guard_survives_a_panic_but_not_an_interrupt() -> None:
+def test_rate_limited_errors_catch_panics_but_not_interrupts() -> None:
     class PanicException(BaseException):
         pass
 

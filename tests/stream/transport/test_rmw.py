@@ -22,13 +22,13 @@ ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
 GID = bytes(range(16))
 
 
-def test_attachment_golden_bytes() -> None:
+def test_rmw_attachment_golden_bytes() -> None:
     data = attachment(5, 1_700_000_000_123_456_789, GID)
     assert data.hex() == "0500000000000000" + "15cd853dfe9c9717" + "10" + GID.hex()
     assert read_attachment(data) == (5, 1_700_000_000_123_456_789, GID)
 
 
-def test_attachment_is_what_zenoh_itself_serializes() -> None:
+def test_rmw_attachment_equals_zenoh_serialization() -> None:
     theirs = z_serialize((Int64(-3), Int64(2**62), GID))
     assert attachment(-3, 2**62, GID) == theirs.to_bytes()
     decoded = z_deserialize(tuple[Int64, Int64, bytes], zenoh.ZBytes(attachment(7, 8, GID)))
@@ -36,11 +36,11 @@ def test_attachment_is_what_zenoh_itself_serializes() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", bytes(33), attachment(1, 2, GID)[:-1], attachment(1, 2, GID) + b"x"])
-def test_other_attachments_are_not_taken_for_one(data: bytes) -> None:
+def test_other_attachments_are_not_rmw_attachments(data: bytes) -> None:
     assert read_attachment(data) is None
 
 
-def test_type_names_and_published_hashes() -> None:
+def test_dds_type_names_and_type_hashes() -> None:
     assert dds_type("sensor_msgs/msg/PointCloud2") == "sensor_msgs::msg::dds_::PointCloud2_"
     for name, digest in {
         "sensor_msgs/msg/PointCloud2": "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
@@ -53,7 +53,7 @@ def test_type_names_and_published_hashes() -> None:
         assert type_hash(name, humble=True) == "TypeHashNotSupported"
 
 
-def test_tokens_are_spelled_as_rmw_zenoh_does() -> None:
+def test_liveliness_tokens_match_rmw_zenoh() -> None:
     # the example of rmw_zenoh's own design notes
     assert node_token(0, ZID, "listener") == f"@ros2_lv/0/{ZID}/0/0/NN/%/%/listener"
     key = robot_keys("rmw_zenoh", "coview", "bot1", domain=7).pose
@@ -64,7 +64,7 @@ def test_tokens_are_spelled_as_rmw_zenoh_does() -> None:
     )
 
 
-def test_a_publisher_counts_and_signs_its_messages_and_names_no_encoding() -> None:
+def test_rmw_publisher_adds_sequence_and_gid_without_encoding() -> None:
     net = FakeTransport()
     keys = [robot_keys("rmw_zenoh", "coview", name, domain=7).pose for name in ("a", "b")]
     tokens = [publisher_token(key, ZID, "coview", number) for number, key in enumerate(keys, 1)]

@@ -12,7 +12,7 @@ from coview_stream.stream.transport.zenoh_config import compose, reason
 from coview_stream.stream.transport.zenoh_transport import open_transport
 
 
-def test_a_port_in_use_names_the_way_out() -> None:
+def test_port_in_use_names_the_remedy() -> None:
     endpoint = free_endpoint()
     first = open_transport(listen=[endpoint])
     try:
@@ -25,7 +25,7 @@ def test_a_port_in_use_names_the_way_out() -> None:
     assert endpoint in str(caught.value)
 
 
-def test_somebody_elses_address() -> None:
+def test_address_of_another_host_is_explained() -> None:
     with pytest.raises(TransportError, match=r"203\.0\.113\.7.*no address of this machine: --listen on"):
         open_transport(listen=["tcp/203.0.113.7:7447"])
 
@@ -38,7 +38,7 @@ def test_somebody_elses_address() -> None:
         {"connect": ["tls/robot.local:0"]},
     ],
 )
-def test_ports_out_of_range(options: dict[str, list[str]]) -> None:
+def test_port_out_of_range_is_explained(options: dict[str, list[str]]) -> None:
     (endpoint,) = next(iter(options.values()))
     with pytest.raises(TransportError, match=r"port must be 1\.\.65535") as caught:
         compose(**options)
@@ -65,7 +65,7 @@ def test_ports_out_of_range(options: dict[str, list[str]]) -> None:
         ("a.json5", "{mode:", "line 1, column 7: expected"),
     ],
 )
-def test_mistakes_in_a_configuration_are_short(tmp_path: Path, name: str, text: str, said: str) -> None:
+def test_configuration_errors_are_one_short_line(tmp_path: Path, name: str, text: str, said: str) -> None:
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(TransportError) as caught:
@@ -76,6 +76,6 @@ def test_mistakes_in_a_configuration_are_short(tmp_path: Path, name: str, text: 
     assert "\n" not in message
 
 
-def test_other_errors_pass_as_they_are() -> None:
+def test_other_errors_are_unchanged() -> None:
     assert reason(ValueError("it broke\n at io/x.rs:12.")) == "it broke"
     assert reason(ValueError("")) == "ValueError"

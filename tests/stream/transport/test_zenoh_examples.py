@@ -51,14 +51,14 @@ def check_round_trip(node: ZenohTransport, robot: ZenohTransport, name: str = "r
     until(lambda: any(reply.ok for reply in session.liveliness().get(keys.alive, timeout=2.0)))
 
 
-def test_peer_on_one_machine(tmp_path: Path) -> None:
+def test_peer_example_on_one_machine(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     config = moved(EXAMPLES / "peer.json5", tmp_path, endpoint)
     with closing(open_transport(config=config)) as node, closing(open_transport([endpoint])) as robot:
         check_round_trip(node, robot)
 
 
-def test_clients_of_a_router(tmp_path: Path) -> None:
+def test_router_example_connects_clients(tmp_path: Path) -> None:
     with Router() as router:
         config = moved(EXAMPLES / "client.json5", tmp_path, router.endpoint)
         with closing(open_transport(config=config)) as node, closing(open_transport(config=config)) as robot:
@@ -90,7 +90,10 @@ def secured(folder: Path) -> Iterator[str]:
         router.close()
 
 
-def test_robots_speak_for_themselves_only(certificates: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_access_control_example_limits_robots_to_their_keys(
+    certificates: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(certificates)
     with (
         secured(certificates),
@@ -124,7 +127,10 @@ def put(transport: ZenohTransport, key: str, payload: bytes) -> None:
     publisher.close()
 
 
-def test_without_a_certificate_nobody_gets_in(certificates: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_tls_example_refuses_clients_without_certificate(
+    certificates: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(certificates)
     with secured(certificates) as endpoint:
         anonymous = zenoh.Config()
@@ -139,12 +145,14 @@ def test_without_a_certificate_nobody_gets_in(certificates: Path, monkeypatch: p
             until(lambda: node.connection().routers)
 
 
-def test_private_keys_are_private(certificates: Path) -> None:
+@pytest.mark.slow
+def test_tls_example_key_files_are_private(certificates: Path) -> None:
     for key in (certificates / "certificates").glob("*.key"):
         assert key.stat().st_mode & 0o077 == 0
 
 
-def test_what_certificates_need_is_named() -> None:
+@pytest.mark.slow
+def test_tls_example_names_missing_certificate_files() -> None:
     program = EXAMPLES / "mtls" / "make_certificates.py"
     code = f"import runpy, sys; sys.modules['cryptography'] = None; runpy.run_path({str(program)!r})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
@@ -153,7 +161,7 @@ def test_what_certificates_need_is_named() -> None:
     assert done.stderr.endswith("pip install cryptography\n")
 
 
-def test_every_example_is_run_here() -> None:
+def test_every_zenoh_example_is_tested() -> None:
     names = {path.relative_to(EXAMPLES).as_posix() for path in EXAMPLES.rglob("*.json5")}
     assert names == {
         "peer.json5",

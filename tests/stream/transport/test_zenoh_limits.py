@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import pytest
 import zenoh
 from sockets import free_endpoint, until
 
@@ -16,7 +17,7 @@ from coview_stream.stream.transport import zenoh_io as zenoh_samples
 from coview_stream.stream.transport.zenoh_transport import open_transport
 
 
-def test_of_a_message_that_is_too_large_only_its_size_is_handed_on():
+def test_oversized_message_is_delivered_as_its_size():
     endpoint = free_endpoint()
     node = open_transport(listen=[endpoint], max_payload=1000)
     robot = open_transport(connect=[endpoint])
@@ -42,7 +43,7 @@ def test_of_a_message_that_is_too_large_only_its_size_is_handed_on():
         node.close()
 
 
-def test_what_is_too_large_is_not_copied():
+def test_oversized_message_is_not_copied():
     class Bytes:
         def __len__(self):
             return 2000
@@ -56,7 +57,7 @@ def test_what_is_too_large_is_not_copied():
     assert zenoh_samples.plain(Big(), 1999) == Sample("k", b"", size=2000)
 
 
-def test_only_what_must_arrive_may_wait():
+def test_only_reliable_messages_may_block():
     quality = {name: zenoh_samples.quality(name) for name in ("realtime", "data", "report")}
     control = zenoh.CongestionControl
     assert quality["data"]["congestion_control"] == control.BLOCK
@@ -74,7 +75,8 @@ sys.stdin.read()
 """
 
 
-def test_reports_wait_for_no_reader_that_stands_still():
+@pytest.mark.slow
+def test_status_reports_do_not_block_on_stuck_reader():
     address = free_endpoint()
     node = open_transport(listen=[f"{address}#so_sndbuf=8192"])
     config = f"""{{mode: "client", connect: {{endpoints: ["{address}#so_rcvbuf=8192"]}},

@@ -43,7 +43,7 @@ def alive(transport: ZenohTransport, key: str) -> bool:
     return any(reply.ok for reply in transport._session.liveliness().get(key, timeout=1.0))
 
 
-def test_samples_arrive_as_they_were_sent(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_samples_arrive_unchanged(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
     node, robot = pair
     got: list[Sample] = []
     node.subscribe("r1/in/*", got.append, "all")
@@ -61,7 +61,7 @@ def test_samples_arrive_as_they_were_sent(pair: tuple[ZenohTransport, ZenohTrans
     ]
 
 
-def test_deletes_are_no_samples(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_deletes_are_not_delivered(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
     node, robot = pair
     got: list[Sample] = []
     node.subscribe("r1/in/odom", got.append, "all")
@@ -72,7 +72,7 @@ def test_deletes_are_no_samples(pair: tuple[ZenohTransport, ZenohTransport]) -> 
     assert [sample.payload for sample in got] == [b"after"]
 
 
-def test_a_slow_reader_of_the_newest_skips_and_of_all_does_not(
+def test_newest_subscription_skips_and_all_subscription_does_not(
     pair: tuple[ZenohTransport, ZenohTransport],
 ) -> None:
     node, robot = pair
@@ -99,7 +99,7 @@ def test_a_slow_reader_of_the_newest_skips_and_of_all_does_not(
     assert every == [b"first", *(str(number).encode() for number in range(200))]
 
 
-def test_a_handler_that_raises_goes_on_and_is_logged_once(
+def test_raising_handler_is_kept_and_logged_once(
     pair: tuple[ZenohTransport, ZenohTransport], caplog: pytest.LogCaptureFixture
 ) -> None:
     node, robot = pair
@@ -118,7 +118,7 @@ def test_a_handler_that_raises_goes_on_and_is_logged_once(
     assert lines == ["r1/x: ValueError: cannot decode this"]
 
 
-def test_queries_get_json_and_errors_are_replies_too(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
+def test_queries_reply_json_and_errors(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
     node, robot = pair
 
     def refuse(_: dict[str, str]) -> dict[str, Any]:
@@ -135,7 +135,8 @@ def test_queries_get_json_and_errors_are_replies_too(pair: tuple[ZenohTransport,
     assert len(ask(robot, "r1/rpc/*")) == 2  # each on its own key
 
 
-def test_the_router_is_killed_and_everything_returns(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.slow
+def test_transport_recovers_after_router_is_killed(caplog: pytest.LogCaptureFixture) -> None:
     endpoint = free_endpoint()
     node = open_transport(connect=[endpoint])  # both before their router
     robot = open_transport(connect=[endpoint])
@@ -170,7 +171,8 @@ def test_the_router_is_killed_and_everything_returns(caplog: pytest.LogCaptureFi
         robot.close()
 
 
-def test_a_host_that_says_nothing_holds_nobody_up() -> None:
+@pytest.mark.slow
+def test_silent_host_does_not_block_opening() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
@@ -184,7 +186,8 @@ def test_a_host_that_says_nothing_holds_nobody_up() -> None:
         assert middle - start < 5.0  # zenoh alone would wait for 10
 
 
-def test_a_process_that_forgets_to_close_ends_in_peace() -> None:
+@pytest.mark.slow
+def test_process_without_close_exits_cleanly() -> None:
     program = (
         "import socket\n"
         "from coview_stream.stream.transport.zenoh_transport import open_transport\n"
@@ -241,7 +244,9 @@ def test_close_ends_all_threads_and_is_idempotent() -> None:
         ),
     ],
 )
-def test_mistakes_are_told_at_once(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_invalid_configuration_is_refused_at_once(
+    options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     if "config" in options:
         path = tmp_path / "zenoh.json5"
         path.write_text(options["config"])
@@ -253,7 +258,7 @@ def test_mistakes_are_told_at_once(options: dict[str, Any], message: str, tmp_pa
     assert ".rs:" not in str(caught.value)
 
 
-def test_a_missing_file_and_a_busy_port_are_named(tmp_path: Path) -> None:
+def test_missing_config_file_and_busy_port_are_named(tmp_path: Path) -> None:
     with pytest.raises(TransportError, match=r"gone\.json5: No such file"):
         open_transport(config=tmp_path / "gone.json5")
     endpoint = free_endpoint()
@@ -263,7 +268,7 @@ def test_a_missing_file_and_a_busy_port_are_named(tmp_path: Path) -> None:
     first.close()
 
 
-def test_a_wrong_key_is_told_before_there_is_a_router() -> None:
+def test_invalid_key_is_refused_without_router() -> None:
     transport = open_transport(connect=[free_endpoint()])
     with pytest.raises(TransportError, match="a//b"):
         transport.subscribe("a//b", print, "all")
@@ -284,7 +289,7 @@ def test_mode_follows_from_the_endpoints() -> None:
     assert settings(compose(), *ENDPOINTS) == ["peer", [], []]
 
 
-def test_a_file_wins_over_our_defaults_and_options_over_its_endpoints(tmp_path: Path) -> None:
+def test_config_file_overrides_defaults_and_options_override_its_endpoints(tmp_path: Path) -> None:
     keys = (
         *ENDPOINTS,
         "scouting/multicast/enabled",

@@ -56,7 +56,7 @@ def clique_number(weights):
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(0, 11), st.floats(0.0, 1.0), st.integers(0, 10_000))
-def test_the_search_equals_trying_everything(nodes, share, seed):
+def test_clique_search_equals_brute_force(nodes, share, seed):
     weights = random_graph(nodes, share, seed)
     expected = clique_number(weights)
     for found in (
@@ -70,14 +70,14 @@ def test_the_search_equals_trying_everything(nodes, share, seed):
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.85])
-def test_sixteen_nodes_equal_trying_everything(share):
+def test_clique_search_on_sixteen_nodes_equals_brute_force(share):
     weights = random_graph(16, share, 7)
     assert len(maximum_clique(weights, 100_000)) == clique_number(weights)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(1, 60), st.floats(0.0, 1.0), st.integers(0, 10_000))
-def test_the_relaxation_claims_no_more_than_a_clique_that_cannot_grow(nodes, share, seed):
+def test_relaxation_returns_a_maximal_clique(nodes, share, seed):
     weights = random_graph(nodes, share, seed)
     members = relaxed_clique(weights)
     assert len(members) >= 1
@@ -90,7 +90,7 @@ def test_the_relaxation_claims_no_more_than_a_clique_that_cannot_grow(nodes, sha
 
 
 @pytest.mark.parametrize(("nodes", "members", "share"), [(200, 20, 0.05), (400, 20, 0.05), (400, 80, 0.1)])
-def test_the_relaxation_finds_what_was_planted(nodes, members, share):
+def test_relaxation_finds_planted_clique(nodes, members, share):
     weights, chosen = planted(nodes, members, share, 3)
     np.testing.assert_array_equal(relaxed_clique(weights), chosen)
     found = maximum_clique(weights, 2000)
@@ -98,7 +98,7 @@ def test_the_relaxation_finds_what_was_planted(nodes, members, share):
     assert found.exact
 
 
-def test_the_relaxation_comes_near_the_largest_where_nothing_stands_out():
+def test_relaxation_is_near_optimal_on_random_graphs():
     """The leading eigenvector alone, without the growing penalty, reaches 0.84 of it on average."""
     reached = []
     for seed in range(10):
@@ -107,14 +107,14 @@ def test_the_relaxation_comes_near_the_largest_where_nothing_stands_out():
     assert np.mean(reached) > 0.87
 
 
-def test_the_search_finds_what_was_planted_without_a_start():
+def test_clique_search_finds_planted_clique_without_start():
     weights, chosen = planted(300, 25, 0.2, 5)
     found = largest_clique(weights > 0, np.empty(0, dtype=np.int64), 20_000)
     np.testing.assert_array_equal(found.members, chosen)
     assert found.exact
 
 
-def test_out_of_branches_it_says_so_and_still_answers():
+def test_clique_search_reports_exhausted_branch_limit():
     weights = random_graph(120, 0.7, 0)
     start = relaxed_clique(weights)
     short = largest_clique(weights > 0, start, 20)
@@ -127,7 +127,7 @@ def test_out_of_branches_it_says_so_and_still_answers():
     np.testing.assert_array_equal(longer.members, largest_clique(weights > 0, start, 1_000_000).members)
 
 
-def test_graphs_of_one_kind():
+def test_empty_and_complete_graphs():
     empty = np.zeros((0, 0), np.float32)
     assert len(maximum_clique(empty, 10)) == 0
     assert maximum_clique(empty, 10).exact
@@ -140,6 +140,6 @@ def test_graphs_of_one_kind():
 
 
 @pytest.mark.parametrize("start", [[0, 1], [2, 2]])
-def test_a_start_that_is_no_clique_is_refused(start):
+def test_start_that_is_not_a_clique_is_refused(start):
     with pytest.raises(ValueError, match="no clique"):
         largest_clique(np.zeros((3, 3), bool), np.array(start), 10)

@@ -78,7 +78,7 @@ def by_loops(query, weight, known, surveyed, yaws, covered):
 @pytest.mark.parametrize(
     "headings", [(0.0, 0.3, 2.0, -1.2), (0.4, 1.7, 0.4 - np.pi, 1.7 + np.pi)], ids=["any", "opposite"]
 )
-def test_it_equals_direct_sums(covered, max_bytes, headings):
+def test_correlation_equals_direct_sums(covered, max_bytes, headings):
     rng = np.random.default_rng(1)
     known = features(rng, 3, 11, 17)
     known[:, :5, :9] = 0.0
@@ -101,7 +101,7 @@ def test_it_equals_direct_sums(covered, max_bytes, headings):
 
 
 @pytest.mark.parametrize(("row", "col", "k"), [(30, 41, 0), (52, 20, 5), (9, 9, 8), (70, 118, 3)])
-def test_a_planted_place_is_found_with_its_heading(row, col, k):
+def test_planted_place_is_found_with_its_heading(row, col, k):
     rng = np.random.default_rng(2)
     known = features(rng, 8, 80, 130)
     query = seen_at(known, row, col, YAWS[k], 32)
@@ -111,7 +111,7 @@ def test_a_planted_place_is_found_with_its_heading(row, col, k):
     assert np.unravel_index(scores.argmax(), scores.shape) == (k, row, col)
 
 
-def test_it_works_on_single_cells_of_half_precision_on_a_map_smaller_than_a_query():
+def test_correlation_on_half_precision_map_smaller_than_query():
     rng = np.random.default_rng(3)
     known = features(rng, 8, 20, 9).astype(np.float16)
     query = seen_at(known.astype(np.float32), 11, 4, YAWS[2], 32)
@@ -120,7 +120,7 @@ def test_it_works_on_single_cells_of_half_precision_on_a_map_smaller_than_a_quer
     assert np.unravel_index(scores.argmax(), scores.shape) == (2, 11, 4)
 
 
-def test_the_maps_edge_neither_favours_nor_punishes():
+def test_map_edge_does_not_bias_scores():
     """A true place scores the same inside and where a third of the query hangs over; half over is not scored."""
     rng = np.random.default_rng(4)
     known = features(rng, 8, 100, 100)
@@ -146,7 +146,7 @@ def centre_of(coarse, row, col):
     return (np.stack([col, row], axis=-1) + 0.5) * coarse.cell + coarse.corner
 
 
-def test_only_the_blocks_asked_for_are_scored_and_like_in_the_whole():
+def test_requested_blocks_score_as_in_full_correlation():
     rng = np.random.default_rng(5)
     known, corner = features(rng, 4, 150, 90), (100.0, -50.0)
     coarse = FeatureIndex(known, corner, block=64)
@@ -165,7 +165,7 @@ def test_only_the_blocks_asked_for_are_scored_and_like_in_the_whole():
     assert np.isneginf(correlate(query, weight, coarse, YAWS[:3], coarse.blocks_near([(0, 5000)], 9.0))).all()
 
 
-def test_each_block_answers_for_its_own_cells_only():
+def test_each_block_covers_only_its_own_cells():
     coarse = FeatureIndex(np.ones((1, 70, 130), np.float16), (0, 0), block=64)
     answered = np.zeros((70, 130), int)
     for block in range(len(coarse)):
@@ -176,7 +176,7 @@ def test_each_block_answers_for_its_own_cells_only():
     assert (answered == 1).all()
 
 
-def test_turning_goes_from_x_to_y():
+def test_rotation_is_counter_clockwise():
     image = np.zeros((1, 32, 32), np.float32)
     image[0, 15:17, 24:26] = 1.0  # 9 cells along x from the middle
     for yaw, (row, col) in ((0.0, (16, 25)), (np.pi / 2, (25, 16)), (np.pi, (16, 7))):
@@ -185,7 +185,7 @@ def test_turning_goes_from_x_to_y():
         assert np.unravel_index(seen.argmax(), seen.shape) == (row, col)
 
 
-def test_coarser_cells_are_weighted_means():
+def test_downsampled_cells_are_weighted_means():
     local = np.arange(16, dtype=np.float32).reshape(1, 4, 4)
     weight = np.zeros((4, 4), np.float32)
     weight[0, 0], weight[1, 1] = 2.0, 1.0
@@ -195,7 +195,7 @@ def test_coarser_cells_are_weighted_means():
     np.testing.assert_allclose(downsample(local)[0][0, 1, 1], np.mean([10, 11, 14, 15]))
 
 
-def test_what_does_not_fit_is_refused():
+def test_mismatched_shapes_are_refused():
     coarse = FeatureIndex(np.ones((2, 40, 40), np.float32), (0, 0))
     query, weight = np.ones((2, 32, 32), np.float32), np.ones((32, 32), np.float32)
     for wrong in (

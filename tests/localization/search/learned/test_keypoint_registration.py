@@ -32,7 +32,7 @@ def paired(rng, count, share, noise=0.3):
 
 
 @pytest.mark.parametrize(("count", "share"), [(200, 0.1), (200, 0.2), (300, 0.05), (400, 0.05), (400, 0.2)])
-def test_a_planted_pose_is_recovered_among_wrong_pairs(count, share):
+def test_planted_pose_is_recovered_among_wrong_pairs(count, share):
     for seed in range(3):
         here, there, pose, right = paired(np.random.default_rng(seed), count, share)
         clique = maximum_clique(consistency_graph(here, there, CONFIG), CONFIG.nodes)
@@ -46,7 +46,7 @@ def test_a_planted_pose_is_recovered_among_wrong_pairs(count, share):
         assert found.rms < 0.8
 
 
-def test_consistency_is_what_it_says():
+def test_pairwise_consistency_matches_definition():
     here = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 1.5], [0.0, 20.0]])
     there = np.array([[5.0, 5.0], [5.0, 15.5], [3.0, 9.0], [5.0, 30.0]])
     weights = consistency_graph(here, there, CONFIG)
@@ -64,7 +64,7 @@ def test_consistency_is_what_it_says():
         consistency_graph(here, there[1:], CONFIG)
 
 
-def test_alignment_is_exact_without_noise_and_follows_weights():
+def test_rigid_fit_is_exact_without_noise_and_follows_weights():
     rng = np.random.default_rng(0)
     here = rng.uniform(-20, 20, (30, 2))
     there = here @ turn(-2.5).T + (700.0, -90.0)
@@ -82,7 +82,7 @@ def test_alignment_is_exact_without_noise_and_follows_weights():
     assert (two.x, two.y, two.yaw) == pytest.approx((1.0, 1.0, 0.0))
 
 
-def test_too_little_to_align_is_refused():
+def test_rigid_fit_of_too_few_pairs_is_refused():
     points = np.zeros((3, 2))
     for wrong in (
         lambda: fit_rigid_2d(points[:1], points[:1]),
@@ -110,7 +110,7 @@ def views(rng, pose, shared=40, own=160, alike=0.35, noise=0.3):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_place_becomes_a_pose(seed):
+def test_rough_place_is_refined_to_a_pose(seed):
     rng = np.random.default_rng(seed)
     pose = (*rng.uniform(-300, 300, 2), rng.uniform(-np.pi, np.pi))
     query, known = views(rng, pose)
@@ -126,7 +126,7 @@ def test_a_place_becomes_a_pose(seed):
 
 
 @pytest.mark.parametrize("off", [(9.0, 0.0, 0.0), (0.0, 0.0, 0.6), (0.0, 0.0, np.pi)])
-def test_a_pose_too_far_from_the_start_is_none(off):
+def test_pose_too_far_from_start_is_discarded(off):
     pose = (10.0, 20.0, 0.5)
     query, known = views(np.random.default_rng(1), pose)
     start = tuple(np.add(pose, off))
@@ -134,7 +134,7 @@ def test_a_pose_too_far_from_the_start_is_none(off):
     assert refine_by_keypoints(query, known, start, config) is None
 
 
-def test_a_mirror_image_is_no_match():
+def test_mirrored_keypoints_do_not_match():
     pose = (0.0, 0.0, 0.0)
     query, known = views(np.random.default_rng(2), pose, own=0)
     assert refine_by_keypoints(query, known, pose) is not None
@@ -144,7 +144,7 @@ def test_a_mirror_image_is_no_match():
     assert refine_by_keypoints(query, mirrored, pose, config) is None
 
 
-def test_chance_agreement_is_not_enough():
+def test_chance_agreement_is_not_accepted():
     found = []
     for seed in range(12):
         query, known = views(np.random.default_rng(seed), (0.0, 0.0, 0.0), shared=0)
@@ -152,7 +152,7 @@ def test_chance_agreement_is_not_enough():
     assert found == [None] * 12
 
 
-def test_nothing_matches_nothing():
+def test_empty_keypoints_give_no_pose():
     query, known = views(np.random.default_rng(3), (0.0, 0.0, 0.0))
     none = np.zeros(0, dtype=np.int64)
     for one, other in (

@@ -15,7 +15,7 @@ from coview_stream.localization.search.learned.keypoints import (
 )
 
 
-def test_minima_equal_the_definition_and_are_never_neighbours():
+def test_local_minima_match_definition_and_are_not_adjacent():
     rng = np.random.default_rng(0)
     values = rng.integers(0, 12, (30, 41)).astype(np.float32)  # with many equal ones
     found = local_minima(values)
@@ -29,12 +29,12 @@ def test_minima_equal_the_definition_and_are_never_neighbours():
     np.testing.assert_array_equal(local_minima(distinct), distinct == windows)
 
 
-def test_a_flat_image_has_one_minimum_and_an_unknown_one_none():
+def test_flat_image_has_one_minimum_and_empty_image_none():
     assert local_minima(np.ones((5, 6))).sum() == 1
     assert not local_minima(np.full((5, 6), np.inf)).any()
 
 
-def test_keypoints_lie_in_the_middle_of_their_cells_best_first():
+def test_keypoints_are_cell_centres_sorted_by_sigma():
     sigma = np.ones((6, 8), np.float32)
     sigma[4, 2], sigma[1, 6] = 0.3, 0.2
     local = np.arange(2 * 6 * 8, dtype=np.float32).reshape(2, 6, 8)
@@ -46,7 +46,7 @@ def test_keypoints_lie_in_the_middle_of_their_cells_best_first():
     np.testing.assert_allclose(keypoints(local, sigma, (0, 0), count=1, cell=2.0).xy, [[13.0, 3.0]])
 
 
-def test_masked_cells_are_none_and_hide_none():
+def test_masked_cells_are_excluded_and_hide_no_keypoint():
     sigma = np.ones((6, 8), np.float32)
     sigma[2, 2], sigma[2, 3] = 0.1, 0.2
     mask = np.ones((6, 8), bool)
@@ -56,13 +56,13 @@ def test_masked_cells_are_none_and_hide_none():
     assert not len(keypoints(np.zeros((2, 6, 8), np.float32), sigma, (0, 0), mask=np.zeros((6, 8), bool)))
 
 
-def test_keypoints_around_a_place():
+def test_keypoints_within_radius_of_a_place():
     xy = np.array([[0.0, 0.0], [3.0, 4.0], [6.0, 8.0]])
     found = Keypoints(xy, np.zeros((3, 2), np.float32), np.ones(3, np.float32)).around((0, 0), 5.0)
     np.testing.assert_array_equal(found.xy, xy[:2])
 
 
-def test_shapes_that_do_not_belong_together_are_refused():
+def test_mismatched_shapes_are_refused():
     with pytest.raises(ValueError, match="different numbers"):
         Keypoints(np.zeros((3, 2)), np.zeros((2, 4), np.float32), np.ones(3, np.float32))
     with pytest.raises(ValueError, match="mask is"):
@@ -78,7 +78,7 @@ def unit(rng, *shape):
     return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_pairs_equal_the_definition():
+def test_nearest_pairs_match_definition():
     rng = np.random.default_rng(1)
     query, known = unit(rng, 20, 6), unit(rng, 33, 6)
     similarity = query @ known.T
@@ -96,7 +96,7 @@ def test_pairs_equal_the_definition():
     np.testing.assert_array_equal(best, values[:5])
 
 
-def test_impossible_pairs_make_room_for_possible_ones():
+def test_infeasible_pairs_are_replaced_by_feasible_ones():
     query = np.array([[1.0, 0.0]], np.float32)
     known = np.array([[1.0, 0.0], [0.8, 0.6]], np.float32)
     assert nearest_pairs(query, known)[0].tolist() == [[0, 0]]
@@ -104,7 +104,7 @@ def test_impossible_pairs_make_room_for_possible_ones():
     assert nearest_pairs(query, known, possible=np.zeros((1, 2), bool))[0].shape == (0, 2)
 
 
-def test_nothing_pairs_with_nothing():
+def test_empty_keypoints_give_no_pairs():
     empty, some = np.zeros((0, 3), np.float32), np.ones((4, 3), np.float32)
     for one, other in ((empty, some), (some, empty), (empty, empty)):
         pairs, values = nearest_pairs(one, other)
@@ -115,6 +115,6 @@ def test_nothing_pairs_with_nothing():
 @pytest.mark.parametrize(
     "wrong", [{"keypoints": 0}, {"pairs": 401}, {"min_inliers": 1}, {"tolerance": 0.0}, {"max_turn": -1.0}]
 )
-def test_a_configuration_out_of_range_is_refused(wrong):
+def test_match_config_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         LearnedMatchConfig(**wrong)

@@ -41,7 +41,7 @@ def named(heights, peaks=5):
 
 
 @pytest.mark.parametrize("gap", [3.0, 8.0])
-def test_each_storey_is_named_and_the_lead_is_over_another_place(gap):
+def test_each_storey_is_a_hypothesis_and_lead_is_over_another_place(gap):
     """At 3 m the consensus takes both for one place, at 8 m for two."""
     (single, *_), _ = named([0.0])
     found, stations = named([0.0, gap])
@@ -58,6 +58,6 @@ def test_each_storey_is_named_and_the_lead_is_over_another_place(gap):
     assert len({(each.station, each.shift) for each in found}) == len(found)
 
 
-def test_storeys_do_not_multiply_without_end():
+def test_storey_hypotheses_are_bounded():
     assert len(named([0.0, 2.9, 5.8])[0]) == 10
     assert len(named([0.0])[0]) == 5

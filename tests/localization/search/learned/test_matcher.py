@@ -41,7 +41,7 @@ PLACES = [((21.0, 33.0), 0), ((-41.0, 75.0), 7), ((61.0, -15.0), 30)]
 
 
 @pytest.mark.parametrize(("xy", "shift"), PLACES)
-def test_the_right_station_and_shift_win(planted, known, stations, xy, shift):
+def test_true_station_and_shift_score_best(planted, known, stations, xy, shift):
     yaw = -2 * np.pi * shift / SECTORS
     distances = known.distances(planted.seen(xy, yaw, np.array([4.0, -7.0, 1.0])))
     assert distances.shape == (len(stations), SECTORS)
@@ -50,13 +50,13 @@ def test_the_right_station_and_shift_win(planted, known, stations, xy, shift):
     assert found == shift
 
 
-def test_the_median_distance_is_that_of_what_was_not_compared(planted, known):
+def test_uncompared_stations_get_the_median_distance(planted, known):
     distances = known.distances(planted.seen((21.0, 33.0), 0.4, np.zeros(3)))
     assert (distances[-1] == 1.0).all()  # the station off the map
     assert np.median(distances[:-1][distances[:-1] != 1.0]) == pytest.approx(1.0, abs=0.01)
 
 
-def test_keyframes_votes_meet_at_the_newest(planted, known, stations):
+def test_votes_of_keyframes_add_up_at_the_newest(planted, known, stations):
     """Each alone is hardly to be told from noise; odometry lays them on each other."""
     yaw, start = -2 * np.pi * 11 / SECTORS, np.array([-21.0, 41.0])
     T = pose_from(rot_z(yaw), [*start, 0.0])
@@ -71,7 +71,7 @@ def test_keyframes_votes_meet_at_the_newest(planted, known, stations):
     assert abs(wrap_angle(yaw_of(best.T_map_odom) - yaw)) < np.radians(6)
 
 
-def test_large_maps_are_searched_around_what_looks_alike(planted, stations):
+def test_large_maps_are_searched_around_place_matches(planted, stations):
     config = LearnedConfig(dense_area=1000.0, shortlist=1)
     known = FeatureMatcher(planted.features, stations, config)
     assert not known.dense
@@ -84,7 +84,7 @@ def test_large_maps_are_searched_around_what_looks_alike(planted, stations):
     assert (far == 1.0).all()
 
 
-def test_they_are_searched_around_suggestions_too(planted, stations):
+def test_large_maps_are_searched_around_pose_hints(planted, stations):
     known = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0, shortlist=1))
     view = planted.seen((-77.0, -43.0), 0.0, np.zeros(3))
     near = np.hypot(*(stations[:, :2] - (50.0, 70.0)).T) < 10.0
@@ -92,7 +92,7 @@ def test_they_are_searched_around_suggestions_too(planted, stations):
     assert (known.distances(view, [[50.0, 70.0]])[near] != 1.0).any(axis=1).all()
 
 
-def test_only_small_maps_are_prepared_to_be_searched_all_over(planted, stations):
+def test_only_small_maps_are_prepared_for_full_search(planted, stations):
     large = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0))
     small = FeatureMatcher(planted.features, stations, LearnedConfig())
     for known, prepared in ((large, {"index"}), (small, {"index", "_feature_blocks"})):
@@ -105,7 +105,7 @@ def at(xy, yaw, centre, z=0.0):
     return pose_from(rot_z(yaw), [*xy, z]) @ pose_from(np.eye(3), -centre)
 
 
-def test_keypoints_make_a_hypothesis_exact(planted, known):
+def test_keypoints_refine_a_hypothesis(planted, known):
     xy, yaw, centre = np.array([13.4, 27.8]), 0.83, np.array([40.0, -3.0, 1.5])
     view = planted.seen(xy, yaw, centre, noise=0.2)
     rough = Hypothesis(
@@ -120,7 +120,7 @@ def test_keypoints_make_a_hypothesis_exact(planted, known):
     assert replace(exact, T_map_odom=rough.T_map_odom, exact=False) == rough  # all else is as it was
 
 
-def test_where_keypoints_do_not_agree_a_hypothesis_stays(planted, known):
+def test_disagreeing_keypoints_leave_hypothesis_unchanged(planted, known):
     view = planted.seen((13.4, 27.8), 0.83, np.zeros(3))
     wrong = Hypothesis(at((-50.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
     beyond = Hypothesis(at((950.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
@@ -141,7 +141,7 @@ def pointwise(image):
 @pytest.mark.parametrize(
     ("xy", "degrees"), [((5.6, -8.8), 100.0), ((5.6, -8.8), -57.0), ((6.0, -9.0), 90.0), ((6.0, -9.0), 0.0)]
 )
-def test_from_clouds_to_a_pose(map_points, monkeypatch, xy, degrees):
+def test_clouds_to_pose_end_to_end(map_points, monkeypatch, xy, degrees):
     """Drawing, features, correlation, stations and keypoints mean the same by x, y and heading."""
     monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: pointwise)
     cloud, place, yaw = map_points.astype(np.float32), np.array([*xy, 0.0]), np.radians(degrees)
@@ -170,7 +170,7 @@ def test_from_clouds_to_a_pose(map_points, monkeypatch, xy, degrees):
         assert turn < 0.5
 
 
-def test_a_cloud_becomes_a_view(known):
+def test_query_features_of_a_cloud(known):
     """By the network of the package, whatever it is worth: shapes, norms, and where it counts."""
     rng = np.random.default_rng(0)
     cloud = rng.uniform([-23, -28, 0], [37, 32, 5], (20_000, 3)).astype(np.float32)

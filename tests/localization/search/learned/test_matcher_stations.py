@@ -18,7 +18,7 @@ def planted():
 
 @pytest.mark.parametrize("block", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
 @pytest.mark.parametrize("cell", [2.0, 4.0])
-def test_a_station_has_the_best_score_of_its_block(planted, block, cell):
+def test_station_takes_best_score_of_its_block(planted, block, cell):
     count = int(TILES * TILE / block)
     xy = np.stack(np.meshgrid(*[(np.arange(count) + 0.5) * block + low * TILE for low in LOW]), -1)
     places = np.column_stack([xy.reshape(-1, 2), np.zeros(count**2)]).astype(np.float32)
@@ -37,7 +37,7 @@ def test_a_station_has_the_best_score_of_its_block(planted, block, cell):
         np.testing.assert_array_equal(found[k], scores[:, rows][:, :, columns].max(axis=(1, 2)))
 
 
-def test_blocks_of_four_metres_find_a_place_anywhere_in_them(planted):
+def test_four_metre_blocks_find_a_place_anywhere_inside(planted):
     axis = np.arange(2.0, TILES * TILE, 4.0)
     xy = np.stack(np.meshgrid(axis + LOW[0] * TILE, axis + LOW[1] * TILE), axis=-1).reshape(-1, 2)
     places = np.column_stack([xy, np.zeros(len(xy))]).astype(np.float32)
@@ -47,7 +47,7 @@ def test_blocks_of_four_metres_find_a_place_anywhere_in_them(planted):
         np.testing.assert_allclose(places[distances.min(axis=1).argmin(), :2], (22.0, 34.0))
 
 
-def test_a_place_that_keypoints_have_moved_stands_on_its_own_storey(planted):
+def test_hypothesis_moved_by_keypoints_keeps_its_storey(planted):
     """Two storeys 3 m apart on a slope, the upper one with a hole; beyond, no stations at all."""
     axis = np.arange(-19.0, 20.0, 2.0)
     xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)

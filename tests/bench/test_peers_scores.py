@@ -8,14 +8,14 @@ import sys
 import numpy as np
 import pytest
 from bench.peers.method import Peer
-from scipy.spatial import cKDTree
-
-from bench.peers import contest, places, summary, trial
-from bench.peers import peers as table
 from bench.peers.ours import Tracking
 from bench.peers.roster import OUR_TRACKING, OURS, PEERS
 from bench.peers.start import OFF, started
 from bench.peers.trial import Trial, run_trial
+from scipy.spatial import cKDTree
+
+from bench.peers import contest, places, summary, trial
+from bench.peers import peers as table
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.sim import SimulationConfig
 

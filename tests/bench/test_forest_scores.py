@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bench.forest.chains import distinct
 
 from bench.forest import forest
 from bench.forest import tables as forest_tables
-from bench.forest.chains import distinct
 from bench.forest.methods import BASELINES, METHODS
 from bench.forest.tables import (
     compared_table,
