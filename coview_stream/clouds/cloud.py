@@ -1,4 +1,4 @@
-"""A point cloud near its own float64 origin, and how it is put together without losing precision."""
+"""Point clouds near their own float64 origins, put together without loss of precision."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOCAL_LIMIT = 10_000.0
 ORIGIN_STEP = 100.0
 """An origin is a multiple of this (metres), so that neighbouring tiles have readable, exact offsets."""
 
-ABSURD = 1e8
+MAX_COORDINATE = 1e8
 """No coordinate on Earth, geocentric ones included, reaches this (metres): such a row is damaged."""
 
 COARSE_FLOAT32 = 1e6
@@ -36,7 +36,7 @@ class Cloud:
             otherwise the rounded (``ORIGIN_STEP``) median of the points.
         crs: coordinate reference system as the file states it (WKT or ``EPSG:code``), if it does.
         classification: (N,) uint8 LAS classes, if the format has them.
-        dropped: rows left out: not finite, absurd, withheld or labelled as noise.
+        dropped: rows left out: not finite, beyond ``MAX_COORDINATE``, withheld or labelled as noise.
     """
 
     points: Points
@@ -49,13 +49,19 @@ class Cloud:
         return len(self.points)
 
     def map_points(self) -> Floats:
-        """(N, 3) float64 coordinates in the file's own frame, metres."""
+        """Return (N, 3) float64 coordinates in the file's own frame, metres."""
         return self.points.astype(np.float64) + self.origin
 
 
 @dataclass
 class CloudBuilder:
-    """Collects chunks of raw coordinates; the first usable chunk decides the origin."""
+    """A cloud in the making, from chunks of raw coordinates; the first usable chunk decides the origin.
+
+    Attributes:
+        crs: as of :class:`Cloud`.
+        origin: (3,) float64 metres; None until a usable chunk was added.
+        dropped: rows left out so far.
+    """
 
     crs: str | None = None
     origin: Floats | None = None
@@ -72,7 +78,7 @@ class CloudBuilder:
         """Append (N, 3) raw coordinates in metres; ``dropped`` counts rows the reader left out before."""
         with np.errstate(invalid="ignore"):
             # false for NaN as well
-            usable = (np.abs(raw) < ABSURD).all(axis=1)
+            usable = (np.abs(raw) < MAX_COORDINATE).all(axis=1)
         self.dropped += dropped + int(len(raw) - usable.sum())
         if not usable.all():
             raw = raw[usable]
@@ -112,7 +118,7 @@ class CloudBuilder:
 
 
 def choose_origin(raw: Reals) -> Floats:
-    """(3,) float64 origin for (N, 3) coordinates in metres; zeros if they are all local.
+    """Choose a float64 origin (3,) for (N, 3) coordinates in metres; zeros if they are all local.
 
     A sparse median rather than the bounding box: one stray point must not move the origin away.
     """
@@ -124,7 +130,7 @@ def choose_origin(raw: Reals) -> Floats:
 
 
 def merge(clouds: Sequence[Cloud]) -> Cloud:
-    """One cloud from several of the same frame, re-based in float64 to the origin of the first.
+    """Join several clouds of the same frame, re-based in float64 to the origin of the first.
 
     Classes survive only if every cloud has them; dropped rows add up.
 

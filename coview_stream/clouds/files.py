@@ -1,6 +1,4 @@
-"""Read a point cloud of any supported format, or say in one line why not."""
-
-# FOLDED coview_stream/clouds/files.py: """Write point clouds: complete files or none."""
+"""Point cloud files: read and written by suffix, complete or not there."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
-from coview_stream.clouds.cloud import Cloud
+from coview_stream.clouds.cloud import LOCAL_LIMIT, Cloud
 from coview_stream.clouds.las import read_las
 from coview_stream.clouds.npy_bin import read_bin, read_npy
 from coview_stream.clouds.pcd import read_pcd
@@ -47,6 +45,8 @@ _MAGIC = (
     (b"\x89HDF", "HDF5"),
     (b"version https://git-lfs", "git-lfs pointer"),
 )
+
+_LAS_SCALE = 0.001  # metres
 
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
@@ -105,7 +105,7 @@ def _head(path: Path) -> bytes:
 
 
 def sniff(head: bytes) -> str | None:
-    """Name of the format whose magic bytes start ``head``; None if they say nothing."""
+    """Return the name of the format whose magic bytes start ``head``; None if there is none."""
     for magic, name in _MAGIC:
         if head.startswith(magic):
             return name
@@ -118,11 +118,6 @@ def sniff(head: bytes) -> str | None:
         # comment lines may come before a PCD's first keyword
         return "PCD" if b"\nFIELDS" in head or b"\nVERSION" in head else "text"
     return None
-
-
-_LAS_SCALE = 0.001
-
-_FLOAT32_LIMIT = 10_000.0
 
 
 def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLike | None = None) -> None:
@@ -143,7 +138,7 @@ def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLi
     rows = points
     if origin is not None and np.any(origin):
         rows = points.astype(np.float64) + np.asarray(origin, dtype=np.float64)
-    far = bool(len(rows)) and float(np.nanmax(np.abs(rows), initial=0.0)) > _FLOAT32_LIMIT
+    far = bool(len(rows)) and float(np.nanmax(np.abs(rows), initial=0.0)) > LOCAL_LIMIT
     rows = rows.astype("<f8" if far and rows.dtype == np.float64 else "<f4", copy=False)
     try:
         with atomic_file(path) as stream:

@@ -1,10 +1,8 @@
-"""LAS and LAZ (COPC included), in chunks."""
+"""LAS and LAZ files (COPC included), in chunks.
 
-# FOLDED coview_stream/clouds/las.py: """A first look at a LAS header: counts that a damaged file must not make the decoder believe.
-#
-# laspy reads on for minutes where the number of records is wrong, and the LAZ decoder aborts the whole process
-# where the number of chunks makes it ask for more memory than there is.
-# """
+The header is checked before laspy reads it: where the number of records is wrong laspy reads on for minutes, and where
+the number of chunks makes the LAZ decoder ask for more memory than there is, it aborts the whole process.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +24,9 @@ NOISE_CLASSES = (7, 18)
 """ASPRS classes low and high noise."""
 
 _FOOT_UNITS = {9002, 9003, 9005}
-
 _PROJECTED_CRS_KEY, _LINEAR_UNIT_KEY = 3072, 3076
+_MIN_HEADER, _MAX_HEADER = 227, 375  # bytes
+_COMPRESSED = 0x80
 
 
 def read_las(path: Path) -> Cloud:
@@ -139,17 +138,12 @@ def _check_metres(header: Any, crs: str | None, path: Path) -> None:
         raise CloudError(f"{path}: coordinates are in degrees according to its reference system; {remedy}")
 
 
-_SHORTEST, _LONGEST = 227, 375
-
-_COMPRESSED = 0x80
-
-
 def impossible_header(path: Path) -> str | None:
-    """Say what is impossible in the header of a LAS or LAZ file; None if nothing is."""
+    """Return what is impossible in the header of a LAS or LAZ file; None if nothing is."""
     size = path.stat().st_size
     with path.open("rb") as stream:
-        header = stream.read(_LONGEST)
-        if len(header) < _SHORTEST:
+        header = stream.read(_MAX_HEADER)
+        if len(header) < _MIN_HEADER:
             return "the header is cut off"
         records = _unsigned(header[100:104])
         extended = _unsigned(header[243:247]) if header[25] >= 4 else 0

@@ -1,4 +1,4 @@
-"""Bare arrays: NPY and the KITTI ``.bin`` layout."""
+"""Files of bare rows: NPY and KITTI's ``.bin``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.errors import CloudError
 
-_KITTI_ROW = 16
-_CHUNK = 1_000_000
+_KITTI_ROW = 16  # bytes
+_CHUNK = 1_000_000  # rows
 
 
 def read_npy(path: Path) -> Cloud:

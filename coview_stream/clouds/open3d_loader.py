@@ -1,4 +1,4 @@
-"""The one place that imports Open3D, and what a bare machine needs for it."""
+"""Open3D, imported on first use and by this module only, with a remedy where a machine lacks what it needs."""
 
 from __future__ import annotations
 

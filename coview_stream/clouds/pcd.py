@@ -18,7 +18,7 @@ from coview_stream.geometry.arrays import Reals
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _AXES = ("x", "y", "z")
-_LONGEST_HEADER = 64 * 1024
+_MAX_HEADER = 64 * 1024  # bytes
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def _parse_header(content: bytes, path: Path) -> _Header:
     entries: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in entries:
-        end = content.find(b"\n", start, _LONGEST_HEADER)
+        end = content.find(b"\n", start, _MAX_HEADER)
         if end < 0:
             raise CloudError(f"{path}: truncated PCD, the header has no DATA line; copy or export it again")
         words = content[start:end].decode("ascii", "replace").split()

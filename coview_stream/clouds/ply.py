@@ -21,7 +21,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _AXES = ("x", "y", "z")
-_LONGEST_HEADER = 64 * 1024
+_MAX_HEADER = 64 * 1024  # bytes
 
 
 @dataclass
@@ -68,7 +68,7 @@ def _parse_header(content: bytes, path: Path) -> tuple[str, list[_Element], int]
     elements: list[_Element] = []
     start = 0
     while True:
-        end = content.find(b"\n", start, _LONGEST_HEADER)
+        end = content.find(b"\n", start, _MAX_HEADER)
         if end < 0:
             raise CloudError(f"{path}: truncated PLY, the header has no end_header; copy or export it again")
         words = content[start:end].decode("ascii", "replace").split()

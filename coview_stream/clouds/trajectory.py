@@ -7,24 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
+from coview_stream.clouds.cloud import MAX_COORDINATE
 from coview_stream.errors import InputError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import nearest_rotation, quat_to_matrix
-from coview_stream.geometry.transforms import Pose, pose_to_tum
-
-Poses = npt.NDArray[np.float64]
+from coview_stream.geometry.transforms import Pose, Poses, pose_to_tum
 
 _TUM_COLUMNS = 8
-_ABSURD = 1e8  # metres; see cloud.ABSURD
-_SHORTEST_QUATERNION = 1e-6
+_MIN_QUATERNION_NORM = 1e-6
 _ROTATION_TOLERANCE = 1e-2
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
-    """Stamps (N,) in seconds and poses (N, 4, 4) in metres of a TUM file.
+    """Read stamps (N,) in seconds and poses (N, 4, 4) in metres from a TUM file.
 
     Blank lines and lines that start with ``#`` are skipped; quaternions need not be normalised. A file
     without poses gives N = 0 (a trajectory of a run that was never localised).
@@ -37,14 +34,14 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
     rows, lines = _read_rows(path, _TUM_COLUMNS, "t x y z qx qy qz qw")
     stamps, quaternions = rows[:, 0], rows[:, 4:]
     check_stamps(stamps, lines, path)
-    short = np.linalg.norm(quaternions, axis=1) < _SHORTEST_QUATERNION
+    short = np.linalg.norm(quaternions, axis=1) < _MIN_QUATERNION_NORM
     if short.any():
         raise RunError(f"{path}:{lines[int(np.argmax(short))]}: quaternion is zero; write qx qy qz qw")
     return stamps, _poses(rows[:, 1:4], quat_to_matrix(quaternions) if len(rows) else None)
 
 
 def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
-    """Poses (N, 4, 4) of a KITTI file: 12 numbers a line, the first three rows of each matrix.
+    """Read poses (N, 4, 4) from a KITTI file: 12 numbers a line, the first three rows of each matrix.
 
     Raises:
         RunError: as ``read_tum``; also where the 3x3 part is no rotation.
@@ -65,7 +62,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
 
 
 def read_times(path: str | os.PathLike[str]) -> Floats:
-    """Stamps (N,) in seconds, one a line, increasing.
+    """Read stamps (N,) in seconds, one a line, increasing.
 
     Raises:
         RunError: as ``read_tum``.
@@ -119,7 +116,7 @@ def columns_of(path: Path) -> int:
 
 
 def _words(path: Path) -> list[tuple[int, list[str]]]:
-    """(line number, words) of each line that is neither blank nor a comment."""
+    """Return (line number, words) of each line that is neither blank nor a comment."""
     try:
         text = path.read_bytes().decode("ascii")
     except FileNotFoundError as error:
@@ -146,7 +143,10 @@ def _read_rows(path: Path, columns: int, meaning: str) -> tuple[Floats, list[int
         except ValueError as error:
             raise RunError(f"{path}:{number}: not a number ({error}); each line is {meaning}") from error
         # false for NaN as well; stamps may be any finite number
-        if not all(abs(value) < np.inf for value in row) or max(map(abs, row[1:]), default=0.0) > _ABSURD:
+        if (
+            not all(abs(value) < np.inf for value in row)
+            or max(map(abs, row[1:]), default=0.0) > MAX_COORDINATE
+        ):
             raise RunError(f"{path}:{number}: NaN, infinite or absurd number; repair or drop the line")
         rows.append(row)
         lines.append(number)

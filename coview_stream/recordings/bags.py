@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.clouds.cloud import ABSURD, Cloud, CloudBuilder
-from coview_stream.clouds.trajectory import Poses, read_tum
+from coview_stream.clouds.cloud import MAX_COORDINATE, Cloud, CloudBuilder
+from coview_stream.clouds.trajectory import read_tum
 from coview_stream.errors import CloudError, MessageError, RunError
 from coview_stream.geometry.arrays import Bools, Floats, Ints
-from coview_stream.geometry.transforms import Points
+from coview_stream.geometry.transforms import Points, Poses
 from coview_stream.messages import ros2
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.deskew import deskew
@@ -45,7 +45,7 @@ class BagClouds:
         """Frame ``index`` in the body frame at its stamp; CloudError if it is damaged or holds no usable point."""
         message = self.message(index)
         # false for NaN as well
-        usable: Bools = np.all(np.abs(message.points) < ABSURD, axis=1)
+        usable: Bools = np.all(np.abs(message.points) < MAX_COORDINATE, axis=1)
         builder = CloudBuilder(dropped=int((~usable).sum()))
         builder.add(self._deskewed(index, message, usable))
         return builder.finish(self._name(index))

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
-from coview_stream.clouds.trajectory import Poses, columns_of, read_kitti_poses, read_times, read_tum
+from coview_stream.clouds.trajectory import columns_of, read_kitti_poses, read_times, read_tum
 from coview_stream.errors import RunError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, inverse
+from coview_stream.geometry.transforms import Pose, Poses, inverse
 
 _KITTI_COLUMNS = 12
 _BAGS = (".mcap", ".db3", ".bag")

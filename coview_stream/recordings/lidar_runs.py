@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.clouds.trajectory import Poses
 from coview_stream.errors import CloudError, RunError
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.transforms import Pose, Poses
 from coview_stream.odometry.lidar_odometry import LidarOdometry
 from coview_stream.recordings.bags import BagClouds, open_bag
 from coview_stream.recordings.layouts import find_bag, find_layout, read_stamps

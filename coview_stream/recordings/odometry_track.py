@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from coview_stream.clouds.trajectory import Poses
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.arrays import Bools, Ints
-from coview_stream.geometry.transforms import interpolate
+from coview_stream.geometry.transforms import Poses, interpolate
 from coview_stream.odometry.buffer import Segment
 
 SAME_NS = 1000

@@ -11,10 +11,9 @@ import numpy as np
 
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.files import read_cloud
-from coview_stream.clouds.trajectory import Poses
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.geometry.transforms import Points, Pose, Poses
 from coview_stream.recordings.layouts import Layout
 
 if TYPE_CHECKING:
