@@ -1,4 +1,4 @@
-"""What the networks see: a cloud from above, cut into layers by height over the ground."""
+"""Bird's-eye view of a cloud, in layers by height above the ground: the networks' input."""
 
 from __future__ import annotations
 
@@ -19,22 +19,25 @@ CELL = 0.5
 """Edge of an image's cell, metres."""
 
 SLABS = (0.5, 1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 40.0)
-"""Bounds of the height layers, metres above the ground."""
+"""Bounds of the height layers, metres above the ground; set by hand, and trained with."""
 
 LAYERS = len(SLABS) + 2
 """One for each pair of bounds, then the greatest height, whether the ground was seen, and the ground's own relief."""
 
-BIRD_VIEW_VERSION = 1
-"""Raised when the same cloud is drawn differently: features of a map are of no use to queries drawn another way."""
+BIRDS_EYE_VIEW_VERSION = 1
+"""To be raised when the same cloud gives another image: features are comparable only between equal versions."""
 
-_LEVEL = 0.25  # metres: a layer counts how many of its levels are occupied, not points: those say how dense a scan is
-_GROUND_CELL = 2.0
-_SEEN = 0.4  # metres above the ground: what lies lower has been ground
-_SLOPING = 0.8  # metres about the first guess in which the ground is sought
-_STEEPEST = 0.7  # metres per metre: what rises faster stands on the ground
-_REACH = 10  # ground cells to either side that may say how low a cell can be: half a large building
-_UNDULATION = 8.0  # metres: relief is what differs from the mean of so far around
-_RELIEF = 1.5  # metres of relief that fill the layer
+# set by hand, and trained with: other values need other weights
+_LEVEL = (
+    0.25  # metres: a layer counts its occupied levels, not points, whose number depends on the scan's density
+)
+_GROUND_CELL = 2.0  # metres
+_MAX_GROUND_HEIGHT = 0.4  # metres above the ground, below which a point is of the ground
+_GROUND_BAND = 0.8  # metres about the first estimate of the ground in which it is refined
+_MAX_SLOPE = 0.7  # metres per metre: what rises faster stands on the ground
+_REACH = 10  # ground cells to either side that bound a cell's height from above: half a large building
+_RELIEF_SIGMA = 8.0  # metres: relief is measured from the ground's mean under a Gaussian of this width
+_MAX_RELIEF = 1.5  # metres, at which the layer saturates
 
 
 def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Image:
@@ -60,19 +63,19 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
         return image.astype(np.uint8).reshape(LAYERS, height, width)
     ratio = round(_GROUND_CELL / CELL)
     ground, relief = _ground(points, index // ratio, (height // ratio, width // ratio))
-    above = points[:, 2] - _sampled(ground, (points[:, :2] - corner) / _GROUND_CELL - 0.5)
+    above = points[:, 2] - _interpolate(ground, (points[:, :2] - corner) / _GROUND_CELL - 0.5)
     cell = index[:, 1] * width + index[:, 0]
     _layers(image, cell, above)
     fine = np.meshgrid(
         (np.arange(width) + 0.5) / ratio - 0.5, (np.arange(height) + 0.5) / ratio - 0.5, indexing="xy"
     )
-    curved = _sampled(relief, np.stack([each.ravel() for each in fine], axis=1))
-    image[-1] = np.clip(128.0 + curved * (127.0 / _RELIEF), 1.0, 255.0)
+    curved = _interpolate(relief, np.stack([each.ravel() for each in fine], axis=1))
+    image[-1] = np.clip(128.0 + curved * (127.0 / _MAX_RELIEF), 1.0, 255.0)
     return image.astype(np.uint8).reshape(LAYERS, height, width)
 
 
 def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
-    """Fill all layers of a flat image but the last from points in ``cell`` (N,) at ``above`` (N,) metres."""
+    """Fill all layers of a flat image but the last from points in ``cell`` (N,), ``above`` (N,) metres high."""
     size, levels = image.shape[1], int(SLABS[-1] / _LEVEL)
     standing = (above >= SLABS[0]) & (above < SLABS[-1])
     level = (above[standing] / _LEVEL).astype(np.int64)
@@ -85,7 +88,7 @@ def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
     top = np.zeros(size, dtype=np.float32)
     np.maximum.at(top, cell, np.clip(above, 0.0, SLABS[-1]).astype(np.float32))
     image[-3] = top * (255.0 / SLABS[-1])
-    image[-2, cell[above < _SEEN]] = 255.0
+    image[-2, cell[above < _MAX_GROUND_HEIGHT]] = 255.0
 
 
 def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
@@ -95,26 +98,26 @@ def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats
     np.minimum.at(least, flat, points[:, 2])
     lowest = least.reshape(shape)
     seen = np.isfinite(lowest)
-    # nothing falls away faster than the steepest slope: the roof's middle is known from the ground beside it
+    # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
     offsets = np.arange(-_REACH, _REACH + 1) * _GROUND_CELL
-    cone = -_STEEPEST * np.hypot(offsets[:, None], offsets[None])
+    cone = -_MAX_SLOPE * np.hypot(offsets[:, None], offsets[None])
     eroded = ndimage.grey_erosion(lowest, structure=cone, mode="constant", cval=np.inf)
     ground = filled(np.where(np.isfinite(eroded), eroded, np.nan).astype(np.float32))
     ground = ndimage.median_filter(ground, 3)
-    # the lowest point of a sloping cell lies below its middle: what is near the first guess says where the ground is
+    # the lowest point of a sloping cell lies below its middle: the mean of the points near it corrects that
     rest = points[:, 2] - ground.ravel()[flat]
-    near = np.abs(rest) < _SLOPING
+    near = np.abs(rest) < _GROUND_BAND
     count = np.bincount(flat[near], minlength=ground.size).reshape(shape)
     total = np.bincount(flat[near], weights=rest[near], minlength=ground.size).reshape(shape)
     ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
     level = seen & (count > 0)
-    weight = ndimage.gaussian_filter(level.astype(np.float32), _UNDULATION / _GROUND_CELL)
-    mean = ndimage.gaussian_filter(np.where(level, ground, 0.0), _UNDULATION / _GROUND_CELL) / np.maximum(
+    weight = ndimage.gaussian_filter(level.astype(np.float32), _RELIEF_SIGMA / _GROUND_CELL)
+    mean = ndimage.gaussian_filter(np.where(level, ground, 0.0), _RELIEF_SIGMA / _GROUND_CELL) / np.maximum(
         weight, 1e-3
     )
     return ground, np.where(level & (weight > 1e-2), ground - mean, 0.0).astype(np.float32)
 
 
-def _sampled(values: Floats32, at: Reals) -> Floats32:
+def _interpolate(values: Floats32, at: Reals) -> Floats32:
     """Bilinear values (N,) of an image (h, w) at (N, 2) columns and rows."""
     return np.asarray(ndimage.map_coordinates(values, at.T[::-1], order=1, mode="nearest", output=np.float32))

@@ -1,4 +1,4 @@
-"""From a virtual scan's polar bins to its descriptor channels (paper, section 3.2, eqs 1-4)."""
+"""Co-view descriptor: channels made from the polar bins of a virtual scan (paper, section 3.2, eqs 1-4)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Descriptor = npt.NDArray[np.float32]
 """(R, S) or (M, R, S) float32."""
 
 _VERTICAL: dict[Channel, Literal["max", "off"]] = {"coview": "max", "coview_strict": "off"}
-_GROUND_RADIUS = 6.0  # metres around a keyframe in which its own VLS shows the ground (notes: sd 3 cm)
+_GROUND_RADIUS = 6.0  # metres around a keyframe in which its virtual scan shows the ground; set by hand
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
@@ -60,8 +60,8 @@ def ring_key(descriptor: Descriptor) -> Floats32:
 def ground_below(points: Points, position: Floats) -> float:
     """Height of the ground below ``position`` (3,), from the points around it, metres in their frame.
 
-    The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and it needs no mast height.
-    Without points below the sensor there, the sensor's own height is returned.
+    The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and independent of the sensor's
+    mounting height. Without points below the sensor there, the sensor's own height.
     """
     near = points[
         (np.hypot(points[:, 0] - position[0], points[:, 1] - position[1]) < _GROUND_RADIUS)
@@ -77,5 +77,5 @@ def ground_below(points: Points, position: Floats) -> float:
 
 
 def on_ground(points: Points, position: Floats) -> Floats:
-    """Return ``position`` (3,), but at the height of the ground below it: see :func:`ground_below`."""
+    """Return ``position`` (3,) at the height of the ground below it, from :func:`ground_below`."""
     return np.array([position[0], position[1], ground_below(points, position)])

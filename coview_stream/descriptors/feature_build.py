@@ -1,6 +1,6 @@
-"""From a map's cloud to its learned features: bird views in windows, and the aerial network over them in windows.
+"""Building of a map's learned features: bird's-eye views of its cloud, and the aerial network over them, by windows.
 
-Windows overlap by more than a window's edge is felt, so the result does not depend on where they lie.
+Windows overlap by more than the network's reach, so the result does not depend on where they lie.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 WINDOW = 256
-"""Metres along the edge of what is drawn and encoded at a time; a multiple of a tile's edge."""
+"""Metres along the edge of a window, drawn and encoded at a time; a multiple of a tile's edge; set by hand."""
 
-_DRAW_MARGIN = 48  # metres around a window whose points say where its ground is
-_NET_MARGIN = 64  # metres around a window that the network looks at: 30 m for its layers, 28 for GeM's disk
-_COVERED = 4  # metres from the nearest point within which the map is known: shadows of trunks and houses are
+_DRAW_MARGIN = 48  # metres around a window whose points determine its ground; set by hand
+_NET_MARGIN = 64  # metres around a window that the network sees: 30 m for its layers, 28 for GeM's disk
+_KNOWN_RADIUS = (
+    4  # metres from the nearest point within which the map is known, to bridge shadows; set by hand
+)
 _CELLS = round(1 / CELL)  # image cells a metre
 _PER_PLACE = 2  # cells of the network's global descriptors along the edge of a stored one's
 
@@ -37,7 +39,7 @@ def feature_arrays(
     directory: Path | None = None,
     window: int = WINDOW,
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """Arrays ``learned.*`` of a map and the parameters that say what made them.
+    """Return the arrays ``learned.*`` of a map, and the parameters that name the weights and the cell.
 
     Args:
         points: (N, 3) the map's cloud, metres, z up, relative to the map's origin.
@@ -65,7 +67,7 @@ def feature_arrays(
 
 
 def _drawn(points: Points, low: Ints, high: Ints, window: int) -> Windows:
-    """Bird views of the windows that have points, by column and row."""
+    """Bird's-eye views of the windows that have points, by column and row."""
     columns, rows = (-(-(high - low) // window)).tolist()
     views: Windows = {}
     for row in range(rows):
@@ -140,7 +142,7 @@ def _known(image: Image) -> Bools:
     coarse = filled.reshape(rows, _CELLS, columns, _CELLS).any(axis=(1, 3))
     if not coarse.any():
         return np.asarray(coarse)
-    return np.asarray(ndimage.distance_transform_edt(~coarse) <= _COVERED)
+    return np.asarray(ndimage.distance_transform_edt(~coarse) <= _KNOWN_RADIUS)
 
 
 def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

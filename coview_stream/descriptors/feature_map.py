@@ -1,6 +1,4 @@
-"""A base map's learned features: what the aerial network saw, looked up around a place or coarsely all over."""
-
-# FOLDED coview_stream/descriptors/feature_map.py: """A map's learned features as they are stored: one byte a number, in square tiles, only where the map has points."""
+"""Feature map: the learned features of a base map, one byte a number, in square tiles where the map has points."""
 
 from __future__ import annotations
 
@@ -13,17 +11,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.descriptors.birds_eye_view import BIRD_VIEW_VERSION
+from coview_stream.descriptors.birds_eye_view import BIRDS_EYE_VIEW_VERSION
 from coview_stream.descriptors.network import LOCAL_CELL, VIEW_NAMES, file_sha256, weights_file
 from coview_stream.errors import InputError, MapError
 from coview_stream.geometry.arrays import Floats, Floats32, Int8s, Ints, Reals
 
+TILE = 32
+"""Cells of 1 m along a tile's edge; tile (i, j) covers ``[32 i, 32 (i + 1))`` metres in x, likewise in y."""
+
 _NAMES = ("local", "sigma", "tiles", "place", "place_at")
+_SCALE = 127.0
+_MIN_SIGMA, _MAX_SIGMA = 0.02, 50.0  # range of the stored sigmas; set by hand
+_STEPS = 255.0 / np.log(_MAX_SIGMA / _MIN_SIGMA)  # of 3 %
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A map's features around a place.
+    """Features of a map around a place.
 
     Attributes:
         local: (C, h, w) float32 of unit norm, zero where the map has nothing; cells of 1 m.
@@ -37,10 +41,10 @@ class Patch:
 
 
 class FeatureMap:
-    """Reads the arrays ``learned.*`` of a base map, which may be memory-mapped.
+    """Learned features of a base map: its arrays ``learned.*``, which may be memory-mapped.
 
     Attributes:
-        weights: what :func:`weights_sha256` was of the networks that made them.
+        weights: :func:`weights_sha256` of the networks that made them.
         place: (K, P) int8 global descriptors times 127.
         place_at: (K, 2) float32 where they were made, metres, map frame.
 
@@ -109,7 +113,7 @@ class FeatureMap:
     def coarse(self, cell: float = 2.0) -> tuple[Floats32, Floats]:
         """Return means (C, H, W) over cells of ``cell`` metres, a divisor of 32, and their lower corner (2,), metres.
 
-        What the map does not have counts as zero.
+        Cells without features count as zero.
         """
         ratio, side = round(cell / LOCAL_CELL), round(TILE * LOCAL_CELL / cell)
         shape = (self.channels, self.index.rows * side, self.index.columns * side)
@@ -123,8 +127,8 @@ class FeatureMap:
         """Refuse to compare these features with those of another network.
 
         Raises:
-            MapError: they were made by other weights than those in ``directory`` (the package's), or of views that were
-                drawn another way. InputError: there are no weights.
+            MapError: they were made by other weights than those in ``directory`` (the package's), or of
+                images of another version. InputError: there are no weights.
         """
         for view in VIEW_NAMES:
             weights_file(view, directory)
@@ -145,22 +149,12 @@ def means(tile: Int8s, ratio: int) -> Floats32:
 
 @lru_cache(maxsize=4)
 def weights_sha256(directory: Path | None = None) -> str:
-    """Return the sha256 of both networks' weights and of how clouds are drawn; empty if a network has no weights."""
+    """Return the sha256 of both networks' weights and the images' version; empty if a network has no weights."""
     try:
         parts = [file_sha256(weights_file(view, directory)) for view in VIEW_NAMES]
     except InputError:
         return ""
-    return hashlib.sha256("\n".join([*parts, str(BIRD_VIEW_VERSION)]).encode()).hexdigest()
-
-
-TILE = 32
-"""Cells of 1 m along a tile's edge; tile (i, j) covers ``[32 i, 32 (i + 1))`` metres in x, likewise in y."""
-
-_SCALE = 127.0
-
-_LEAST, _MOST = 0.02, 50.0  # sigmas that a byte can tell: steps of 3 %
-
-_STEPS = 255.0 / np.log(_MOST / _LEAST)
+    return hashlib.sha256("\n".join([*parts, str(BIRDS_EYE_VIEW_VERSION)]).encode()).hexdigest()
 
 
 def quantized(vectors: Floats32) -> Int8s:
@@ -169,23 +163,23 @@ def quantized(vectors: Floats32) -> Int8s:
 
 
 def dequantized(vectors: Int8s) -> Floats32:
-    """Undo :func:`packed`."""
+    """Undo :func:`quantized`."""
     return np.asarray(vectors * np.float32(1.0 / _SCALE), dtype=np.float32)
 
 
 def quantized_sigma(sigma: Floats32) -> npt.NDArray[np.uint8]:
     """Positive sigmas (any shape) as bytes on a logarithmic scale; off by 1.5 % between 0.02 and 50."""
-    steps = np.log(np.clip(sigma, _LEAST, _MOST) / _LEAST) * _STEPS
+    steps = np.log(np.clip(sigma, _MIN_SIGMA, _MAX_SIGMA) / _MIN_SIGMA) * _STEPS
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
 
 def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> Floats32:
-    """Undo :func:`packed_sigma`."""
-    return np.asarray(_LEAST * np.exp(sigma / _STEPS), dtype=np.float32)
+    """Undo :func:`quantized_sigma`."""
+    return np.asarray(_MIN_SIGMA * np.exp(sigma / _STEPS), dtype=np.float32)
 
 
 class TileIndex:
-    """Finds tiles by place; made of (T, 2) tile numbers, column (x) and row (y)."""
+    """Look-up of tiles by their place; made of (T, 2) tile numbers, column (x) and row (y)."""
 
     def __init__(self, tiles: npt.NDArray[np.int32]) -> None:
         self.tiles = np.array(tiles, dtype=np.int64).reshape(-1, 2)
@@ -196,7 +190,7 @@ class TileIndex:
         self._number[tuple((self.tiles - self.low).T[::-1])] = np.arange(len(self.tiles))
 
     def gather(self, values: npt.NDArray[Any], corner: Ints, out: npt.NDArray[Any]) -> None:
-        """Copy into ``out`` (h, w, ...) what ``values`` (T, 32, 32, ...) have from cell ``corner`` (x, y) on."""
+        """Copy ``values`` (T, 32, 32, ...) from cell ``corner`` (x, y) on into ``out`` (h, w, ...)."""
         height, width = out.shape[:2]
         first = np.floor_divide(corner, TILE) - self.low
         last = np.floor_divide(corner + np.array([width - 1, height - 1]), TILE) - self.low
@@ -211,6 +205,6 @@ class TileIndex:
 
 
 def _overlap(begin: int, size: int) -> tuple[slice, slice]:
-    """Where a tile that begins at ``begin`` lies in an axis of ``size`` cells, and which of its cells that are."""
+    """Slices of an axis of ``size`` cells and of a tile that begins at its cell ``begin``, where they overlap."""
     low, high = max(0, begin), min(size, begin + TILE)
     return slice(low, high), slice(low - begin, high - begin)

@@ -1,4 +1,4 @@
-"""The trained encoders, run by onnxruntime on the CPU."""
+"""Trained encoders of bird's-eye views, run by onnxruntime on the CPU."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ ViewName = Literal["aerial", "ground"]
 VIEW_NAMES: tuple[ViewName, ...] = ("aerial", "ground")
 
 OUTPUTS = ("local", "sigma", "place")
-"""What a network gives, in this order."""
+"""A network's outputs, in this order."""
 
 CARD = "card.json"
-"""The file beside the weights that says how they were made."""
+"""Name of the file beside the weights that records how they were made."""
 
 LOCAL_CELL = 1.0
 """Edge of a cell of local descriptors, metres."""
@@ -40,12 +40,12 @@ _REMEDY = "install the package again, or name your own weights' folder in COVIEW
 
 @dataclass(frozen=True)
 class Features:
-    """What a network makes of an image whose corner is the corner of all three.
+    """A network's outputs for an image; all three begin at its corner.
 
     Attributes:
         local: (C, H / 2, W / 2) float32 of unit norm, independent of heading; cells of 1 m, row along y.
-        sigma: (H / 2, W / 2) float32, how uncertain a cell is as a keypoint, > 0.
-        place: (P, H / 8, W / 8) float32 of unit norm: global descriptor of what lies around each 4 m cell.
+        sigma: (H / 2, W / 2) float32, uncertainty of each cell as a keypoint, > 0.
+        place: (P, H / 8, W / 8) float32 of unit norm: global descriptor of the surroundings of each 4 m cell.
     """
 
     local: Floats32
@@ -54,7 +54,7 @@ class Features:
 
 
 class Network:
-    """The encoder of one view.
+    """Encoder of one view.
 
     Raises:
         InputError: there are no weights in the directory, they are not of this version, or of the other view.
@@ -64,7 +64,7 @@ class Network:
     def __init__(self, view: ViewName, directory: Path | None = None, threads: int = 1) -> None:
         runtime = _runtime()
         path = weights_file(view, directory)
-        _compare(path)
+        _check_hash(path)
         options = runtime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
@@ -115,7 +115,7 @@ def network(view: ViewName, directory: Path | None = None, threads: int | None =
     return Network(view, directory, threads)
 
 
-def shipped() -> Path:
+def weights_directory() -> Path:
     """Return the directory of the weights: ``COVIEW_WEIGHTS`` if that is set, else the package's."""
     own = os.environ.get("COVIEW_WEIGHTS")
     return Path(own) if own else Path(__file__).parent / "weights"
@@ -123,7 +123,7 @@ def shipped() -> Path:
 
 def weights_file(view: ViewName, directory: Path | None = None) -> Path:
     """Return where a view's weights are; raises :class:`InputError` if there are none."""
-    path = (directory or shipped()) / weights_name(view)
+    path = (directory or weights_directory()) / weights_name(view)
     if not path.is_file():
         raise InputError(f"{path}: no weights of the {view} network; {_REMEDY}")
     return path
@@ -149,11 +149,11 @@ def _runtime() -> Any:
     return runtime
 
 
-def _compare(path: Path) -> None:
-    """Refuse weights that are not those that the card beside them names, if it names any."""
+def _check_hash(path: Path) -> None:
+    """Refuse weights with another hash than the card beside them names, if it names one."""
     try:
-        noted = json.loads((path.parent / CARD).read_text())["sha256"][path.name]
+        expected = json.loads((path.parent / CARD).read_text())["sha256"][path.name]
     except (OSError, ValueError, KeyError, TypeError):
         return
-    if file_sha256(path) != noted:
+    if file_sha256(path) != expected:
         raise InputError(f"{path}: not the weights that {CARD} beside it names; {_REMEDY}")
