@@ -1,11 +1,10 @@
-"""A glance at every frame: whether it, by itself, lies on the map as the frames before it did.
+"""Check of a single frame against the map, that asks for a registration before the next one is due.
 
 A registration is due once a metre. A robot that is lifted and put down elsewhere, or carried with its wheels in the
-air, would be at a wrong place until then. The glance asks of a few hundred of the frame's points above the ground how
-many have a map point near them, and compares with what has been usual. Below 0.7 of the usual share were fewer than one
-frame in 100 at the right pose, more than half of them half a metre off it, and more than 98 in 100 anywhere else; that
-was seen once, on the simulated worlds 5101, 5103, 5106 and 5108, and no command prints it. So it decides nothing, it
-only asks for a registration now.
+air, would be at a wrong place until then. So of a few hundred points above the ground of every frame the share that
+have a map point near them is compared with what has been usual. Below 0.7 of the usual share were fewer than one frame
+in 100 at the right pose, more than half of them half a metre off it, and more than 98 in 100 anywhere else; that was
+seen once, on the simulated worlds 5101, 5103, 5106 and 5108, and no command prints it. The check decides nothing else.
 """
 
 from __future__ import annotations
@@ -17,18 +16,19 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap
 
+# set by hand
 _REACH = 0.3  # metres: about the map's point spacing
-_NEAREST, _FARTHEST = 2.0, 35.0  # metres from the sensor
+_MIN_RANGE, _MAX_RANGE = 2.0, 35.0  # metres from the sensor
 _HEIGHT = 1.0  # metres above the lowest of the ground nearby
-_FLOOR_RADIUS = 10.0
-_POINTS = 400
-_LEAST_POINTS = 60
-_HABIT = 0.3  # of a new share in the usual one: about the last three registrations
-_DROP = 0.7  # of the usual share
+_FLOOR_RADIUS = 10.0  # metres within which that is looked for
+_POINTS = 400  # compared
+_MIN_POINTS = 60  # fewer say nothing
+_NEWEST_SHARE = 0.3  # of a new share in the usual one: about the last three registrations
+_DROP = 0.7  # of the usual share: see the module
 
 
 class DisplacementCheck:
-    """The usual share of points on the map, and whether a frame has much less.
+    """The usual share of points on the map, which every frame's is compared with.
 
     Attributes:
         usual: share in [0, 1]; None before the first registration.
@@ -42,7 +42,7 @@ class DisplacementCheck:
         self.usual = None
 
     def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:
-        """Take note of a frame whose registration was believed; not of others: a slow error would become usual.
+        """Add a frame whose registration was verified; not others, or a slow error would become usual.
 
         Args:
             points: (N, 3) float32 of the frame, gravity-aligned frame, metres.
@@ -52,10 +52,10 @@ class DisplacementCheck:
         """
         share = share_on_map(points, position, T, target)
         if share is not None:
-            self.usual = share if self.usual is None else self.usual + _HABIT * (share - self.usual)
+            self.usual = share if self.usual is None else self.usual + _NEWEST_SHARE * (share - self.usual)
 
-    def alarming(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> bool:
-        """Whether a frame lies on the map much less than usual; not if there is too little to tell by.
+    def is_displaced(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> bool:
+        """Whether a frame lies on the map much less than usual; False if there is too little to tell by.
 
         Arguments are those of :meth:`learn`, ``T`` as predicted.
         """
@@ -78,12 +78,12 @@ def share_on_map(
     x, y = points[:, 0] - np.float32(position[0]), points[:, 1] - np.float32(position[1])
     square = x * x + y * y
     near = points[:, 2][square < _FLOOR_RADIUS**2]
-    if len(near) < _LEAST_POINTS:
+    if len(near) < _MIN_POINTS:
         return None
     floor = np.partition(near, len(near) // 20)[len(near) // 20]
-    between = (square > _NEAREST**2) & (square < _FARTHEST**2)
+    between = (square > _MIN_RANGE**2) & (square < _MAX_RANGE**2)
     wanted = np.flatnonzero(between & (points[:, 2] > floor + _HEIGHT))
-    if len(wanted) < _LEAST_POINTS:
+    if len(wanted) < _MIN_POINTS:
         return None
     some = wanted[np.linspace(0, len(wanted) - 1, min(_POINTS, len(wanted))).astype(np.int64)]
     distance, _ = kernels.nearest(target.grid, transform(T, points[some]), _REACH)

@@ -1,4 +1,4 @@
-"""How fast odometry drifts: what it is believed to do at first, and what registrations show that it does.
+"""Noise of odometry: the configured rates of its drift, and what registrations show them to be.
 
 A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. With one sigma for all, the poses of the
 first would be reported far too uncertain and those of the second too certain. So the rates are measured while tracking:
@@ -17,12 +17,13 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
-# of the configured rate; a scale error is no random walk, and needs a pull
-_LEAST_FACTOR, _MOST_FACTOR = 0.3, 20.0
+# set by hand
+_MIN_FACTOR = 0.3  # of the configured rates
+_MAX_FACTOR = 20.0  # likewise: a scale error is no random walk, and looks like a high rate
 _OUTLIER = 16.0  # variances; a slip beyond counts as one so large, so that rates grow step by step
-# over less, drift cannot be told from the registrations' noise
-_LEAST_STEP, _LEAST_TURN = 0.2, np.radians(5.0)
-_LEAST_DRIVEN = 1e-3  # metres: standing still, a covariance of zero would be none
+_MIN_STEP = 0.2  # metres; over less, drift cannot be told from the registrations' noise
+_MIN_TURN = float(np.radians(5.0))  # likewise
+_MIN_DRIVEN = 1e-3  # metres: standing still, a covariance of zero would be none
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Drift:
 
     @classmethod
     def of(cls, config: TrackingConfig) -> Drift:
-        """Return what is believed before anything has been measured."""
+        """Return the configured rates."""
         return cls(
             config.position_drift, config.height_drift, config.tilt_drift, config.yaw_drift, config.turn_drift
         )
@@ -53,7 +54,7 @@ class Drift:
     def variances(self, driven: float, turned: float) -> Floats:
         """Variances (6,) over (rx, ry, rz, x, y, z) that gather in metres driven and radians turned."""
         rates = np.array([self.tilt, self.tilt, self.yaw, self.position, self.position, self.height])
-        gathered: Floats = rates**2 * max(driven, _LEAST_DRIVEN)
+        gathered: Floats = rates**2 * max(driven, _MIN_DRIVEN)
         gathered[2] += (self.turn * turned) ** 2
         return gathered
 
@@ -67,7 +68,7 @@ class Drift:
 
 
 class DriftEstimator:
-    """Measures the rates of the drift, forgetting by the metre, and beginning with the configured ones."""
+    """Rates of the drift: the configured ones at first, then measured, and forgotten by the metre."""
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
@@ -78,7 +79,7 @@ class DriftEstimator:
     @property
     def drift(self) -> Drift:
         """The rates as they seem to be now."""
-        factors = np.sqrt(np.clip(self._sums / self._metres, _LEAST_FACTOR**2, _MOST_FACTOR**2))
+        factors = np.sqrt(np.clip(self._sums / self._metres, _MIN_FACTOR**2, _MAX_FACTOR**2))
         tilt, yaw, position, height = factors.tolist()
         known = self._nominal
         return Drift(
@@ -86,7 +87,7 @@ class DriftEstimator:
         )  # fmt: skip
 
     def add(self, gap: Floats, noise: Floats, driven: float, turned: float) -> None:
-        """Take note of the motion between two registrations; see :func:`worth_learning`.
+        """Add the motion between two registrations, where it is :func:`worth_learning`.
 
         Args:
             gap: (6,) over (rx, ry, rz, x, y, z): the later one, less where odometry leads from the earlier one.
@@ -100,7 +101,7 @@ class DriftEstimator:
         seen = np.minimum(gap**2, _OUTLIER * (now + noise)) - noise
         for group, axes in enumerate(_GROUPS):
             rows = list(axes)
-            if driven < _LEAST_STEP and rows != [2]:
+            if driven < _MIN_STEP and rows != [2]:
                 continue  # turning on the spot tells of the heading alone
             # a turn on the spot says of the heading what metres of driving do
             metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
@@ -114,4 +115,4 @@ class DriftEstimator:
 
 def worth_learning(driven: float, turned: float) -> bool:
     """Whether a motion of so many metres and radians tells drift from the registrations' noise."""
-    return driven >= _LEAST_STEP or turned >= float(_LEAST_TURN)
+    return driven >= _MIN_STEP or turned >= _MIN_TURN

@@ -37,6 +37,7 @@ from coview_stream.geometry.se3 import (
 from coview_stream.geometry.transforms import Pose, inverse, orthonormal
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
+# set by hand
 _RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are weighed again
 _MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
 
@@ -151,7 +152,8 @@ class PoseGraph:
         Args:
             T_map_body: (4, 4) as the map alone has it: a pose in whose search the prediction took part counts it
                 twice (see :func:`coview_stream.localization.registration.covariance.remove_prior`).
-            covariance: of that measurement alone (see :func:`coview_stream.localization.registration.covariance.registration_covariance`).
+            covariance: of that measurement alone (see
+                :func:`coview_stream.localization.registration.covariance.registration_covariance`).
         """
         T = check_rigid(T_map_body, "T_map_body")
         spread = check_covariance(covariance, "covariance")

@@ -1,8 +1,8 @@
-"""What the pairs of a registration say of its error by disagreeing with one another, surface by surface.
+"""Cluster-robust (sandwich) covariance of a registration: the error that neighbouring registrations share.
 
 The inverse Hessian presumes that residuals are independent. They are not: a wall that the map has 3 cm off pulls with
-all of its points, and a tree's crown looks different from above, all of it. So pairs are gathered by place, and what
-counts is how far the *places* pull apart: the sandwich estimator, clustered, A^-1 B A^-1 with A the sum of J^T J and B
+all of its points, and a tree's crown looks different from above, all of it. So pairs are gathered into clusters by
+place, and what counts is how far the *clusters* pull apart: A^-1 B A^-1 with A the sum of J^T J over the pairs and B
 the sum over clusters of the outer products of their gradients.
 """
 
@@ -16,14 +16,15 @@ from coview_stream.geometry.arrays import Bools, Floats, Ints, Reals
 from coview_stream.geometry.transforms import Pose, transform
 from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
 
+# set by hand
 _CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 answer much alike
 _EVERY = 2  # of the points: more change nothing
-_HABIT = 0.3  # of a new covariance in that of late
-_LEAST_CLUSTERS = 8  # six unknowns need more
+_NEWEST_SHARE = 0.3  # of a new covariance in the running average
+_MIN_CLUSTERS = 8  # six unknowns need more
 
 
 class SharedErrorModel:
-    """The error that neighbouring registrations share, and that does not average out over them."""
+    """The error that neighbouring registrations share, and that does not average out over them: a running average."""
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
@@ -34,17 +35,17 @@ class SharedErrorModel:
         self._clustered = None
 
     def learn(self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats) -> None:
-        """Take note of a registration; arguments are those of :func:`clustered_covariance`."""
+        """Add a verified registration; arguments are those of :func:`clustered_covariance`."""
         now = clustered_covariance(source, T_map_source, target, pivot, self._config)
         if now is not None:
             before = self._clustered
-            self._clustered = now if before is None else before + _HABIT * (now - before)
+            self._clustered = now if before is None else before + _NEWEST_SHARE * (now - before)
 
     @property
     def covariance(self) -> Floats:
         """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the sigma of late, and what the pairs do not show.
 
-        That is how odometry's roll and pitch tremble from frame to frame, above all.
+        The latter is above all that odometry's roll and pitch tremble from frame to frame.
         """
         config = self._config
         tilt, yaw, place, height = (
@@ -65,7 +66,7 @@ def clustered_covariance(
     pivot: Floats,
     config: RegistrationConfig,
 ) -> Floats | None:
-    """Covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, along the map's axes; None if too little was seen.
+    """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, map axes; None if too little was seen.
 
     Args:
         source: what was registered.
@@ -79,7 +80,7 @@ def clustered_covariance(
     moved = transform(T_map_source, source.points)
     distance, partner = kernels.nearest(target.grid, moved, reach)
     # none are trimmed: those that fit best disagree least
-    weights = _evened(distance < reach, source.above)
+    weights = _equal_weights(distance < reach, source.above)
     chosen = np.flatnonzero(weights)
     q, n = target.points[partner[chosen]], target.normals[partner[chosen]]
     residual = np.einsum("ij,ij->i", moved[chosen] - q, n).astype(np.float64)
@@ -88,16 +89,16 @@ def clustered_covariance(
     J = np.concatenate([np.cross(arm, n), n], axis=1).astype(np.float64)
     cluster = _clusters(moved[chosen], source.above[chosen])
     count = int(cluster.max()) + 1 if len(cluster) else 0
-    if count < _LEAST_CLUSTERS:
+    if count < _MIN_CLUSTERS:
         return None
-    pull = J * (weight * residual)[:, None]
-    pulls = np.stack([np.bincount(cluster, column, count) for column in pull.T], axis=1)
-    back = np.linalg.inv((J * weight[:, None]).T @ J + 1e-6 * np.eye(6))
+    gradient = J * (weight * residual)[:, None]
+    gradients = np.stack([np.bincount(cluster, column, count) for column in gradient.T], axis=1)
+    inverse_A = np.linalg.inv((J * weight[:, None]).T @ J + 1e-6 * np.eye(6))
     # of as many clusters six are used up by the fit
-    return np.asarray(back @ (pulls.T @ pulls) @ back * count / (count - 6))
+    return np.asarray(inverse_A @ (gradients.T @ gradients) @ inverse_A * count / (count - 6))
 
 
-def _evened(found: Bools, above: Bools) -> Floats:
+def _equal_weights(found: Bools, above: Bools) -> Floats:
     """Weights (N,) of points: 0 for those without a partner, and equal sums for both kinds."""
     weights = np.zeros(len(found))
     for kind in (above, ~above):
