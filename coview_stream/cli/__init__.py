@@ -1,11 +1,10 @@
 """The ``coview-stream`` command: one thin module per subcommand, one line per error.
 
-A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Whatever is heavy
-it imports inside ``run``, for ``coview-stream --help`` must answer at once.
+A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Heavy libraries are
+imported inside ``run``: ``coview-stream --help`` must answer at once.
 
-Exit codes: 0 done; 1 could not localise (files are written all the same), nobody listened (replay), a check failed
-(doctor); 2 bad usage or input;
-130 interrupted; 141 the reader of a pipe went away.
+Exit codes: 0 done; 1 could not localise (files are written all the same), no subscriber (replay), a check failed
+(doctor); 2 bad usage or input; 130 interrupted; 141 the reader of a pipe went away.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import importlib.util
 import os
 import sys
 from collections.abc import Sequence
@@ -37,25 +35,25 @@ COMMANDS = (
     "doctor",
     "train",
 )
-"""Names in the order of ``--help``; a command whose module does not exist is left out."""
+"""Names in the order of ``--help``."""
 
-_MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin wherever it is imported
+_MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin where it is imported
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports bad usage like any other bad input instead of printing the usage and exiting."""
+    """Parser that raises bad usage as an error, like any other bad input, instead of printing it and exiting."""
 
     def error(self, message: str) -> NoReturn:
-        # argparse's own "try --help" names the subcommand, which is where the reader has to look
+        # prog includes the subcommand, whose help is the one to read
         raise ConfigError(f"{message}; see `{self.prog} --help`")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; ``argv`` defaults to the process's arguments.
 
-    Raises nothing on purpose: errors of the caller's making become one line on stderr and exit code 2.
+    Errors of this package and of the system become one line on stderr and exit code 2; others are bugs and are raised.
     """
-    # Our matrices are small: BLAS threads cost more than they bring, most of all beside other programs.
+    # our matrices are small: BLAS threads cost more than they bring, most of all beside other programs
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = _dispatch(sys.argv[1:] if argv is None else list(argv))
@@ -76,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Register every command that exists and return the parser."""
+    """Return the parser with all commands."""
     parser = _Parser(
         prog=PROGRAM,
         description="Tells a robot where it is on a base map, by lidar: no GPU, no GNSS, no initial guess.",
@@ -84,10 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, title="commands")
     for name in COMMANDS:
-        module_name = f"{__name__}.{_MODULES.get(name, name)}"
-        if importlib.util.find_spec(module_name) is None:
-            continue
-        module = importlib.import_module(module_name)
+        module = importlib.import_module(f"{__name__}.{_MODULES.get(name, name)}")
         sub = commands.add_parser(name, help=module.HELP, description=module.HELP)
         module.add_arguments(sub)
         sub.set_defaults(run=module.run)
@@ -113,6 +108,6 @@ def _describe(error: OSError) -> str:
 
 
 def _discard_stdout() -> None:
-    """Point stdout at nothing, or the interpreter complains about the closed pipe on its way out."""
+    """Point stdout at the null device; the interpreter would report the closed pipe at its exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

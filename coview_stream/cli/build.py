@@ -1,4 +1,4 @@
-"""``coview-stream build``: a base map file from one or many clouds."""
+"""``coview-stream build``: a base map file of one or many clouds."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
-    options["learned"] = _can_be_learned() if args.learned is None else args.learned
+    options["learned"] = _networks_available() if args.learned is None else args.learned
     begin = time.perf_counter()
     base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
     base_map.save(args.output)
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _can_be_learned() -> bool:
-    """Whether features can be made; says so if not, for somebody may rely on them."""
+def _networks_available() -> bool:
+    """Return whether features can be made; if not, print why: the user may rely on them."""
     from coview_stream.descriptors.network import VIEW_NAMES, network
     from coview_stream.errors import CoViewError
 

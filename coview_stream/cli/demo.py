@@ -1,4 +1,4 @@
-"""``coview-stream demo``: the whole way from a laser scan to live poses, without input and without a network."""
+"""``coview-stream demo``: the whole way from a laser scan to live poses, without input files or other machines."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     config = SimulationConfig(
         scene=args.scene, sensor=args.sensor, seed=args.seed, size=args.size, length=args.length
     )
-    out = _own_folder(args.out)
+    out = _prepare_folder(args.out)
     world, shown = out / "world", sys.stderr.isatty()
     seconds: dict[str, float] = {}
     with _step(seconds, "simulate", f"simulating a {args.scene}, {args.size:g} m wide, and a {args.sensor}"):
@@ -60,16 +60,20 @@ def run(args: argparse.Namespace) -> int:
         base_map.save(out / "site.coview")
     with _step(seconds, "locate", f"driving {args.length:g} m without knowing where"):
         recorded = open_run(world / "run")
-        located = _locate(base_map, recorded, shown) if args.offline else _live(recorded, out, shown)
+        located = _offline(base_map, recorded, shown) if args.offline else _live(recorded, out, shown)
     with _step(seconds, "report", "comparing with the truth, drawing"):
-        verdict = _report(located, base_map, read_tum(world / "truth.tum"), out)
-    _write_report(verdict, config, seconds, out)
-    print(_text(verdict, located, out))
-    return 0 if verdict.success else 1
+        evaluation = _write_results(located, base_map, read_tum(world / "truth.tum"), out)
+    _write_report(evaluation, config, seconds, out)
+    print(_text(evaluation, located, out))
+    return 0 if evaluation.success else 1
 
 
-def _own_folder(out: Path) -> Path:
-    """Return the directory, created or cleared of an earlier demo's results; refuses anybody else's files."""
+def _prepare_folder(out: Path) -> Path:
+    """Return the directory, created, or cleared of an earlier demo's results.
+
+    Raises:
+        InputError: it holds other files, or cannot be written.
+    """
     from coview_stream.errors import InputError
 
     if out.exists() and not out.is_dir():
@@ -78,7 +82,7 @@ def _own_folder(out: Path) -> Path:
         raise InputError(f"{out}: is not empty and holds no earlier demo; name a new directory with --out")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in _WRITTEN:  # an old picture beside a new result would lie
+        for name in _WRITTEN:  # an old picture would contradict the new result
             (out / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); name another with --out") from error
@@ -87,7 +91,7 @@ def _own_folder(out: Path) -> Path:
 
 @contextmanager
 def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
-    """Say on stderr what is going on and, afterwards, how long it took."""
+    """Print on stderr what the block does and, at its end, how long it took; enter its seconds by name."""
     import time
 
     number = len(seconds) + 1
@@ -98,7 +102,8 @@ def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
     print(f"[{number}/{_STEPS}] done in {seconds[name]:.1f} s", file=sys.stderr, flush=True)
 
 
-def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> RunResult:
+def _offline(base_map: BaseMap, recorded: Run, shown: bool) -> RunResult:
+    """Localize the run without a network, frame by frame."""
     from tqdm import tqdm
 
     from coview_stream.localization.offline import locate
@@ -109,16 +114,16 @@ def _locate(base_map: BaseMap, recorded: Run, shown: bool) -> RunResult:
         def step(done: int, total: int, fix: Fix | None) -> None:
             bar.update(done - bar.n)
             if fix is not None:
-                bar.set_postfix_str(fix.state.value)
+                bar.set_postfix_str(fix.state.reported)
 
         return locate(base_map, recorded, progress=step)
 
 
 def _live(recorded: Run, out: Path, shown: bool) -> RunResult:
-    """Serve, replay and watch; what was published, frame by frame."""
+    """Serve, replay and watch the run as three processes; return what was published, frame by frame."""
     from tqdm import tqdm
 
-    from coview_stream.cli.demo_processes import stream
+    from coview_stream.cli.demo_processes import record_live
     from coview_stream.localization.offline import from_stream
 
     stamps = recorded.stamps.tolist()
@@ -130,12 +135,12 @@ def _live(recorded: Run, out: Path, shown: bool) -> RunResult:
                 bar.set_postfix_str(str(record["state"]))
 
         (out / "logs").mkdir(exist_ok=True)
-        recording = stream(out / "site.coview", recorded.path, out / "logs", heard)
+        recording = record_live(out / "site.coview", recorded.path, out / "logs", heard)
     return from_stream(stamps, recording.poses, recording.statuses)
 
 
-def _report(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
-    """Write trajectory, evidence and pictures; return the evaluation."""
+def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
+    """Write trajectory, evidence and pictures; return the evaluation of what was written."""
     import numpy as np
 
     from coview_stream.clouds.trajectory import read_tum
@@ -148,28 +153,28 @@ def _report(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path)
     draw_run(located, base_map, out, truth[1][:, :3, 3])
     points = base_map.points.astype(np.float64) + base_map.origin
     plot_map(points, base_map.stations + base_map.origin, out / "map.png")
-    estimate = read_tum(out / "trajectory.tum")  # what is judged is what was written
+    estimate = read_tum(out / "trajectory.tum")
     errors = frame_errors(estimate, truth)
     plot_errors(errors.distance, errors.e_t, errors.e_r, out / "errors.png")
     return evaluate(estimate, truth)
 
 
 def _write_report(
-    verdict: Evaluation, config: SimulationConfig, seconds: dict[str, float], out: Path
+    evaluation: Evaluation, config: SimulationConfig, seconds: dict[str, float], out: Path
 ) -> None:
     import json
 
     from coview_stream.clouds.atomic_file import atomic_file
 
-    facts = json.loads(verdict.to_json()) | {"world": config.to_dict(), "seconds": seconds}
+    facts = json.loads(evaluation.to_json()) | {"world": config.to_dict(), "seconds": seconds}
     with atomic_file(out / "report.json") as stream:
         stream.write((json.dumps(facts, indent=1) + "\n").encode())
 
 
-def _text(verdict: Evaluation, located: RunResult, out: Path) -> str:
+def _text(evaluation: Evaluation, located: RunResult, out: Path) -> str:
     from coview_stream.cli.evaluate import table
 
-    lines = [table(verdict)]
+    lines = [table(evaluation)]
     if not located.posed and located.keyframes:
         lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
     written = [name for name in _WRITTEN if (out / name).is_file()]

@@ -1,4 +1,4 @@
-"""A node, a robot and a watcher as three processes on loopback: the demo, and a pattern for tests of a site."""
+"""Processes of the demo: a node, a robot and a watcher on loopback; a pattern for tests of a site."""
 
 from __future__ import annotations
 
@@ -21,23 +21,30 @@ from coview_stream.errors import TransportError
 
 ROBOT = "demo"
 
-_START = 30.0  # seconds for the node to say something; a first run compiles its kernels
-_END = 5.0  # seconds for a process to end after a signal
+# all set by hand, seconds
+_MAX_START = 30.0  # until the node publishes something; a first run compiles its kernels
+_MAX_SHUTDOWN = 5.0  # for a process after a signal
+_IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
 
 
 @dataclass
 class Recording:
-    """What the watcher saw: poses and statuses as published, in order."""
+    """What the watcher received, in order.
+
+    Attributes:
+        poses: as published, JSON.
+        statuses: likewise.
+    """
 
     poses: list[dict[str, Any]] = field(default_factory=list)
     statuses: list[dict[str, Any]] = field(default_factory=list)
 
-    def take(self, record: dict[str, Any]) -> None:
-        """Sort one line of the watcher in."""
+    def add(self, record: dict[str, Any]) -> None:
+        """Append one line of the watcher to the list that its key names."""
         (self.poses if str(record.get("key", "")).endswith("/out/pose") else self.statuses).append(record)
 
 
-def stream(
+def record_live(
     map_path: Path, run_path: Path, logs: Path, heard: Callable[[dict[str, Any]], None] = lambda record: None
 ) -> Recording:
     """Serve a map, replay a run to it at its own pace, and record what is published.
@@ -45,11 +52,11 @@ def stream(
     Args:
         map_path: a ``.coview`` file.
         run_path: a run directory.
-        logs: directory for what the three processes say.
+        logs: directory for the stderr of the three processes.
         heard: called with every pose and status, as they come.
 
     Raises:
-        TransportError: a process failed; the message ends with what it said.
+        TransportError: a process failed; the message ends with the last line of its log.
     """
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     recording = Recording()
@@ -66,17 +73,17 @@ def stream(
         while robot.poll() is None or not lines.empty():
             with contextlib.suppress(queue.Empty):
                 record = lines.get(timeout=0.1)
-                recording.take(record)
+                recording.add(record)
                 heard(record)
             if node.poll() is not None or watcher.poll() is not None:
                 raise _failure("serve" if node.poll() is not None else "watch", logs)
         if robot.returncode:
             raise _failure("replay", logs)
-        time.sleep(0.3)  # the last frame is still under way
+        time.sleep(_IN_TRANSIT)
         _end(node)
         with contextlib.suppress(queue.Empty):
             while True:
-                recording.take(lines.get(timeout=0.5))
+                recording.add(lines.get(timeout=0.5))
     return recording
 
 
@@ -96,7 +103,7 @@ def _process(log: Path, *args: str) -> Iterator[subprocess.Popen[bytes]]:
             stdout=subprocess.PIPE if args[0] == "watch" else subprocess.DEVNULL,
             stderr=errors,
             env=os.environ | {"PYTHONPATH": paths},
-            start_new_session=True,  # an interrupt at the terminal is ours to pass on
+            start_new_session=True,  # this process passes an interrupt at the terminal on
         )
         try:
             yield process
@@ -108,7 +115,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
         try:
-            process.wait(timeout=_END)
+            process.wait(timeout=_MAX_SHUTDOWN)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -133,17 +140,17 @@ def _await_first(
     processes: tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]],
     logs: Path,
 ) -> None:
-    deadline = time.monotonic() + _START
+    deadline = time.monotonic() + _MAX_START
     while time.monotonic() < deadline:
         with contextlib.suppress(queue.Empty):
-            recording.take(lines.get(timeout=0.1))
+            recording.add(lines.get(timeout=0.1))
             return
         for name, process in zip(("serve", "watch"), processes, strict=True):
             if process.poll() is not None:
                 raise _failure(name, logs)
-    raise TransportError(f"the node has said nothing for {_START:g} s; see {logs / 'serve.log'}")
+    raise TransportError(f"the node has said nothing for {_MAX_START:g} s; see {logs / 'serve.log'}")
 
 
 def _failure(name: str, logs: Path) -> TransportError:
-    said = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
-    return TransportError(f"`coview-stream {name}` ended: {said[-1] if said else 'it said nothing'}")
+    log = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
+    return TransportError(f"`coview-stream {name}` ended: {log[-1] if log else 'it said nothing'}")

@@ -1,4 +1,4 @@
-"""``coview-stream doctor``: check the machine, a map, the network and what robots send."""
+"""``coview-stream doctor``: checks of the machine, a map, the network and what robots send."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.options import check_codec
 from coview_stream.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 HELP = "check this machine, a map, the network and what robots send, and say what to do"
 
-_LONGEST = 600.0  # seconds
+_MAX_SECONDS = 600.0  # to listen, set by hand
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument("--domain", type=int, default=0, help="ROS domain id, for rmw_zenoh (0)")
     keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's")
     keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
-    keys.add_argument("--cloud-encoding", metavar="CODEC", help="whatever frames say")
+    keys.add_argument("--cloud-encoding", metavar="CODEC", help="for all frames")
     keys.add_argument("--odometry-encoding", metavar="CODEC", help="likewise")
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
 
@@ -45,9 +46,9 @@ def run(args: argparse.Namespace) -> int:
     """Print a line per finding; exit code 1 if something will not work."""
     from coview_stream.doctor.finding import failed
 
-    keys = _checked(args)
+    keys = _robot_keys(args)
     findings: list[Finding] = []
-    for finding in _checkup(args, keys):
+    for finding in _findings(args, keys):
         findings.append(finding)
         if not args.json:
             print(finding.line(), flush=True)  # the next one may take seconds
@@ -56,47 +57,51 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failed(findings) else 0
 
 
-def _checked(args: argparse.Namespace) -> list[RobotKeys]:
-    """Refuse wrong options before anything slow is done, and return the robots' keys."""
+def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
+    """Return the keys of the robots to listen to; refuse wrong options before anything slow is done.
+
+    Raises:
+        ConfigError: a wrong option, with or without robots.
+    """
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS
     from coview_stream.stream.transport.keys import robot_keys
 
-    if not 0 < args.seconds <= _LONGEST:
-        raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0, {_LONGEST:g} at most")
-    for option, name, known in (
-        ("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS),
-        ("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS),
-    ):
-        if name is not None and name not in known:
-            raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")
-    names = dict.fromkeys(args.robot or ["any"])
-    made = [
+    if not 0 < args.seconds <= _MAX_SECONDS:
+        raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0, {_MAX_SECONDS:g} at most")
+    check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
+    check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
+    names = dict.fromkeys(args.robot or ["any"])  # one robot at least, to check the keys
+    keys = [
         robot_keys(args.preset, args.base, name, args.cloud_key, args.odometry_key, None, args.domain)
         for name in names
     ]
-    return made if args.robot else []
+    return keys if args.robot else []
 
 
-def _checkup(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
+def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
     from coview_stream.doctor.machine_checks import machine_findings, memory
-    from coview_stream.doctor.map_checks import open_site, site_findings
+    from coview_stream.doctor.map_checks import map_findings, open_map
 
     connect = _endpoints(args)
-    zenoh = connect is not None and _zenoh_takes(args, connect)
+    zenoh = connect is not None and _check_zenoh_config(args, connect)
     yield from machine_findings()
     sha256 = None
     if args.map is not None:
-        base_map, finding = open_site(args.map)
+        base_map, finding = open_map(args.map)
         yield finding
         if base_map is not None:
             sha256 = base_map.sha256
-            yield from site_findings(base_map, args.map.stat().st_size, memory()[1])
+            yield from map_findings(base_map, args.map.stat().st_size, memory()[1])
     if connect is not None and zenoh:
         yield from _network(args, connect, keys, sha256)
 
 
-def _zenoh_takes(args: argparse.Namespace, connect: list[str]) -> bool:
-    """Report wrong endpoints and files before anything slow; False if there is no zenoh, which is a finding."""
+def _check_zenoh_config(args: argparse.Namespace, connect: list[str]) -> bool:
+    """Check endpoints and files before anything slow; False if zenoh is missing, which is a finding.
+
+    Raises:
+        TransportError: zenoh refuses them.
+    """
     try:
         import zenoh  # noqa: F401 - only whether it is there
     except ImportError:
@@ -108,7 +113,7 @@ def _zenoh_takes(args: argparse.Namespace, connect: list[str]) -> bool:
 
 
 def _endpoints(args: argparse.Namespace) -> list[str] | None:
-    """Endpoints to connect to; None if the network is not asked for."""
+    """Return the endpoints to connect to; None if the network is not asked for."""
     from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
 
     if not (args.robot or args.connect or args.listen or args.config):
@@ -120,19 +125,19 @@ def _network(
     args: argparse.Namespace, connect: list[str], keys: list[RobotKeys], sha256: str | None
 ) -> Iterator[Finding]:
     from coview_stream.doctor.finding import from_error
-    from coview_stream.doctor.network_checks import reach_finding, robots_findings
+    from coview_stream.doctor.network_checks import connection_finding, robots_findings
     from coview_stream.stream.transport.zenoh_transport import open_transport
 
     try:
-        with _silence("coview_stream.stream"):  # what the transport would log is a finding here
+        with _silent("coview_stream.stream"):  # what the transport would log is a finding here
             transport = open_transport(connect, args.listen, args.config)
     except TransportError as error:
         yield from_error("network", error)
         return
     try:
-        reached = reach_finding(transport, connect)
-        yield reached
-        if reached.verdict != "FAIL":
+        connected = connection_finding(transport, connect)
+        yield connected
+        if connected.verdict != "FAIL":
             codecs = (args.cloud_encoding, args.odometry_encoding)
             yield from robots_findings(transport, keys, args.seconds, codecs, sha256)
     finally:
@@ -140,7 +145,7 @@ def _network(
 
 
 @contextlib.contextmanager
-def _silence(name: str) -> Iterator[None]:
+def _silent(name: str) -> Iterator[None]:
     logger = logging.getLogger(name)
     before = logger.level
     logger.setLevel(logging.CRITICAL)

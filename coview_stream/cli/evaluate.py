@@ -1,4 +1,4 @@
-"""``coview-stream eval``: how far a trajectory is from the truth."""
+"""``coview-stream eval``: errors of a trajectory against the truth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the evaluation; whatever it says, the comparison itself is done (exit code 0)."""
+    """Print the evaluation; exit code 0 for a bad trajectory, too: the comparison is done."""
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.errors import InputError
     from coview_stream.report.evaluation import evaluate, frame_errors
@@ -29,36 +29,36 @@ def run(args: argparse.Namespace) -> int:
     estimate, truth = read_tum(args.estimate), read_tum(args.truth)
     if not len(truth[0]):
         raise InputError(f"{args.truth}: holds no pose; give the trajectory that was really driven")
-    verdict = evaluate(estimate, truth)
+    evaluation = evaluate(estimate, truth)
     if args.plot is not None:
         from coview_stream.report.plots import plot_errors
 
         errors = frame_errors(estimate, truth)
         plot_errors(errors.distance, errors.e_t, errors.e_r, args.plot)
-    print(verdict.to_json() if args.json else table(verdict))
+    print(evaluation.to_json() if args.json else table(evaluation))
     return 0
 
 
-def table(verdict: Evaluation) -> str:
-    """Lay the evaluation out for a person to read."""
-    fix = "never" if verdict.first_fix_m is None else f"after {verdict.first_fix_m:.1f} m"
+def table(evaluation: Evaluation) -> str:
+    """Return the evaluation as lines of a name and its value."""
+    first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
     rows = [
-        ("success", "yes" if verdict.success else "no"),
-        ("localised", f"{verdict.share_localised:.1%} of {verdict.frames} frames"),
-        ("false frames", f"{verdict.false_frames} of {verdict.posed} poses"),
-        ("first pose", fix),
+        ("success", "yes" if evaluation.success else "no"),
+        ("localised", f"{evaluation.share_localised:.1%} of {evaluation.frames} frames"),
+        ("false frames", f"{evaluation.false_frames} of {evaluation.posed} poses"),
+        ("first pose", first),
     ]
-    if verdict.unmatched:
-        rows.append(("not compared", f"{verdict.unmatched} poses without a true one at that time"))
-    if verdict.translation and verdict.rotation:
-        rows.append(("translation error", _spread(verdict.translation, "m")))
-        rows.append(("rotation error", _spread(verdict.rotation, "deg")))
-    if verdict.false_frames:
-        rows.append(("worst pose", f"{verdict.worst_t_m:.2f} m, {verdict.worst_r_deg:.2f} deg"))
+    if evaluation.unmatched:
+        rows.append(("not compared", f"{evaluation.unmatched} poses without a true one at that time"))
+    if evaluation.translation and evaluation.rotation:
+        rows.append(("translation error", _errors_text(evaluation.translation, "m")))
+        rows.append(("rotation error", _errors_text(evaluation.rotation, "deg")))
+    if evaluation.false_frames:
+        rows.append(("worst pose", f"{evaluation.worst_t_m:.2f} m, {evaluation.worst_r_deg:.2f} deg"))
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
 
 
-def _spread(stats: ErrorStats, unit: str) -> str:
+def _errors_text(stats: ErrorStats, unit: str) -> str:
     return (
         f"mean {stats.mean:.3f}  rmse {stats.rmse:.3f}  median {stats.median:.3f}  max {stats.max:.3f} {unit}"
         "  (of the right poses)"

@@ -1,4 +1,4 @@
-"""``coview-stream info``: what is inside a base map file."""
+"""``coview-stream info``: the contents of a base map file."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def describe(base_map: BaseMap) -> dict[str, object]:
-    """Return the facts worth showing; metres in the source's frame."""
+    """Return what ``info`` shows, by name; metres in the source's frame."""
     from dataclasses import asdict
 
     low = base_map.points.min(axis=0) + base_map.origin
@@ -64,7 +64,7 @@ def describe(base_map: BaseMap) -> dict[str, object]:
 
 
 def _learned(base_map: BaseMap) -> str:
-    """Return what there is for learned re-localization."""
+    """Describe the map's features for learned re-localization."""
     features = base_map.learned
     if features is None:
         return "no features"

@@ -7,7 +7,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.options import add_gravity, add_reloc, lidar_options
+from coview_stream.cli.options import (
+    add_gravity,
+    add_registration,
+    add_reloc,
+    add_run_path,
+    add_topics,
+    lidar_config,
+)
 
 if TYPE_CHECKING:
     from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -18,9 +25,7 @@ HELP = "localize a recorded run on a base map, offline"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("map", type=Path, metavar="SITE.coview")
-    parser.add_argument(
-        "run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag"
-    )
+    add_run_path(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="directory to write")
     parser.add_argument(
         "--odometry",
@@ -29,17 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the run's, a file's, or made of the clouds (auto)",
     )
     add_gravity(parser)
-    parser.add_argument(
-        "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
-    )
-    parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
+    add_topics(parser)
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
-    parser.add_argument(
-        "--registration",
-        choices=("trimmed-icp", "gicp"),
-        default="trimmed-icp",
-        help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
-    )
+    add_registration(parser)
     add_reloc(parser)
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
@@ -49,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     """Localize and write; exit code 1 if no frame could be localised."""
     from tqdm import tqdm
 
-    from coview_stream.basemap.basemap import BaseMap, check_reloc
+    from coview_stream.basemap.basemap import BaseMap
     from coview_stream.config import LocalizerConfig, RegistrationConfig, RetrievalConfig
     from coview_stream.errors import InputError
     from coview_stream.localization.offline import locate, summary, write
@@ -57,13 +54,13 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.localization.result import Fix
     from coview_stream.recordings.open_run import open_run
 
-    lidar = _lidar(args.odometry, args.gravity)
+    lidar = _lidar_odometry(args.odometry, args.gravity)
     if args.registration == "gicp":
-        library()  # it may be missing, so ask before reading
+        library()  # before anything is read: it may be missing
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     base_map = BaseMap.load(args.map)
-    missing = check_reloc(base_map, args.reloc)
+    missing = base_map.require_features(args.reloc)
     if missing is not None:
         print(f"{args.map}: {missing}", file=sys.stderr)
     quiet = not (args.progress or sys.stderr.isatty())
@@ -88,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         def step(done: int, total: int, fix: Fix | None) -> None:
             bar.update(done - bar.n)
             if fix is not None:
-                bar.set_postfix_str(fix.state.value)
+                bar.set_postfix_str(fix.state.reported)
 
         located = locate(base_map, recorded, config, step)
     write(located, base_map, args.output)
@@ -100,9 +97,13 @@ def run(args: argparse.Namespace) -> int:
     return 0 if located.posed else 1
 
 
-def _lidar(odometry: str, gravity: str | None) -> LidarOdometry | None:
-    """Return what makes odometry of the clouds, if that is asked for; it may be missing, so ask before reading."""
-    config = lidar_options(odometry, gravity)
+def _lidar_odometry(odometry: str, gravity: str | None) -> LidarOdometry | None:
+    """Return what makes odometry of the clouds, None if that is not asked for.
+
+    Raises:
+        DependencyError: KISS-ICP is not installed; asked before anything is read.
+    """
+    config = lidar_config(odometry, gravity)
     if config is None:
         return None
     from coview_stream.odometry.lidar_odometry import LidarOdometry

@@ -1,16 +1,104 @@
-"""Where ``serve`` keeps what it knows from one start to the next: its two options."""
-
-# FOLDED coview_stream/cli/options.py: """Options of lidar odometry, the same for every command that can make it."""
-# FOLDED coview_stream/cli/options.py: """The option that says who names the places to look at, the same for every command that localizes."""
+"""Options that several commands share, and what they mean: runs, registration, network, odometry, kept state."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coview_stream.config.odometry import LidarOdometryConfig
+
+ROBOT, KISS_ICP = "robot", "kiss-icp"
+"""Makers of odometry, as ``serve --odometry`` names them."""
+
+
+def add_run_path(parser: argparse.ArgumentParser) -> None:
+    """Declare ``RUN``, a recorded run."""
+    parser.add_argument(
+        "run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag"
+    )
+
+
+def add_topics(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--cloud-topic`` and ``--odometry-topic`` of a ROS recording."""
+    parser.add_argument(
+        "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
+    )
+    parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
+
+
+def add_client_network(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--connect``, ``--listen``, ``--config`` and ``--base`` of a command that joins a running node."""
+    parser.add_argument(
+        "--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)"
+    )
+    parser.add_argument("--listen", action="append", metavar="EP", help="endpoint to be connected to on")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
+    parser.add_argument("--base", default="coview", help="first part of the keys (coview)")
+
+
+def check_codec(option: str, name: str | None, known: Iterable[str]) -> None:
+    """Refuse an encoding that no codec has; None is always right.
+
+    Raises:
+        ConfigError: ``name`` is not among the ``known``.
+    """
+    from coview_stream.errors import ConfigError
+
+    if name is not None and name not in known:
+        raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")
+
+
+def add_registration(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--registration``."""
+    parser.add_argument(
+        "--registration",
+        choices=("trimmed-icp", "gicp"),
+        default="trimmed-icp",
+        help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
+    )
+
+
+def add_reloc(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--reloc``."""
+    parser.add_argument(
+        "--reloc",
+        choices=("auto", "coview", "learned"),
+        default="auto",
+        help="what names places to look at: co-view descriptors, learned features, or both on maps that have "
+        "features (auto)",
+    )
+
+
+def add_gravity(parser: argparse._ActionsContainer) -> None:
+    """Declare ``--gravity``."""
+    parser.add_argument(
+        "--gravity",
+        metavar="ground|level|X,Y,Z",
+        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame, as in "
+        "--gravity=-0.1,0,-9.8 (ground)",
+    )
+
+
+def lidar_config(odometry: str, gravity: str | None, max_speed: float = 50.0) -> LidarOdometryConfig | None:
+    """Return how odometry is made of the clouds; None if ``odometry`` is not kiss-icp.
+
+    ``max_speed`` is the robot's, metres per second.
+
+    Raises:
+        ConfigError: ``gravity`` is no direction, or comes with other odometry.
+    """
+    from coview_stream.config.odometry import LidarOdometryConfig, parse_gravity
+    from coview_stream.errors import ConfigError
+
+    if odometry != KISS_ICP:
+        if gravity is not None:
+            raise ConfigError(f"--gravity goes with --odometry {KISS_ICP}: other odometry is gravity aligned")
+        return None
+    down = parse_gravity("ground" if gravity is None else gravity)
+    return LidarOdometryConfig(gravity=down, max_speed=max_speed)
 
 
 def add_state(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +115,11 @@ def add_state(parser: argparse.ArgumentParser) -> None:
 
 
 def state_folder(args: argparse.Namespace) -> Path | None:
-    """Return where to keep it, None for nowhere; ConfigError for an empty ``--state``."""
+    """Return the folder of the last poses; None for nowhere.
+
+    Raises:
+        ConfigError: ``--state`` is empty.
+    """
     import logging
 
     from coview_stream.errors import ConfigError
@@ -46,11 +138,14 @@ def state_folder(args: argparse.Namespace) -> Path | None:
         return None
 
 
-def ready_state(args: argparse.Namespace) -> Path | None:
-    """Return what :func:`state_folder` does, tried out, and log it: a robot must not find out where it is first.
+def writable_state_folder(args: argparse.Namespace) -> Path | None:
+    """Return :func:`state_folder` after a trial write, and log it: better refused at the start than while driving.
+
+    A default folder that cannot be written is logged only: the disk may be mounted later.
 
     Raises:
-        InputError: ``--state`` names what cannot be used. ConfigError: it is empty.
+        InputError: ``--state`` names a directory that cannot be written.
+        ConfigError: ``--state`` is empty.
     """
     import logging
 
@@ -69,46 +164,7 @@ def ready_state(args: argparse.Namespace) -> Path | None:
             raise InputError(
                 f"--state {text}; name a directory that can be written, or use --no-state"
             ) from error
-        log.warning("%s; use --state DIR or --no-state", text)  # and go on: a disk may come later
+        log.warning("%s; use --state DIR or --no-state", text)
     else:
         log.info("the last poses are kept in %s", folder)
     return folder
-
-
-KISS_ICP = "kiss-icp"
-
-ROBOT = "robot"
-
-
-def add_gravity(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--gravity``."""
-    parser.add_argument(
-        "--gravity",
-        metavar="ground|level|X,Y,Z",
-        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame, as in "
-        "--gravity=-0.1,0,-9.8 (ground)",
-    )
-
-
-def lidar_options(odometry: str, gravity: str | None, max_speed: float = 50.0) -> LidarOdometryConfig | None:
-    """Return how odometry is to be made; None if ``odometry`` is not kiss-icp. ConfigError for a wrong gravity."""
-    from coview_stream.config.odometry import LidarOdometryConfig, parse_gravity
-    from coview_stream.errors import ConfigError
-
-    if odometry != KISS_ICP:
-        if gravity is not None:
-            raise ConfigError(f"--gravity goes with --odometry {KISS_ICP}: other odometry is gravity aligned")
-        return None
-    down = parse_gravity("ground" if gravity is None else gravity)
-    return LidarOdometryConfig(gravity=down, max_speed=max_speed)
-
-
-def add_reloc(parser: argparse._ActionsContainer) -> None:
-    """Declare ``--reloc``."""
-    parser.add_argument(
-        "--reloc",
-        choices=("auto", "coview", "learned"),
-        default="auto",
-        help="who names places to look at: co-view descriptors, learned features, or both on maps that have "
-        "features (auto)",
-    )

@@ -1,10 +1,9 @@
-"""``coview-stream serve``: the node. Lidar frames and odometry in, map-frame poses out, over zenoh."""
+"""``coview-stream serve``: the node; lidar frames and odometry in, map-frame poses out, over zenoh."""
 
 from __future__ import annotations
 
 import argparse
 import threading
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,10 +11,12 @@ from coview_stream.cli.options import (
     KISS_ICP,
     ROBOT,
     add_gravity,
+    add_registration,
     add_reloc,
     add_state,
-    lidar_options,
-    ready_state,
+    check_codec,
+    lidar_config,
+    writable_state_folder,
 )
 from coview_stream.errors import ConfigError
 
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.serve import ServeOptions
 
-_ENDING = 1.5  # seconds for everything to end after a signal: we promise two
-
 HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
+
+_MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/streaming.md promises two
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
     keys.add_argument("--pose-key", metavar="KEY", help="likewise")
     keys.add_argument(
-        "--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, whatever frames say"
+        "--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, for all frames"
     )
     keys.add_argument("--odometry-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson, likewise")
     keys.add_argument(
@@ -86,12 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-payload", type=int, default=16 << 20, metavar="BYTES", help="larger is not looked at (16 MiB)"
     )
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
-    parser.add_argument(
-        "--registration",
-        choices=("trimmed-icp", "gicp"),
-        default="trimmed-icp",
-        help="of scans to the map; gicp takes longer and needs the extra of that name (trimmed-icp)",
-    )
+    add_registration(parser)
     add_reloc(parser)
     add_state(parser)
     parser.add_argument("--quiet", action="store_true", help="log errors only")
@@ -111,41 +107,41 @@ def run(args: argparse.Namespace) -> int:
     logging.basicConfig(
         level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
     )
-    _check("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
-    _check("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
-    _check("--pose-encoding", args.pose_encoding, POSE_CODECS)
-    lidar = lidar_options(args.odometry, args.gravity, args.max_speed)
+    check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
+    check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
+    check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
+    lidar = lidar_config(args.odometry, args.gravity, args.max_speed)
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
     given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
     keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
-    alone = not (args.connect or args.listen or args.config)
+    by_default = not (args.connect or args.listen or args.config)
     node = NodeConfig(
         pose_rate=args.pose_rate,
         odometry_timeout=args.odometry_timeout,
         max_gap=max(0.5, args.odometry_timeout),  # a pause that keeps the pose up keeps its frames as well
         max_outage=args.max_outage,
         max_speed=args.max_speed,
-        coast=args.coast,
+        dead_reckoning_timeout=args.coast,
         max_payload=args.max_payload,
         deskew=not args.no_deskew,
     )
     options = ServeOptions(
-        args.map, keys, args.connect, [DEFAULT_ENDPOINT] if alone else args.listen, args.config, node,
+        args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
-        args.registration, ready_state(args), args.reloc,
+        args.registration, writable_state_folder(args), args.reloc,
     )  # fmt: skip
     with stop_on_signals() as stop:
         ended = _serve(options, stop)
     if not ended:
-        _leave()
+        _exit_now()
     return 0
 
 
 def _serve(options: ServeOptions, stop: Stop) -> bool:
-    """Open the node and run it until asked to stop; False if something does not end then.
+    """Open the node and run it until asked to stop; False if a thread does not end in time.
 
-    Opening has a thread of its own, for a signal must end even what waits for a host that does not answer.
+    A thread of its own opens the node: a signal must end a wait for a host that does not answer, too.
     """
     from coview_stream.stream.node.engine_process import CancelledError
     from coview_stream.stream.node.serve import open_node
@@ -169,13 +165,13 @@ def _serve(options: ServeOptions, stop: Stop) -> bool:
         pass
     if failed and not stop.requested:
         raise failed[0]
-    end = stop.now() + _ENDING
-    opening.join(_ENDING)
+    end = stop.now() + _MAX_SHUTDOWN
+    opening.join(_MAX_SHUTDOWN)
     return not opening.is_alive() and all(node.close(end - stop.now()) for node in opened)
 
 
-def _leave() -> None:
-    """End the process though a thread is stuck in the network, which a regular exit would wait for."""
+def _exit_now() -> None:
+    """End the process; a regular exit would wait for the thread that is stuck in the network."""
     import logging
     import os
     import sys
@@ -184,8 +180,3 @@ def _leave() -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
-
-
-def _check(option: str, name: str | None, known: Iterable[str]) -> None:
-    if name is not None and name not in known:
-        raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")

@@ -1,4 +1,4 @@
-"""Ending on SIGINT and SIGTERM without leaving anything half done."""
+"""A request to end, made by SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from collections.abc import Iterator
 
 
 class Stop:
-    """Becomes true once, from a signal handler or any thread, and wakes whoever waits.
+    """Request to end, set once from a signal handler or any thread; it wakes the thread that waits.
 
-    It is no :class:`threading.Event`, for setting one of those in a signal handler can deadlock with a wait of the
-    interrupted thread; a byte through a pipe cannot.
+    No :class:`threading.Event`: setting one in a signal handler can deadlock with a wait of the interrupted thread.
+    Writing a byte to a pipe cannot.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Stop:
             os.write(self._write, b".")
 
     def now(self) -> float:
-        """Seconds, steady."""
+        """Return the steady clock, seconds."""
         return time.monotonic()
 
     def wait(self, seconds: float) -> bool:

@@ -1,4 +1,4 @@
-"""``coview-stream simulate``: make a world on disk."""
+"""``coview-stream simulate``: a simulated world on disk."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from coview_stream.errors import ConfigError
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
 
-# an offset such as UTM coordinates have
-_UTM = (412_000.0, 5_318_000.0, 240.0)
+_UTM = (412_000.0, 5_318_000.0, 240.0)  # metres; an offset such as UTM coordinates have
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("--utm and --origin: give one of them")
     if not 0.0 <= args.drift <= 20.0:
         raise ConfigError(f"drift: {args.drift!r} is out of range; use 0 to 20")
-    usual = OdometryConfig()
+    drift = OdometryConfig()
     config = SimulationConfig(
         scene=args.scene,
         sensor=args.sensor,
@@ -56,10 +55,10 @@ def run(args: argparse.Namespace) -> int:
         changed=args.changed,
         origin=_UTM if args.utm else tuple(args.origin or (0.0, 0.0, 0.0)),
         odometry=OdometryConfig(
-            yaw_walk=args.drift * usual.yaw_walk,
-            scale_error=args.drift * usual.scale_error,
-            position_walk=args.drift * usual.position_walk,
-            tilt_noise=args.drift * usual.tilt_noise,
+            yaw_walk=args.drift * drift.yaw_walk,
+            scale_error=args.drift * drift.scale_error,
+            position_walk=args.drift * drift.position_walk,
+            tilt_noise=args.drift * drift.tilt_noise,
         ),
     )
     progress = args.progress or sys.stderr.isatty()

@@ -1,6 +1,6 @@
-"""``coview-stream train``: train the encoders of learned re-localization anew, on simulated worlds.
+"""``coview-stream train``: training of the encoders of learned re-localization, on simulated worlds.
 
-Two cores take about an hour: a third to simulate, the rest to train, and 2 GB. One that was interrupted goes on.
+Two cores take about an hour, a third of it to simulate, and 2 GB. A training that was interrupted goes on.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``coview-stream watch``: see poses live, as a table, as JSON lines or in a viewer."""
+"""``coview-stream watch``: poses live, as a table, as JSON lines or in a viewer."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from coview_stream.cli.options import add_client_network
 from coview_stream.errors import ConfigError, MessageError
 
 if TYPE_CHECKING:
@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 
 HELP = "see robots' poses live: a table, JSON lines, or a viewer"
 
-_PATIENCE = 3.0  # seconds without a message after which watch says where it is listening
-_REDRAW = 0.5  # seconds, on a terminal
-_LINE = 1.0  # seconds between lines where there is none
-_KEPT = 10_000  # samples waiting for a slow reader of our output
+# all set by hand
+_SILENCE = 3.0  # seconds without a first message after which the keys and endpoints are printed
+_REDRAW_PERIOD = 0.5  # seconds, on a terminal
+_PRINT_PERIOD = 1.0  # seconds, elsewhere
+_MAX_QUEUED = 10_000  # samples waiting for a slow reader of our output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,12 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)"
     )
-    parser.add_argument(
-        "--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)"
-    )
-    parser.add_argument("--listen", action="append", metavar="EP", help="endpoint to be connected to on")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
-    parser.add_argument("--base", default="coview", help="first part of the keys (coview)")
+    add_client_network(parser)
     parser.add_argument(
         "--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson; needs --robot (native)"
     )
@@ -56,37 +52,46 @@ def run(args: argparse.Namespace) -> int:
 
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
-    sources = _sources(args)
+    topics = _topics(args)
     show_pose = _viewer() if args.rerun else lambda pose: None
     transport = open_client(args.connect, args.listen, args.config)
     try:
         with stop_on_signals() as stop:
-            watch = _Watch(args, FleetTable(), sources, show_pose, transport)
-            watch.until(stop, None if args.seconds is None else time.monotonic() + args.seconds)
+            watch = _Watch(args, FleetTable(), topics, show_pose, transport)
+            watch.run(stop, None if args.seconds is None else time.monotonic() + args.seconds)
     finally:
         transport.close()
     return 0
 
 
-class _Source:
-    """What one key expression carries, and how to read it."""
+class _Topic(NamedTuple):
+    """One key expression to subscribe to.
 
-    def __init__(self, key: str, poses: bool, robot: str | None = None, hint: str | None = None) -> None:
-        self.key, self.poses, self.robot, self.hint = key, poses, robot, hint
+    Attributes:
+        key: the expression.
+        poses: it carries poses; else statuses.
+        robot: whose; None if the keys of the samples say.
+        hint: codec of poses without an Encoding; None if there is no such rule.
+    """
+
+    key: str
+    poses: bool
+    robot: str | None = None
+    hint: str | None = None
 
 
-def _sources(args: argparse.Namespace) -> list[_Source]:
+def _topics(args: argparse.Namespace) -> list[_Topic]:
     from coview_stream.stream.transport.key_expressions import check_prefix
     from coview_stream.stream.transport.keys import robot_keys
 
     if args.robot:
         keys = [robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)]
-        poses = [_Source(k.pose, True, k.robot, k.pose_hint) for k in keys]
-        return poses + [_Source(k.status, False, k.robot) for k in keys]
+        poses = [_Topic(k.pose, True, k.robot, k.pose_hint) for k in keys]
+        return poses + [_Topic(k.status, False, k.robot) for k in keys]
     if args.preset != "native":
         raise ConfigError(f"--preset {args.preset} has no key for all robots' poses: name them with --robot")
     base = check_prefix(args.base, "--base")
-    return [_Source(f"{base}/*/out/pose", True), _Source(f"{base}/*/out/status", False)]
+    return [_Topic(f"{base}/*/out/pose", True), _Topic(f"{base}/*/out/status", False)]
 
 
 def _viewer() -> Callable[[PoseMessage], None]:
@@ -96,82 +101,81 @@ def _viewer() -> Callable[[PoseMessage], None]:
 
 
 class _Watch:
-    """Takes samples from the network's threads and shows them on this one."""
+    """Display of samples on this thread; the network's threads deliver them."""
 
     def __init__(
         self,
         args: argparse.Namespace,
         fleet: FleetTable,
-        sources: list[_Source],
+        topics: list[_Topic],
         show_pose: Callable[[PoseMessage], None],
         transport: Transport,
     ) -> None:
         from coview_stream.stream.client.client import LatestQueue
 
-        self._args, self._fleet, self._sources = args, fleet, sources
+        self._args, self._fleet, self._topics = args, fleet, topics
         self._show_pose, self._transport = show_pose, transport
-        self._box: LatestQueue[tuple[float, _Source, Sample]] = LatestQueue(_KEPT)
+        self._queue: LatestQueue[tuple[float, _Topic, Sample]] = LatestQueue(_MAX_QUEUED)
         self._terminal = sys.stdout.isatty() and not args.json
-        self._drawn = 0  # lines of the table on the terminal
-        self._complained: set[str] = set()
+        self._lines_drawn = 0  # of the table on the terminal
+        self._unreadable_keys: set[str] = set()
         self._depth = len(args.base.split("/"))
-        for source in sources:
-            transport.subscribe(source.key, self._receiver(source), "all")
+        for topic in topics:
+            transport.subscribe(topic.key, self._receiver(topic), "all")
 
-    def until(self, stop: Stop, end: float | None) -> None:
-        """Show until told to stop, or until ``end`` on the steady clock."""
-        period = _REDRAW if self._terminal else _LINE
+    def run(self, stop: Stop, end: float | None) -> None:
+        """Show samples until told to stop, or until ``end`` on the steady clock."""
+        period = _REDRAW_PERIOD if self._terminal else _PRINT_PERIOD
         started = time.monotonic()
-        redraw, patience, heard = started + period, started + _PATIENCE, False
+        redraw, silent_until, heard = started + period, started + _SILENCE, False
         while not stop.requested and (end is None or time.monotonic() < end):
-            item = self._box.get(timeout=0.1)
+            item = self._queue.get(timeout=0.1)
             if item is not None:
                 heard = True
-                self._take(*item)
+                self._show(*item)
             now = time.monotonic()
-            if not heard and now > patience:
-                self._say_where()
-                patience = float("inf")
+            if not heard and now > silent_until:
+                self._print_silence()
+                silent_until = float("inf")
             if now >= redraw and not self._args.json:
                 self._draw(now)
                 redraw = now + period
-        if self._box.dropped:
-            print(f"{self._box.dropped} messages were not shown: the output is too slow", file=sys.stderr)
+        if self._queue.dropped:
+            print(f"{self._queue.dropped} messages were not shown: the output is too slow", file=sys.stderr)
 
-    def _receiver(self, source: _Source) -> Callable[[Sample], None]:
-        return lambda sample: self._box.put((time.monotonic(), source, sample))
+    def _receiver(self, topic: _Topic) -> Callable[[Sample], None]:
+        return lambda sample: self._queue.put((time.monotonic(), topic, sample))
 
-    def _take(self, arrived: float, source: _Source, sample: Sample) -> None:
+    def _show(self, arrived: float, topic: _Topic, sample: Sample) -> None:
+        read = self._pose if topic.poses else self._status
         try:
-            record = (
-                self._pose(arrived, source, sample) if source.poses else self._status(arrived, source, sample)
-            )
+            record = read(arrived, topic, sample)
         except MessageError as error:
-            if sample.key not in self._complained:  # once per key: it would come ten times a second
-                self._complained.add(sample.key)
+            if sample.key not in self._unreadable_keys:  # once per key: it would come ten times a second
+                self._unreadable_keys.add(sample.key)
                 print(f"cannot be read: {error}", file=sys.stderr)
             return
         if self._args.json:
             print(json.dumps({"key": sample.key, **record}), flush=True)
 
-    def _pose(self, arrived: float, source: _Source, sample: Sample) -> dict[str, Any]:
+    def _pose(self, arrived: float, topic: _Topic, sample: Sample) -> dict[str, Any]:
         from coview_stream.messages import decode_pose
         from coview_stream.messages.json_messages import pose_record
 
-        pose = replace(decode_pose(sample, hint=source.hint), robot=self._name(source, sample))
+        pose = replace(decode_pose(sample, hint=topic.hint), robot=self._robot(topic, sample))
         self._fleet.add_pose(pose, arrived)
         self._show_pose(pose)
         return pose_record(pose, sample)
 
-    def _status(self, arrived: float, source: _Source, sample: Sample) -> dict[str, Any]:
+    def _status(self, arrived: float, topic: _Topic, sample: Sample) -> dict[str, Any]:
         from coview_stream.messages.json_messages import read_status
 
         status = read_status(sample)
-        self._fleet.add_status(self._name(source, sample), status, arrived)
+        self._fleet.add_status(self._robot(topic, sample), status, arrived)
         return status
 
-    def _name(self, source: _Source, sample: Sample) -> str:
-        return source.robot or sample.key.split("/")[self._depth]
+    def _robot(self, topic: _Topic, sample: Sample) -> str:
+        return topic.robot or sample.key.split("/")[self._depth]
 
     def _draw(self, now: float) -> None:
         if not self._terminal:
@@ -180,20 +184,19 @@ class _Watch:
             return
         width = shutil.get_terminal_size().columns
         lines = [line[: width - 1] for line in self._fleet.table(now)]
-        back = f"\x1b[{self._drawn}F" if self._drawn else ""
+        back = f"\x1b[{self._lines_drawn}F" if self._lines_drawn else ""
         print(f"{back}\x1b[J" + "\n".join(lines), flush=True)
-        self._drawn = len(lines)
+        self._lines_drawn = len(lines)
 
-    def _say_where(self) -> None:
+    def _print_silence(self) -> None:
+        """Print the keys, the connections and the endpoints to which nothing has come."""
+        from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
+
         connection = self._transport.connection()
         count = len(connection.routers) + len(connection.peers)
-        whom = f"connected to {count} other(s)" if count else "connected to nobody"
-        at = ", ".join(self._args.connect or self._args.listen or [str(self._args.config or "")])
-        keys = ", ".join(source.key for source in self._sources)
-        print(f"nothing yet on {keys}; {whom} ({at or _default()})", file=sys.stderr, flush=True)
-
-
-def _default() -> str:
-    from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
-
-    return DEFAULT_ENDPOINT
+        connected = f"connected to {count} other(s)" if count else "not connected"
+        at = ", ".join(
+            self._args.connect or self._args.listen or [str(self._args.config or DEFAULT_ENDPOINT)]
+        )
+        keys = ", ".join(topic.key for topic in self._topics)
+        print(f"nothing yet on {keys}; {connected} ({at})", file=sys.stderr, flush=True)

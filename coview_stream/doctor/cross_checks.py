@@ -1,4 +1,4 @@
-"""A robot's clouds and odometry beside each other, and the node beside both."""
+"""Checks of a robot's clouds against its odometry, and of the node against both."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.doctor.capture import Heard, Seen
+from coview_stream.doctor.capture import CapturedMessage, RobotCapture
 from coview_stream.doctor.finding import Finding
 from coview_stream.messages.types import CloudMessage, OdometryMessage
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
@@ -19,31 +19,33 @@ from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.frame_sync import FrameSync
 from coview_stream.version import __version__
 
-_LAG = 1.0  # seconds that a cloud may come after the odometry of its stamp; drivers take 0.05 to 0.3
+_MAX_LAG = 1.0  # seconds of a cloud after the odometry of its stamp, set by hand; drivers take 0.05 to 0.3
 _YEAR = 3.2e7  # seconds
-_LEAPS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
-_EVENTS = ("out_of_order", "duplicate", "no_odometry", "late")
+_MIN_PAIRED = 0.9  # share of the clouds that find odometry, set by hand
+_MAX_STATUS_AGE = 5.0  # seconds, set by hand; a node publishes one every second
+_LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
+_DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 
 
-def together_findings(heard: Heard) -> Iterator[Finding]:
-    """Whether both are on one clock, and how many clouds would find their odometry."""
-    clouds = [s for s in heard.clouds if s.stamp_ns is not None]
-    odometry = [s for s in heard.odometry if s.stamp_ns is not None]
+def cross_findings(capture: RobotCapture) -> Iterator[Finding]:
+    """Judge whether both are on one clock, and how many clouds find their odometry."""
+    clouds = [m for m in capture.clouds if m.stamp_ns is not None]
+    odometry = [m for m in capture.odometry if m.stamp_ns is not None]
     if not clouds or not odometry:
         return
-    clock = clock_finding(clouds, odometry, heard.keys.robot)
+    clock = clock_finding(clouds, odometry, capture.keys.robot)
     yield clock
     if clock.verdict != "FAIL":
-        yield pairing_finding(clouds, odometry, heard.ended, heard.keys.robot)
+        yield pairing_finding(clouds, odometry, capture.ended, capture.keys.robot)
 
 
-def clock_finding(clouds: list[Seen], odometry: list[Seen], robot: str) -> Finding:
-    """Compare how far stamps are from the time of arrival."""
+def clock_finding(clouds: list[CapturedMessage], odometry: list[CapturedMessage], robot: str) -> Finding:
+    """Compare the distances of both channels' stamps from their times of arrival."""
     ahead = _offset(odometry) - _offset(clouds)
     size = abs(ahead)
     found = f"odometry stamps are {_seconds(size)} {'ahead of' if ahead > 0 else 'behind'} the clouds'"
     horizon, wait = NodeConfig().odometry_history, NodeConfig().pairing_wait
-    if -wait <= ahead <= _LAG:
+    if -wait <= ahead <= _MAX_LAG:
         return Finding("ok", "one clock", found, robot=robot)
     if 0 < ahead < horizon:
         remedy = "poses come all the same; a slow lidar driver, or two clocks: put both on one"
@@ -51,64 +53,68 @@ def clock_finding(clouds: list[Seen], odometry: list[Seen], robot: str) -> Findi
     remedy = "put both on one clock"
     if size > _YEAR:
         remedy += "; one counts from 1970, the other from when it was switched on"
-    elif (leap := _LEAPS.get(round(size))) and abs(size - round(size)) < 0.4:
+    elif (leap := _LEAP_SECONDS.get(round(size))) and abs(size - round(size)) < 0.4:
         remedy += f"; this looks like {leap}"
     return Finding("FAIL", "one clock", found, remedy, robot)
 
 
-def _offset(seen: list[Seen]) -> float:
-    """Stamp less arrival, seconds, of the typical message."""
-    first = seen[0].stamp_ns or 0
-    return first * 1e-9 + statistics.median(((s.stamp_ns or 0) - first) * 1e-9 - s.arrived for s in seen)
+def _offset(messages: list[CapturedMessage]) -> float:
+    """Return the median of stamp less arrival, seconds."""
+    first = messages[0].stamp_ns or 0
+    return first * 1e-9 + statistics.median(((m.stamp_ns or 0) - first) * 1e-9 - m.arrived for m in messages)
 
 
 def _seconds(value: float) -> str:
     return f"{value:.3g} s" if value >= 100 else f"{value:.2f} s"
 
 
-def pairing_finding(clouds: list[Seen], odometry: list[Seen], ended: float, robot: str) -> Finding:
-    """Play the messages to the node's own pairing, in order of arrival, and see what becomes of the clouds."""
+def pairing_finding(
+    clouds: list[CapturedMessage], odometry: list[CapturedMessage], ended: float, robot: str
+) -> Finding:
+    """Pass the messages to the node's own pairing, in order of arrival, and judge what becomes of the clouds."""
     config, counters = NodeConfig(odometry_history=60.0), Counters()
     buffer = OdometryBuffer(config)
     pairing = FrameSync(config, buffer, counters)
-    # what was under way when listening began or ended says nothing
-    first = min(s.stamp_ns or 0 for s in odometry)
-    clouds = [s for s in clouds if (s.stamp_ns or 0) >= first and s.arrived <= ended - config.pairing_wait]
+    # clouds whose odometry came before the capture began or after it ended are not judged
+    first = min(m.stamp_ns or 0 for m in odometry)
+    clouds = [m for m in clouds if (m.stamp_ns or 0) >= first and m.arrived <= ended - config.pairing_wait]
     if not clouds:
         return Finding("warn", "pairing", "too few clouds to say", "listen longer: --seconds 10", robot)
-    intake: dict[SampleKind, int] = dict.fromkeys(SampleKind, 0)
+    kinds: dict[SampleKind, int] = dict.fromkeys(SampleKind, 0)
     paired = 0
-    for seen in heapq.merge(odometry, clouds, key=lambda s: s.arrived):
-        if seen.T_odom_body is not None:
-            intake[buffer.add(OdometryMessage(seen.stamp_ns or 0, seen.T_odom_body), seen.arrived)] += 1
+    for message in heapq.merge(odometry, clouds, key=lambda m: m.arrived):
+        if message.T_odom_body is not None:
+            kinds[
+                buffer.add(OdometryMessage(message.stamp_ns or 0, message.T_odom_body), message.arrived)
+            ] += 1
         else:
-            pairing.add(_outline(seen), seen.arrived)
-        paired += sum(1 for _ in pairing.paired(seen.arrived))
+            pairing.add(_without_points(message), message.arrived)
+        paired += sum(1 for _ in pairing.paired(message.arrived))
     paired += sum(1 for _ in pairing.paired(ended + config.pairing_wait))
     found = f"{paired} of {len(clouds)} clouds find odometry around their stamps"
-    lost = [f"{getattr(counters, name)} {name}" for name in _EVENTS if getattr(counters, name)]
-    if lost:
-        found += f" ({', '.join(lost)})"
-    if jumps := intake[SampleKind.JUMP]:
+    dropped = [f"{getattr(counters, name)} {name}" for name in _DROP_COUNTERS if getattr(counters, name)]
+    if dropped:
+        found += f" ({', '.join(dropped)})"
+    if jumps := kinds[SampleKind.JUMP]:
         found += f"; odometry jumps {jumps} times"
         remedy = "two senders of odometry, or one that starts anew: after each jump the robot is LOST"
         return Finding("FAIL", "pairing", found, remedy, robot)
     if paired < len(clouds) / 2:
         remedy = "send odometry before the cloud that it belongs to, 20 to 100 a second, on the same clock"
         return Finding("FAIL", "pairing", found, remedy, robot)
-    return Finding("ok" if paired >= 0.9 * len(clouds) else "warn", "pairing", found, robot=robot)
+    return Finding("ok" if paired >= _MIN_PAIRED * len(clouds) else "warn", "pairing", found, robot=robot)
 
 
-def _outline(seen: Seen) -> CloudMessage:
-    """Return a cloud without points: pairing looks at stamps only."""
-    times = None if seen.sweep is None else np.array(seen.sweep)
-    return CloudMessage(seen.stamp_ns or 0, np.zeros((0, 3), np.float32), times)
+def _without_points(captured: CapturedMessage) -> CloudMessage:
+    """Return a cloud of the same stamp without points: pairing reads stamps only."""
+    times = None if captured.sweep is None else np.array(captured.sweep)
+    return CloudMessage(captured.stamp_ns or 0, np.zeros((0, 3), np.float32), times)
 
 
-def node_finding(heard: Heard, sha256: str | None, now_ns: int | None = None) -> Finding:
-    """Whether a node serves the robot, and what it says; ``sha256`` of the map it should have, None for any."""
-    robot, status = heard.keys.robot, heard.status
-    if status is None and not heard.alive:
+def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None = None) -> Finding:
+    """Judge whether a node serves the robot, and its status; ``sha256`` of the map it should have, None for any."""
+    robot, status = capture.keys.robot, capture.status
+    if status is None and not capture.alive:
         return Finding(
             "warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot
         )
@@ -117,7 +123,7 @@ def node_finding(heard: Heard, sha256: str | None, now_ns: int | None = None) ->
         return Finding("warn", "node", "alive, but says nothing", remedy, robot)
     found = f"{_text(status, 'state')}: {_text(status, 'reason') or 'no reason given'}"
     found += f", version {_text(status, 'version')}, map {_text(status, 'map_sha256')[:12]}"
-    if not heard.alive:
+    if not capture.alive:
         return Finding(
             "warn", "node", f"{found}; no liveliness token", "do access rules let it hold one?", robot
         )
@@ -130,13 +136,13 @@ def node_finding(heard: Heard, sha256: str | None, now_ns: int | None = None) ->
             "warn", "node", f"{found}, here {__version__}", "run the same version on both sides", robot
         )
     behind = ((time.time_ns() if now_ns is None else now_ns) - _number(status, "stamp_ns")) * 1e-9
-    if behind > 5.0:
+    if behind > _MAX_STATUS_AGE:
         return Finding(
             "warn", "node", f"{found}; {_seconds(behind)} old", "its clock, or this one, is wrong", robot
         )
     errors = status.get("errors")
     if isinstance(errors, list) and errors:
-        return Finding("warn", "node", f"{found}; complains: {str(errors[-1])[:200]}", robot=robot)
+        return Finding("warn", "node", f"{found}; reports: {str(errors[-1])[:200]}", robot=robot)
     return Finding("ok", "node", found, robot=robot)
 
 

@@ -1,4 +1,4 @@
-"""Who else is on the network: robots by their keys, ROS topics by the liveliness tokens of bridge and rmw_zenoh."""
+"""Discovery of clouds and odometry on the network: by keys of samples, by liveliness tokens of ROS publishers."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _KEYS = (
     "**/@v0/*/pubsub/point_cloud/**",
     "**/@v0/*/pubsub/frame_transform/odometry/**",
 )
-_MOST = 3  # suggestions in one line
-_KEPT = 200  # different offers: a large site has more, and nobody reads them
+_MAX_SUGGESTED = 3  # candidates in one line, set by hand
+_MAX_CANDIDATES = 200  # set by hand; a large site has more than anyone reads
 
 
 @dataclass(frozen=True, order=True)
-class Offer:
-    """Clouds or odometry that could be had.
+class Candidate:
+    """Clouds or odometry that a robot could be served from.
 
     Attributes:
         channel: ``cloud`` or ``odometry``.
         where: key or topic.
-        options: of ``serve`` and ``doctor`` to get at it.
+        options: options of ``serve`` and ``doctor`` that subscribe to it.
     """
 
     channel: str
@@ -42,18 +42,18 @@ class Offer:
     options: str
 
 
-def look(
+def discover(
     transport: Transport, seconds: float = 2.0, wait: Callable[[float], object] = time.sleep
-) -> list[Offer]:
-    """Listen for ``seconds``, ask for tokens, and return what there is, sorted.
+) -> list[Candidate]:
+    """Return the clouds and odometry on the network, sorted.
 
-    Subscribes to keys of all robots, so clouds of all of them come here for the time.
+    Listens for ``seconds`` to the keys of all robots, whose clouds all come here meanwhile, then asks for tokens.
     """
-    found: set[Offer] = set()
+    found: set[Candidate] = set()
 
-    def add(offer: Offer | None) -> None:
-        if offer is not None and len(found) < _KEPT:
-            found.add(offer)
+    def add(candidate: Candidate | None) -> None:
+        if candidate is not None and len(found) < _MAX_CANDIDATES:
+            found.add(candidate)
 
     for key in _KEYS:
         transport.subscribe(key, lambda sample: add(from_key(sample.key)), "newest")
@@ -64,18 +64,20 @@ def look(
     return sorted(found)
 
 
-def suggestion(offers: Iterable[Offer], channel: str) -> str:
-    """Where else clouds or odometry come, with the options that would take them; empty if nowhere."""
-    fitting = [offer for offer in offers if offer.channel == channel]
+def suggestion(candidates: Iterable[Candidate], channel: str) -> str:
+    """Name the candidates of a channel, with the options that subscribe to them; empty if there are none."""
+    fitting = [candidate for candidate in candidates if candidate.channel == channel]
     if not fitting:
         return ""
     what = "clouds come" if channel == "cloud" else "odometry comes"
-    listed = "; ".join(f"on {offer.where}: try {offer.options}" for offer in fitting[:_MOST])
-    more = f"; and {len(fitting) - _MOST} more" if len(fitting) > _MOST else ""
+    listed = "; ".join(
+        f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_SUGGESTED]
+    )
+    more = f"; and {len(fitting) - _MAX_SUGGESTED} more" if len(fitting) > _MAX_SUGGESTED else ""
     return f"{what} {listed}{more}"
 
 
-def from_token(token: str) -> Offer | None:
+def from_token(token: str) -> Candidate | None:
     """Read a publisher's liveliness token; None for any other.
 
     rmw_zenoh: ``@ros2_lv/<domain>/<zid>/<nid>/<eid>/MP/<enclave>/<ns>/<node>/<topic>/<type>/<hash>/<qos>``, a '/' in
@@ -84,54 +86,56 @@ def from_token(token: str) -> Offer | None:
     parts = token.split("/")
     if parts[0] == "@ros2_lv" and len(parts) >= 12 and parts[5] == "MP" and parts[10] in _DDS:
         topic = parts[9].replace("%", "/").strip("/")
-        return _ros("rmw_zenoh", _DDS[parts[10]], topic, parts[1], f"/{parts[10]}/*")
+        return _ros_topic("rmw_zenoh", _DDS[parts[10]], topic, parts[1], f"/{parts[10]}/*")
     if parts[0] == "@" and len(parts) >= 6 and parts[2:4] == ["@ros2_lv", "MP"]:
         topic, kind = (part.replace("\xa7", "/").strip("/") for part in parts[4:6])
         channel = next((channel for channel, name in _TYPES.items() if name == kind), None)
-        return _ros("ros2dds", channel, topic) if channel else None
+        return _ros_topic("ros2dds", channel, topic) if channel else None
     return None
 
 
-def from_key(key: str) -> Offer | None:
+def from_key(key: str) -> Candidate | None:
     """Read the key of a sample; None if no preset has such keys."""
     parts = key.split("/")
     if len(parts) >= 4 and parts[-2] == "in":
         channel = {"cloud": "cloud", "odom": "odometry"}.get(parts[-1])
-        return _plain("native", channel, key, parts[-3], "/".join(parts[:-3])) if channel else None
+        return _named("native", channel, key, parts[-3], "/".join(parts[:-3])) if channel else None
     if len(parts) >= 4 and parts[-2] in _DDS:
-        return _ros("rmw_zenoh", _DDS[parts[-2]], "/".join(parts[1:-2]), parts[0], f"/{parts[-2]}/*")
+        return _ros_topic("rmw_zenoh", _DDS[parts[-2]], "/".join(parts[1:-2]), parts[0], f"/{parts[-2]}/*")
     if "@v0" in parts[1:] and len(parts) >= (at := parts.index("@v0")) + 4:
         channel = "cloud" if parts[at + 3] == "point_cloud" else "odometry"
-        return _plain("keelson", channel, key, parts[at + 1], "/".join(parts[:at]))
+        return _named("keelson", channel, key, parts[at + 1], "/".join(parts[:at]))
     if parts[-1] in ("points", "odom") and len(parts) > 1:
-        return _ros("ros2dds", "cloud" if parts[-1] == "points" else "odometry", key)
+        return _ros_topic("ros2dds", "cloud" if parts[-1] == "points" else "odometry", key)
     return None
 
 
-def _plain(preset: str, channel: str, key: str, robot: str, base: str) -> Offer | None:
+def _named(preset: str, channel: str, key: str, robot: str, base: str) -> Candidate | None:
     options = f"--robot {robot}" + (f" --base {base}" if base != "coview" else "")
-    return _checked(
+    return _valid(
         preset, channel, key, options if preset == "native" else f"--preset {preset} {options}", robot, base
     )
 
 
-def _ros(preset: str, channel: str, topic: str, domain: str = "0", ending: str = "") -> Offer | None:
-    """Return the offer of a ROS topic: by the preset where its name is the preset's, else by an explicit key."""
+def _ros_topic(
+    preset: str, channel: str, topic: str, domain: str = "0", ending: str = ""
+) -> Candidate | None:
+    """Return the candidate of a ROS topic: by the preset where its name is the preset's, else by an explicit key."""
     more = f" --domain {domain}" if domain != "0" else ""
     robot, _, rest = topic.partition("/")
     if rest == {"cloud": "points", "odometry": "odom"}[channel]:
-        return _checked(preset, channel, f"/{topic}", f"--preset {preset} --robot {robot}{more}", robot)
+        return _valid(preset, channel, f"/{topic}", f"--preset {preset} --robot {robot}{more}", robot)
     key = f"{{domain}}/{topic}{ending}" if ending else topic
     option = "--cloud-key" if channel == "cloud" else "--odometry-key"
-    return Offer(channel, f"/{topic}", f"--preset {preset}{more} {option} '{key}'")
+    return Candidate(channel, f"/{topic}", f"--preset {preset}{more} {option} '{key}'")
 
 
-def _checked(
+def _valid(
     preset: str, channel: str, where: str, options: str, robot: str, base: str = "coview"
-) -> Offer | None:
-    """Return the offer, unless its names are none that we could be told."""
+) -> Candidate | None:
+    """Return the candidate; None if its names are none that the options accept."""
     try:
         robot_keys(preset, base, robot)
     except ConfigError:
         return None
-    return Offer(channel, where, options)
+    return Candidate(channel, where, options)

@@ -1,4 +1,4 @@
-"""One thing that was looked at, what was found, and what to do about it."""
+"""Findings of the doctor: what was checked, what is the case, and what to do about it."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from coview_stream.stream.client.fleet import printable
 
 Verdict = Literal["ok", "warn", "FAIL"]
 
-_VERDICT, _WHAT = 4, 22  # widths of the first columns
+_VERDICT_WIDTH, _WHAT_WIDTH = 4, 22  # characters of the first columns
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a checkup.
+    """Result of one check.
 
     Attributes:
         verdict: ``ok``; ``warn``: it works, but less well or not for everything; ``FAIL``: it will not work.
-        what: was looked at.
+        what: what was checked.
         found: what is the case.
         remedy: what to do; may be empty.
-        robot: whom it concerns; None if all.
+        robot: name of the robot; None if it concerns all.
     """
 
     verdict: Verdict
@@ -32,13 +32,15 @@ class Finding:
     robot: str | None = None
 
     def line(self) -> str:
-        """One printable line, whatever came from the network."""
+        """Return one printable line, without control characters that came from the network."""
         what = f"{self.robot} {self.what}" if self.robot else self.what
         remedy = f"  ({self.remedy})" if self.remedy else ""
-        return printable(f"{self.verdict:<{_VERDICT}}  {what:<{_WHAT}}  {self.found}{remedy}").rstrip()
+        return printable(
+            f"{self.verdict:<{_VERDICT_WIDTH}}  {what:<{_WHAT_WIDTH}}  {self.found}{remedy}"
+        ).rstrip()
 
     def to_json(self) -> dict[str, str | None]:
-        """Plain data."""
+        """Return plain data, for JSON."""
         return {
             "verdict": self.verdict,
             "robot": self.robot,
@@ -49,11 +51,11 @@ class Finding:
 
 
 def from_error(what: str, error: Exception | str, robot: str | None = None) -> Finding:
-    """FAIL with an error's message; messages of this library end with the remedy, after a semicolon."""
+    """Return a FAIL with an error's message; this package's messages end with the remedy, after a semicolon."""
     found, _, remedy = " ".join(str(error).split()).partition("; ")
     return Finding("FAIL", what, found, remedy, robot)
 
 
 def failed(findings: Iterable[Finding]) -> bool:
-    """Whether anything will not work."""
+    """Return whether any finding is a FAIL."""
     return any(finding.verdict == "FAIL" for finding in findings)

@@ -1,4 +1,4 @@
-"""The machine: Python, processor, memory, and the libraries that do the work."""
+"""Checks of the machine: Python, processor, memory, and the libraries that do the work."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from coview_stream.doctor.finding import Finding
 from coview_stream.doctor.probes import probe
 
 GB = 1e9
-LEAST_MEMORY = 0.6 * GB
-"""Bytes: a node is three processes of 0.17 GB each (two engines measured, before any search), and some to spare."""
+MIN_MEMORY = 0.6 * GB
+"""Bytes, set by hand: a node is three processes of 0.17 GB each before any search, and some to spare."""
 
-_OLDEST_ZENOH = (1, 10)
+_MIN_ZENOH = (1, 10)
 
 
 def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterator[Finding]:
-    """Look at the machine; takes some seconds, for the kernels are compiled."""
+    """Judge the machine; takes some seconds: the kernels are compiled."""
     yield python_finding(sys.version_info[:3])
     yield processor_finding(_model(), cores(), _quota())
     total, available = memory()
@@ -35,7 +35,7 @@ def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterato
 
 
 def python_finding(version: tuple[int, ...]) -> Finding:
-    """Look at the interpreter's version."""
+    """Judge the interpreter's version."""
     text = f"{'.'.join(map(str, version))}, {platform.system()} {platform.machine()}"
     if (3, 11) <= version[:2] < (3, 14):
         return Finding("ok", "python", text)
@@ -45,7 +45,7 @@ def python_finding(version: tuple[int, ...]) -> Finding:
 
 
 def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
-    """Look at ``cores`` that we may run on, ``quota`` of which a container grants at a time (None: all)."""
+    """Judge ``cores`` that we may run on, ``quota`` of which a container grants at a time (None: all)."""
     text = f"{model}, {cores} core{'s' if cores != 1 else ''} to use"
     if quota is not None and quota < cores:
         text += f", {quota:g} of them at a time (container limit)"
@@ -58,19 +58,19 @@ def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
 
 
 def memory_finding(total: int | None, available: int | None) -> Finding:
-    """Look at the memory in bytes; None is unknown."""
+    """Judge the memory in bytes; None is unknown."""
     if total is None or available is None:
         return Finding("ok", "memory", "unknown on this system")
     text = f"{available / GB:.1f} GB of {total / GB:.1f} GB available"
-    if available < LEAST_MEMORY:
+    if available < MIN_MEMORY:
         return Finding(
-            "warn", "memory", text, f"a node needs {LEAST_MEMORY / GB:g} GB and more: end other programs"
+            "warn", "memory", text, f"a node needs {MIN_MEMORY / GB:g} GB and more: end other programs"
         )
     return Finding("ok", "memory", text)
 
 
 def blas_finding(threads: str) -> Finding:
-    """Look at what ``OPENBLAS_NUM_THREADS`` says."""
+    """Judge what ``OPENBLAS_NUM_THREADS`` says."""
     text = f"OPENBLAS_NUM_THREADS={threads}" if threads else "OPENBLAS_NUM_THREADS is not set"
     if threads == "1":
         return Finding("ok", "BLAS threads", text)
@@ -79,7 +79,7 @@ def blas_finding(threads: str) -> Finding:
 
 
 def kernels_finding(found: dict[str, Any], forced: bool) -> Finding:
-    """Look at the backend of the kernels; ``forced``: ``COVIEW_KERNELS`` is set."""
+    """Judge the backend of the kernels; ``forced``: ``COVIEW_KERNELS`` is set."""
     if "error" in found:
         remedy = "COVIEW_KERNELS=numpy does without, but is slower; reinstall taichi"
         if forced:
@@ -97,11 +97,11 @@ def kernels_finding(found: dict[str, Any], forced: bool) -> Finding:
 
 
 def zenoh_finding(found: dict[str, Any]) -> Finding:
-    """Look at zenoh, which all live commands need."""
+    """Judge zenoh, which all live commands need."""
     if "error" in found:
         return Finding("FAIL", "zenoh", str(found["error"]), "`pip install 'eclipse-zenoh>=1.10'`")
     parts = str(found["version"]).split(".")[:2]
-    if all(p.isdigit() for p in parts) and tuple(map(int, parts)) < _OLDEST_ZENOH:
+    if all(p.isdigit() for p in parts) and tuple(map(int, parts)) < _MIN_ZENOH:
         return Finding(
             "warn", "zenoh", str(found["version"]), "tested with 1.10 and newer: upgrade eclipse-zenoh"
         )
@@ -109,7 +109,7 @@ def zenoh_finding(found: dict[str, Any]) -> Finding:
 
 
 def codecs_finding(found: dict[str, Any]) -> Finding:
-    """Look at what reading ROS 2, Foxglove and keelson messages needs."""
+    """Judge what reading ROS 2, Foxglove and keelson messages needs."""
     missing = [found["error"]] if "error" in found else found["missing"]
     if missing:
         text = f"cannot be read: {', '.join(missing)}"
@@ -118,7 +118,7 @@ def codecs_finding(found: dict[str, Any]) -> Finding:
 
 
 def open3d_finding(found: dict[str, Any]) -> Finding:
-    """Look at Open3D: normals and outliers of maps to be built, and ray casting in simulated worlds."""
+    """Judge Open3D: normals and outliers of maps to be built, and ray casting in simulated worlds."""
     if "error" in found:
         text, _, remedy = str(found["error"]).removeprefix("DependencyError: ").partition("; ")
         return Finding(
@@ -128,7 +128,7 @@ def open3d_finding(found: dict[str, Any]) -> Finding:
 
 
 def matplotlib_finding(found: dict[str, Any]) -> Finding:
-    """Look at Matplotlib: pictures only."""
+    """Judge Matplotlib: pictures only."""
     if "error" in found:
         text = f"{found['error']}: no pictures from locate, demo, info and eval"
         return Finding("warn", "matplotlib", text, "`pip install matplotlib`")
@@ -136,7 +136,7 @@ def matplotlib_finding(found: dict[str, Any]) -> Finding:
 
 
 def memory() -> tuple[int | None, int | None]:
-    """Bytes in total and available, a container's limit included; None where the system does not say."""
+    """Return bytes in total and available, a container's limit included; None where the system does not say."""
     fields: dict[str, int] = {}
     for line in _read("/proc/meminfo").splitlines():
         name, _, rest = line.partition(":")
@@ -165,7 +165,7 @@ def _model() -> str:
 
 
 def _quota() -> float | None:
-    """Cores that a container grants at a time; None without a limit."""
+    """Return the cores that a container grants at a time; None without a limit."""
     parts = _read("/sys/fs/cgroup/cpu.max").split()
     if len(parts) == 2 and parts[0].isdigit() and parts[1].isdigit() and int(parts[1]):
         return int(parts[0]) / int(parts[1])

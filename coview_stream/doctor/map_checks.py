@@ -1,4 +1,4 @@
-"""A base map: does it open, what is inside, and is there memory for it."""
+"""Checks of a base map: whether it opens, its contents, and the memory that a node needs for it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.doctor.finding import Finding, from_error
-from coview_stream.doctor.machine_checks import GB, LEAST_MEMORY
+from coview_stream.doctor.machine_checks import GB, MIN_MEMORY
 from coview_stream.errors import MapError
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
 
-_NETWORK = 0.2 * GB  # onnxruntime and the network in two processes, and what else is imported
-_SPECTRA = 80.0  # bytes per square metre
+_NETWORK_MEMORY = (
+    0.2 * GB
+)  # onnxruntime and the network in two processes, and what else is imported; set by hand
+_SPECTRA_MEMORY = 80.0  # bytes per square metre, set by hand
 
 
-def open_site(path: Path) -> tuple[BaseMap | None, Finding]:
-    """Open a map, which reads all of it and compares its checksum; None if it cannot be used."""
+def open_map(path: Path) -> tuple[BaseMap | None, Finding]:
+    """Open a map, reading all of it and comparing its checksum; None if it cannot be used."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.file_format import VERSION
 
@@ -33,7 +35,7 @@ def open_site(path: Path) -> tuple[BaseMap | None, Finding]:
     return base_map, Finding("ok", "map", text)
 
 
-def site_findings(base_map: BaseMap, size: int, available: int | None) -> Iterator[Finding]:
+def map_findings(base_map: BaseMap, size: int, available: int | None) -> Iterator[Finding]:
     """Judge an open map whose file has ``size`` bytes, with ``available`` bytes of memory (None: unknown)."""
     yield Finding("ok", "map sha256", base_map.sha256)
     if not len(base_map):
@@ -63,29 +65,27 @@ def _features_finding(base_map: BaseMap) -> Finding:
 
 
 def node_memory(base_map: BaseMap) -> float:
-    """Bytes a node takes for itself: processes, spectra as far as they are kept, and the volumes of one search."""
+    """Return a node's own bytes: processes, spectra as far as they are cached, and the volumes of one search."""
     from coview_stream.localization.search.retrieval import _CACHE_BYTES
 
     config = base_map.descriptor_config
     channels = len(config.channels)
     spectra = len(base_map) * config.rings * (config.sectors // 2 + 1) * 8 * channels
-    volumes = (
-        len(base_map) * config.sectors * 4 * (channels + 1)
-    )  # one is held twice while it is put together
-    return LEAST_MEMORY + min(spectra, _CACHE_BYTES) + volumes + _learned_memory(base_map)
+    volumes = len(base_map) * config.sectors * 4 * (channels + 1)  # one exists twice while it is assembled
+    return MIN_MEMORY + min(spectra, _CACHE_BYTES) + volumes + _learned_memory(base_map)
 
 
 def _learned_memory(base_map: BaseMap) -> float:
-    """Bytes that searching by learned features adds: libraries, the map's spectra as far as they are kept, volumes.
+    """Return the bytes that learned features add: libraries, spectra as far as they are cached, volumes.
 
     Coarse features and a query's scores fill the rectangle around the map, however little of it has points.
     """
     if base_map.require_features("auto") is not None or base_map.learned is None:
         return 0.0
     from coview_stream.config import LearnedConfig
-    from coview_stream.localization.search.learned.feature_index import KEPT_BYTES
+    from coview_stream.localization.search.learned.feature_index import MAX_BYTES
 
     features, config = base_map.learned, LearnedConfig()
-    spectra = min(features.box_area * _SPECTRA, KEPT_BYTES)
+    spectra = min(features.box_area * _SPECTRA_MEMORY, MAX_BYTES)
     coarse = features.box_area / config.cell**2 * (2 * features.channels + 4 * config.yaws)
-    return _NETWORK + spectra + coarse + 3 * len(base_map) * config.yaws * 4
+    return _NETWORK_MEMORY + spectra + coarse + 3 * len(base_map) * config.yaws * 4

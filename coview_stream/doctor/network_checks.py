@@ -1,4 +1,4 @@
-"""The network: whether anybody is there, and what the robots send."""
+"""Checks of the network: connections, and what the robots send."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
-from coview_stream.doctor.capture import Heard, Seen, see_cloud, see_odometry
+from coview_stream.doctor.capture import CapturedMessage, RobotCapture, capture_cloud, capture_odometry
 from coview_stream.doctor.channel_checks import cloud_findings, odometry_findings
-from coview_stream.doctor.cross_checks import node_finding, together_findings
-from coview_stream.doctor.discovery import Offer, look, suggestion
+from coview_stream.doctor.cross_checks import cross_findings, node_finding
+from coview_stream.doctor.discovery import Candidate, discover, suggestion
 from coview_stream.doctor.finding import Finding
 from coview_stream.errors import MessageError
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, prepare
@@ -24,27 +24,29 @@ from coview_stream.stream.transport.transport import Connection, Transport
 Wait = Callable[[float], object]
 Codecs = tuple[str | None, str | None]
 
-_PATIENCE = 2.0  # seconds for a first connection
-_CALLERS = 6.0  # the same where others have to find us: a client tries again every 1 to 4 s
-_STEP = 0.05
-_KNOCK = 1.0  # seconds
-_MOST = 20_000  # messages kept of a channel: enough for 30 s of the fastest IMU odometry
+# all set by hand, seconds
+_CONNECT_TIMEOUT = 2.0  # for a first connection to the given endpoints
+_LISTEN_TIMEOUT = 6.0  # for a first connection from outside: a client tries again every 1 to 4 s
+_POLL_PERIOD = 0.05
+_TCP_TIMEOUT = 1.0
+_MAX_MESSAGES = 20_000  # kept of a channel, set by hand: enough for 30 s of the fastest IMU odometry
+_OPEN = "is open, but no zenoh session came about"
 _TCP = re.compile(r"(?:tcp|tls|ws)/(\[[^\]]+\]|[^:/]+):(\d+)")
 
 
-def reach_finding(transport: Transport, connect: Sequence[str], wait: Wait = time.sleep) -> Finding:
-    """Whether a router or a peer is connected; ``connect`` are the endpoints to name if not."""
+def connection_finding(transport: Transport, connect: Sequence[str], wait: Wait = time.sleep) -> Finding:
+    """Judge whether a router or a peer is connected; ``connect`` are the endpoints to name if not."""
     waited = 0.0
-    while not _met(transport) and waited < (_PATIENCE if connect else _CALLERS):
-        wait(_STEP)
-        waited += _STEP
-    if _met(transport):
-        return Finding("ok", "network", f"connected: {_counted(transport.connection())}")
+    while not _connected(transport) and waited < (_CONNECT_TIMEOUT if connect else _LISTEN_TIMEOUT):
+        wait(_POLL_PERIOD)
+        waited += _POLL_PERIOD
+    if _connected(transport):
+        return Finding("ok", "network", f"connected: {_counts(transport.connection())}")
     if not connect:
         return Finding(
-            "FAIL", "network", "nobody has connected", "start the others, and name this endpoint to them"
+            "FAIL", "network", "nothing has connected", "start the others, and name this endpoint to them"
         )
-    reasons = [(endpoint, knock(endpoint)) for endpoint in connect]
+    reasons = [(endpoint, try_tcp(endpoint)) for endpoint in connect]
     found = "no session: " + ", ".join(f"{endpoint} {reason}" for endpoint, reason in reasons)
     if any(reason == _OPEN for _, reason in reasons):
         remedy = "another program, or it wants TLS or a password: RUST_LOG=zenoh=warn says more"
@@ -53,16 +55,13 @@ def reach_finding(transport: Transport, connect: Sequence[str], wait: Wait = tim
     return Finding("FAIL", "network", found, remedy)
 
 
-_OPEN = "is open, but no zenoh session came about"
-
-
-def knock(endpoint: str) -> str:
-    """Say what becomes of a plain TCP connection to an endpoint that zenoh cannot reach."""
-    found = _TCP.match(endpoint)
-    if found is None:
+def try_tcp(endpoint: str) -> str:
+    """Try a plain TCP connection to an endpoint that zenoh cannot reach, and return what came of it, in words."""
+    address = _TCP.match(endpoint)
+    if address is None:
         return "does not answer"
     try:
-        with socket.create_connection((found[1].strip("[]"), int(found[2])), timeout=_KNOCK):
+        with socket.create_connection((address[1].strip("[]"), int(address[2])), timeout=_TCP_TIMEOUT):
             return _OPEN
     except ConnectionRefusedError:
         return "refuses: nothing listens there"
@@ -74,76 +73,80 @@ def knock(endpoint: str) -> str:
         return f"cannot be reached: {error.strerror or error}"
 
 
-def _met(transport: Transport) -> bool:
+def _connected(transport: Transport) -> bool:
     connection = transport.connection()
     return bool(connection.routers or connection.peers)
 
 
-def _counted(connection: Connection) -> str:
-    """Text of how many routers, peers and clients are connected, such as ``1 router, 2 peers``."""
+def _counts(connection: Connection) -> str:
+    """Return how many routers, peers and clients are connected, such as ``1 router, 2 peers``."""
     clients = len(connection.clients)
     counts = {"router": len(connection.routers), "peer": len(connection.peers) - clients, "client": clients}
     return ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
 
 
-def listen(
+def capture_robots(
     transport: Transport,
     keys: Sequence[RobotKeys],
     seconds: float,
     codecs: Codecs = (None, None),
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
-) -> list[Heard]:
+) -> list[RobotCapture]:
     """Receive what robots send for ``seconds``.
 
     Args:
-        transport: open.
-        keys: of each robot.
-        seconds: to listen.
-        codecs: of all clouds and all odometry, whatever they say; None believes them.
+        transport: open transport.
+        keys: keys of each robot.
+        seconds: duration.
+        codecs: codec of all clouds and of all odometry, over what they name themselves; None goes by that.
         wait: passes the time.
         clock: local time, seconds.
     """
     prepare(*CLOUD_CODECS, *ODOMETRY_CODECS)
-    heard = [Heard(k) for k in keys]
+    captures = [RobotCapture(k) for k in keys]
     over = False
 
-    def keep(channel: list[Seen], see: Callable[[Sample, float], Seen]) -> Callable[[Sample], None]:
+    def keep(
+        messages: list[CapturedMessage], describe: Callable[[Sample, float], CapturedMessage]
+    ) -> Callable[[Sample], None]:
         def handler(sample: Sample) -> None:
-            if not over and len(channel) < _MOST:
-                channel.append(see(sample, clock()))
+            if not over and len(messages) < _MAX_MESSAGES:
+                messages.append(describe(sample, clock()))
 
         return handler
 
-    def status_of(one: Heard) -> Callable[[Sample], None]:
+    def keep_status(capture: RobotCapture) -> Callable[[Sample], None]:
         def handler(sample: Sample) -> None:
             with contextlib.suppress(MessageError):
-                one.status = read_status(sample)
+                capture.status = read_status(sample)
 
         return handler
 
-    for one in heard:
-        k = one.keys
-        one.began = clock()
-        odometry = keep(one.odometry, partial(see_odometry, option=codecs[1], hint=k.odometry_hint))
+    for capture in captures:
+        k = capture.keys
+        capture.began = clock()
+        odometry = keep(capture.odometry, partial(capture_odometry, option=codecs[1], hint=k.odometry_hint))
         transport.subscribe(k.odometry, odometry, "all")
-        clouds = keep(one.clouds, partial(see_cloud, option=codecs[0], hint=k.cloud_hint))
+        clouds = keep(capture.clouds, partial(capture_cloud, option=codecs[0], hint=k.cloud_hint))
         transport.subscribe(k.cloud, clouds, "all")
-        transport.subscribe(k.status, status_of(one), "all")
+        transport.subscribe(k.status, keep_status(capture), "all")
     wait(seconds)
     over = True
-    for one in heard:
-        one.ended = clock()
-        one.alive = bool(transport.tokens(one.keys.alive))
-    return heard
+    for capture in captures:
+        capture.ended = clock()
+        capture.alive = bool(transport.tokens(capture.keys.alive))
+    return captures
 
 
-def robot_findings(heard: Heard, offers: Sequence[Offer], sha256: str | None) -> Iterator[Finding]:
-    """Judge all of one robot; ``offers`` are what else is on the network, ``sha256`` the map's if one is known."""
-    yield from cloud_findings(heard, suggestion(offers, "cloud"))
-    yield from odometry_findings(heard, suggestion(offers, "odometry"))
-    yield from together_findings(heard)
-    yield node_finding(heard, sha256)
+def robot_findings(
+    capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None
+) -> Iterator[Finding]:
+    """Judge all of one robot; ``candidates`` are what else is on the network, ``sha256`` the map's if one is known."""
+    yield from cloud_findings(capture, suggestion(candidates, "cloud"))
+    yield from odometry_findings(capture, suggestion(candidates, "odometry"))
+    yield from cross_findings(capture)
+    yield node_finding(capture, sha256)
 
 
 def robots_findings(
@@ -155,19 +158,19 @@ def robots_findings(
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Finding]:
-    """Listen to all robots at once and judge each; without any, or if one is silent, say who else is there."""
-    heard = listen(transport, keys, seconds, codecs, wait, clock) if keys else []
-    silent = not all(one.clouds and one.odometry for one in heard)
-    offers = look(transport, wait=wait) if silent or not keys else []
-    for one in heard:
-        yield from robot_findings(one, offers, sha256)
+    """Listen to all robots at once and judge each; without any, or if one is silent, look for others."""
+    captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
+    silent = not all(capture.clouds and capture.odometry for capture in captures)
+    candidates = discover(transport, wait=wait) if silent or not keys else []
+    for capture in captures:
+        yield from robot_findings(capture, candidates, sha256)
     if not keys:
-        yield offers_finding(offers)
+        yield candidates_finding(candidates)
 
 
-def offers_finding(offers: Sequence[Offer]) -> Finding:
-    """Name what there is, for somebody who has named no robot."""
-    texts = [text for channel in ("cloud", "odometry") if (text := suggestion(offers, channel))]
+def candidates_finding(candidates: Sequence[Candidate]) -> Finding:
+    """Name the clouds and odometry there are, for a user who has named no robot."""
+    texts = [text for channel in ("cloud", "odometry") if (text := suggestion(candidates, channel))]
     if texts:
         return Finding("ok", "robots", "; ".join(texts))
     return Finding("warn", "robots", "nothing that looks like clouds or odometry", "name one: --robot NAME")

@@ -1,4 +1,4 @@
-"""Looks at native libraries in a process of their own: one that crashes or hangs must not end the checkup.
+"""Probes of native libraries, each in a process of its own: one that crashes or hangs must not end the doctor.
 
 ``python -m coview_stream.doctor.probes NAME`` prints one line of JSON.
 """
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-_PATIENCE = 120.0  # seconds; compiling all kernels takes 3 to 10 on two cores
+_TIMEOUT = 120.0  # seconds, set by hand; compiling all kernels takes 3 to 10 on two cores
 
 # imports that reading a robot's messages needs, and the installation that brings each
 _CODECS = {
@@ -27,7 +27,7 @@ _CODECS = {
 }
 
 
-def probe(name: str, timeout: float = _PATIENCE) -> dict[str, Any]:
+def probe(name: str, timeout: float = _TIMEOUT) -> dict[str, Any]:
     """Run one of :data:`PROBES` in a process of its own; ``{"error": ...}`` if it fails, crashes or hangs."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     try:
@@ -72,7 +72,7 @@ def _kernels() -> dict[str, Any]:
 
 
 def differing(native: Any, twin: Any) -> list[str]:
-    """Names of the kernels whose results differ from their twins' on a small cloud."""
+    """Return the names of the kernels whose results differ from their twins' on a small cloud."""
     rng = np.random.default_rng(0)
     cloud = rng.uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
     T = np.eye(4)
@@ -85,13 +85,13 @@ def differing(native: Any, twin: Any) -> list[str]:
     return [
         name
         for name, args in cases.items()
-        if not _alike(getattr(native, name)(*args), getattr(twin, name)(*args))
+        if not _close(getattr(native, name)(*args), getattr(twin, name)(*args))
     ]
 
 
-def _alike(one: Any, other: Any) -> bool:
+def _close(one: Any, other: Any) -> bool:
     if isinstance(one, tuple):
-        return len(one) == len(other) and all(_alike(a, b) for a, b in zip(one, other, strict=True))
+        return len(one) == len(other) and all(_close(a, b) for a, b in zip(one, other, strict=True))
     a, b = np.asarray(one), np.asarray(other)
     # sums are taken in another order: float32 has 7 digits
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-5, atol=1e-5))
@@ -139,7 +139,7 @@ PROBES: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def main(name: str) -> None:
-    """Print what the probe found."""
+    """Run a probe in this process and print what it found."""
     try:
         found = PROBES[name]()
     except Exception as error:
