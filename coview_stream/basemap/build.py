@@ -1,4 +1,4 @@
-"""From clouds to the arrays of a base map (paper, section 3.1, and the VRS part of 3.2)."""
+"""Building of a base map: clouds to arrays (paper, section 3.1, and the virtual reference scans of 3.2)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 
-_MIN_POINTS = 1000
-_SURVEY_MARGIN = 1  # cells
+_MIN_POINTS = 1000  # set by hand
+_SURVEY_MARGIN = 1  # cells; set by hand
 
 
 def build_arrays(
@@ -42,7 +42,7 @@ def build_arrays(
     if config.learned:
         from coview_stream.descriptors.network import VIEW_NAMES, network
 
-        for view in VIEW_NAMES:  # they may be missing, so ask before reading
+        for view in VIEW_NAMES:  # before the clouds are read: they may be missing
             network(view)
     if not paths:
         raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
@@ -50,17 +50,17 @@ def build_arrays(
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
             raise MapError(f"{path}: given twice; name every source once")
-    with _bar(progress, "reading") as step:
+    with _progress_bar(progress, "reading") as step:
         clouds = [_read(path, k, len(paths), step) for k, path in enumerate(paths)]
     whole = merge(clouds)
     source_points = len(whole)
     origin, crs, raw = whole.origin, whole.crs, whole.points
     del clouds, whole
-    # stations and float32 like a zero near the site, whatever the source's own origin is
+    # float32 needs a zero near the site, and the source's own origin may be far from it
     shift = np.round(np.median(raw[:: max(1, len(raw) // 100_000)], axis=0).astype(np.float64) / 10.0) * 10.0
     raw -= shift.astype(np.float32)
 
-    with _bar(progress, "cleaning and normals") as step:
+    with _progress_bar(progress, "cleaning and normals") as step:
         points = voxel_grid(raw, config.voxel)
         del raw
         step(1, 3)
@@ -73,21 +73,21 @@ def build_arrays(
         step(2, 3)
         normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
-    with _bar(progress, "ground") as step:
+    with _progress_bar(progress, "ground") as step:
         stations = find_stations(points, config.block, config.levels)
         if not len(stations):
             raise MapError(
                 "no ground found in the base map; it needs points on the ground to put stations on"
             )
         step(1, 1)
-    with _bar(progress, "describing stations") as step:
+    with _progress_bar(progress, "describing stations") as step:
         described = describe_storeys(points, stations, config.block, config.descriptor, step)
 
     learned: tuple[Arrays, dict[str, Any] | None] = ({}, None)
     if config.learned:
         from coview_stream.descriptors.feature_build import feature_arrays
 
-        with _bar(progress, "learned features") as step:
+        with _progress_bar(progress, "learned features") as step:
             learned = feature_arrays(points, step)
     sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
@@ -122,7 +122,7 @@ def _read(path: Path, done: int, total: int, step: Progress) -> Any:
 def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
     """Block-sized cells (H, W) that hold points or neighbour on cells that do, and the lower left corner (2,).
 
-    The neighbours bridge the shadows of buildings: a scan that shows nothing there has still been there.
+    The neighbours bridge the shadows of buildings, which have no points but were surveyed.
     """
     cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
     low = cells.min(axis=0) - _SURVEY_MARGIN
@@ -149,8 +149,8 @@ def _sha256(path: Path) -> str:
 
 
 @contextmanager
-def _bar(show: bool, title: str) -> Iterator[Progress]:
-    """Progress on stderr with an ETA; silent unless asked for."""
+def _progress_bar(show: bool, title: str) -> Iterator[Progress]:
+    """Progress bar on stderr with an ETA, if ``show``."""
     from tqdm import tqdm
 
     with tqdm(total=1, desc=title, unit="", disable=not show, leave=False) as bar:

@@ -1,4 +1,4 @@
-"""The cloth-simulation-filter wheel: silenced, and in tiles."""
+"""Cloth simulation filter: the wheel of that name, silenced, and run by tiles."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from coview_stream.geometry.transforms import Points
 
 _TILE = 256.0
 _MARGIN = 24.0
-"""Metres. A cloth per tile rests after fewer steps and stays in the cache: 1.5 km2 as one cloth took 75 s."""
+"""Metres, set by hand. A cloth per tile rests after fewer steps and stays in the cache: 1.5 km2 as one took 75 s."""
 
-_FEWEST = 10
+_MIN_POINTS = 10  # for a cloth to rest on; set by hand
 
 
 def cloth_available() -> bool:
@@ -47,7 +47,7 @@ def cloth_ground(
     iterations: int,
     threshold: float,
 ) -> Bools:
-    """Which of (N, 3) points in metres the cloth, dropped on the upturned cloud, comes to lie on.
+    """Mask of the points (N, 3), metres, that the cloth comes to lie on, dropped on the upturned cloud.
 
     Raises:
         DependencyError: the wheel is not installed.
@@ -66,7 +66,7 @@ def cloth_ground(
             if not own.any():
                 continue
             inside = own
-            if len(index) >= _FEWEST:
+            if len(index) >= _MIN_POINTS:
                 inside = _one_cloth(points[index], resolution, rigidness, slope_smooth, iterations, threshold)
             ground[index[inside & own]] = True
     return ground
@@ -98,7 +98,7 @@ def _one_cloth(
 
 @functools.cache
 def _one_thread() -> None:
-    """Run the cloth in one thread: its many short parallel loops spin: three times slower on busy cores."""
+    """Run the cloth in one thread: its many short parallel loops busy-wait, three times slower on busy cores."""
     library = importlib.import_module("_CSF").__file__
     try:
         # its private OpenMP is among its dependencies, where a symbol lookup by handle finds it
@@ -109,7 +109,7 @@ def _one_thread() -> None:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Send the C library's standard output to nowhere: the wheel reports every step there."""
+    """Discard what the C library writes to standard output: the wheel reports every step there."""
     libc = ctypes.CDLL(None) if os.name == "posix" else None
     sys.stdout.flush()
     try:
@@ -117,13 +117,13 @@ def _silence() -> Iterator[None]:
     except OSError:  # no standard output at all
         yield
         return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    null = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, 1)
+        os.dup2(null, 1)
         yield
     finally:
         if libc is not None:
             libc.fflush(None)  # before the descriptor comes back, or the buffer lands there
         os.dup2(saved, 1)
-        os.close(nowhere)
+        os.close(null)
         os.close(saved)

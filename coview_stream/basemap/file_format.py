@@ -22,7 +22,7 @@ VERSION = 1
 
 Arrays = dict[str, npt.NDArray[Any]]
 
-_CHUNK = 1 << 22
+_CHUNK = 1 << 22  # bytes written or hashed at a time
 _TYPES = {
     "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U8": "|u1",
 }  # fmt: skip
@@ -30,10 +30,10 @@ _NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
-    """Write a map and return its sha256; a file that was there before stays whole until the new one is complete.
+    """Write a map and return its sha256; an existing file stays whole until the new one is complete.
 
     Raises:
-        MapError: the directory does not exist or cannot be written, or something else than a map is in the place.
+        MapError: the directory does not exist or cannot be written, or the path holds something else than a map.
     """
     check_target(path)
     text = json.dumps(parameters, sort_keys=True)
@@ -52,7 +52,7 @@ def check_target(path: Path) -> None:
     """Refuse to replace anything but a map.
 
     Raises:
-        MapError: the place is a directory, a device, another kind of file, or in no directory that exists.
+        MapError: the path is a directory, a device, another kind of file, or in a directory that does not exist.
     """
     if path.is_dir() or not path.resolve().parent.is_dir():
         raise MapError(f"{path}: not a place for a file; give a name in a directory that exists")
@@ -133,7 +133,7 @@ def _header(path: Path) -> tuple[dict[str, Any], int]:
         raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
     except ValueError as error:
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
-    # only blanks may pad it: JSON would take a damaged one that became a line end for another
+    # only blanks may pad it: JSON would also accept a blank damaged into a line end
     padded = text.rstrip(b" ").endswith(b"}")
     if not (padded and isinstance(header, dict) and isinstance(header.get("__metadata__", {}), dict)):
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again")

@@ -1,4 +1,4 @@
-"""Ground levels: every floor of a building that a robot can stand on, not one height per cell."""
+"""Floors: the ground and every storey of a building that a robot can stand on, one station height for each."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level
 
 @dataclass(frozen=True)
 class LevelConfig:
-    """What counts as an upper floor.
+    """What counts as an upper floor; set by hand.
 
     Attributes:
         headroom: free height above it, metres.
         cover: something flat must lie above within this height, metres; a roof in the open has nothing.
-        area: least connected area, square metres.
+        area: minimal connected area, square metres.
         flatness: neighbouring half-metre cells differ by less than this, metres.
     """
 
@@ -82,7 +82,7 @@ def ground_levels(
 
 
 def below_another(stations: Points, cell: float) -> Bools:
-    """Which of (M, 3) stations have another one above them in their ``cell``-sized square: a storey over a storey."""
+    """Mask of the stations (M, 3) that have another one above them in their ``cell``-sized square."""
     if not len(stations):
         return np.zeros(0, dtype=bool)
     _, _, flat = cells(stations, cell)
@@ -118,7 +118,7 @@ def _flat_and_wide(
     shape: tuple[int, int],
     config: LevelConfig,
 ) -> Bools:
-    """Candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
+    """Mask of the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
     kept = np.zeros(len(column), dtype=bool)
     steps = max(1, round(config.flatness / _STEP))
     # candidates of one column differ by the headroom at least, so each slab holds one of a column
@@ -188,7 +188,7 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     base_height.flat[flat[len(floors) :]] = base[:, 2]
     above = floors[:, 2] > base_height.flat[own] + _SAME_LEVEL
     remaining, own = floors[above], own[above]
-    least = max(1, int(0.25 * (cell / _SUBCELL) ** 2))
+    min_cells = max(1, int(0.25 * (cell / _SUBCELL) ** 2))
     found = [np.zeros((0, 3), dtype=np.float32)]
     while len(remaining):  # one storey per round, from below
         lowest = lowest_per_cell(remaining, own)
@@ -196,7 +196,7 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
         bottom.flat[own[lowest]] = remaining[lowest, 2]
         now = remaining[:, 2] <= bottom.flat[own] + _SAME_LEVEL
         counts = np.bincount(own[now], minlength=shape[0] * shape[1])
-        enough = now & (counts[own] >= least)
+        enough = now & (counts[own] >= min_cells)
         unique = np.unique(own[enough])
         row, column = np.divmod(unique, shape[1])
         z = ndimage.median(remaining[enough, 2], own[enough], unique)

@@ -1,7 +1,4 @@
-"""Ground points of a base map, by cloth simulation (paper, section 3.1) or by a morphological filter."""
-
-# FOLDED coview_stream/basemap/ground.py: """A raster of ground heights, and the raster tools that the ground filter needs."""
-# FOLDED coview_stream/basemap/ground.py: """Progressive morphological ground filter: the stand-in where the cloth has no wheel."""
+"""Ground of a base map: its points and heights, by cloth simulation (paper, section 3.1) or a morphological filter."""
 
 from __future__ import annotations
 
@@ -17,15 +14,20 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
 from coview_stream.geometry.rasters import cells, filled, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
-_FEWEST = 50
-"""Below this many occupied cells a cloth has nothing to hang on."""
+_MIN_CELLS = 50
+"""Occupied cells below which all lowest points count as ground: a cloth has nothing to rest on; set by hand."""
 
-_CLASSIFY_PORTION = 1_000_000
+_PORTION = 1_000_000  # points that are classified at a time; set by hand
+
+# of the morphological filter; scored by ``python -m bench ground``
+_MAX_WINDOW = 40.0  # metres: wider roofs are taken for ground, larger hills survive whole
+_MAX_SLOPE = 0.3  # of terrain between two windows
+_FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
 
 
 @dataclass(frozen=True)
 class GroundConfig:
-    """How ground is told from the rest. Defaults are scored in ``bench/ground.py``.
+    """How ground is separated from the rest; ``python -m bench ground`` scores the defaults on labelled scans.
 
     Attributes:
         method: ``auto`` takes the cloth where its wheel is installed, else the morphological filter
@@ -34,8 +36,8 @@ class GroundConfig:
         cloth_resolution: distance of cloth nodes, metres.
         rigidness: 1 for mountains, 2 for relief, 3 for plains.
         slope_smooth: let the cloth follow steep steps (banks, terraces).
-        iterations: most steps of the simulation; it stops when the cloth rests
-            (in steep forest 50 are too few, 200 no better).
+        iterations: maximum of simulation steps; it stops when the cloth rests (in steep forest 50 are too few, 200 no
+            better).
         cloth_threshold: a lowest point within this distance of the cloth is ground, metres.
         class_threshold: a point within this height of the ground raster is ground, metres.
         slope_allowance: added to ``class_threshold`` for each unit of local slope, metres.
@@ -74,8 +76,49 @@ class GroundConfig:
                 raise ConfigError(f"{name}={getattr(self, name)}: must lie in {low} to {high}")
 
 
+@dataclass(frozen=True)
+class GroundRaster:
+    """Ground heights of square cells in the frame of the points, metres.
+
+    Attributes:
+        z: (H, W) float32, row along y and column along x; NaN where the ground is unknown.
+        x0: x of the lower corner of cell (0, 0).
+        y0: y of the lower corner of cell (0, 0).
+        cell: edge length.
+    """
+
+    z: Floats32
+    x0: float
+    y0: float
+    cell: float
+
+    def height_at(self, xy: Reals) -> Floats32:
+        """Ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
+
+        Bilinear between cell centres; unknown neighbours carry no weight.
+        """
+        height, width = self.z.shape
+        column = (xy[:, 0].astype(np.float64) - self.x0) / self.cell
+        row = (xy[:, 1].astype(np.float64) - self.y0) / self.cell
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
+        known = inside & np.isfinite(self.z[row.astype(np.intp), column.astype(np.intp)])
+        left, low = np.floor(column - 0.5).astype(np.intp), np.floor(row - 0.5).astype(np.intp)
+        total, weight = np.zeros(len(xy)), np.zeros(len(xy))
+        for dr, dc in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            r, c = np.clip(low + dr, 0, height - 1), np.clip(left + dc, 0, width - 1)
+            w = (1 - np.abs(row - 0.5 - (low + dr))) * (1 - np.abs(column - 0.5 - (left + dc)))
+            z = self.z[r, c].astype(np.float64)
+            usable = np.isfinite(z)
+            total += np.where(usable, w * z, 0.0)
+            weight += np.where(usable, w, 0.0)
+        out = np.full(len(xy), np.nan, dtype=np.float32)
+        np.divide(total, weight, out=out, where=known & (weight > 0), casting="unsafe")
+        return out
+
+
 def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal["cloth", "morphological"]:
-    """Name of the filter that tells the ground of these (N, 3) points, metres.
+    """Name of the filter that finds the ground of these (N, 3) points, metres.
 
     With ``auto`` it is the cloth, but the morphological filter where the cloth's wheel is not installed (there is none
     for Python 3.13 and for ARM) and where the points are too narrow for the cloth to hang.
@@ -95,7 +138,7 @@ def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal
 
 
 def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
-    """Which of the points lie on the ground.
+    """Mask of the points that lie on the ground.
 
     The lowest point of each cell goes through the filter; then all points are classified by their height
     above the raster of the lowest points that were ground.
@@ -117,8 +160,8 @@ def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
     surface = ground_surface(points, config)
     mask = np.zeros(len(points), dtype=bool)
     slope = _slope(surface)
-    for start in range(0, len(points), _CLASSIFY_PORTION):
-        part = points[start : start + _CLASSIFY_PORTION]
+    for start in range(0, len(points), _PORTION):
+        part = points[start : start + _PORTION]
         column = ((part[:, 0] - surface.x0) / surface.cell).astype(np.intp)
         row = ((part[:, 1] - surface.y0) / surface.cell).astype(np.intp)
         allowed = config.class_threshold + config.slope_allowance * slope[row, column]
@@ -168,8 +211,8 @@ def _filtered(
     config: GroundConfig,
     method: Literal["cloth", "morphological"],
 ) -> Bools:
-    """Which of the lowest points are ground; all of them if they are too few to tell."""
-    if len(lowest) < _FEWEST:
+    """Mask of the lowest points that are ground; all of them if they are too few for a filter."""
+    if len(lowest) < _MIN_CELLS:
         return np.ones(len(lowest), dtype=bool)
     if method == "cloth":
         ground = cloth_ground(
@@ -194,13 +237,13 @@ def _refined(
     config: GroundConfig,
     cell: float,
 ) -> Floats32:
-    """Raster of the ground cells; lowest points on its interpolation join, which mends steep slopes."""
+    """Raster of the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
     heights = z.flat[occupied]
     for _ in range(config.refinements + 1):
         kept = np.full(z.shape, np.nan, dtype=np.float32)
         kept.flat[occupied[ground]] = heights[ground]
         surface = filled(kept)
-        # a little smoothing: single low returns must not carry the surface, and slopes need a scale
+        # a little smoothing: single low returns must not pull the surface down, and slopes need a scale
         smooth = ndimage.gaussian_filter(surface, 1.0 / cell, mode="nearest")
         away = np.abs(heights - smooth.flat[occupied])
         slope = _gradient(smooth, cell).flat[occupied]
@@ -223,57 +266,8 @@ def _slope(surface: GroundRaster) -> Floats32:
     return _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
 
 
-@dataclass(frozen=True)
-class GroundRaster:
-    """Ground heights of square cells in the frame of the points, metres.
-
-    Attributes:
-        z: (H, W) float32, row along y and column along x; NaN where the ground is unknown.
-        x0: x of the lower corner of cell (0, 0).
-        y0: y of the lower corner of cell (0, 0).
-        cell: edge length.
-    """
-
-    z: Floats32
-    x0: float
-    y0: float
-    cell: float
-
-    def height_at(self, xy: Reals) -> Floats32:
-        """Ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
-
-        Bilinear between cell centres; unknown neighbours carry no weight.
-        """
-        height, width = self.z.shape
-        column = (xy[:, 0].astype(np.float64) - self.x0) / self.cell
-        row = (xy[:, 1].astype(np.float64) - self.y0) / self.cell
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
-        known = inside & np.isfinite(self.z[row.astype(np.intp), column.astype(np.intp)])
-        left, low = np.floor(column - 0.5).astype(np.intp), np.floor(row - 0.5).astype(np.intp)
-        total, weight = np.zeros(len(xy)), np.zeros(len(xy))
-        for dr, dc in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            r, c = np.clip(low + dr, 0, height - 1), np.clip(left + dc, 0, width - 1)
-            w = (1 - np.abs(row - 0.5 - (low + dr))) * (1 - np.abs(column - 0.5 - (left + dc)))
-            z = self.z[r, c].astype(np.float64)
-            usable = np.isfinite(z)
-            total += np.where(usable, w * z, 0.0)
-            weight += np.where(usable, w, 0.0)
-        out = np.full(len(xy), np.nan, dtype=np.float32)
-        np.divide(total, weight, out=out, where=known & (weight > 0), casting="unsafe")
-        return out
-
-
-_LARGEST_WINDOW = 40.0
-"""Metres: wider roofs are taken for ground, larger hills survive whole."""
-
-_STEEPEST = 0.3
-
-_FIRST_THRESHOLD = 0.5
-
-
 def morphological_ground(z: Floats32, cell: float) -> Bools:
-    """Which cells of a raster of lowest heights (H, W; NaN where empty; metres) are ground.
+    """Mask of the ground cells of a raster of lowest heights (H, W; NaN where empty; metres): a progressive filter.
 
     Openings with growing windows remove what is narrower than the window and stands out of the opened surface
     by more than a slope of 0.3 explains.
@@ -281,11 +275,11 @@ def morphological_ground(z: Floats32, cell: float) -> Bools:
     surface = filled(z)
     ground = np.isfinite(z)
     window, previous = 1.0, 0.0
-    while window <= _LARGEST_WINDOW:
+    while window <= _MAX_WINDOW:
         size = 2 * max(1, round(window / cell / 2)) + 1
         # separable: a square window costs two passes of one row
         opened = ndimage.grey_opening(surface, size=(size, size), mode="nearest")
-        threshold = min(_FIRST_THRESHOLD + _STEEPEST * (window - previous) / 2, 3.0)
+        threshold = min(_FIRST_THRESHOLD + _MAX_SLOPE * (window - previous) / 2, 3.0)
         ground &= ~(surface - opened > threshold)
         surface, previous, window = opened, window, window * 1.5
     return ground

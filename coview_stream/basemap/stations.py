@@ -1,7 +1,5 @@
 """Stations: where virtual reference scans are taken, and their descriptors (paper, sections 3.1 and 3.2)."""
 
-# FOLDED coview_stream/basemap/stations.py: """A raster of the base map: what virtual reference scans are gathered from."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -25,15 +23,12 @@ Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
 RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
-
 _PORTION = 512  # stations at a time: 7 MB of bins
-
-_FLOORS = LevelConfig(area=25.0)  # square metres: smaller ones are overhangs more often than floors
-
-_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
-
-_BELOW_FLOOR = 1.0  # metres of what lies below the floor that still belongs to the storey
-
+_FLOORS = LevelConfig(
+    area=25.0
+)  # square metres: smaller floors are overhangs more often than not; set by hand
+_STOREY = 1.0  # metres: indoor stations whose floors differ less are described together; set by hand
+_BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey; set by hand
 _CEILING = 6.0  # metres: as LevelConfig.cover
 
 
@@ -60,8 +55,8 @@ def describe_storeys(
 ) -> Described:
     """Descriptor channels (M, R, S) of all stations, those with a storey above them storey by storey.
 
-    Who stands below another floor sees up to it, not the roof: such stations of similar height share a raster of the
-    points between a metre below their floor and the highest ceiling that counts as one.
+    A robot below another floor sees up to it, not the roof: such stations of similar height share a raster of the
+    points from a metre below their floor up to the highest ceiling that counts as one.
     """
     indoors = below_another(stations, block)
     corner = aligned_corner(points, block, RASTER_CELL)
@@ -98,8 +93,8 @@ def describe_stations(
 ) -> Described:
     """Descriptor channels (M, R, S) float16 of the virtual reference scans at ``stations`` (M, 3).
 
-    Works through portions of stations: only the descriptors of all stations are ever in memory, never their points.
-    float16 keeps 2 cm at 30 m height, far below the noise of a maximum over a bin.
+    Stations are described in portions: the descriptors of all of them are in memory, their points never. float16 keeps
+    2 cm at 30 m height, far below the noise of a maximum over a bin.
     """
     shape = (len(stations), config.rings, config.sectors)
     described: Described = {name: np.empty(shape, dtype=np.float16) for name in config.channels}
@@ -126,10 +121,16 @@ def describe_stations(
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Greatest height and number of voxels of square cells.
+    """Raster of a cloud: greatest height and number of occupied voxels of square cells.
 
     Arrays are (H, W): row along y, column along x; cell (r, c) has its centre at
-    ``corner + cell * (c + 1/2, r + 1/2)``. Metres in the map frame. Empty cells have count 0.
+    ``corner + cell * (c + 1/2, r + 1/2)``.
+
+    Attributes:
+        top: greatest height, metres, map frame; 0 in empty cells.
+        count: occupied voxels.
+        corner: (2,) lower left corner, metres, map frame.
+        cell: edge, metres.
     """
 
     top: Floats32

@@ -1,4 +1,4 @@
-"""The map's cloud, sorted by tile so that a crop touches only the pages of its tiles."""
+"""Tiles of the map's cloud: sorted by them, so that a crop touches only the pages of its tiles."""
 
 from __future__ import annotations
 

@@ -132,9 +132,9 @@ def test_usable_features_give_no_warning(learned_map, world_map, weights):
 
 def test_track_engine_loads_no_network(learned_map, weights):
     engine = TrackEngine(learned_map)
-    assert engine._knowledge.learned is not None
+    assert engine._index.learned is not None
     assert network.network.cache_info().currsize == 0
-    assert SearchEngine(learned_map)._knowledge.learned is not None
+    assert SearchEngine(learned_map)._index.learned is not None
     assert network.network.cache_info().currsize == 1
 
 
