@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from coview_stream.geometry.transforms import transform
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 
 def plane(corner, a, b, spacing=0.25):

@@ -17,8 +17,8 @@ from bench.forest.worlds import Drive, in_odometry
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z
-from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
-from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan, voxelized
 from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.refinement import Candidate, Refinement

@@ -51,8 +51,8 @@ from coview_stream.geometry.transforms import (
     rotation_angle,
     transform,
 )
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, RegistrationCloud
-from coview_stream.localization.registration.prepare_scan import height_above_lowest
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
 from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig

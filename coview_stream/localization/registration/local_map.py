@@ -1,4 +1,4 @@
-"""The map around a place, and the scan that is compared with it, each with what registration makes of them.
+"""The map around a place, with what registration and verification make of it.
 
 Roof edges: an airborne scan shows roofs and few of the facades that a robot sees. But a facade stands under the edge of
 a roof, so a point there is explained by the map though no map point is near it. Seen by hand on one simulated campus
@@ -134,31 +134,3 @@ def roof_edges(points: Points) -> RoofEdges:
     top = flat.reshape(rows, columns)
     edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
     return RoofEdges(max_filter(edge, _OVERHANG), corner)
-
-
-@dataclass(frozen=True)
-class RegistrationCloud:
-    """A local scan that is registered and verified.
-
-    Attributes:
-        points: (N, 3) float32, gravity-aligned frame, metres.
-        above: (N,) which of them stand above the ground; the others lie on it.
-        height: (N,) metres above the lowest ground nearby.
-    """
-
-    points: Points
-    above: Bools
-    height: Floats32
-
-    def every(self, nth: int) -> RegistrationCloud:
-        """Return a thinner scan: every ``nth`` point of each kind."""
-        order = np.concatenate((np.flatnonzero(self.above), np.flatnonzero(~self.above)))[::nth]
-        return RegistrationCloud(self.points[order], self.above[order], self.height[order])
-
-    @cached_property
-    def surfaces(self) -> list[Surfaces]:
-        """The points above the ground and those on it as GICP takes them, what there is of them."""
-        from coview_stream.localization.registration.gicp import surfaces
-
-        kinds = [surfaces(self.points[some]) for some in (self.above, ~self.above)]
-        return [kind for kind in kinds if kind is not None]

@@ -2,19 +2,53 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig, RegistrationConfig
-from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, Pose, norms
-from coview_stream.localization.registration.local_map import RegistrationCloud
+
+if TYPE_CHECKING:
+    from coview_stream.localization.registration.gicp import Surfaces
 
 # set by hand
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
 _CLEAR = 0.5  # metres above the lowest point nearby: standing on the ground, not part of it
 _SEED = 20240  # of the choice among too many points
+
+
+@dataclass(frozen=True)
+class RegistrationCloud:
+    """A local scan that is registered and verified.
+
+    Attributes:
+        points: (N, 3) float32, gravity-aligned frame, metres.
+        above: (N,) which of them stand above the ground; the others lie on it.
+        height: (N,) metres above the lowest ground nearby.
+    """
+
+    points: Points
+    above: Bools
+    height: Floats32
+
+    def every(self, nth: int) -> RegistrationCloud:
+        """Return a thinner scan: every ``nth`` point of each kind."""
+        order = np.concatenate((np.flatnonzero(self.above), np.flatnonzero(~self.above)))[::nth]
+        return RegistrationCloud(self.points[order], self.above[order], self.height[order])
+
+    @cached_property
+    def surfaces(self) -> list[Surfaces]:
+        """The points above the ground and those on it as GICP takes them, what there is of them."""
+        from coview_stream.localization.registration.gicp import surfaces
+
+        kinds = [surfaces(self.points[some]) for some in (self.above, ~self.above)]
+        return [kind for kind in kinds if kind is not None]
 
 
 def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -> RegistrationCloud:

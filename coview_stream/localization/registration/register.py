@@ -8,7 +8,8 @@ import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.result import MIN_PAIRS, Prior, Registration
 
 # set by hand

@@ -8,7 +8,8 @@ from functools import cached_property
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import Points, Pose, transform
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior, Registration
 from coview_stream.localization.registration.verification import Evidence, RangeImage, verify

@@ -31,7 +31,8 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Bools, Floats32, Ints, Reals
 from coview_stream.geometry.transforms import Points, Pose, inverse, norms, transform
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 # structure and ground
 _STRUCTURE_HEIGHT = 1.0  # metres above the ground

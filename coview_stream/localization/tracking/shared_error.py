@@ -14,7 +14,8 @@ import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Bools, Floats, Ints, Reals
 from coview_stream.geometry.transforms import Pose, transform
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 # set by hand
 _CELL = 16.0  # metres: about a house, or a tree and its neighbours; 8 to 30 answer much alike

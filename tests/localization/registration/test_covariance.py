@@ -17,7 +17,8 @@ from coview_stream.localization.registration.covariance import (
     remove_prior,
     swap_rotation_translation,
 )
-from coview_stream.localization.registration.local_map import LocalMap, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 

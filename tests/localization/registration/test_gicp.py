@@ -23,7 +23,8 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
 from coview_stream.localization.registration import gicp as pivot
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
-from coview_stream.localization.registration.local_map import LocalMap, LocalMaps, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.search.global_search import GlobalSearch

@@ -10,7 +10,8 @@ from se3 import exp_se3
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
-from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
 

@@ -10,8 +10,8 @@ from courtyard import local_map, parts, plane
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.registration import verification as rays
-from coview_stream.localization.registration.local_map import LocalMaps, RegistrationCloud
-from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.verification import RangeImage, free_space, verify
 
 CONFIG = RegistrationConfig()
