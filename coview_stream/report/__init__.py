@@ -1,4 +1,4 @@
-"""How good was it: errors against truth, and pictures that a person can read."""
+"""Reports: errors against truth, and pictures that a person can read."""
 
 from __future__ import annotations
 
