@@ -1,4 +1,4 @@
-"""Recordings as ROS writes them: which topics there are, and their messages as CDR in order of arrival."""
+"""ROS recordings: topics, and messages as CDR in order of arrival."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _REMEDIES = (  # the first whose word occurs in the reason
 
 
 @contextmanager
-def explained(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
-    """Turn whatever rosbags raises on a damaged recording into one line that names it and the remedy."""
+def readable(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
+    """Turn any error that rosbags raises on a damaged recording into one line that names it and the remedy."""
     try:
         yield
     except CoViewError:
@@ -50,13 +50,13 @@ class BagReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._ros1 = path.suffix == ".bag" and path.is_file()
-        with explained(path):
+        with readable(path):
             self._reader = _reader_of(path, self._ros1)
             self._reader.open()
         weakref.finalize(self, self._reader.close)
 
     def counts(self) -> dict[tuple[str, str], int]:
-        """Return how many messages each (type, topic) has."""
+        """Count the messages of each (type, topic)."""
         found: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             key = (connection.msgtype, connection.topic)
@@ -71,7 +71,7 @@ class BagReader:
         Arrival is the recorder's clock, good for finding a message again and for nothing else.
 
         Raises:
-            Exception: whatever rosbags raises; see :func:`explained`.
+            Exception: any that rosbags raises; see :func:`readable`.
         """
         wanted = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
         for connection, arrived, data in self._reader.messages(wanted, start=start):
@@ -90,12 +90,12 @@ def _reader_of(path: Path, ros1: bool) -> Any:
 
 
 def header_stamp(payload: bytes) -> int:
-    """Nanoseconds of the header that a CDR message starts with, without reading the rest; else MessageError."""
+    """Read the stamp (ns) of the header that a CDR message starts with; MessageError if there is none."""
     return stamp_join(*_unpack("iI", payload, 4))
 
 
 def frame_id(payload: bytes, skip: int = 0) -> str:
-    """Return the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
+    """Read the string after the stamp of a CDR message, or a later one: an Odometry's second is its child frame."""
     offset = 12
     for _ in range(skip):
         (length,) = _unpack("I", payload, offset)

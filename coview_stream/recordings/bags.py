@@ -1,10 +1,8 @@
-"""Clouds of a recording, read when they are asked for and deskewed by its odometry."""
+"""Runs out of ROS recordings: PointCloud2 frames, each with the odometry at its stamp.
 
-# FOLDED coview_stream/recordings/bags.py: """Runs out of recordings: PointCloud2 frames, each with the odometry at its stamp, deskewed where points have times.
-#
-# A bag is a recorded stream, so its messages go through the decoders and the deskewing of the live one; this is the one
-# place where ``clouds`` builds on ``stream``, and :mod:`coview_stream.recordings.run` imports it only once a bag is met.
-# """
+A recording is a recorded stream: its messages go through the decoders and the deskewing of the live one. Clouds are
+read when they are asked for, and deskewed where their points have times.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +21,63 @@ from coview_stream.geometry.transforms import Points, Poses
 from coview_stream.messages import ros2
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.deskew import deskew
-from coview_stream.recordings.bag_reader import BagReader, explained, frame_id, header_stamp
+from coview_stream.recordings.bag_reader import BagReader, frame_id, header_stamp, readable
 from coview_stream.recordings.odometry_track import SAME_NS, Track
+from coview_stream.recordings.run import Run
 
 _NS = 1e-9
+_MAX_SETBACK_NS = 5_000_000_000  # set by hand: stamps that go back by less are messages out of order
+_MAX_STRAYS = 0.01  # set by hand: share of stamps that may go back farther, and are left out
+
+OdometryFromClouds = Callable[["BagClouds"], Track]
+"""Makes odometry of nothing but the clouds, which are not deskewed."""
+
+
+def open_bag(
+    path: Path,
+    explicit: Path | None = None,
+    cloud_topic: str | None = None,
+    odometry_topic: str | None = None,
+    from_clouds: OdometryFromClouds | None = None,
+) -> Run:
+    """Read all stamps and odometry of a recording in one pass, and keep where each cloud is.
+
+    Clouds pass through memory one at a time; 16 bytes of each stay, and 150 of each odometry sample.
+
+    Args:
+        path: as :func:`~coview_stream.recordings.layouts.find_bag` found it.
+        explicit: TUM file to be taken for the odometry, with any stamps; None takes the recording's.
+        cloud_topic: needed where there is more than one topic with PointCloud2.
+        odometry_topic: likewise with Odometry.
+        from_clouds: makes the odometry, also where the recording has some.
+
+    Raises:
+        RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
+    """
+    reader = BagReader(path)
+    counts = reader.counts()
+    clouds = _choose(path, counts, ros2.CLOUD, cloud_topic, "--cloud-topic")
+    topics = {clouds: ros2.CLOUD}
+    if from_clouds is not None:
+        survey = _survey(reader, topics)
+        return _pair(reader, clouds, survey, from_clouds(_without_odometry(reader, clouds, survey)))
+    if explicit is not None and odometry_topic is not None:
+        raise RunError(
+            f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them"
+        )
+    # a single scan needs no odometry, as among files
+    lone = counts[ros2.CLOUD, clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
+    if explicit is None and not lone:
+        topics[_choose(path, counts, ros2.ODOMETRY, odometry_topic, "--odometry-topic")] = ros2.ODOMETRY
+    survey = _survey(reader, topics)
+    return _pair(reader, clouds, survey, _track(path, survey, explicit, lone))
 
 
 class BagClouds:
-    """Clouds of a recording by index; in order, the recording is read once, and otherwise sought by arrival."""
+    """Clouds of a recording by index.
+
+    Read in order, they cost one pass over the recording; read in another order, each is sought by its arrival.
+    """
 
     def __init__(
         self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses
@@ -38,11 +85,11 @@ class BagClouds:
         self.reader, self.topic, self.track = reader, topic, track
         self.stamps, self.arrivals, self.poses = stamps, arrivals, poses
         self._lock = threading.Lock()  # a replay reads on another thread
-        self._coming: Iterator[tuple[str, int, bytes]] = iter(())
+        self._pending: Iterator[tuple[str, int, bytes]] = iter(())
         self._next = -1
 
     def read(self, index: int) -> Cloud:
-        """Frame ``index`` in the body frame at its stamp; CloudError if it is damaged or holds no usable point."""
+        """Read frame ``index`` in the body frame at its stamp; CloudError if damaged or without a usable point."""
         message = self.message(index)
         # false for NaN as well
         usable: Bools = np.all(np.abs(message.points) < MAX_COORDINATE, axis=1)
@@ -51,9 +98,9 @@ class BagClouds:
         return builder.finish(self._name(index))
 
     def message(self, index: int) -> CloudMessage:
-        """Frame ``index`` as it was recorded; CloudError if it is damaged."""
+        """Read frame ``index`` as it was recorded; CloudError if it is damaged."""
         name = self._name(index)
-        with self._lock, explained(name, CloudError):
+        with self._lock, readable(name, CloudError):
             payload = self._payload(index)
         try:
             return ros2.decode_cloud(Sample(self.topic, payload))
@@ -69,8 +116,8 @@ class BagClouds:
         for _ in range(2):
             if not reads_on:
                 start = int(self.arrivals[index])
-                self._coming = self.reader.messages({self.topic: ros2.CLOUD}, start)
-            for _, arrived, payload in self._coming:
+                self._pending = self.reader.messages({self.topic: ros2.CLOUD}, start)
+            for _, arrived, payload in self._pending:
                 if arrived == self.arrivals[index] and _is_of(payload, int(self.stamps[index])):
                     self._next = index + 1
                     return payload
@@ -86,82 +133,36 @@ class BagClouds:
         return deskew(points, times, self.track.around(begin, end, stamp), stamp, self.poses[index])
 
 
-def _is_of(payload: bytes, stamp_ns: int) -> bool:
-    try:
-        return header_stamp(payload) == stamp_ns
-    except MessageError:
-        return False
-
-
-_LONGEST_WAY_BACK = 5_000_000_000  # ns of stamps going back: less is messages overtaking each other
-
-_STRAY = 0.01  # share of stamps that may go back farther, and are left out
-
-
-FromClouds = Callable[[BagClouds], Track]
-"""Makes odometry of nothing but the clouds, which are not deskewed."""
-
-
-@dataclass(frozen=True)
-class Opened:
-    """What a run of a bag consists of: stamps (N,) in ns, poses (N, 4, 4) and who reads the clouds."""
-
-    stamps: Ints
-    poses: Poses
-    source: BagClouds
-    notes: tuple[str, ...]
-
-
 @dataclass
 class _Survey:
-    """What one pass over a bag found: clouds' stamps and arrivals, odometry by stamp, names of the frames."""
+    """Result of one pass over a recording."""
 
-    stamps: list[int] = field(default_factory=list)
-    arrivals: list[int] = field(default_factory=list)
-    odometry: list[tuple[int, Floats]] = field(default_factory=list)
-    damaged: int = 0
-    lidar: str = ""
-    body: str = ""
+    stamps: list[int] = field(default_factory=list)  # of the clouds, ns
+    arrivals: list[int] = field(default_factory=list)  # of the clouds, ns of the recorder's clock
+    odometry: list[tuple[int, Floats]] = field(default_factory=list)  # stamp in ns, pose (4, 4)
+    damaged: int = 0  # messages
+    lidar: str = ""  # frame id of the clouds
+    body: str = ""  # child frame id of the odometry
 
 
-def open_bag(
-    path: Path,
-    explicit: Path | None = None,
-    cloud_topic: str | None = None,
-    odometry_topic: str | None = None,
-    from_clouds: FromClouds | None = None,
-) -> Opened:
-    """Read all stamps and odometry of a recording in one pass, and keep where each cloud is.
-
-    Clouds pass through memory one at a time; 16 bytes of each stay, and 150 of each odometry sample.
-
-    Args:
-        path: as :func:`~coview_stream.recordings.layouts.find_bag` found it.
-        explicit: TUM file to be taken for the odometry, with any stamps; None takes the recording's.
-        cloud_topic: needed where there is more than one topic with PointCloud2.
-        odometry_topic: likewise with Odometry.
-        from_clouds: makes the odometry, whatever the recording has.
-
-    Raises:
-        RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
-    """
-    reader = BagReader(path)
-    counts = reader.counts()
-    clouds = _choose(path, counts, ros2.CLOUD, cloud_topic, "--cloud-topic")
-    topics = {clouds: ros2.CLOUD}
-    if from_clouds is not None:
-        survey = _survey(reader, topics)
-        return _pair(reader, clouds, survey, from_clouds(_bare(reader, clouds, survey)))
-    if explicit is not None and odometry_topic is not None:
-        raise RunError(
-            f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them"
-        )
-    # a single scan needs no odometry, as among files
-    lone = counts[ros2.CLOUD, clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
-    if explicit is None and not lone:
-        topics[_choose(path, counts, ros2.ODOMETRY, odometry_topic, "--odometry-topic")] = ros2.ODOMETRY
-    survey = _survey(reader, topics)
-    return _pair(reader, clouds, survey, _track(path, survey, explicit, lone))
+def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
+    survey = _Survey()
+    with readable(reader.path):
+        for topic, arrived, payload in reader.messages(topics):
+            try:
+                if topics[topic] == ros2.CLOUD:
+                    survey.stamps.append(header_stamp(payload))
+                    survey.arrivals.append(arrived)
+                    survey.lidar = survey.lidar or frame_id(payload)
+                else:
+                    sample = ros2.decode_odometry(Sample(topic, payload))
+                    survey.odometry.append((sample.stamp_ns, sample.T_odom_body))
+                    survey.body = survey.body or frame_id(payload, 1)
+            except MessageError:
+                survey.damaged += 1
+    if not survey.stamps:
+        raise RunError(f"{reader.path}: not one cloud in its topic; choose another one or record again")
+    return survey
 
 
 def _choose(
@@ -184,26 +185,6 @@ def _choose(
     return next(iter(full))
 
 
-def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
-    survey = _Survey()
-    with explained(reader.path):
-        for topic, arrived, payload in reader.messages(topics):
-            try:
-                if topics[topic] == ros2.CLOUD:
-                    survey.stamps.append(header_stamp(payload))
-                    survey.arrivals.append(arrived)
-                    survey.lidar = survey.lidar or frame_id(payload)
-                else:
-                    sample = ros2.decode_odometry(Sample(topic, payload))
-                    survey.odometry.append((sample.stamp_ns, sample.T_odom_body))
-                    survey.body = survey.body or frame_id(payload, 1)
-            except MessageError:
-                survey.damaged += 1
-    if not survey.stamps:
-        raise RunError(f"{reader.path}: not one cloud in its topic; choose another one or record again")
-    return survey
-
-
 def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Track:
     if explicit is not None:
         seconds, poses = read_tum(explicit)
@@ -219,27 +200,14 @@ def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Tr
     return Track(stamps[kept], np.array([T for _, T in survey.odometry])[kept])
 
 
-def _steady(path: Path, stamps: Ints, what: str) -> Bools:
-    """(N,) whether each stamp comes after those before it; RunError if the clock started anew."""
-    back = np.maximum.accumulate(stamps) - stamps
-    strays = back > _LONGEST_WAY_BACK
-    if strays.sum() > _STRAY * len(stamps):
-        at = int(np.argmax(strays))
-        raise RunError(
-            f"{path}: stamps of {what} go back by {_NS * back[at]:.1f} s at message {at}: the clock started anew; "
-            "split the recording there"
-        )
-    return ~strays
-
-
 @dataclass(frozen=True)
 class _Order:
-    """Clouds by stamp (K,), of those whose stamp is ``steady`` (N,); ``fresh`` (K,) if none before has the same one."""
+    """Clouds in order of their stamps."""
 
-    stamps: Ints
-    arrivals: Ints
-    fresh: Bools
-    steady: Bools
+    stamps: Ints  # (K,) ns
+    arrivals: Ints  # (K,) ns
+    fresh: Bools  # (K,) no cloud before has the same stamp
+    steady: Bools  # (N,) in order of arrival: the stamp goes not far back, so the cloud is one of the K
 
 
 def _in_order(path: Path, survey: _Survey) -> _Order:
@@ -251,16 +219,29 @@ def _in_order(path: Path, survey: _Survey) -> _Order:
     return _Order(in_order, arrivals[steady][order], fresh, steady)
 
 
-def _bare(reader: BagReader, topic: str, survey: _Survey) -> BagClouds:
-    """All clouds that have a stamp of their own, without odometry."""
+def _steady(path: Path, stamps: Ints, what: str) -> Bools:
+    """Return whether each stamp (N,) comes after those before it; RunError if the clock started anew."""
+    back = np.maximum.accumulate(stamps) - stamps
+    strays = back > _MAX_SETBACK_NS
+    if strays.sum() > _MAX_STRAYS * len(stamps):
+        at = int(np.argmax(strays))
+        raise RunError(
+            f"{path}: stamps of {what} go back by {_NS * back[at]:.1f} s at message {at}: the clock started anew; "
+            "split the recording there"
+        )
+    return ~strays
+
+
+def _without_odometry(reader: BagReader, topic: str, survey: _Survey) -> BagClouds:
+    """Return all clouds that have a stamp of their own, without odometry."""
     order = _in_order(reader.path, survey)
     stamps, arrivals = order.stamps[order.fresh], order.arrivals[order.fresh]
     nowhere = np.tile(np.eye(4), (len(stamps), 1, 1))
     return BagClouds(reader, topic, stamps, arrivals, Track(stamps, nowhere), nowhere)
 
 
-def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opened:
-    """Frames in order of their stamps, those without odometry left out."""
+def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Run:
+    """Return the run of the clouds in order of their stamps, those without odometry left out."""
     path = reader.path
     order = _in_order(path, survey)
     fresh, steady, stamps = order.fresh, order.steady, order.stamps
@@ -288,7 +269,14 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Opene
             "if the lidar is mounted away from it, write the odometry of the lidar (--odometry FILE)"
         )
     source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept])
-    return Opened(source.stamps, source.poses, source, tuple(notes))
+    return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes))
+
+
+def _is_of(payload: bytes, stamp_ns: int) -> bool:
+    try:
+        return header_stamp(payload) == stamp_ns
+    except MessageError:
+        return False
 
 
 def _span(stamps: Ints) -> str:

@@ -1,4 +1,4 @@
-"""Where a run keeps its frames and its odometry."""
+"""Layouts of runs on disk: files of frames, stamps and odometry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,14 @@ _LAYOUTS = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Files of a run: ``frames`` in order, ``odometry`` (TUM or KITTI poses) and ``times`` if present."""
+    """Files of a run.
+
+    Attributes:
+        path: the directory, or the single cloud.
+        frames: the clouds in order.
+        odometry: TUM or KITTI poses, if present.
+        times: stamps of the frames, if present.
+    """
 
     path: Path
     frames: tuple[Path, ...]
@@ -32,7 +39,7 @@ class Layout:
 
 
 def find_layout(path: Path) -> Layout:
-    """Files of the run at ``path``, a directory or a single cloud file.
+    """Find the files of the run at ``path``, a directory or a single cloud file.
 
     Raises:
         RunError: nothing there, no layout that is known, or no frames; the message says what is expected.
@@ -57,7 +64,7 @@ def find_layout(path: Path) -> Layout:
 
 
 def find_bag(path: Path) -> Path | None:
-    """Return the recording at ``path``: a file, or a rosbag2 directory; None if it is something else.
+    """Find the recording at ``path``: a file, or a rosbag2 directory; None if it is something else.
 
     Raises:
         RunError: a directory holds several recordings, and no ``metadata.yaml`` says that they belong together.
@@ -78,7 +85,7 @@ def find_bag(path: Path) -> Path | None:
 
 
 def _frames(folder: Path) -> tuple[Path, ...]:
-    """Cloud files of a folder by number, or by name where a name is no number.
+    """List the cloud files of a folder by number, or by name where a name is no number.
 
     Raises:
         RunError: none at all, two files of one number, or one that is no file.
@@ -103,7 +110,7 @@ def _frames(folder: Path) -> tuple[Path, ...]:
 
 
 def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats, Poses]:
-    """Stamps (N,) in seconds and poses (N, 4, 4), odometry <- body, one per frame.
+    """Read stamps (N,) in seconds and poses (N, 4, 4), odometry <- body, one per frame.
 
     Raises:
         RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
@@ -119,7 +126,7 @@ def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats,
 
 
 def read_stamps(layout: Layout) -> Floats | None:
-    """Stamps (N,) in seconds, one per frame, of a run whose odometry is not asked for; None if it has none.
+    """Read stamps (N,) in seconds, one per frame, of a run whose odometry is not asked for; None if it has none.
 
     Raises:
         RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
@@ -156,7 +163,7 @@ def _kitti(layout: Layout, file: Path) -> tuple[Floats, Poses]:
 
 
 def _calibration(path: Path) -> Pose | None:
-    """T_camera_velodyne (4, 4) of a KITTI ``calib.txt``; None without the file or without a Tr line."""
+    """Read T_camera_velodyne (4, 4) from a KITTI ``calib.txt``; None without the file or without a Tr line."""
     if not path.is_file():
         return None
     try:

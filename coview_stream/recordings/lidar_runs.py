@@ -1,11 +1,12 @@
-"""Runs without odometry: a first pass over the clouds makes it, and they are read again where they are used."""
+"""Runs whose odometry is made of their clouds, and runs without odometry.
 
-# FOLDED coview_stream/recordings/lidar_runs.py: """Runs whose odometry is missing, or not wanted: frames and stamps, and no poses worth the name."""
+Lidar odometry takes a first pass over the clouds; they are read again where they are used.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +17,24 @@ from coview_stream.odometry.lidar_odometry import LidarOdometry
 from coview_stream.recordings.bags import BagClouds, open_bag
 from coview_stream.recordings.layouts import find_bag, find_layout, read_stamps
 from coview_stream.recordings.odometry_track import Track
-from coview_stream.recordings.run import Run, of_bag, single
+from coview_stream.recordings.run import Run, single_frame_run
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, frames)."""
 
-_FEW_WALLS = 15  # patches: with fewer the slope of the ground decides
+_PERIOD = 0.1  # seconds, set by hand: between frames that have no stamps
+_MIN_WALLS = 15  # patches, set by hand: with fewer the slope of the ground decides
 
 
 @dataclass(frozen=True)
-class Followed:
-    """Which frames have a pose, the poses (K, 4, 4) odometry <- body, and remarks for people."""
+class Placed:
+    """Result of lidar odometry over a run.
+
+    Attributes:
+        kept: indices of the frames that have a pose.
+        poses: (K, 4, 4) theirs, odometry <- body, metres.
+        notes: remarks for people, a line each.
+    """
 
     kept: list[int]
     poses: Poses
@@ -42,9 +50,8 @@ def open_lidar_run(
 ) -> Run:
     """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, with odometry made of its clouds.
 
-    Frames in files are taken for deskewed, as ever; their stamps are those of ``times.txt``, of an
-    ``odometry.tum`` that lies there, or else 0.1 s apart. Frames that odometry cannot place are left out, and notes say
-    why.
+    Frames in files count as deskewed; their stamps are those of ``times.txt``, of an ``odometry.tum`` beside them, or
+    else 0.1 s apart. Frames that odometry cannot place are left out, and notes say why.
 
     Raises:
         RunError: no frames, or none that odometry could place. DependencyError: kiss-icp is missing.
@@ -58,7 +65,7 @@ def open_lidar_run(
         return _of_bag(bag, lidar, cloud_topic, progress)
     layout = find_layout(path)
     if len(layout.frames) == 1:
-        return single(layout)
+        return single_frame_run(layout)
     lidar = lidar or LidarOdometry()
     run = open_bare_run(path)
 
@@ -66,9 +73,9 @@ def open_lidar_run(
         frame = run.read(index)
         return lidar.step(frame.points, None, frame.stamp)
 
-    followed = follow(path, lidar, len(run), place, progress)
-    files = tuple(run.frames_paths[index] for index in followed.kept)
-    return Run(path, files, run.stamps[followed.kept], followed.poses, notes=(*run.notes, *followed.notes))
+    placed = _place_all(path, lidar, len(run), place, progress)
+    files = tuple(run.frames_paths[index] for index in placed.kept)
+    return Run(path, files, run.stamps[placed.kept], placed.poses, notes=(*run.notes, *placed.notes))
 
 
 def _of_bag(bag: Path, lidar: LidarOdometry | None, topic: str | None, progress: Progress | None) -> Run:
@@ -80,26 +87,25 @@ def _of_bag(bag: Path, lidar: LidarOdometry | None, topic: str | None, progress:
             message = clouds.message(index)
             return odometry.step(message.points, message.times, message.stamp_ns * 1e-9)
 
-        followed = follow(bag, odometry, len(clouds.stamps), place, progress)
-        notes.extend(followed.notes)
-        return Track(clouds.stamps[followed.kept], followed.poses)
+        placed = _place_all(bag, odometry, len(clouds.stamps), place, progress)
+        notes.extend(placed.notes)
+        return Track(clouds.stamps[placed.kept], placed.poses)
 
-    opened = open_bag(bag, None, topic, None, track)
-    run = of_bag(bag, opened)
-    return Run(bag, run.frames_paths, run.stamps, run.poses, run.source, (*notes, *run.notes))
+    run = open_bag(bag, None, topic, None, track)
+    return replace(run, notes=(*notes, *run.notes))
 
 
-def follow(
+def _place_all(
     path: Path,
     lidar: LidarOdometry,
     count: int,
     place: Callable[[int], Pose],
     progress: Progress | None = None,
-) -> Followed:
-    """Place ``count`` frames one after the other, whatever of them can be.
+) -> Placed:
+    """Place ``count`` frames one after the other, and leave out those that cannot be placed.
 
     Raises:
-        RunError: not one could be; the message ends with the first one's.
+        RunError: none can be placed; the message ends with the first one's.
     """
     kept, poses, failed = [], [], []
     for index in range(count):
@@ -116,8 +122,8 @@ def follow(
     if lidar.ground is not None:
         ground = lidar.ground
         lean = np.degrees(np.arccos(np.clip(ground.up[2], -1.0, 1.0)))
-        sure = ground.walls >= _FEW_WALLS
-        slope = "" if sure else "; it is off by the slope, if there is one: --gravity says better"
+        reliable = ground.walls >= _MIN_WALLS
+        slope = "" if reliable else "; it is off by the slope, if there is one: --gravity says better"
         notes.append(
             f"{path}: down is taken from the ground, {ground.height:.1f} m below the sensor, and {ground.walls} "
             f"patches of wall: the sensor leans {lean:.1f} deg{slope}"
@@ -130,25 +136,20 @@ def follow(
         notes.append(
             f"{path}: lidar odometry began anew {lidar.restarts} times; what was driven there is missing"
         )
-    return Followed(kept, np.array(poses), tuple(notes))
-
-
-_PERIOD = 0.1  # seconds between frames that nobody has dated
+    return Placed(kept, np.array(poses), tuple(notes))
 
 
 def open_bare_run(path: Path, cloud_topic: str | None = None) -> Run:
-    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, but for its odometry: all poses are the identity.
+    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, but with the identity for all poses.
 
-    Stamps of frames in files are those of ``times.txt``, of an ``odometry.tum`` that lies there, or else 0.1 s apart.
+    Stamps of frames in files are those of ``times.txt``, of an ``odometry.tum`` beside them, or else 0.1 s apart.
     Clouds of recordings are not deskewed.
 
     Raises:
         RunError: no frames, or stamps that do not fit.
     """
     if (bag := find_bag(path)) is not None:
-        from coview_stream.recordings.bags import open_bag  # as in open_run: bags build on the live decoders
-
-        return of_bag(bag, open_bag(bag, None, cloud_topic, None, lambda clouds: _nowhere(clouds.stamps)))
+        return open_bag(bag, None, cloud_topic, None, _identity_track)
     layout = find_layout(path)
     told = read_stamps(layout)
     notes = () if told is not None else (f"{path}: no times.txt; frames are taken for {_PERIOD:g} s apart",)
@@ -156,8 +157,8 @@ def open_bare_run(path: Path, cloud_topic: str | None = None) -> Run:
     return Run(path, layout.frames, stamps, _identities(len(stamps)), notes=notes)
 
 
-def _nowhere(stamps: np.ndarray) -> Track:
-    return Track(stamps, _identities(len(stamps)))
+def _identity_track(clouds: BagClouds) -> Track:
+    return Track(clouds.stamps, _identities(len(clouds.stamps)))
 
 
 def _identities(count: int) -> Poses:

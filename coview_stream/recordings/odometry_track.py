@@ -1,4 +1,4 @@
-"""Odometry of a whole recording: the poses at many stamps at once, and what was driven during a sweep."""
+"""Odometry of a whole recording: poses at many stamps at once, and the samples around a sweep."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SAME_NS = 1000
 """Stamps this close are one moment: text files and float64 seconds are good to a microsecond."""
 
 _NS = 1e-9
-_JUMP_DISTANCE = 1.0  # metres: as for live odometry
+_JUMP_DISTANCE = 1.0  # metres, set by hand: shorter steps are no jump at any rate
 
 
 class Track:
-    """Odometry by stamp. What the node would not interpolate across (gaps, jumps) is not interpolated across here.
+    """Odometry by stamp, interpolated, but not across gaps and jumps: neither does the node.
 
     Attributes:
         stamps: (K,) nanoseconds, increasing.
@@ -37,7 +37,7 @@ class Track:
         self._part = np.concatenate([[0], np.cumsum(~steady)])
 
     def at(self, stamps: Ints) -> tuple[Poses, Bools]:
-        """Poses (N, 4, 4) at the stamps (N,), interpolated, and (N,) whether each is known."""
+        """Interpolate poses (N, 4, 4) at the stamps (N,); also return whether each is known (N,)."""
         last = len(self.stamps) - 1
         after = np.clip(np.searchsorted(self.stamps, stamps), 0, last)
         before = np.clip(after - 1, 0, last)
@@ -52,7 +52,7 @@ class Track:
     def around(self, begin_ns: int, end_ns: int, stamp_ns: int) -> Segment:
         """Return the samples from the last before ``begin_ns`` to the first after ``end_ns``.
 
-        Only such as belong to one steady piece with ``stamp_ns``.
+        Samples beyond a gap or jump, seen from ``stamp_ns``, are left out.
         """
         first = np.searchsorted(self.stamps, begin_ns + 1) - 1
         last = np.searchsorted(self.stamps, end_ns) + 1

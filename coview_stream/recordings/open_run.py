@@ -1,4 +1,4 @@
-"""MODULE DOCSTRING."""
+"""Opening of runs: directories, ROS recordings and single clouds, with their odometry or one made of the clouds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from coview_stream.errors import RunError
 from coview_stream.recordings.layouts import find_bag, find_layout, read_odometry
-from coview_stream.recordings.run import Run, of_bag, single
+from coview_stream.recordings.run import Run, single_frame_run
 
 if TYPE_CHECKING:
     from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -50,32 +50,29 @@ def open_run(
         DependencyError: kiss-icp is missing.
     """
     path = Path(path)
+    explicit = None if odometry == "auto" else Path(odometry)
     if odometry == KISS_ICP:
         from coview_stream.recordings.lidar_runs import open_lidar_run
 
         return open_lidar_run(path, lidar, cloud_topic, odometry_topic, progress)
     if (bag := find_bag(path)) is not None:
-        return _recorded(bag, None if odometry == "auto" else Path(odometry), cloud_topic, odometry_topic)
+        from coview_stream.recordings.bags import (
+            open_bag,  # with the decoders of messages: only once a bag is met
+        )
+
+        return open_bag(bag, explicit, cloud_topic, odometry_topic)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):
         raise RunError(
             f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out"
         )
     layout = find_layout(path)
     count = len(layout.frames)
-    explicit = None if odometry == "auto" else Path(odometry)
     if explicit is None and layout.odometry is None:
         if count == 1:
-            return single(layout)
+            return single_frame_run(layout)
         raise RunError(
             f"{path}: {count} frames but no odometry; add {path / 'odometry.tum'} "
             "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
         )
     stamps, poses = read_odometry(layout, explicit)
     return Run(path, layout.frames, stamps, poses)
-
-
-def _recorded(bag: Path, explicit: Path | None, cloud_topic: str | None, odometry_topic: str | None) -> Run:
-    # imported here, for bags are read by the decoders of live messages, and those read no runs
-    from coview_stream.recordings.bags import open_bag
-
-    return of_bag(bag, open_bag(bag, explicit, cloud_topic, odometry_topic))

@@ -1,11 +1,11 @@
-"""Runs: a robot's frames with their odometry, read one frame at a time."""
+"""Runs: a robot's frames with their odometry, read one at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses
 from coview_stream.recordings.layouts import Layout
-
-if TYPE_CHECKING:
-    from coview_stream.recordings.bags import Opened
 
 
 @dataclass(frozen=True)
@@ -44,10 +41,10 @@ class Frame:
 
 
 class CloudSource(Protocol):
-    """Where the clouds of a run come from, if not from one file each."""
+    """Reader of a run's clouds, where they are not in a file each."""
 
     def read(self, index: int) -> Cloud:
-        """Frame ``index`` in the body frame at its stamp, metres; CloudError if it cannot be had."""
+        """Read frame ``index`` in the body frame at its stamp, metres; CloudError if it is damaged."""
         ...
 
 
@@ -105,12 +102,6 @@ class Run:
         )
 
 
-def single(layout: Layout) -> Run:
-    """Run of one frame, which needs no odometry."""
+def single_frame_run(layout: Layout) -> Run:
+    """Return the run of one frame, which needs no odometry."""
     return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None])
-
-
-def of_bag(bag: Path, opened: Opened) -> Run:
-    """Run of a recording that has been opened."""
-    paths = (bag,) * len(opened.stamps)
-    return Run(bag, paths, opened.stamps / 1e9, opened.poses, opened.source, opened.notes)
