@@ -329,7 +329,7 @@ ANSWERS = (
     *WORLDS,
     *(f"coview_stream/{part}" for part in ("config", "descriptors", "odometry", "basemap", "localization")),
     "coview_kernels",
-    *(f"bench/forest/{part}.py" for part in ("methods", "canopy", "query")),
+    *(f"bench/forest/{part}.py" for part in ("methods", "query")),
 )
 """What answers to single queries depend on as well, but for the weights. Whole runs depend on all of the product."""
 
@@ -348,11 +348,11 @@ def say(text: str) -> None:
 
 def weights() -> str:
     """Say which weights the package has, by both networks' hashes."""
-    from coview_stream.descriptors.network import shipped, weights_name
+    from coview_stream.descriptors.network import weights_directory, weights_name
 
     total = hashlib.sha256()
     for view in ("aerial", "ground"):
-        file = shipped() / weights_name(view)
+        file = weights_directory() / weights_name(view)
         total.update(file.read_bytes() if file.is_file() else b"")
     return total.hexdigest()[:10]
 

@@ -30,22 +30,20 @@ Times = dict[str, float]
 def stages() -> list[tuple[str, Any, str]]:
     """Return what is timed: name in the table, and where the function is looked up."""
     from coview_stream.localization import localizer
-    from coview_stream.localization.registration import register as registration
-    from coview_stream.localization.registration import verification
-    from coview_stream.localization.tracking import map_matching as attempt
-    from coview_stream.localization.tracking import tracker as tracking
+    from coview_stream.localization.registration import local_map, scan_matcher, verification
+    from coview_stream.localization.tracking import tracker
 
     return [
-        ("take the frame in, check it", localizer.Localizer, "_checked"),
-        ("remember its points, thinned", localizer.KeyframeBuffer, "thin"),
-        ("update", localizer.Tracker, "update"),
-        ("  crop of the map", registration.LocalMaps, "around"),
-        ("  points to register", tracking, "local_source"),
-        ("  registration", attempt, "register"),
-        ("  rays of the newest frame", attempt.RangeImage, "of"),
-        ("  verification", attempt, "verify"),
+        ("take the frame in, check it", localizer, "validate_cloud"),
+        ("remember its points, thinned", localizer.KeyframeBuffer, "voxelize"),
+        ("match to map", localizer.Tracker, "match_to_map"),
+        ("  crop of the map", local_map.LocalMaps, "around"),
+        ("  points to register", tracker, "prepare_scan"),
+        ("  registration", scan_matcher, "register"),
+        ("  rays of the newest frame", scan_matcher.RangeImage, "of"),
+        ("  verification", scan_matcher, "verify"),
         ("    nearest map points", verification.kernels, "nearest"),
-        ("    rays against the map", verification, "rays_against_map"),
+        ("    rays against the map", verification, "free_space"),
     ]
 
 
@@ -108,8 +106,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
     """Medians of the stages, of both kinds of frames."""
     frames = measured(600 if asked.quick else max(asked.frames, _SETTLED + 1))
     for title, chosen in (
-        ("frames that register", [each for each in frames if "update" in each]),
-        ("all others", [each for each in frames if "update" not in each]),
+        ("frames that register", [each for each in frames if "match to map" in each]),
+        ("all others", [each for each in frames if "match to map" not in each]),
     ):
         for label in ["step", *(label for label, _, _ in stages())]:
             values = 1e3 * np.array([frame.get(label, 0.0) for frame in chosen])

@@ -1,15 +1,14 @@
-"""The forest benchmark's figures follow from planted results, and its command writes them into a page."""
-
-from pathlib import Path
+"""Scores of the forest benchmarks follow from planted results."""
 
 import numpy as np
 import pytest
-from bench.forest.chains import distinct
+from told import told
 
-from bench.forest import forest
-from bench.forest import tables as forest_tables
+from bench.forest import runs
 from bench.forest.methods import BASELINES, METHODS
+from bench.forest.query import distinct, errors, query_of
 from bench.forest.tables import (
+    STEPS,
     compared_table,
     false,
     groups,
@@ -20,9 +19,9 @@ from bench.forest.tables import (
     tables,
     times_table,
 )
-from bench.harness.suite import OWN
-
-ROOT = Path(__file__).parents[2]
+from bench.forest.worlds import Drive, in_odometry
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import pose_from, rot_z
 
 
 def answer(off, kind="forest rows dense steep leaf-off column", sensor="vlp16", **more):
@@ -41,7 +40,7 @@ def answer(off, kind="forest rows dense steep leaf-off column", sensor="vlp16", 
         "after": [0.1, 0.2],
         "passes": True,
         "accepted": True,
-        "ms": dict.fromkeys(forest_tables.STEPS, 10.0),
+        "ms": dict.fromkeys(STEPS, 10.0),
         "first": False,
         **more,
     }
@@ -123,9 +122,9 @@ def test_every_methods_places_are_registered_and_judged_alike():
 
 def test_worlds_on_disk_alone_have_tables_of_their_own():
     planted = answer([3.0], kind="on disk")
-    assert set(tables([planted])) == {f"forest disk {name}" for name in ("recall", "metric", "compared")}
+    assert set(tables([planted])) == {f"disk {name}" for name in ("recall", "metric", "compared")}
     assert set(tables([planted, answer([3.0])])) == {
-        "forest recall", "forest metric", "forest compared", "forest times",
+        "recall", "metric", "compared", "times",
     }  # fmt: skip
 
 
@@ -142,10 +141,10 @@ def test_what_is_believed_and_wrong_is_false():
 
 
 def test_times_leave_a_maps_first_query_out():
-    slow = answer([1.0], first=True, ms=dict.fromkeys(forest_tables.STEPS, 1000.0))
+    slow = answer([1.0], first=True, ms=dict.fromkeys(STEPS, 1000.0))
     text = times_table([slow, answer([1.0]), answer([1.0])])
     assert "1000" not in text
-    assert text.count(" 10 |") == len(forest_tables.STEPS)
+    assert text.count(" 10 |") == len(STEPS)
     assert cells(text, "learned, from")[1] == "40"
     assert " 1000 |" in times_table([slow])
 
@@ -158,84 +157,29 @@ def test_places_are_ten_metres_apart_and_best_first():
     assert distinct(xy[:0], score[:0]).shape == (0, 2)
 
 
-@pytest.fixture
-def planted(monkeypatch):
-    asked = []
-
-    def answers(folder, options):
-        asked.append((folder, options))
-        return [answer([3.0])], ["drawn-1: gone"] if options.seeds == 1 else []
-
-    monkeypatch.setattr(forest, "all_answers", answers)
-    return asked
-
-
-def test_the_command_puts_its_tables_between_the_markers(tmp_path, capsys, planted):
-    page = tmp_path / "page.md"
-    places = "".join(
-        f"<!-- table: forest {n} -->\nold\n<!-- end -->\n" for n in ("recall", "metric", "compared", "times")
-    )
-    page.write_text(f"before\n{places}<!-- table: forest runs -->\nkept\n<!-- end -->\nafter\n")
-    assert forest.main(["--work", str(tmp_path), "--write", str(page), "--quick"]) == 0
-    text = page.read_text()
-    assert text.startswith("before\n<!-- table: forest recall -->\n| AR@1 / AR@5, %")
-    assert text.endswith("<!-- table: forest runs -->\nkept\n<!-- end -->\nafter\n")
-    assert "old" not in text
-    assert text.count("`python -m bench.forest --seeds 20000 --worlds 4 --queries 4`. Weights ") == 4
-    assert "100 / 100" in capsys.readouterr().out
+def test_errors_are_those_of_the_robot_not_of_the_odometrys_origin():
+    told = np.array([pose_from(rot_z(0.2), [100.0, 0.0, 0.0])])
+    drive = Drive("os64", 0.0, told, (np.zeros((1, 3), np.float32),), pose_from(rot_z(1.0), [5.0, 6.0, 7.0]))
+    at, truth = in_odometry(drive)
+    query = query_of(drive, LocalizerConfig(reloc="learned"))[0]
+    np.testing.assert_allclose(at[-1, :3, 3], 0.0)
+    np.testing.assert_allclose(truth @ at[-1], drive.truth)
+    assert errors(truth, truth, query) == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-5)
+    off = pose_from(np.eye(3), [3.0, 4.0, 12.0]) @ truth
+    assert errors(off, truth, query) == pytest.approx((5.0, 0.0, 13.0, 0.0), abs=1e-5)
+    turned = truth @ pose_from(rot_z(np.radians(90.0)), np.zeros(3))
+    assert errors(turned, truth, query) == pytest.approx((0.0, 90.0, 0.0, 90.0), abs=1e-5)
 
 
-def test_a_world_that_failed_is_named_and_the_others_are_shown(tmp_path, capsys, planted):
-    assert forest.main(["--seeds", "1", "--work", str(tmp_path)]) == 1
-    out, err = capsys.readouterr()
-    assert "100 / 100" in out
-    assert "drawn-1: gone" in err
-
-
-def test_a_missing_page_is_refused_before_anything_is_measured(tmp_path, capsys, planted):
-    assert forest.main(["--write", str(tmp_path / "none.md"), "--work", str(tmp_path)]) == 2
-    assert "there is no such page" in capsys.readouterr().err
-    assert not planted
-
-
-def test_answers_are_kept_per_world_until_weights_or_code_change(tmp_path, monkeypatch):
-    opened = []
-
-    def place():
-        opened.append(1)
-        raise RuntimeError("asked anew")
-
-    kept = tmp_path / "answers" / "w.json"
-    kept.parent.mkdir()
-    monkeypatch.setattr(forest, "weights", lambda: "a")
-    monkeypatch.setattr(forest, "code", lambda: "b")
-    kept.write_text(
-        '{"spec": {"name": "w", "weights": "a", "code": "b", "radius": 30.0, "files": "x"},'
-        ' "result": {"answers": [1], "seconds": 2}}'
-    )
-    assert forest.asked(tmp_path, "w", place, {"files": "x"}) == [1]
-    assert not opened
-    with pytest.raises(RuntimeError, match="asked anew"):
-        forest.asked(tmp_path, "w", place, {"files": "y"})
-    monkeypatch.setattr(forest, "weights", lambda: "c")
-    with pytest.raises(RuntimeError, match="asked anew"):
-        forest.asked(tmp_path, "w", place, {"files": "x"})
-
-
-def test_scans_that_are_not_there_are_named_in_one_line(tmp_path, capsys):
-    assert forest.main(["--plot", str(tmp_path), "--work", str(tmp_path)]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("bench.forest: ")
-    assert "ALS_Clip.laz" in error
-
-
-def test_the_page_has_a_place_for_every_table_and_the_suite_knows_the_command():
-    from bench.harness.publish import filled
-
-    page = (ROOT / forest.PAGE).read_text()
-    names = (
-        "recall", "metric", "compared", "times", "scale", "runs", "plot", "disk recall", "disk metric",
-        "disk compared",
-    )  # fmt: skip
-    assert filled(page, {f"forest {name}": "" for name in names}) != page
-    assert "forest" in OWN
+def test_a_run_is_scored_by_two_metres_and_outside_every_pose_is_false():
+    truth = np.array([pose_from(np.eye(3), [10.0 * k, 0, 0]) for k in range(5)])
+    poses = truth.copy()
+    poses[:, 0, 3] += [0.0, 0.3, 0.0, 2.5, 0.4]
+    said = told(["SEARCHING", "TRACKING", "SEARCHING", "TRACKING", "TRACKING"], poses)
+    row = runs.scored(said, truth, outside=False)
+    assert (row["driven_m"], row["first_fix_m"]) == (40.0, 10.0)
+    assert (row["posed"], row["posed_after"], row["false"]) == (0.6, 0.75, 1)
+    assert row["rmse_m"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
+    assert runs.scored(said, truth, outside=True)["false"] == 3
+    silent = runs.scored(told(["SEARCHING"] * 5), truth, outside=True)
+    assert (silent["false"], silent["first_fix_m"], silent["rmse_m"]) == (0, None, None)
