@@ -25,14 +25,14 @@ _MIN_CLUSTERS = 8  # six unknowns need more
 
 
 class SharedErrorModel:
-    """The error that neighbouring registrations share, and that does not average out over them: a running average."""
+    """Running average of the error that neighbouring registrations share, and that does not average out over them."""
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
         self._clustered: Floats | None = None
 
     def clear(self) -> None:
-        """Forget what was seen: the place is another."""
+        """Forget all registrations: the place is another."""
         self._clustered = None
 
     def learn(self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats) -> None:
@@ -44,20 +44,15 @@ class SharedErrorModel:
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the sigma of late, and what the pairs do not show.
+        """(6, 6) over (rx, ry, rz, x, y, z): ``shared`` times the clustered sigma, and what the pairs do not show.
 
         The latter is above all that odometry's roll and pitch tremble from frame to frame.
         """
-        config = self._config
-        tilt, yaw, place, height = (
-            config.shared_tilt,
-            config.shared_yaw,
-            config.shared_position,
-            config.shared_height,
-        )
-        rest = np.diag(np.square([tilt, tilt, yaw, place, place, height]))
-        seen = np.zeros((6, 6)) if self._clustered is None else self._clustered
-        return np.asarray(config.shared**2 * seen + rest)
+        c = self._config
+        tilt, position = c.shared_tilt, c.shared_position
+        rest = np.square([tilt, tilt, c.shared_yaw, position, position, c.shared_height])
+        clustered = np.zeros((6, 6)) if self._clustered is None else self._clustered
+        return np.asarray(c.shared**2 * clustered + np.diag(rest))
 
 
 def clustered_covariance(

@@ -21,7 +21,6 @@ from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
-from coview_stream.localization.registration import gicp as pivot
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
@@ -90,8 +89,8 @@ def test_hessian_and_gradient_match_numerical_derivatives():
 
     r = residuals(TILTED)
     theirs = slope(lambda d: TILTED @ exp_se3(d))
-    ours = slope(lambda d: pivot.retract(TILTED, d, PIVOT))
-    H, b = pivot.about_pivot(theirs.T @ theirs, theirs.T @ r, TILTED, PIVOT)
+    ours = slope(lambda d: gicp.retract(TILTED, d, PIVOT))
+    H, b = gicp.about_pivot(theirs.T @ theirs, theirs.T @ r, TILTED, PIVOT)
     np.testing.assert_allclose(H, ours.T @ ours, rtol=1e-6, atol=1e-5 * np.abs(H).max())
     np.testing.assert_allclose(b, ours.T @ r, rtol=1e-6, atol=1e-6 * np.abs(b).max())
 
@@ -103,17 +102,17 @@ def test_point_to_point_system_matches_its_residuals():
         return (transform(T, p) - q).ravel()
 
     h = 1e-6
-    moves = [(pivot.retract(TILTED, h * e, PIVOT), pivot.retract(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
+    moves = [(gicp.retract(TILTED, h * e, PIVOT), gicp.retract(TILTED, -h * e, PIVOT)) for e in np.eye(6)]
     slope = np.column_stack([(gaps(a) - gaps(b)) / (2 * h) for a, b in moves])
     there = transform(TILTED, p)
-    H, b = pivot.point_to_point_system(there, there - q, transform(TILTED, PIVOT[None])[0])
+    H, b = gicp.point_to_point_system(there, there - q, transform(TILTED, PIVOT[None])[0])
     np.testing.assert_allclose(H, slope.T @ slope, rtol=1e-6, atol=1e-5)
     np.testing.assert_allclose(b, slope.T @ gaps(TILTED), rtol=1e-6, atol=1e-5)
 
 
 def test_retract_rotates_about_the_pivot_and_translates_along_map_axes():
     step = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
-    there = pivot.retract(TILTED, step, PIVOT)
+    there = gicp.retract(TILTED, step, PIVOT)
     gap = transform(there, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
     np.testing.assert_allclose(gap, step[3:], atol=1e-12)
     np.testing.assert_allclose(boxminus(there, TILTED)[:3], step[:3], atol=1e-9)
@@ -124,13 +123,13 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
     rng = np.random.default_rng(4)
     A, B = (m @ m.T + 50 * np.eye(6) for m in 10 * rng.standard_normal((2, 6, 6)))
     gap = np.array([1e-6, -2e-6, 3e-6, 0.003, -0.002, 0.005])  # small: turns add up to first order only
-    measured = pivot.retract(TILTED, gap, PIVOT)
+    measured = gicp.retract(TILTED, gap, PIVOT)
     prior = Belief(TILTED, B)
     wanted = np.linalg.solve(A + B, A @ gap)
     for begin, gradient in ((TILTED, -A @ gap), (measured, np.zeros(6))):
-        step, information = pivot.fused_step(A, gradient, begin, PIVOT, prior)
+        step, information = gicp.fused_step(A, gradient, begin, PIVOT, prior)
         np.testing.assert_array_equal(information, A + B)
-        found = pivot.retract(begin, step, PIVOT)
+        found = gicp.retract(begin, step, PIVOT)
         away = transform(found, PIVOT[None])[0] - transform(TILTED, PIVOT[None])[0]
         np.testing.assert_allclose(away, wanted[3:], atol=1e-7)
         np.testing.assert_allclose(boxminus(found, TILTED)[:3], wanted[:3], atol=1e-7)
@@ -138,7 +137,7 @@ def test_pairs_and_prior_fuse_as_two_gaussians():
 
 def test_step_without_prior_is_that_of_the_pairs():
     A = np.diag([4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
-    step, information = pivot.fused_step(A, np.ones(6), TILTED, PIVOT, None)
+    step, information = gicp.fused_step(A, np.ones(6), TILTED, PIVOT, None)
     np.testing.assert_allclose(step, -1.0 / np.diag(A), rtol=1e-6)
     np.testing.assert_array_equal(information, A)
 

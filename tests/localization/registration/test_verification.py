@@ -9,7 +9,7 @@ from courtyard import local_map, parts, plane
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
-from coview_stream.localization.registration import verification as rays
+from coview_stream.localization.registration import verification
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan
 from coview_stream.localization.registration.verification import RangeImage, free_space, verify
@@ -20,7 +20,7 @@ CONFIG = RegistrationConfig()
 @pytest.fixture(autouse=True)
 def every_map_point(monkeypatch):
     """Count every map point, not every third."""
-    monkeypatch.setattr(rays, "_FREE_EVERY", 1)
+    monkeypatch.setattr(verification, "_FREE_EVERY", 1)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_points_outside_surveyed_cells_are_ignored(seen):
 def test_dense_frame_is_verified_by_a_sample(monkeypatch):
     cloud = np.repeat(fan(10.2), 9, axis=0)
     whole = free_space(RangeImage.of(cloud), BODY, WALL)
-    monkeypatch.setattr(rays, "_MAX_RAYS", len(fan(10.2)) * 3)
+    monkeypatch.setattr(verification, "_MAX_RAYS", len(fan(10.2)) * 3)
     part = RangeImage.of(cloud)
     assert 0.2 * len(cloud) < part.hits.sum() < 0.4 * len(cloud)
     assert free_space(part, BODY, WALL) == whole

@@ -1,4 +1,4 @@
-"""The glance: a frame that lies on the map much less than the ones before it asks for a registration."""
+"""Displacement check: a frame that lies on the map much less than the ones before it asks for a registration."""
 
 from __future__ import annotations
 
@@ -65,34 +65,34 @@ def test_too_few_points_give_no_share(target):
     flat = frame[transform(T_MAP_ODOM, frame)[:, 2] < 0.1]
     assert len(flat) > 500
     assert share_on_map(flat, HERE, T_MAP_ODOM, target) is None
-    glance = used_to(target)
-    usual = glance.usual
-    glance.learn(flat, HERE, T_MAP_ODOM, target)
-    assert glance.usual == usual
-    assert not glance.is_displaced(flat, HERE, ELSEWHERE, target)
+    check = used_to(target)
+    usual = check.usual
+    check.learn(flat, HERE, T_MAP_ODOM, target)
+    assert check.usual == usual
+    assert not check.is_displaced(flat, HERE, ELSEWHERE, target)
 
 
 def used_to(target, frames=5):
-    """A glance that has seen the yard a few times."""
-    glance = DisplacementCheck()
+    """A check that has seen the yard a few times."""
+    check = DisplacementCheck()
     for k in range(frames):
-        glance.learn(yard(100 + k), HERE, T_MAP_ODOM, target)
-    return glance
+        check.learn(yard(100 + k), HERE, T_MAP_ODOM, target)
+    return check
 
 
 def test_displaced_frame_is_detected_and_not_learned(target):
-    glance = used_to(target)
-    usual = glance.usual
-    assert not any(glance.is_displaced(yard(k), HERE, T_MAP_ODOM, target) for k in range(5))
-    assert all(glance.is_displaced(yard(k), HERE, ELSEWHERE, target) for k in range(5, 30))
-    assert glance.usual == usual
-    assert not glance.is_displaced(yard(40), HERE, T_MAP_ODOM, target)
+    check = used_to(target)
+    usual = check.usual
+    assert not any(check.is_displaced(yard(k), HERE, T_MAP_ODOM, target) for k in range(5))
+    assert all(check.is_displaced(yard(k), HERE, ELSEWHERE, target) for k in range(5, 30))
+    assert check.usual == usual
+    assert not check.is_displaced(yard(40), HERE, T_MAP_ODOM, target)
 
 
 def test_no_displacement_without_a_baseline(target):
-    glance = DisplacementCheck()
-    assert not glance.is_displaced(yard(), HERE, ELSEWHERE, target)
-    assert glance.usual is None
+    check = DisplacementCheck()
+    assert not check.is_displaced(yard(), HERE, ELSEWHERE, target)
+    assert check.usual is None
 
 
 def cluttered(share, seed):
@@ -105,45 +105,45 @@ def cluttered(share, seed):
 
 
 def test_slow_change_updates_baseline_and_sudden_change_is_detected(target):
-    glance, alarms = DisplacementCheck(), []
+    check, alarms = DisplacementCheck(), []
     for k, share in enumerate(np.linspace(0.0, 0.6, 40)):
         frame = cluttered(share, k)
-        alarms.append(glance.is_displaced(frame, HERE, T_MAP_ODOM, target))
-        glance.learn(frame, HERE, T_MAP_ODOM, target)
+        alarms.append(check.is_displaced(frame, HERE, T_MAP_ODOM, target))
+        check.learn(frame, HERE, T_MAP_ODOM, target)
     assert not any(alarms)
-    assert glance.usual < 0.6
+    assert check.usual < 0.6
     assert used_to(target).is_displaced(cluttered(0.6, 9), HERE, T_MAP_ODOM, target)
 
 
 def test_one_badly_fitting_frame_does_not_become_the_baseline(target):
     """The registration may have been believed by a hair."""
-    glance = used_to(target)
-    before = glance.usual
-    glance.learn(cluttered(0.6, 1), HERE, T_MAP_ODOM, target)
-    assert before - 0.3 < glance.usual < before
-    assert glance.is_displaced(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
+    check = used_to(target)
+    before = check.usual
+    check.learn(cluttered(0.6, 1), HERE, T_MAP_ODOM, target)
+    assert before - 0.3 < check.usual < before
+    assert check.is_displaced(cluttered(0.6, 2), HERE, T_MAP_ODOM, target)
 
 
 def test_baseline_can_be_cleared(target):
-    glance = used_to(target)
-    glance.clear()
-    assert glance.usual is None
-    assert not glance.is_displaced(yard(), HERE, ELSEWHERE, target)
+    check = used_to(target)
+    check.clear()
+    assert check.usual is None
+    assert not check.is_displaced(yard(), HERE, ELSEWHERE, target)
 
 
 def test_scan_of_another_world_is_detected_as_displaced(world_map, world_drive, scene):
     T, cloud = world_drive.T_map_body[4], world_drive.clouds[4]
     around = LocalMaps(world_map, 50.0).around(T[:3, 3])
-    glance, other = DisplacementCheck(), scan(boxes(seed=77), T)
+    check, other = DisplacementCheck(), scan(boxes(seed=77), T)
 
     def arguments(cloud):
         level = transform(pose_from(T[:3, :3], np.zeros(3)), cloud).astype(np.float32)
         return level, np.zeros(3), pose_from(np.eye(3), T[:3, 3]), around
 
-    glance.learn(*arguments(cloud))
-    assert glance.usual > 0.9
-    assert glance.is_displaced(*arguments(other))
-    assert not glance.is_displaced(*arguments(scan(scene, T, 5)))
+    check.learn(*arguments(cloud))
+    assert check.usual > 0.9
+    assert check.is_displaced(*arguments(other))
+    assert not check.is_displaced(*arguments(scan(scene, T, 5)))
 
 
 def test_displacement_check_samples_a_bounded_number_of_points(target, monkeypatch):
