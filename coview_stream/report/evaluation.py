@@ -1,4 +1,4 @@
-"""Errors of a trajectory against truth (eqs 15-17), and what an operator would ask.
+"""Errors of a trajectory against the truth (eqs 15-17), and whether a run succeeded.
 
 Both trajectories are poses ``T_map_body``. A frame without a pose is *not localised*; it is never an error.
 """
@@ -22,10 +22,10 @@ MAX_TRANSLATION = 3.0
 """... and below this translation error (eq. 16), metres (the success criterion of eq. 17)."""
 
 MAX_STAMP_GAP = 0.051
-"""Poses that differ by this from every true stamp (seconds) are not compared: half a 10 Hz frame, rounded."""
+"""Poses farther than this from every true stamp (seconds) are not compared; half a frame at 10 Hz, set by hand."""
 
-RIGHT_SHARE = 0.95
-"""A run succeeds if its first pose is right and more than this share of all poses."""
+MIN_RIGHT_SHARE = 0.95
+"""A run succeeds if its first pose is right and more than this share of all poses; set by hand."""
 
 Trajectory = tuple[Floats, Floats]
 """Stamps (N,) in seconds, increasing, and poses (N, 4, 4) in metres, as ``read_tum`` returns them."""
@@ -55,7 +55,7 @@ class FrameErrors:
 
 @dataclass(frozen=True)
 class ErrorStats:
-    """Mean, root mean square, median and maximum of an error."""
+    """Mean, root mean square, median and maximum of an error; metres or degrees."""
 
     mean: float
     rmse: float
@@ -65,14 +65,14 @@ class ErrorStats:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The verdict on one run.
+    """Comparison of one run with the truth.
 
     Attributes:
         frames: true poses.
         posed: estimated poses that have a true one within ``MAX_STAMP_GAP``.
         unmatched: estimated poses that have none.
         share_localised: share of the frames with a right pose, 0 to 1.
-        false_frames: poses that are wrong; the number that has to be zero.
+        false_frames: wrong poses; the number that has to be zero.
         first_fix_m: metres driven before the first pose; None if there is none.
         success: the first pose is right, and more than 95 % of all.
         translation: errors of the right poses, metres; None if there are none.
@@ -132,7 +132,7 @@ def driven(poses: Floats) -> Floats:
 def evaluate(
     estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Pose] | None = None
 ) -> Evaluation:
-    """Judge an estimated trajectory; an empty one is "not localised", never an error.
+    """Compare an estimated trajectory with the truth; an empty one is "not localised", never an error.
 
     Args:
         estimate: stamps and poses ``T_map_body``, only where the robot was localised.
@@ -151,7 +151,7 @@ def evaluate(
         share_localised=len(np.unique(errors.index[right])) / frames,
         false_frames=int((~right).sum()),
         first_fix_m=float(errors.distance[0]) if posed else None,
-        success=bool(posed and right[0] and right.mean() > RIGHT_SHARE),
+        success=bool(posed and right[0] and right.mean() > MIN_RIGHT_SHARE),
         translation=_stats(errors.e_t[right]),
         rotation=_stats(np.degrees(errors.e_r[right])),
         worst_t_m=float(errors.e_t.max()) if posed else None,

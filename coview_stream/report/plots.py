@@ -20,11 +20,11 @@ from coview_stream.report.style import (
     STATE_COLOURS,
     TRUTH,
     draw_base_map,
+    draw_notice,
     figure,
     legend_above,
     legend_below,
     map_figure_size,
-    say,
 )
 
 Path = str | os.PathLike[str]
@@ -44,7 +44,7 @@ def plot_map(base: Reals, stations: Reals, path: Path, title: str = "Base map") 
             label = f"{len(at):,} stations".replace(",", " ")
             axes.scatter(at[:, 0], at[:, 1], s=size, c=STATE_COLOURS["TRACKING"], linewidths=0, label=label)
         else:
-            say(axes, "no stations")
+            draw_notice(axes, "no stations")
         axes.set_title(title)
         legend_below(drawing, axes)
 
@@ -62,7 +62,7 @@ def plot_trajectory(
     Args:
         base: (N, 3) base map points, metres.
         positions: (K, 3) map positions of the robot, one per frame; NaN where it was not localised: such a
-            frame has no position and is drawn nowhere, but counted in the legend.
+            frame is not drawn, but counted in the legend.
         states: K states, SEARCHING, AMBIGUOUS, TRACKING or LOST.
         path: picture to write.
         truth: (T, 3) true positions, if known.
@@ -84,7 +84,7 @@ def plot_trajectory(
             )
         _draw_states(axes, positions - shift, drawn, np.asarray(states, dtype=object))
         if not drawn.any():
-            say(axes, "not localised: no frame has a pose")
+            draw_notice(axes, "not localised: no frame has a pose")
         axes.set_title(title)
         legend_below(drawing, axes)
 
@@ -126,7 +126,7 @@ def plot_errors(
             axes.grid(color="#DDDDDD", linewidth=0.6)
             axes.set_ylabel(label)
             if not len(values):
-                say(axes, "no pose to compare")
+                draw_notice(axes, "no pose to compare")
                 axes.set_yticks([])
                 continue
             mean = float(values[~wrong].mean()) if (~wrong).any() else float("nan")

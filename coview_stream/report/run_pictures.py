@@ -23,7 +23,7 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
     no_position = np.full(3, np.nan)
     positions = np.array([no_position if f.T_map_body is None else f.T_map_body[:3, 3] for f in result.fixes])
     points = base_map.points.astype(np.float64) + base_map.origin
-    states = [fix.state.value for fix in result.fixes]
+    states = [fix.state.reported for fix in result.fixes]
     plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth)
     winner = result.winner
     if winner is not None and winner.station is not None and winner.shift is not None and result.query:

@@ -1,4 +1,4 @@
-"""How the pictures look: one figure size, one type, colours that colour-blind readers tell apart."""
+"""Style of the pictures: figure size, type, colours that colour-blind readers tell apart, the grey base map."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TRUTH = "#000000"
 ACCENT = "#009E73"
 
 MAX_BASE_POINTS = 1_000_000
-"""A base map is thinned to this many points: more do not show in a picture of 800 cells across."""
+"""A base map is thinned to this many points, set by hand: more do not show in a picture of 800 cells across."""
 
-_SURROUNDINGS = 25.0  # metres; terrain changes little over them, and few buildings are wider
+_GROUND_WINDOW = 25.0  # metres, set by hand; terrain changes little over it, and few buildings are wider
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -77,8 +77,8 @@ def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, 
 def draw_base_map(axes: Any, points: Reals) -> Floats:
     """Draw (N, 3) base map points from above, darker the higher they stand over their surroundings.
 
-    Returns what was subtracted from the coordinates: far from zero (UTM) they are shifted by a round number,
-    which the axis labels then name, for ticks with seven digits cannot be read.
+    Returns the offset (3,) subtracted from the coordinates: far from zero (UTM) they are shifted by a round number,
+    named in the axis labels; ticks with seven digits cannot be read.
     """
     shift = base_shift(points)
     if len(points):
@@ -109,7 +109,7 @@ def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
     heights[i[order], j[order]] = points[order, 2]
     heights = np.where(np.isinf(heights), grey_closing(heights, size=(3, 3)), heights)
     known = np.isfinite(heights)
-    window = max(3, int(_SURROUNDINGS / cell))
+    window = max(3, int(_GROUND_WINDOW / cell))
     above = np.where(known, heights, 0.0) - minimum_filter(np.where(known, heights, np.inf), size=window)
     tall = max(float(np.percentile(above[known], 98)), 0.5)
     grey = 0.93 - 0.55 * np.clip(above / tall, 0.0, 1.0) ** 0.7
@@ -144,8 +144,8 @@ def _axis_label(name: str, shift: float) -> str:
     return f"{name} {sign} {abs(shift):,.0f} [m]".replace(",", " ")
 
 
-def say(axes: Any, text: str) -> None:
-    """Write a notice across the middle of a picture that would else be empty."""
+def draw_notice(axes: Any, text: str) -> None:
+    """Write a text across the middle of a picture that would else be empty."""
     axes.text(
         0.5,
         0.5,

@@ -1,4 +1,4 @@
-"""Poses in the rerun viewer: the robots' bodies and the ways they went, in the map frame."""
+"""Viewer of live poses (rerun): the robots' axes and paths, in the map frame."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from coview_stream.errors import require_library
 from coview_stream.geometry.transforms import pose_to_tum
 from coview_stream.messages.types import PoseMessage
 
-_STRIP = 50  # poses after which a new piece of the way starts: redrawing all of it each time is quadratic
+_MAX_STRIP = 50  # poses of one line strip, set by hand: redrawing the whole path at each pose is quadratic
 _COLOURS = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up
 
 
 class PoseViewer:
-    """Opens the viewer and shows poses as they come.
+    """Window of the rerun viewer, opened on creation.
 
-    The first position becomes the viewer's origin, for it draws in float32 and maps may lie at UTM coordinates.
+    The first position is the viewer's origin: it draws in float32, and maps may have UTM coordinates.
 
     Raises:
         DependencyError: rerun is not installed.
@@ -29,11 +29,11 @@ class PoseViewer:
         self._rerun.init(application, spawn=True)
 
     def show(self, pose: PoseMessage) -> None:
-        """Log one pose and the way to it."""
+        """Draw one pose and the path to it."""
         row = pose_to_tum(pose.T_map_body)
         if self._origin is None:
             self._origin = row[:3].copy()
-        place = row[:3] - self._origin
+        position = row[:3] - self._origin
         name = f"robots/{pose.robot}"
         if name not in self._strips:
             axes = self._rerun.Arrows3D(vectors=np.eye(3), colors=_COLOURS)
@@ -41,18 +41,18 @@ class PoseViewer:
         self._set_time(pose.stamp_ns)
         self._rerun.log(
             f"{name}/body",
-            self._rerun.Transform3D(translation=place, rotation=self._rerun.Quaternion(xyzw=row[3:])),
+            self._rerun.Transform3D(translation=position, rotation=self._rerun.Quaternion(xyzw=row[3:])),
         )
-        self._extend(name, place)
+        self._extend(name, position)
 
-    def _extend(self, name: str, place: np.ndarray) -> None:
+    def _extend(self, name: str, position: np.ndarray) -> None:
         strip = self._strips.setdefault(name, [])
-        strip.append(place)
+        strip.append(position)
         piece = self._pieces.setdefault(name, 0)
         if len(strip) > 1:
             self._rerun.log(f"{name}/way/{piece}", self._rerun.LineStrips3D([np.array(strip)]))
-        if len(strip) >= _STRIP:
-            self._strips[name] = [place]
+        if len(strip) >= _MAX_STRIP:
+            self._strips[name] = [position]
             self._pieces[name] = piece + 1
 
     def _set_time(self, stamp_ns: int) -> None:

@@ -1,4 +1,7 @@
-"""The base map's scanner: an aircraft that sweeps the scene in strips, in two directions."""
+"""Airborne scan for the base map: an aircraft that sweeps the scene in strips, in two directions.
+
+All figures are set by hand, after data sheets of airborne scanners.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +25,13 @@ RANGE_NOISE = 0.025
 POROSITY = 0.5
 """Probability that a pulse passes one surface of foliage."""
 
-_OVERLAP = 0.2
+_OVERLAP = 0.2  # share of a strip's width
 _FOOTPRINT = 6e-4  # radians, one sigma of the pointing
 
 
 @dataclass(frozen=True)
 class Flight:
-    """How the scene is flown over.
+    """Flight over the scene.
 
     Attributes:
         altitude: metres above the scene's zero.
@@ -45,11 +48,11 @@ class Flight:
     margin: float = 15.0
 
 
-_USUAL = Flight()
+_DEFAULT_FLIGHT = Flight()
 
 
 def airborne_scan(
-    caster: Caster, size: float, density: float, rng: np.random.Generator, flight: Flight = _USUAL
+    caster: Caster, size: float, density: float, rng: np.random.Generator, flight: Flight = _DEFAULT_FLIGHT
 ) -> Iterator[tuple[float, Floats]]:
     """Scan the square of ``size`` metres with ``density`` pulses per square metre, strip by strip.
 

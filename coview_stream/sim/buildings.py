@@ -1,6 +1,6 @@
 """Buildings: each function draws one at the origin, frontage along x and the street towards -y.
 
-Walls reach ``_FOOTING`` below z = 0, so that a building may stand on a slope. Lengths in metres.
+Walls reach ``_FOOTING`` below z = 0: a building may stand on a slope. Lengths in metres, all set by hand.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 
 from coview_stream.sim.mesh import Mesh, box, cylinder, frustum, gable, join, placed, shed
 
-_FOOTING = 2.0
-_EAVES = 0.45
+_FOOTING = 2.0  # metres
+_EAVES = 0.45  # metres
 
 Draw = Callable[[np.random.Generator, float, float], Mesh]
 """(rng, frontage w, depth d) -> building."""

@@ -1,4 +1,4 @@
-"""Rays through a scene: solid things stop them, foliage lets some pass."""
+"""Ray casting into a scene: solid surfaces stop rays, foliage lets some pass."""
 
 from __future__ import annotations
 
@@ -11,23 +11,28 @@ from coview_stream.geometry.arrays import Bools, Floats32, Indices
 from coview_stream.sim.scenes import Epoch
 
 BLOCK = 200_000
-"""Rays cast at a time: bounds the memory to about 30 MB."""
+"""Rays cast at a time, set by hand: bounds the memory to about 30 MB."""
 
 _THREADS = 2
-_MAX_LAYERS = 6  # leaves that a ray may pass before it is stopped for good
-_LEAF_DEPTH = 0.12  # metres; mean depth below the hull of a crown at which a leaf is hit
+_MAX_LAYERS = 6  # surfaces of foliage that a ray may pass; set by hand
+_LEAF_DEPTH = 0.12  # metres, set by hand; mean depth below the hull of a crown at which a leaf is hit
 _STEP = 2e-3  # metres beyond a leaf at which the ray goes on
 
 
 class Hits(NamedTuple):
-    """What (N,) rays met: distance in metres (inf for nothing) and |cos| of the angle of incidence."""
+    """First hits of (N,) rays.
+
+    Attributes:
+        distance: (N,) metres; inf without a hit.
+        incidence: (N,) absolute cosines of the angles of incidence; 1 on foliage.
+    """
 
     distance: Floats32
     incidence: Floats32
 
 
 class Caster:
-    """Casts rays into one epoch of a scene, on ``threads`` cores.
+    """Ray caster for one epoch of a scene, on ``threads`` cores.
 
     Leaves are hit ``leaf_depth`` metres on average below the surface of their foliage.
 
@@ -49,7 +54,7 @@ class Caster:
                 self._foliage = number if name == "foliage" else self._foliage
 
     def cast(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
-        """First hits of (N, 3) unit rays from (N, 3) origins, scene frame, metres.
+        """Return the first hits of (N, 3) unit rays from (N, 3) origins, scene frame, metres.
 
         Each surface of foliage lets a ray pass with probability ``porosity``.
         """
@@ -87,5 +92,5 @@ class Caster:
         packed = np.ascontiguousarray(np.concatenate([origins, rays], axis=1), dtype=np.float32)
         answer = self._scene.cast_rays(self._o3d.core.Tensor(packed), nthreads=self._threads)
         cosine = np.abs(np.einsum("ij,ij->i", answer["primitive_normals"].numpy(), rays))
-        # copies, for the arrays belong to the tensors of the answer
+        # copies: the arrays belong to the tensors of the answer
         return answer["t_hit"].numpy().copy(), cosine, answer["geometry_ids"].numpy() == self._foliage

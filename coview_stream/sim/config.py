@@ -1,4 +1,4 @@
-"""What to simulate."""
+"""Configuration of a simulated world."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """A world and a drive through it.
+    """Configuration of a world and a drive through it.
 
     Attributes:
         scene: town, campus, village, industrial or forest.
         sensor: vlp16, os64, os64-2048 or mid360.
-        seed: everything else follows from it; equal configurations give equal files.
+        seed: of all random numbers; equal configurations give equal files.
         size: side of the square map, metres.
         length: distance driven, metres.
         density: airborne pulses per square metre.
-        changed: share of trees, cars and poles that are others than when the map was made.
+        changed: share of the trees, cars and poles that were replaced since the map was made.
         origin: added to all map coordinates, metres (a UTM-like offset).
-        speed: metres per second.
+        speed: of the robot, metres per second.
         height: of the sensor above the ground, metres.
-        odometry: how the odometry drifts.
+        odometry: errors of the odometry.
 
     Raises:
         ConfigError: unknown scene or sensor, or a value out of its range.
@@ -67,5 +67,5 @@ class SimulationConfig:
             raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain values, for JSON."""
+        """Return all fields as plain values, for JSON."""
         return asdict(self)

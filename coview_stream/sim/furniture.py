@@ -1,4 +1,4 @@
-"""What stands along streets: parked cars, lamp posts, signs, fences."""
+"""Street furniture: parked vehicles, lamp posts, signs and masts. Sizes in metres, all set by hand."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.sim.layout import Layout, Site, directions
 from coview_stream.sim.mesh import Mesh, box, cylinder, frustum, join, placed
 
-_LORRIES = 0.95  # from this kind on
-_LANE = 2.2  # metres from the middle of the robot's lane to the middle of a vehicle
+_LORRIES = 0.95  # vehicles of this ``kind`` and above
+_MIN_CLEARANCE = 2.2  # metres from the robot's route to the middle of a vehicle
 
 
 def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: float) -> Floats:
-    """(N, 4) x, y, yaw and kind of places beside the streets, ``offset`` metres from the centre line, in random order.
+    """Return (N, 4) x, y, yaw and kind of places ``offset`` metres beside the streets' centre lines, in random order.
 
     Places on a crossing are left out. ``kind`` is a random number in [0, 1).
     """
@@ -32,27 +32,27 @@ def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: floa
             rows.append(np.column_stack([xy, yaw, rng.random(len(k))]))
     found = np.concatenate(rows)
     clear = tree.query(found[:, :2])[0] > 0.8 * offset
-    return np.asarray(rng.permutation(found[clear & _leaves_lane(found, layout.route)]))
+    return np.asarray(rng.permutation(found[clear & _leaves_lane_free(found, layout.route)]))
 
 
-def _leaves_lane(rows: Floats, route: Floats) -> Bools:
-    """(N,) whether a vehicle parked there leaves the robot's lane free, its two ends included."""
+def _leaves_lane_free(rows: Floats, route: Floats) -> Bools:
+    """Return (N,) whether a vehicle parked there leaves the robot's lane free, both its ends included."""
     tree = cKDTree(route)
     reach = np.where(rows[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
     along = reach * np.column_stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])])
     ends = np.stack(
         [rows[:, :2] - along, rows[:, :2] - along / 2, rows[:, :2] + along / 2, rows[:, :2] + along]
     )
-    return np.asarray((tree.query(ends)[0] > _LANE).all(axis=0))
+    return np.asarray((tree.query(ends)[0] > _MIN_CLEARANCE).all(axis=0))
 
 
 def cars(rows: Floats, site: Site) -> Mesh:
-    """Parked cars, vans and, for the largest ``kind``, lorries."""
+    """Return parked cars, vans and, for the largest ``kind``, lorries."""
     return join(_stand(_vehicle(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
 
 
 def poles(rows: Floats, site: Site) -> Mesh:
-    """Lamp posts with an arm over the road, traffic signs and masts."""
+    """Return lamp posts with an arm over the road, traffic signs and masts."""
     return join(_stand(_pole(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
 
 

@@ -1,4 +1,7 @@
-"""The kinds of scene, as numbers: what stands in a town, on a campus, in a village, a forest, a works."""
+"""Kinds of scene: the streets, buildings and vegetation of towns, campuses, villages, industry and forests.
+
+All numbers are set by hand.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,14 @@ Range = tuple[float, float]
 
 
 class Plot(NamedTuple):
-    """One type of building and the ranges of its size; lengths in metres."""
+    """One type of building.
+
+    Attributes:
+        draw: function that draws one.
+        weight: how often it is chosen, relative to the others.
+        frontage: range of its length along the street, metres.
+        depth: range of its depth, metres.
+    """
 
     draw: buildings.Draw
     weight: float
@@ -24,15 +34,23 @@ class Plot(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What a scene is made of; lengths in metres, densities per square metre.
+    """Contents of a scene; lengths in metres, densities per square metre.
 
     Attributes:
         streets: (rng, size, half) -> layout.
-        relief, roughness, ditch: see ``Site``.
-        plots: buildings along the streets, ``setback`` from the footway and ``gap`` from each other; a share
-            of ``vacant`` plots stays empty.
-        infill: buildings away from streets.
-        trees, species, undergrowth, rocks, logs: vegetation and what lies in it.
+        relief: amplitude of the hills.
+        roughness: amplitude of the ground off the road.
+        ditch: depth of the ditches along the roads.
+        plots: buildings along the streets.
+        setback: range of the distance from the footway to a building.
+        gap: range of the distance between neighbours.
+        vacant: share of the plots that stay empty.
+        infill: density of buildings away from streets.
+        trees: density.
+        species: their sizes and shapes.
+        undergrowth: density of bushes.
+        rocks: density of boulders.
+        logs: density of fallen trunks.
         cars: share of the parking places that are taken.
         pole_spacing: mean distance between poles on one side of a street; 0 for none.
         hedges: share of the plots with a hedge or fence in front.

@@ -1,6 +1,4 @@
-"""Where the streets run, and the closed loop that the robot drives along them."""
-
-# FOLDED coview_stream/sim/layout.py: """The ground of a scene: its relief, its roads, and which square metres are taken."""
+"""Layout of a scene: streets, the closed loop that the robot drives, the ground, and which of it is taken."""
 
 from __future__ import annotations
 
@@ -13,9 +11,9 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Indices
 from coview_stream.sim.mesh import Mesh, height_field
 
-_LOOP_STEP = 0.25
-
-_STREET_STEP = 1.0
+_LOOP_STEP = 0.25  # metres between points of the route
+_STREET_STEP = 1.0  # metres between points of a street
+_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Layout:
 
 
 def resample(points: Floats, step: float) -> Floats:
-    """Polyline (N, 2) with points ``step`` metres apart."""
+    """Return a polyline (N, 2) with points ``step`` metres apart."""
     arc = arc_lengths(points)
     count = max(2, round(arc[-1] / step) + 1)
     at = np.linspace(0.0, arc[-1], count)
@@ -60,7 +58,7 @@ def grid_layout(
     half_width: float,
     bend: float,
 ) -> Layout:
-    """Blocks between crossing streets; the loop goes round some blocks. ``bend`` metres curve the streets."""
+    """Return blocks between crossing streets; the loop goes round some. Streets curve by ``bend`` metres."""
     yaw = rng.uniform(0, np.pi / 2)
     xs, x0, x1 = _loop_lines(_street_lines(rng, half, spacing), size)
     ys, y0, y1 = _loop_lines(_street_lines(rng, half, spacing), size)
@@ -89,7 +87,7 @@ def grid_layout(
 def loop_layout(
     rng: np.random.Generator, size: float, half: float, half_width: float, branches: int, waviness: float
 ) -> Layout:
-    """Winding loop with side roads that leave it outwards, and one path across its middle."""
+    """Return a winding loop with side roads that leave it outwards, and one path across its middle."""
     angle = np.linspace(0, 2 * np.pi, 1500)
     radius = np.ones_like(angle)
     for k in (2, 3, 4):
@@ -150,11 +148,8 @@ def _inside(points: Floats, half: float) -> Floats:
     return points[(np.abs(points) < half).all(axis=1)]
 
 
-_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb
-
-
 class Site:
-    """A square piece of land of +-``half`` metres about the origin.
+    """Ground of a scene, a square of +-``half`` metres about the origin, and which of it is taken.
 
     ``relief`` is the amplitude of the hills, ``roughness`` that of the ground off the road, ``ditch`` the
     depth of the ditches along it; metres.
@@ -190,21 +185,21 @@ class Site:
         return np.asarray(z - ditch * np.exp(-(((beside - 1.5) / 0.9) ** 2)))
 
     def z(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
-        """Height of the ground at (N,) coordinates, metres."""
+        """Return the height of the ground at (N,) coordinates, metres."""
         scale = (len(self._axis) - 1) / (2 * self.half)
         at = (np.stack(np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))) + self.half) * scale
         return np.asarray(map_coordinates(self._heights, at, order=1, mode="nearest"))
 
     def height(self, x: float, y: float) -> float:
-        """Height of the ground at one place, metres."""
+        """Return the height of the ground at one place, metres."""
         return float(self.z(x, y)[0])
 
     def mesh(self) -> Mesh:
-        """Mesh of the ground itself."""
+        """Return the ground's mesh."""
         return height_field(self._axis, self._heights)
 
     def road_distance(self, x: Floats, y: Floats) -> Floats:
-        """(N,) metres to the nearest street's centre line."""
+        """Return (N,) metres to the nearest street's centre line."""
         i, j = self._cells(x, y)
         return self._road[i, j].astype(np.float64)
 
@@ -229,7 +224,7 @@ class Site:
 
 
 def _rasters(layout: Layout, half: float) -> tuple[Bools, Floats32]:
-    """Taken cells (the streets, to begin with) and each cell's distance to a street's centre, metres."""
+    """Return taken cells (the streets, to begin with) and each cell's distance to a street's centre, metres."""
     n = int(2 * half / _CELL) + 1
     centre = np.ones((n, n), dtype=bool)
     for line in (layout.route, *layout.streets):

@@ -1,6 +1,6 @@
 """Triangle meshes of simple solids, as arrays.
 
-Every solid stands on z = 0 around the origin, in metres, and is put in its place by ``placed``.
+Every solid stands on z = 0 around the origin, in metres; :func:`placed` turns and moves it.
 """
 
 from __future__ import annotations

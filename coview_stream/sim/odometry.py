@@ -1,6 +1,8 @@
-"""Odometry as a robot has it: its own origin and heading, gravity aligned, drifting."""
+"""Motion of a simulated robot: true poses along the route, and odometry that drifts from them.
 
-# FOLDED coview_stream/sim/odometry.py: """How the robot drives: along the route at a steady speed, swaying on the ground it drives over."""
+The robot keeps a steady speed and sways on uneven ground. Its odometry has an origin and heading of its own and is
+gravity aligned. All figures are set by hand.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +18,25 @@ from coview_stream.sim.layout import arc_lengths, directions
 from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
 
+_SWAY = float(np.radians(0.6))  # radians; roll and pitch jitter, one sigma
+_SWAY_MEMORY = 0.8  # share of the frame before; a body on wheels swings at about 1 Hz
+_WANDER = 0.25  # metres; the robot does not keep to the middle of its lane
+_WHEELBASE = 1.0  # metres over which the ground tilts the robot
+
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """How the odometry errs.
+    """Errors of the odometry.
 
     Attributes:
         yaw_walk: random walk of the heading, radians per square root of a metre driven, one sigma.
         scale_error: constant error of the scale over the run, one sigma.
         position_walk: random walk of the position, metres per square root of a metre, one sigma.
         tilt_noise: error of roll and pitch, radians, one sigma, independent from frame to frame.
-        offset: the odometry starts anywhere within +- this, metres (a tenth of it in z).
+        offset: the odometry starts within +- this of its origin, metres (a tenth of it in z).
 
     Raises:
-        ConfigError: a negative value, or one that is no odometry any more.
+        ConfigError: a negative value, or one too large for odometry.
     """
 
     yaw_walk: float = float(np.radians(0.15))
@@ -47,47 +54,11 @@ class OdometryConfig:
                 )
 
 
-def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random.Generator) -> Floats:
-    """Odometry (N, 4, 4) ``T_odom_body`` of a robot that really drove (N, 4, 4) ``T_map_body``.
-
-    The frame is turned about z only: roll and pitch stay those of gravity.
-    """
-    count = len(T_map_body)
-    steps = np.diff(T_map_body[:, :3, 3], axis=0)
-    root = np.sqrt(np.linalg.norm(steps, axis=1))
-    start = rng.uniform(-np.pi, np.pi)
-    origin = rng.uniform(-1, 1, 3) * config.offset * (1, 1, 0.1)
-    scale = 1.0 + np.clip(rng.normal(), -2, 2) * config.scale_error
-    yaw = start + np.concatenate([[0.0], np.cumsum(rng.normal(size=count - 1) * root * config.yaw_walk)])
-    noise = rng.normal(size=(count - 1, 3)) * root[:, None] * config.position_walk
-    tilts = rng.normal(size=(count, 2)) * config.tilt_noise
-    turns = np.stack([rot_z(angle) for angle in yaw])
-    moved = np.einsum("nij,nj->ni", turns[:-1], steps) * scale + noise
-    T_odom_body = np.tile(np.eye(4), (count, 1, 1))
-    T_odom_body[:, :3, :3] = turns @ T_map_body[:, :3, :3] @ _small_tilts(tilts)
-    T_odom_body[:, :3, 3] = origin + np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
-    return T_odom_body
-
-
-def _small_tilts(tilts: Floats) -> Floats:
-    """(N, 3, 3) rotations by (N, 2) roll and pitch angles that are too small for their order to matter."""
-    return np.asarray(Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))])).as_matrix())
-
-
-_SWAY = float(np.radians(0.6))  # roll and pitch jitter, one sigma
-
-_SWAY_MEMORY = 0.8  # of the frame before; a body on wheels swings at about 1 Hz
-
-_WANDER = 0.25  # metres; the robot does not keep to the middle of its lane
-
-_WHEELBASE = 1.0  # metres over which the ground tilts the robot
-
-
 def drive(scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator) -> Floats:
-    """Poses (N, 4, 4) of the sensor in the scene, one every 0.1 s over ``length`` metres.
+    """Return poses (N, 4, 4) of the sensor in the scene, one every 0.1 s over ``length`` metres.
 
-    The start lies anywhere on the route, which is driven round again if need be; either direction. The sensor
-    is ``height`` metres above the ground, and pitches and rolls with it.
+    The start is anywhere on the route, the direction either; a long drive goes round again. The sensor is ``height``
+    metres above the ground, and pitches and rolls with it.
     """
     route = scene.route if rng.random() < 0.5 else scene.route[::-1]
     arc = arc_lengths(route)
@@ -120,3 +91,30 @@ def _sway(rng: np.random.Generator, count: int) -> Floats:
     for k in range(1, count):
         sway[k] = _SWAY_MEMORY * sway[k - 1] + fresh[k]
     return sway
+
+
+def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random.Generator) -> Floats:
+    """Return odometry (N, 4, 4) ``T_odom_body`` of a robot with true poses (N, 4, 4) ``T_map_body``.
+
+    The frames differ by a turn about z and an offset: roll and pitch stay those of gravity.
+    """
+    count = len(T_map_body)
+    steps = np.diff(T_map_body[:, :3, 3], axis=0)
+    root = np.sqrt(np.linalg.norm(steps, axis=1))
+    start = rng.uniform(-np.pi, np.pi)
+    origin = rng.uniform(-1, 1, 3) * config.offset * (1, 1, 0.1)
+    scale = 1.0 + np.clip(rng.normal(), -2, 2) * config.scale_error
+    yaw = start + np.concatenate([[0.0], np.cumsum(rng.normal(size=count - 1) * root * config.yaw_walk)])
+    noise = rng.normal(size=(count - 1, 3)) * root[:, None] * config.position_walk
+    tilts = rng.normal(size=(count, 2)) * config.tilt_noise
+    turns = np.stack([rot_z(angle) for angle in yaw])
+    moved = np.einsum("nij,nj->ni", turns[:-1], steps) * scale + noise
+    T_odom_body = np.tile(np.eye(4), (count, 1, 1))
+    T_odom_body[:, :3, :3] = turns @ T_map_body[:, :3, :3] @ _small_tilts(tilts)
+    T_odom_body[:, :3, 3] = origin + np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])
+    return T_odom_body
+
+
+def _small_tilts(tilts: Floats) -> Floats:
+    """Return (N, 3, 3) rotations by (N, 2) roll and pitch angles, too small for their order to matter."""
+    return np.asarray(Rotation.from_rotvec(np.column_stack([tilts, np.zeros(len(tilts))])).as_matrix())

@@ -1,7 +1,7 @@
-"""Seeded scenes: the same place when the map was made, and now.
+"""Seeded scenes in two epochs: when the map was made, and now.
 
-Frame: the scene's own, z up, metres, origin in the middle. What may change between the two epochs are trees,
-cars and poles; ground, buildings and hedges stay.
+Frame: the scene's own, z up, metres, origin in the middle. Trees, cars and poles may change between the two epochs;
+ground, buildings and hedges stay.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from coview_stream.sim.kinds import KINDS, Kind, Plot
 from coview_stream.sim.layout import Site, directions, resample
 from coview_stream.sim.mesh import Mesh, join, placed
 
-_MARGIN = 50.0  # metres of world beyond the map, for a robot near its edge still sees something
-_FOOTWAY = 1.8
-_PARKING = 6.4
+# metres, set by hand
+_MARGIN = 50.0  # of the scene beyond the map: a robot near its edge sees what stands there
+_FOOTWAY = 1.8  # width
+_PARKING = 6.4  # length of a parking place
 
 # one random stream per purpose: a change of one leaves the others as they are
 _GROUND, _BUILT, _GREEN, _STREET, _SPARE = range(5)
@@ -28,7 +29,17 @@ _GROUND, _BUILT, _GREEN, _STREET, _SPARE = range(5)
 
 @dataclass(frozen=True)
 class Footprint:
-    """Where a building stands: centre, frontage w, depth d, heading, ground and ridge height."""
+    """Footprint of a building, scene frame.
+
+    Attributes:
+        x: centre, metres.
+        y: centre, metres.
+        w: frontage, metres.
+        d: depth, metres.
+        yaw: heading, radians.
+        ground: height of the ground, metres.
+        top: height of the ridge, metres.
+    """
 
     x: float
     y: float
@@ -41,7 +52,12 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Epoch:
-    """The scene at one time: what stops every ray, and the foliage that lets some pass."""
+    """Scene at one time.
+
+    Attributes:
+        solid: surfaces that stop every ray.
+        foliage: surfaces that let some rays pass.
+    """
 
     solid: Mesh
     foliage: Mesh
@@ -49,7 +65,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Scene:
-    """A place.
+    """Scene in both epochs.
 
     Attributes:
         kind: one of ``KINDS``.
@@ -57,8 +73,8 @@ class Scene:
         mapped: the scene as the aircraft saw it.
         now: the scene as the robot sees it.
         site: ground and roads.
-        route: (N, 2) closed loop to drive on.
-        footprints: the buildings.
+        route: (N, 2) closed loop that robots drive on, metres.
+        footprints: of the buildings.
     """
 
     kind: str
@@ -72,20 +88,25 @@ class Scene:
 
 @dataclass(frozen=True)
 class _Movable:
-    """Things of one sort, as rows, and spares for those that change."""
+    """Objects of one sort that may change between the epochs.
+
+    Attributes:
+        rows: one per object when the map was made.
+        spares: objects that replace changed ones.
+    """
 
     rows: Floats
     spares: Floats
 
     def now(self, rng: np.random.Generator, changed: float) -> Floats:
-        """Take a share of the rows away and put as many elsewhere."""
+        """Return the rows with a share of them replaced by spares."""
         count = round(changed * len(self.rows))
         keep = np.sort(rng.permutation(len(self.rows))[count:])
         return np.concatenate([self.rows[keep], self.spares[:count]])
 
 
 def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0) -> Scene:
-    """Draw a scene of ``size`` metres; the share ``changed`` of trees, cars and poles is another one now.
+    """Draw a scene of ``size`` metres; the share ``changed`` of the trees, cars and poles is replaced now.
 
     Scenes that differ in ``changed`` only have the same map.
 
@@ -189,7 +210,7 @@ def _draw_plot(rng: np.random.Generator, spec: Kind) -> tuple[Plot, float, float
 
 
 def _greenery(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Mesh], list[Mesh]]:
-    """Solid and leafy things that stay: rocks and logs, bushes."""
+    """Return the meshes that stay in both epochs: solid rocks and logs, leafy bushes."""
     area, extent = (2 * site.half) ** 2, site.half - 2.0
     solid = [
         vegetation.rocks(rng, site, int(spec.rocks * area), extent),

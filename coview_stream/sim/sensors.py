@@ -1,6 +1,6 @@
-"""Ground lidars: where their beams point, how far they reach, what they miss.
+"""Lidars of robots: beam directions, range, noise and lost pulses.
 
-Sensor frame: x forward, y left, z up; a frame is 0.1 s.
+Sensor frame: x forward, y left, z up; a frame is 0.1 s. Figures are set by hand, after the sensors' data sheets.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ RANGE_NOISE = 0.02
 POROSITY = 0.3
 """Probability that a beam passes one surface of foliage, seen from the side."""
 
-_LOST_PULSES = 0.01  # share of pulses that give nothing whatever they meet
+_LOST_PULSES = 0.01  # share of pulses without a return, on any surface
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A lidar.
+    """Lidar of a robot.
 
     Attributes:
         name: as on the command line.
         beams: frame number -> (N, 3) unit directions in the sensor frame.
         min_range: metres; nearer returns are dropped.
-        max_range: metres, on a surface that is hit squarely.
+        max_range: metres, at perpendicular incidence.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Sensor:
         porosity: float = POROSITY,
         noise: float = RANGE_NOISE,
     ) -> Points:
-        """One deskewed frame (N, 3) in the sensor frame, float32 metres; ``noise`` is that of the range."""
+        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres; ``noise`` is that of the range."""
         rays = self.beams(frame)
         origins = np.broadcast_to(T_scene_body[:3, 3].astype(np.float32), rays.shape)
         turned = (rays @ T_scene_body[:3, :3].T).astype(np.float32)

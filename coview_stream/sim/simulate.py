@@ -1,10 +1,10 @@
-"""Simulate a world on disk: a base map, a run of a robot, and the truth.
+"""A simulated world on disk: a base map, a run of a robot, and the truth.
 
-OUT/base.laz              airborne scan, map frame
+OUT/base.laz                   airborne scan, map frame
 OUT/run/frames/000000.pcd ...  deskewed frames, body frame
-OUT/run/odometry.tum      odom <- body, drifting
-OUT/truth.tum             map <- body
-OUT/world.json            the configuration and what came of it
+OUT/run/odometry.tum           odom <- body, drifting
+OUT/truth.tum                  map <- body
+OUT/world.json                 the configuration, and counts of points and frames
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from coview_stream.sim.odometry import drifting_odometry, drive
 from coview_stream.sim.scenes import Scene, build_scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS
 
-_FIRST_STAMP = 1000.0
+_FIRST_STAMP = 1000.0  # seconds
 _AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY = range(100, 104)  # random streams, apart from those of the scene
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """What ``simulate`` wrote.
+    """World that :func:`simulate` wrote.
 
     Attributes:
-        directory: where.
+        directory: its directory.
         base_points: points of the base map.
         frames: frames of the run.
         distance: metres driven.
@@ -62,8 +62,8 @@ def simulate(
 ) -> Simulated:
     """Write a simulated world to the directory ``out``; it is complete or not there.
 
-    ``progress`` draws a bar on stderr. ``overwrite`` replaces a world that was simulated there before, and
-    nothing else.
+    ``progress`` draws a bar on stderr. ``overwrite`` replaces a world that was simulated there before; other files
+    are refused all the same.
 
     Raises:
         InputError: ``out`` exists and is not empty, or cannot be written.
@@ -106,7 +106,7 @@ def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) ->
 
 
 def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats, Floats]:
-    """Stamps (N,), true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4)."""
+    """Return stamps (N,) in seconds, true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4)."""
     truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE))
     odometry = drifting_odometry(truth, config.odometry, _stream(config, _ODOMETRY))
     stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
@@ -127,7 +127,7 @@ def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:
 
 @contextmanager
 def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Give a directory beside ``out`` that becomes ``out`` if all goes well, and vanishes if not."""
+    """Give a directory beside ``out`` that becomes ``out`` without an error, and is removed with one."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a new directory")
     ours = (out / "world.json").is_file()
@@ -149,7 +149,7 @@ def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
 
 
 class _Bar:
-    """A progress bar per phase on stderr, or nothing."""
+    """Progress bars on stderr, one per phase; none unless ``shown``."""
 
     def __init__(self, shown: bool) -> None:
         self._shown = shown

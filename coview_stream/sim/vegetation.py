@@ -1,4 +1,4 @@
-"""Trees and hedges: trunks are solid, foliage lets some rays pass."""
+"""Vegetation, boulders and fallen trunks: trunks are solid, foliage lets some rays pass. Sizes are set by hand."""
 
 from __future__ import annotations
 
@@ -19,12 +19,17 @@ TREE_COLUMNS = ("x", "y", "height", "spread", "conifer", "lean_x", "lean_y", "se
 
 
 class Species(NamedTuple):
-    """How tall trees grow, how wide their crowns are (share of the height), and how many are conifers."""
+    """Sizes and shapes of a scene's trees.
+
+    Attributes:
+        height: range, metres.
+        spread: range of the crown's radius, share of the height.
+        conifers: share of the trees.
+    """
 
     height: tuple[float, float]
     spread: tuple[float, float] = (0.16, 0.28)
     conifers: float = 0.0
-    undergrowth: float = 0.0
 
 
 def draw_tree(rng: np.random.Generator, x: float, y: float, species: Species) -> Floats:

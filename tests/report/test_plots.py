@@ -58,7 +58,7 @@ def test_trajectory_is_coloured_by_state(base, tmp_path):
 
 def test_trajectory_plot_without_poses_shows_a_note(base, tmp_path, monkeypatch):
     said = []
-    monkeypatch.setattr(plots, "say", lambda axes, text: said.append(text))
+    monkeypatch.setattr(plots, "draw_notice", lambda axes, text: said.append(text))
     plots.plot_trajectory(base, np.full((3, 3), np.nan), ["SEARCHING"] * 3, tmp_path / "none.png")
     plots.plot_trajectory(NO_POINTS, NO_POINTS, [], tmp_path / "empty.png")
     assert [text.split(":")[0] for text in said] == ["not localised", "not localised"]
@@ -85,7 +85,7 @@ def test_false_poses_are_highlighted(tmp_path):
 
 def test_error_plot_without_errors_shows_a_note(tmp_path, monkeypatch):
     said = []
-    monkeypatch.setattr(plots, "say", lambda axes, text: said.append(text))
+    monkeypatch.setattr(plots, "draw_notice", lambda axes, text: said.append(text))
     plots.plot_errors(np.zeros(0), np.zeros(0), np.zeros(0), tmp_path / "none.png")
     assert said == ["no pose to compare"] * 2
     pixels(tmp_path / "none.png")
