@@ -26,36 +26,34 @@ class AcceptanceConfig:
     docs/tracking.md.
 
     Attributes:
-        score: a hypothesis of a search counts from this score on,
-        lead: where it exceeds every registered rival's by this much,
-        ground: and this share of the robot's ground lies on the map's.
-        confirmations: keyframes for which a hypothesis has to count before it is accepted, none between them having
+        score: minimum score of a hypothesis of a search for a keyframe to count for it.
+        lead: minimum by which that score has to exceed every registered rival's.
+        ground: minimum share of the robot's ground that has to lie on the map's.
+        confirmations: keyframes that have to count for a hypothesis before it is accepted, none between them having
             found another place; and registrations that it takes to be believed again after a doubt of ``max_doubt_s``.
         agree_distance: metres within which keyframes agree.
         agree_angle: radians, likewise.
-        evidence_sum: what their scores exceed ``evidence_floor`` by has to add up to this: weak evidence needs more
-            driving.
-        evidence_floor: see there.
-        learned_floor: takes its place where learned features favour the same place above all others.
-        learned_lead: robust standard deviations of the mean keyframe's votes by which they have to favour it for
-            ``learned_score`` and ``learned_ground`` to be enough,
-        learned_score: in place of ``score``: crowns that changed fit badly even where they stand;
-        learned_ground: in place of ``ground``.
-        full_overlap: where a smaller share of the points lies where the map has been surveyed, the sum grows by that
-            much less: a few walls at the map's edge fit many a place.
-        single_score: ``score`` of one frame alone (``LocalizerConfig.stationary``).
-        single_lead: ``lead``, likewise.
-        min_overlap: share of the points that have to lie where the map has been surveyed, in a search and while
-            tracking.
+        evidence_sum: sum to which what their scores exceed ``evidence_floor`` by has to add up: weak evidence needs
+            more driving.
+        evidence_floor: score that adds nothing to that sum.
+        learned_floor: in its place where learned features favour the same place above all others.
+        learned_lead: robust standard deviations of the mean keyframe's votes by which learned features have to favour
+            a place for ``learned_score`` and ``learned_ground`` to be enough.
+        learned_score: in place of ``score`` then: crowns that changed fit badly even where they stand.
+        learned_ground: in place of ``ground`` then.
+        full_overlap: share of the points that lie where the map has been surveyed; where it is smaller, the sum grows
+            by that much less: a few walls at the map's edge fit many a place.
+        single_score: in place of ``score`` where one frame alone decides (``LocalizerConfig.stationary``).
+        single_lead: in place of ``lead``, likewise.
+        min_overlap: minimum share of the points where the map has been surveyed, in a search and while tracking.
         max_tilt: radians by which a pose may lean against gravity, likewise.
-        tracking_min_score: while tracking a registration with a lower score is rejected,
-        tracking_min_share: or one below this share of the score that has been usual on the last metres,
-        tracking_min_ground: or where less of the robot's ground lies on the map's.
+        tracking_min_score: while tracking, a registration with a lower score is rejected.
+        tracking_min_share: so is one whose score is below this share of what has been usual on the last metres.
+        tracking_min_ground: so is one with less of the robot's ground on the map's.
         max_innovation: squared Mahalanobis distance to what odometry predicts, 6 degrees of freedom, above which the
-            pose is withheld. 22 is exceeded by one in a thousand if all covariances are right, but their tails are
-            not.
-        max_rejections: registrations, ``TrackingConfig.distance`` apart, whose rejection loses the place.
-        max_doubt_s: seconds of doubt that do so too.
+            pose is withheld. 22 is exceeded by one in a thousand if all covariances are right, but their tails are not.
+        max_rejections: rejected registrations, ``TrackingConfig.distance`` apart, that lose the place.
+        max_doubt_s: seconds of doubt that lose it.
         max_blind_s: seconds for which odometry goes on, without a pose given, while the sensor is blind: nothing speaks
             against the place then.
     """

@@ -14,7 +14,7 @@ Preset = Literal["slam", "tls"]
 
 @dataclass(frozen=True)
 class DescriptorConfig:
-    """How a virtual scan becomes a polar descriptor (paper, section 3.2, eqs 1-4).
+    """Polar descriptor of a virtual scan (paper, section 3.2, eqs 1-4); set by hand where the paper gives no value.
 
     Stored in the map and read back from it, so that map and robot cannot drift apart.
 
@@ -52,7 +52,7 @@ class DescriptorConfig:
 
 @dataclass(frozen=True)
 class MapConfig:
-    """How a base map is built (paper, section 3.1); set by hand where the paper gives no value.
+    """Building of a base map (paper, section 3.1); set by hand where the paper gives no value.
 
     Attributes:
         descriptor: of the stations.
@@ -61,8 +61,8 @@ class MapConfig:
         tile: metres, size of the tiles by which points are sorted.
         outlier_neighbours: of each point, for the statistical outlier filter; 0 switches it off.
         outlier_std_ratio: standard deviations of their mean distance beyond which a point is removed.
-        normal_radius: metres within which a point's neighbours make its normal,
-        normal_neighbours: and how many of them at most.
+        normal_radius: metres within which a point's neighbours make its normal.
+        normal_neighbours: how many of them at most.
         levels: a station for every floor of a building above the ground, too.
         learned: also store the features that learned re-localization needs.
     """

@@ -35,8 +35,8 @@ class LidarOdometryConfig:
         max_turn_rate: radians per second, likewise.
         level_with_walls: keep roll and pitch from drifting by the walls in each frame.
         threads: of kiss-icp.
-        convergence: its registration ends at a smaller step than this, metres and radians,
-        iterations: or after so many.
+        convergence: step, metres and radians, below which its registration ends.
+        iterations: after which it ends at the latest.
     """
 
     gravity: Gravity = "ground"

@@ -11,14 +11,14 @@ from coview_stream.config.checks import counts, positive, require
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """When the robot's frames become a virtual local scan, VLS (paper, section 3.3).
+    """Keyframes: when the robot's frames become a virtual local scan, VLS (paper, section 3.3); set by hand.
 
     Attributes:
         distance: metres driven from keyframe to keyframe, the paper's sigma_d.
-        capacity: keyframes held, so memory is fixed; set by hand.
+        capacity: keyframes held, so that memory is fixed.
         voxel: metres; one point of a frame is kept in each cube of this size.
         range_min: metres; nearer points are the robot itself.
-        min_points: points, after that, which a VLS needs before it may vote; set by hand.
+        min_points: points, after that, which a VLS needs before it may vote.
     """
 
     distance: float = 2.0
@@ -35,7 +35,7 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class RetrievalConfig:
-    """Which stations are scored (paper, section 3.4); ``python -m bench ablation`` compares the two modes.
+    """Retrieval: which stations are scored (paper, section 3.4); ``python -m bench ablation`` compares the two modes.
 
     Attributes:
         mode: ``exhaustive`` scores all stations at all shifts. ``ring_key`` is the paper's way, kept for comparison:
@@ -53,15 +53,15 @@ class RetrievalConfig:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """How keyframes vote for one ``T_map_odom``.
+    """Consensus: the votes of keyframes for one ``T_map_odom``.
 
     Attributes:
         mode: ``consensus``; or ``single``, the paper's rule: the one smallest distance of all keyframes.
             ``python -m bench ablation`` compares them.
         window: newest keyframes that vote; set by hand.
         peaks: best hypotheses that go on to registration; set by hand.
-        distinct_distance: metres; a hypothesis is one of its own where it lies farther than this from every better one,
-        distinct_yaw: or is turned by more than this, radians; both set by hand.
+        distinct_distance: metres; a hypothesis farther than this from every better one is one of its own; set by hand.
+        distinct_yaw: radians; so is one turned by more than this; set by hand.
     """
 
     mode: Literal["consensus", "single"] = "consensus"
@@ -82,7 +82,7 @@ Reloc = Literal["auto", "coview", "learned"]
 
 @dataclass(frozen=True)
 class LearnedConfig:
-    """How a scan's learned features are looked up in the map's (:mod:`coview_stream.localization.search.learned`).
+    """Search of a scan's learned features among the map's (:mod:`coview_stream.localization.search.learned`).
 
     Set by hand; ``python -m bench forest`` prints what comes of it, ``bench learned_match`` what it costs.
 

@@ -10,7 +10,7 @@ from coview_stream.config.checks import all_positive, counts, positive, require
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """When to register while tracking, with which frames, and how fast odometry is believed to drift.
+    """Registrations while tracking: when, with which frames; and the drift that odometry is believed to have.
 
     A registration is due after ``distance``, ``turn`` or ``seconds``, the last whatever odometry says, for wheels slip,
     drivers hang and robots are carried; and sooner where odometry is so bad that the pose has become uncertain.
@@ -67,13 +67,13 @@ class TrackingConfig:
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """How poses are smoothed (see :mod:`coview_stream.localization.tracking.pose_graph`); set by hand.
+    """Smoothing of poses (see :mod:`coview_stream.localization.tracking.pose_graph`); set by hand.
 
     Attributes:
         window: newest keyframes with which the graph begins anew. What it drops lives on in the belief that it left
             behind, so a longer window only lets older registrations be weighed and linearised again in the light of
             later ones.
-        restart: keyframes at which it does.
+        restart: keyframes at which the graph begins anew.
         huber: standard deviations from which a registration's pull grows no more. It is the norm of six residuals at
             once, 2.4 on average and above 3.5 in one case of twenty; the usual 1.345 is meant for one residual. A
             kernel that lets go altogether would, with an optimistic covariance, lock the map out for good

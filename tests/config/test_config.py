@@ -10,6 +10,7 @@ from coview_stream.config import (
     AcceptanceConfig,
     ConsensusConfig,
     DescriptorConfig,
+    GraphConfig,
     KeyframeConfig,
     LearnedConfig,
     LocalizerConfig,
@@ -19,7 +20,16 @@ from coview_stream.config import (
     TrackingConfig,
     map_preset,
 )
+from coview_stream.config.node import NodeConfig
+from coview_stream.config.odometry import LidarOdometryConfig
+from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.errors import ConfigError
+
+CONFIGS = [
+    AcceptanceConfig, ConsensusConfig, DescriptorConfig, GraphConfig, KeyframeConfig, LearnedConfig,
+    LearnedMatchConfig, LidarOdometryConfig, LocalizerConfig, MapConfig, NodeConfig, RegistrationConfig,
+    RetrievalConfig, TrackingConfig,
+]  # fmt: skip
 
 BAD = [
     (DescriptorConfig, "radius", 0.0),
@@ -120,3 +130,10 @@ def test_unknown_presets_and_options_are_named():
 
 def test_config_errors_are_value_errors():
     assert issubclass(ConfigError, ValueError)
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_every_field_is_documented(kind):
+    text = kind.__doc__
+    missing = [item.name for item in fields(kind) if f"\n        {item.name}: " not in text]
+    assert missing == []

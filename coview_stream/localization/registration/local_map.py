@@ -67,7 +67,7 @@ class LocalMap:
 
     @cached_property
     def edges(self) -> RoofEdges:
-        """Where the map must have walls that it does not show."""
+        """The walls that the map must have though it may not show them."""
         return roof_edges(self.points)
 
     @cached_property
@@ -103,7 +103,7 @@ class LocalMaps:
 
 @dataclass(frozen=True)
 class RoofEdges:
-    """Where a map crop, seen from above, must have walls: below the edges of what stands high.
+    """Walls that a map crop, seen from above, must have: below the edges of what stands high.
 
     Attributes:
         height: (H, W) of the edges, metres; far below everything where there is none. Rows along x, columns along y.

@@ -27,7 +27,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Registration:
-    """What a registration found, with its evidence.
+    """Pose that a registration found, and how it fits.
 
     Attributes:
         T_map_source: (4, 4) float64.

@@ -57,7 +57,7 @@ _SLACK_SLOPE = 0.03
 
 @dataclass(frozen=True)
 class Evidence:
-    """How well a pose explains what the robot sees; all are shares in [0, 1].
+    """Shares in [0, 1] of what the robot sees that a pose explains, and of what the map has that the robot sees.
 
     Attributes:
         near: of the points > 1 m above the ground, those within 0.5 m of a map point; 0 if there are fewer than 60.

@@ -83,7 +83,7 @@ class OdometryTracker:
 
     @property
     def drift(self) -> Drift:
-        """How fast odometry seems to drift."""
+        """Rates of odometry's drift, as measured so far."""
         return self._estimator.drift
 
     def learn(self, T_map_body: Pose, covariance: Floats) -> None:
