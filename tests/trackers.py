@@ -1,4 +1,4 @@
-"""A tracker in the small world, and drives to show it: in short steps, and with odometry that lies."""
+"""A tracker in the small world, and drives with odometry that is right or wrong."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import small_world
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.tracking.tracker import Tracker
 
@@ -33,9 +34,21 @@ def tracker_of(world_map, config=None):
     return Tracker(world_map, config, LocalMaps(world_map, config.registration.source_range))
 
 
+def add_frame(tracker, cloud, T_odom_body):
+    """Add a raw frame, body frame, as the localizer does: one point per voxel, odometry frame."""
+    tracker.add_scan(voxelized(cloud, T_odom_body, tracker.config.keyframe), T_odom_body)
+
+
+def match_and_update(tracker, cloud, T_odom_body, **how):
+    """Register the newest scans and correct the belief; the verdict."""
+    match = tracker.match_to_map(cloud, T_odom_body, **how)
+    tracker.update(match, T_odom_body)
+    return match.verdict
+
+
 @dataclass
 class Ride:
-    """A tracker and the odometry that it is shown.
+    """A tracker and the odometry that it gets.
 
     Attributes:
         tracker: see :class:`coview_stream.localization.tracking.tracker.Tracker`.
@@ -57,12 +70,12 @@ class Ride:
         return self.T_odom_map @ truth
 
     def see(self, cloud, truth):
-        self.tracker.observe(cloud, self.odometry(truth))
+        add_frame(self.tracker, cloud, self.odometry(truth))
 
     def update(self, cloud, truth, **how):
-        """Observe a frame and register it."""
+        """Add a frame and register it; the verdict."""
         self.see(cloud, truth)
-        return self.tracker.update(cloud, self.odometry(truth), **how)
+        return match_and_update(self.tracker, cloud, self.odometry(truth), **how)
 
     def error(self, truth):
         """Metres and degrees that the belief is off at a pose."""
@@ -87,10 +100,10 @@ def on_the_way(world_map, drive, config=None, frames=8):
 
 
 def refused(ride, cloud, truth, **how):
-    """Update with something that is not believed; the judgement. The belief stays where odometry leads."""
+    """Update with something that is not believed; the verdict. The belief stays where odometry leads."""
     before, sure = ride.tracker.T_map_odom.copy(), np.diag(ride.tracker.predicted_covariance())
-    judgement = ride.update(cloud, truth, **how)
-    assert not judgement.verified
+    verdict = ride.update(cloud, truth, **how)
+    assert not verdict.verified
     np.testing.assert_array_equal(ride.tracker.T_map_odom, before)
     assert (np.diag(ride.tracker.predicted_covariance()) >= 0.999 * sure).all()
-    return judgement
+    return verdict

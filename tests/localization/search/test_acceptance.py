@@ -1,4 +1,4 @@
-"""What learned features that favour the same place add to a weak proof, and what they cannot do."""
+"""The acceptance test: what learned features that favour the same place add to weak evidence, and what not."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), dtype=np.float32)
-QUERY = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
+REQUEST = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
 HERE, ELSEWHERE = (pose_from(rot_z(-0.8), [x, 9.0, 0.5]) for x in (3.0, 40.0))
 WEAK = RULE.score + 0.03
 
@@ -34,9 +34,9 @@ def candidate(
 
 def keyframes_needed(*candidates: Candidate) -> int | None:
     """Keyframes of the same candidates, best first, until the first is accepted; None if 40 are not enough."""
-    decision = AcceptanceTest(LocalizerConfig())
+    test = AcceptanceTest(LocalizerConfig())
     for count in range(1, 41):
-        if decision.judge(list(candidates), QUERY, count).accepted is not None:
+        if test.decide(list(candidates), REQUEST, count).accepted is not None:
             return count
     return None
 
@@ -90,6 +90,6 @@ def test_lower_score_is_accepted_only_with_clear_learned_lead() -> None:
 
 
 def test_single_scan_gets_no_learned_support() -> None:
-    decision = AcceptanceTest(replace(LocalizerConfig(), stationary=True))
-    verdict = decision.judge([candidate(RULE.single_score - 0.02, lead=100.0)], QUERY, 1)
-    assert verdict.evidence.state is State.SEARCHING
+    test = AcceptanceTest(replace(LocalizerConfig(), stationary=True))
+    result = test.decide([candidate(RULE.single_score - 0.02, lead=100.0)], REQUEST, 1)
+    assert result.evidence.state is State.SEARCHING

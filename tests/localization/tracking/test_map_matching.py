@@ -1,4 +1,4 @@
-"""An attempt: what the map alone says of the pose, how far off the graph that is, and what to think of it."""
+"""Map matching: the pose as the map alone has it, its innovation against the graph, and the verdict."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.se3 import boxminus, boxplus
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
+from coview_stream.localization.registration import scan_matcher
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
-from coview_stream.localization.tracking import map_matching as attempt
-from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, ScanInput
+from coview_stream.localization.registration.scan_matcher import ScanInput
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
@@ -37,13 +38,13 @@ def scan_of(cloud, truth) -> ScanInput:
     return ScanInput(prepare_scan(points, T_odom_body[:3, 3], CONFIG.registration), cloud, T_odom_body)
 
 
-def attempted(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
-    """Attempt it from a belief, which is what the graph predicts unless that is given too."""
+def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) -> MapMatch:
+    """Match from a belief, which is what the graph predicts unless that is given too."""
     pose_graph = PoseGraph(CONFIG.graph)
     pose_graph.start(*(graph or belief))
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
     scales = CONFIG.registration.track
-    return MapMatcher(world_map, CONFIG).attempt(scan, belief, target, scales, EvidenceBaseline(), pose_graph)
+    return MapMatcher(world_map, CONFIG, EvidenceBaseline()).match(scan, belief, target, scales, pose_graph)
 
 
 def off(found, truth):
@@ -58,11 +59,11 @@ def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
     settings = CONFIG.registration
     prior = Prior(believed @ inverse(scan.T_odom_body), np.linalg.inv(sure))
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
-    arguments = (scan.source, prior.T_map_source, target, settings, settings.track)
+    arguments = (scan.cloud, prior.T_map_source, target, settings, settings.track)
     fused = register(*arguments, prior, scan.T_odom_body[:3, 3]).T_map_source @ scan.T_odom_body
-    loose = attempted(world_map, scan, Estimate(believed, LOOSE))
-    found = attempted(world_map, scan, Estimate(believed, sure))
-    assert loose.judgement.cause is found.judgement.cause is RejectionReason.VERIFIED
+    loose = matched(world_map, scan, Estimate(believed, LOOSE))
+    found = matched(world_map, scan, Estimate(believed, sure))
+    assert loose.verdict.cause is found.verdict.cause is RejectionReason.VERIFIED
     assert off(loose.T_map_body, truth) < 0.01
     assert off(fused, truth) > 0.003
     assert off(found.T_map_body, truth) < 0.5 * off(fused, truth)
@@ -70,35 +71,35 @@ def test_match_does_not_depend_on_the_prior(world_map, world_drive, scan):
 
 def test_match_covariance_does_not_depend_on_prior_covariance(world_map, world_drive, scan):
     truth = world_drive.T_map_body[4]
-    loose, tight = (attempted(world_map, scan, Estimate(truth, C)).covariance for C in (LOOSE, TIGHT))
+    loose, tight = (matched(world_map, scan, Estimate(truth, C)).covariance for C in (LOOSE, TIGHT))
     check_covariance(loose, "loose")
     np.testing.assert_allclose(np.sqrt(np.diag(tight)), np.sqrt(np.diag(loose)), rtol=0.2)
 
 
 def test_innovation_is_measured_against_graph_prediction(world_map, world_drive, scan):
-    """Which need not be what the attempt began with."""
+    """Which need not be what the match began with."""
     truth = world_drive.T_map_body[4]
     away = boxplus(truth, np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
-    near = attempted(world_map, scan, Estimate(truth, LOOSE), Estimate(truth, TIGHT))
-    far = attempted(world_map, scan, Estimate(truth, LOOSE), Estimate(away, TIGHT))
+    near = matched(world_map, scan, Estimate(truth, LOOSE), Estimate(truth, TIGHT))
+    far = matched(world_map, scan, Estimate(truth, LOOSE), Estimate(away, TIGHT))
     assert near.innovation < 1.0
     gap = boxminus(far.T_map_body, away)
     expected = gap @ np.linalg.solve(TIGHT + far.covariance, gap)
     assert far.innovation == pytest.approx(expected, rel=1e-6)
     assert far.innovation > CONFIG.acceptance.max_innovation
-    assert far.judgement.innovation == far.innovation
+    assert far.verdict.innovation == far.innovation
     # the place fits: what to think of odometry is another question
-    assert far.judgement.cause is RejectionReason.VERIFIED
+    assert far.verdict.cause is RejectionReason.VERIFIED
 
 
 def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_drive, scan):
     """Ten metres above everything."""
     truth = world_drive.T_map_body[4]
     belief = Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 40.0])), TIGHT)
-    found = attempted(world_map, scan, belief)
-    assert not found.judgement.verified
-    assert found.judgement.cause in (RejectionReason.GROUND, RejectionReason.FITNESS)
-    assert found.judgement.innovation is None
+    found = matched(world_map, scan, belief)
+    assert not found.verdict.verified
+    assert found.verdict.cause in (RejectionReason.GROUND, RejectionReason.FITNESS)
+    assert found.verdict.innovation is None
     assert found.innovation == 0.0
     np.testing.assert_array_equal(found.T_map_body, belief.T_map_body)
 
@@ -106,24 +107,24 @@ def test_without_matching_structure_the_prior_pose_is_kept(world_map, world_driv
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
 def test_singular_prior_covariance_is_rejected(world_map, world_drive, scan, bad):
     truth = world_drive.T_map_body[4]
-    found = attempted(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
-    assert_unheld(found, truth)
-    assert found.judgement.evidence is None
+    found = matched(world_map, scan, Estimate(truth, bad), Estimate(truth, TIGHT))
+    assert_no_hold(found, truth)
+    assert found.verdict.evidence is None
 
 
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
 def test_singular_registration_information_is_rejected(world_map, world_drive, scan, bad, monkeypatch):
     truth, whole = world_drive.T_map_body[4], register
-    monkeypatch.setattr(attempt, "register", lambda *given: replace(whole(*given), information=bad))
-    found = attempted(world_map, scan, Estimate(truth, TIGHT))
-    assert_unheld(found, truth)
-    assert found.judgement.evidence is not None  # it is as good as ever, and does not help
+    monkeypatch.setattr(scan_matcher, "register", lambda *given: replace(whole(*given), information=bad))
+    found = matched(world_map, scan, Estimate(truth, TIGHT))
+    assert_no_hold(found, truth)
+    assert found.verdict.evidence is not None  # it is as good as ever, and does not help
 
 
-def assert_unheld(found, truth):
-    assert found.judgement.cause is RejectionReason.FITNESS
-    assert found.judgement.reason.startswith("no hold: ")
-    assert found.judgement.innovation is None
+def assert_no_hold(found, truth):
+    assert found.verdict.cause is RejectionReason.FITNESS
+    assert found.verdict.reason.startswith("no hold: ")
+    assert found.verdict.innovation is None
     np.testing.assert_array_equal(found.T_map_body, truth)
 
 
@@ -135,11 +136,9 @@ def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
     pose_graph.start(*belief)
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
     scales = CONFIG.registration.track
-    found = MapMatcher(world_map, CONFIG).attempt(
-        scan, belief, target, scales, EvidenceBaseline(), pose_graph
-    )
-    assert found.judgement.cause is RejectionReason.OFF_MAP
+    found = MapMatcher(world_map, CONFIG, EvidenceBaseline()).match(scan, belief, target, scales, pose_graph)
+    assert found.verdict.cause is RejectionReason.OFF_MAP
 
 
 def test_range_image_of_a_scan_is_computed_once(scan):
-    assert scan.seen is scan.seen
+    assert scan.range_image is scan.range_image

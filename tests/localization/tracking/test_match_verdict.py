@@ -1,4 +1,4 @@
-"""Judgements: each thing that can speak against a registration is named, by itself and against what was usual."""
+"""Verdicts on registrations: each cause is named, by its own threshold and against the usual evidence."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
 @pytest.fixture
 def used():
     """Used to places that fit well."""
-    habit = EvidenceBaseline()
+    baseline = EvidenceBaseline()
     for _ in range(10):
-        habit.learn(GOOD)
-    return habit
+        baseline.learn(GOOD)
+    return baseline
 
 
-@pytest.mark.parametrize("habit", ["fresh", "used"])
-def test_normal_evidence_is_verified(habit, used):
-    cause, reason = (used if habit == "used" else EvidenceBaseline()).judge(GOOD, RULE)
+@pytest.mark.parametrize("baseline", ["fresh", "used"])
+def test_normal_evidence_is_verified(baseline, used):
+    cause, reason = (used if baseline == "used" else EvidenceBaseline()).judge(GOOD, RULE)
     assert cause is RejectionReason.VERIFIED
     assert reason == "verified"
 
@@ -41,9 +41,9 @@ def test_normal_evidence_is_verified(habit, used):
         ({"free_space": 0.05}, RejectionReason.FREE_SPACE, "rays pass through 95% of the map"),
     ],
 )
-@pytest.mark.parametrize("habit", ["fresh", "used"])
-def test_each_failed_share_names_its_cause(changes, cause, told, habit, used):
-    found, reason = (used if habit == "used" else EvidenceBaseline()).judge(replace(GOOD, **changes), RULE)
+@pytest.mark.parametrize("baseline", ["fresh", "used"])
+def test_each_failed_share_names_its_cause(changes, cause, told, baseline, used):
+    found, reason = (used if baseline == "used" else EvidenceBaseline()).judge(replace(GOOD, **changes), RULE)
     assert found is cause
     assert told in reason
 
@@ -63,32 +63,32 @@ def test_score_far_below_baseline_is_rejected(used):
     assert cause is RejectionReason.FITNESS
     assert f"score {poor.score:.2f}, {RULE.tracking_min_share * GOOD.score:.2f} needed" in reason
     assert "80% usual here" in reason
-    poor_habit = EvidenceBaseline()
-    poor_habit.learn(poor)
-    assert poor_habit.judge(poor, RULE)[0] is RejectionReason.VERIFIED
+    poor_baseline = EvidenceBaseline()
+    poor_baseline.learn(poor)
+    assert poor_baseline.judge(poor, RULE)[0] is RejectionReason.VERIFIED
 
 
 def test_poor_baseline_does_not_lower_the_absolute_threshold():
     bad = replace(GOOD, near=0.05, covered=0.5)
     assert bad.score < RULE.tracking_min_score
-    habit = EvidenceBaseline()
-    habit.learn(bad)
-    cause, reason = habit.judge(bad, RULE)
+    baseline = EvidenceBaseline()
+    baseline.learn(bad)
+    cause, reason = baseline.judge(bad, RULE)
     assert cause is not RejectionReason.VERIFIED
     assert f"{RULE.tracking_min_score:.2f} needed" in reason
 
 
 def test_cause_is_the_share_furthest_below_baseline():
     """Where hardly anything above the ground is ever on the map, rays through what it shows are the news."""
-    habit, usual = (
+    baseline, usual = (
         EvidenceBaseline(),
         Evidence(near=0.45, covered=0.6, ground=0.9, free_space=0.9, inside=1.0),
     )
-    habit.learn(usual)
+    baseline.learn(usual)
     tight = replace(RULE, tracking_min_share=0.9)
-    assert habit.judge(replace(usual, free_space=0.5, near=0.4), tight)[0] is RejectionReason.FREE_SPACE
-    assert habit.judge(replace(usual, ground=0.6, near=0.42), tight)[0] is RejectionReason.GROUND
-    assert habit.judge(replace(usual, free_space=0.8, near=0.2), tight)[0] is RejectionReason.FITNESS
+    assert baseline.judge(replace(usual, free_space=0.5, near=0.4), tight)[0] is RejectionReason.FREE_SPACE
+    assert baseline.judge(replace(usual, ground=0.6, near=0.42), tight)[0] is RejectionReason.GROUND
+    assert baseline.judge(replace(usual, free_space=0.8, near=0.2), tight)[0] is RejectionReason.FITNESS
 
 
 def test_baseline_follows_slowly_and_clears_at_once(used):
@@ -114,7 +114,7 @@ def test_judging_does_not_change_the_baseline(used):
 
 @pytest.mark.parametrize("cause", list(RejectionReason))
 def test_match_verdict_has_verified_flag_and_score(cause):
-    judgement = MatchVerdict(cause, "why", GOOD)
-    assert judgement.verified == (cause is RejectionReason.VERIFIED)
-    assert judgement.score == GOOD.score
+    verdict = MatchVerdict(cause, "why", GOOD)
+    assert verdict.verified == (cause is RejectionReason.VERIFIED)
+    assert verdict.score == GOOD.score
     assert MatchVerdict(cause, "why").score == 0.0

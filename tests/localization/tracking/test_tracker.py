@@ -1,4 +1,4 @@
-"""Updates: which registrations are believed, what they do to the belief, and what is said of the others."""
+"""Updates of a tracker: which registrations are believed, what they do to the belief, and the others' verdicts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from se3 import exp_se3
 from small_world import pose_error, scan
-from trackers import OFF, Ride, garbage, on_the_way, refused, registration, ride_of
+from trackers import (
+    OFF,
+    Ride,
+    add_frame,
+    garbage,
+    match_and_update,
+    on_the_way,
+    refused,
+    registration,
+    ride_of,
+)
 
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import inverse, pose_from
@@ -28,12 +38,12 @@ def test_good_registration_is_accepted(world_map, world_drive):
     ride = ride_of(world_map, world_drive)
     before = ride.tracker.predicted_covariance()
     assert ride.error(truth)[0] == pytest.approx(0.25)
-    judgement = ride.update(cloud, truth)
-    assert judgement.cause is RejectionReason.VERIFIED
-    assert judgement.verified
-    assert judgement.reason == "verified"
-    assert judgement.score == judgement.evidence.score > 0.8
-    assert 0.0 < judgement.innovation < RULE.max_innovation
+    verdict = ride.update(cloud, truth)
+    assert verdict.cause is RejectionReason.VERIFIED
+    assert verdict.verified
+    assert verdict.reason == "verified"
+    assert verdict.score == verdict.evidence.score > 0.8
+    assert 0.0 < verdict.innovation < RULE.max_innovation
     metres, degrees = ride.error(truth)
     assert metres < 0.05
     assert degrees < 0.2
@@ -61,9 +71,9 @@ def test_error_is_within_reported_covariance(world_map, slow_drive):
             step = inverse(slow_drive.T_map_body[k - 1]) @ slow_drive.T_map_body[k]
             step[:3, 3] *= scale
             T = T @ step
-            ride.tracker.observe(slow_drive.clouds[k], T)
-            if ride.tracker.due():
-                assert ride.tracker.update(slow_drive.clouds[k], T).verified
+            add_frame(ride.tracker, slow_drive.clouds[k], T)
+            if ride.tracker.needs_registration():
+                assert match_and_update(ride.tracker, slow_drive.clouds[k], T).verified
                 gap = (ride.tracker.T_map_odom @ T)[:2, 3] - slow_drive.T_map_body[k][:2, 3]
                 C = ride.tracker.reported_covariance()[:2, :2]
                 off.append(gap @ np.linalg.solve(C, gap))
@@ -95,25 +105,25 @@ def test_prefetch_map_crops_before_registration(world_map, world_drive, monkeypa
 )
 def test_stricter_thresholds_reject_the_same_registration(world_map, world_drive, rule, cause):
     cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
-    judgement = refused(ride_of(world_map, world_drive, ruled(**{rule: 1.0})), cloud, truth)
-    evidence = judgement.evidence
+    verdict = refused(ride_of(world_map, world_drive, ruled(**{rule: 1.0})), cloud, truth)
+    evidence = verdict.evidence
     assert 0.8 < min(evidence.score, evidence.inside, evidence.ground) < 1.0
-    assert judgement.cause is cause or cause is None
+    assert verdict.cause is cause or cause is None
 
 
 def test_random_points_are_rejected(world_map, world_drive):
     ride = ride_of(world_map, world_drive)
-    judgement = refused(ride, garbage(), world_drive.T_map_body[4], alone=True)
-    assert judgement.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
-    assert judgement.score < RULE.tracking_min_score
+    verdict = refused(ride, garbage(), world_drive.T_map_body[4], newest_only=True)
+    assert verdict.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
+    assert verdict.score < RULE.tracking_min_score
 
 
 def test_scan_of_another_world_is_rejected_by_structure(world_map, world_drive, elsewhere):
     ride = ride_of(world_map, world_drive)
     assert ride.update(world_drive.clouds[4], world_drive.T_map_body[4]).verified
-    judgement = refused(ride, elsewhere.clouds[2], world_drive.T_map_body[4], alone=True)
-    assert judgement.cause in (RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
-    assert "usual here" in judgement.reason or "rays pass" in judgement.reason
+    verdict = refused(ride, elsewhere.clouds[2], world_drive.T_map_body[4], newest_only=True)
+    assert verdict.cause in (RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
+    assert "usual here" in verdict.reason or "rays pass" in verdict.reason
 
 
 def test_free_space_violation_is_named(world_map, world_drive, scene):
@@ -122,9 +132,9 @@ def test_free_space_violation_is_named(world_map, world_drive, scene):
     near = sorted(scene, key=lambda box: np.hypot(*(box.centre - truth[:2, 3])))
     ride = ride_of(world_map, world_drive, ruled(tracking_min_share=0.95))
     assert ride.update(world_drive.clouds[4], truth).verified
-    judgement = refused(ride, scan(near[4:], truth), truth, alone=True)
-    assert judgement.cause is RejectionReason.FREE_SPACE
-    assert judgement.evidence.near > 0.9
+    verdict = refused(ride, scan(near[4:], truth), truth, newest_only=True)
+    assert verdict.cause is RejectionReason.FREE_SPACE
+    assert verdict.evidence.near > 0.9
 
 
 @pytest.mark.parametrize("seen", [0, 20, 90])
@@ -133,20 +143,20 @@ def test_nearly_empty_frame_is_blind_despite_earlier_frames(world_map, world_dri
     ride = ride_of(world_map, world_drive)
     truth = world_drive.T_map_body
     assert ride.update(world_drive.clouds[4], truth[4]).verified
-    judgement = refused(ride, world_drive.clouds[5][:seen], truth[5])
-    assert judgement.cause is RejectionReason.BLIND
-    assert judgement.evidence is None
-    assert judgement.innovation is None
-    assert judgement.score == 0.0
+    verdict = refused(ride, world_drive.clouds[5][:seen], truth[5])
+    assert verdict.cause is RejectionReason.BLIND
+    assert verdict.evidence is None
+    assert verdict.innovation is None
+    assert verdict.score == 0.0
     assert ride.update(world_drive.clouds[5], truth[5]).verified
 
 
 def test_off_map_frame_is_not_compared(world_map, world_drive):
     far = pose_from(np.eye(3), [5000.0, 0.0, 1.7])
     ride = Ride.begin(world_map, None, world_drive.clouds[4], far)
-    judgement = refused(ride, world_drive.clouds[4], far)
-    assert judgement.cause is RejectionReason.OFF_MAP
-    assert "empty" in judgement.reason
+    verdict = refused(ride, world_drive.clouds[4], far)
+    assert verdict.cause is RejectionReason.OFF_MAP
+    assert "empty" in verdict.reason
 
 
 @pytest.mark.parametrize("limit", [2.0, 0.5])
@@ -168,9 +178,9 @@ def test_pose_tilted_beyond_limit_is_rejected(world_map, world_drive, limit):
         assert ride.update(world_drive.clouds[4], truth).verified
         assert ride.error(truth)[0] < 0.1
     else:
-        judgement = refused(ride, world_drive.clouds[4], truth)
-        assert judgement.cause is RejectionReason.TILT
-        assert "leans 3 degrees" in judgement.reason
+        verdict = refused(ride, world_drive.clouds[4], truth)
+        assert verdict.cause is RejectionReason.TILT
+        assert "leans 3 degrees" in verdict.reason
 
 
 def test_rejected_frames_do_not_affect_the_next(world_map, slow_drive):
@@ -183,9 +193,9 @@ def test_rejected_frames_do_not_affect_the_next(world_map, slow_drive):
     ride.see(garbage(2), truth[4])
     refused(ride, garbage(3), truth[5])
     ride.see(clouds[6], truth[6])
-    judgement = ride.update(clouds[7], truth[7])
-    assert judgement.verified
-    assert judgement.score > 0.9
+    verdict = ride.update(clouds[7], truth[7])
+    assert verdict.verified
+    assert verdict.score > 0.9
     assert ride.error(truth[7])[0] < 0.05
 
 
@@ -195,7 +205,7 @@ def test_newest_only_uses_the_newest_frame(world_map, slow_drive):
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
     for seed in range(3):
         ride.see(garbage(seed), truth[1])
-    assert ride.update(clouds[1], truth[1], alone=True).score > 0.9
+    assert ride.update(clouds[1], truth[1], newest_only=True).score > 0.9
     again = ride_of(world_map, slow_drive, LocalizerConfig(tracking=wide), 0)
     for seed in range(3):
         again.see(garbage(seed), truth[1])
@@ -211,8 +221,8 @@ def test_restart_carries_nothing_over(world_map, slow_drive, world_drive):
     T = ride.odometry(world_drive.T_map_body[8])
     ride.tracker.start(registration(world_drive.T_map_body[8] @ OFF @ inverse(T)), T, ride.tracker.travelled)
     assert (np.diag(ride.tracker.predicted_covariance()) > 10 * np.diag(usual)).all()
-    judgement = ride.update(world_drive.clouds[8], world_drive.T_map_body[8])
-    assert judgement.verified
+    verdict = ride.update(world_drive.clouds[8], world_drive.T_map_body[8])
+    assert verdict.verified
     assert ride.error(world_drive.T_map_body[8])[0] < 0.03
 
 

@@ -1,10 +1,10 @@
-"""Between registrations: when the next is due, what it will use, and how unsure the pose grows meanwhile."""
+"""Between registrations: when the next is needed, what it will use, and how the covariance grows meanwhile."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from trackers import Ride, registration, tracker_of
+from trackers import Ride, add_frame, match_and_update, registration, tracker_of
 
 from coview_stream.config import LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import pose_from, rot_z
@@ -21,8 +21,8 @@ def steps_until_due(world_map, poses, patience=1.0, **settings):
     """How many of the poses it takes after the first; a registration is never due at the first."""
     tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(**{**GOOD, **settings})))
     for k, T in enumerate(poses):
-        tracker.observe(NOTHING, T, NOTHING)
-        if tracker.due(patience):
+        tracker.add_scan(NOTHING, T)
+        if tracker.needs_registration(patience):
             return k
     return None
 
@@ -85,19 +85,19 @@ def test_no_registration_is_needed_right_after_an_update(world_map, world_drive)
     clouds, truth = world_drive.clouds, world_drive.T_map_body
     ride = Ride.begin(world_map, None, clouds[0], truth[0])
     ride.see(clouds[1], truth[1])
-    assert ride.tracker.due()
-    ride.tracker.update(clouds[1], ride.odometry(truth[1]))
-    assert not ride.tracker.due()
+    assert ride.tracker.needs_registration()
+    match_and_update(ride.tracker, clouds[1], ride.odometry(truth[1]))
+    assert not ride.tracker.needs_registration()
     ride.see(clouds[1], truth[1])
-    assert not ride.tracker.due()
+    assert not ride.tracker.needs_registration()
     ride.see(clouds[2], truth[2])
-    assert ride.tracker.due()
+    assert ride.tracker.needs_registration()
 
 
 def test_no_registration_is_needed_right_after_a_rejection(world_map, world_drive):
     ride = Ride.begin(world_map, None, world_drive.clouds[0], world_drive.T_map_body[0])
     assert not ride.update(NOTHING, world_drive.T_map_body[1]).verified
-    assert not ride.tracker.due()
+    assert not ride.tracker.needs_registration()
 
 
 # ---- from what
@@ -109,8 +109,8 @@ def test_scan_buffer_window_adapts_to_point_count(world_map):
         tracker = tracker_of(world_map, config)
         for k in range(8):
             T = pose_from(np.eye(3), [0.5 * k, 0, 0])
-            tracker.observe(NOTHING, T, np.full((points, 3), k, np.float32))
-        return sorted({int(k) for k in tracker._recent.window()[:, 0]})
+            tracker.add_scan(np.full((points, 3), k, np.float32), T)
+        return sorted({int(k) for k in tracker._scans.window()[:, 0]})
 
     assert window(1000, window=2.0) == [3, 4, 5, 6, 7]
     assert window(300, window=2.0) == list(range(8))  # 2,500 points need more
@@ -123,8 +123,8 @@ def test_scan_buffer_drops_old_frames(world_map):
     """A robot that never gets its points together, on a robot that runs for weeks."""
     tracker = tracker_of(world_map, LocalizerConfig(tracking=TrackingConfig(min_points=10**6)))
     for k in range(300):
-        tracker.observe(NOTHING, pose_from(np.eye(3), [0.01 * k, 0, 0]), np.zeros((10, 3), np.float32))
-    assert len(tracker._recent.window()) <= 400
+        tracker.add_scan(np.zeros((10, 3), np.float32), pose_from(np.eye(3), [0.01 * k, 0, 0]))
+    assert len(tracker._scans.window()) <= 400
 
 
 # ---- how unsure
@@ -132,9 +132,9 @@ def test_scan_buffer_drops_old_frames(world_map):
 
 def test_update_before_start_raises(world_map, world_drive):
     tracker = tracker_of(world_map)
-    tracker.observe(world_drive.clouds[0], np.eye(4))
+    add_frame(tracker, world_drive.clouds[0], np.eye(4))
     with pytest.raises(RuntimeError, match="call start first"):
-        tracker.update(world_drive.clouds[0], np.eye(4))
+        tracker.match_to_map(world_drive.clouds[0], np.eye(4))
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def started(world_map):
 
     def covariance(*poses):
         for T in poses:
-            tracker.observe(NOTHING, T, NOTHING)
+            tracker.add_scan(NOTHING, T)
         return tracker.predicted_covariance()
 
     covariance(np.eye(4))
@@ -178,7 +178,7 @@ def test_late_fix_has_larger_covariance(world_map):
     for found_at in (3.0, 0.0):
         tracker = tracker_of(world_map)
         for x in (0.0, 3.0):
-            tracker.observe(NOTHING, pose_from(np.eye(3), [x, 0.0, 0.0]), NOTHING)
+            tracker.add_scan(NOTHING, pose_from(np.eye(3), [x, 0.0, 0.0]))
         tracker.start(registration(np.eye(4)), pose_from(np.eye(3), [3.0, 0.0, 0.0]), found_at)
         sigmas.append(np.diag(tracker.predicted_covariance()))
     expected = tracker.drift.variances(3.0, 0.0)
@@ -217,16 +217,16 @@ def ridden(world_map, drive, scale):
         step = np.linalg.inv(before) @ now
         step[:3, 3] *= scale
         T = T @ step
-        ride.tracker.observe(cloud, T)
-        if ride.tracker.due():
-            assert ride.tracker.update(cloud, T).verified
+        add_frame(ride.tracker, cloud, T)
+        if ride.tracker.needs_registration():
+            assert match_and_update(ride.tracker, cloud, T).verified
     return ride.tracker, T
 
 
 def metres_until_due(tracker, T):
     for k in range(1, 200):
-        tracker.observe(NOTHING, T @ pose_from(np.eye(3), [0.01 * k, 0.0, 0.0]), NOTHING)
-        if tracker.due():
+        tracker.add_scan(NOTHING, T @ pose_from(np.eye(3), [0.01 * k, 0.0, 0.0]))
+        if tracker.needs_registration():
             return 0.01 * k
     raise AssertionError("nothing is due after two metres")
 
@@ -239,14 +239,14 @@ def test_noisy_odometry_is_estimated_and_registered_more_often(world_map, slow_d
     assert bad[0].drift.position > 1.5 * known
     ahead = pose_from(np.eye(3), [0.9, 0.0, 0.0])
     for tracker, T in (good, bad):
-        tracker.update(slow_drive.clouds[-1], T)
+        match_and_update(tracker, slow_drive.clouds[-1], T)
     grown = []
     for tracker, T in (good, bad):
         before = tracker.predicted_covariance()[3:5, 3:5].trace()
-        tracker.observe(NOTHING, T @ ahead, NOTHING)
+        tracker.add_scan(NOTHING, T @ ahead)
         grown.append(tracker.predicted_covariance()[3:5, 3:5].trace() - before)
     assert grown[1] > 2.0 * grown[0]
     for tracker, T in (good, bad):
-        tracker.observe(NOTHING, T, NOTHING)
-        tracker.update(slow_drive.clouds[-1], T)
+        tracker.add_scan(NOTHING, T)
+        match_and_update(tracker, slow_drive.clouds[-1], T)
     assert metres_until_due(*bad) < 0.8 * metres_until_due(*good)

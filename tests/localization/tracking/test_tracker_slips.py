@@ -35,15 +35,15 @@ def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     drift = ride.tracker.drift
     metres, degrees = pose_error(slip, np.eye(4))
     ride.slips(slip, truth[k - 1])
-    judgement = ride.update(clouds[k], truth[k])
-    assert judgement.cause is RejectionReason.ODOMETRY
-    assert not judgement.verified
-    assert judgement.innovation > RULE.max_innovation
-    told = [float(word) for word in judgement.reason.split() if word[0].isdigit()]
+    verdict = ride.update(clouds[k], truth[k])
+    assert verdict.cause is RejectionReason.ODOMETRY
+    assert not verdict.verified
+    assert verdict.innovation > RULE.max_innovation
+    told = [float(word) for word in verdict.reason.split() if word[0].isdigit()]
     # by the new way's end a wrong heading is a wrong place, too
     assert told[0] == pytest.approx(metres, abs=0.03 + 0.2 * np.radians(degrees))
     assert told[1] == pytest.approx(degrees, abs=0.2)
-    assert judgement.score > 0.8
+    assert verdict.score > 0.8
     assert ride.error(truth[k])[0] < 0.03
     assert ride.tracker.drift == drift  # it was no drift
     assert ride.update(clouds[k + 1], truth[k + 1]).cause is RejectionReason.VERIFIED
@@ -58,7 +58,8 @@ def test_random_points_are_not_taken_for_a_slip(world_map, slow_drive, elsewhere
     ride = on_the_way(world_map, slow_drive)
     for cloud in (garbage(), *elsewhere.clouds):
         assert (
-            refused(ride, cloud, slow_drive.T_map_body[8], alone=True).cause is not RejectionReason.ODOMETRY
+            refused(ride, cloud, slow_drive.T_map_body[8], newest_only=True).cause
+            is not RejectionReason.ODOMETRY
         )
 
 
@@ -88,27 +89,29 @@ def test_displaced_frame_is_detected_only_after_a_good_one(world_map, slow_drive
     ride.slips(away, truth[8])
     ride.see(clouds[9], truth[9])
     assert ride.tracker.looks_displaced(ride.odometry(truth[9]))
-    ride.tracker.forget_points()
+    ride.tracker.forget_scans()
     assert not ride.tracker.looks_displaced(ride.odometry(truth[9]))  # no frame to look at
 
 
 # ---- standing still
 
 
-def stood(world_map, slow_drive, looks, idle):
+def stood(world_map, slow_drive, looks, standing_still):
     """Variances of the belief after looking again and again at the same thing."""
     ride = on_the_way(world_map, slow_drive, frames=3)
     for _ in range(looks):
-        assert ride.update(slow_drive.clouds[3], slow_drive.T_map_body[3], idle=idle).verified
+        assert ride.update(
+            slow_drive.clouds[3], slow_drive.T_map_body[3], standing_still=standing_still
+        ).verified
     return np.diag(ride.tracker.predicted_covariance())
 
 
 @pytest.mark.slow
 def test_repeated_registrations_while_standing_do_not_shrink_covariance(world_map, slow_drive):
-    some, many = (stood(world_map, slow_drive, looks, idle=True) for looks in (5, 40))
+    some, many = (stood(world_map, slow_drive, looks, standing_still=True) for looks in (5, 40))
     np.testing.assert_allclose(many, some, rtol=0.15)
     assert (
-        stood(world_map, slow_drive, 40, idle=False) < 0.5 * some
+        stood(world_map, slow_drive, 40, standing_still=False) < 0.5 * some
     ).sum() >= 2  # or it could not be seen here
 
 
@@ -118,10 +121,10 @@ def test_standing_still_uses_only_scans_since_last_registration(world_map, slow_
     ride = on_the_way(world_map, slow_drive, wide, 4)
     for k in (1, 2):
         ride.see(garbage(k), slow_drive.T_map_body[4])
-    judgement = ride.update(garbage(3), slow_drive.T_map_body[4], idle=True)
-    assert not judgement.verified
-    assert judgement.score < RULE.tracking_min_score
+    verdict = ride.update(garbage(3), slow_drive.T_map_body[4], standing_still=True)
+    assert not verdict.verified
+    assert verdict.score < RULE.tracking_min_score
     moving = on_the_way(world_map, slow_drive, wide, 4)
     for k in (1, 2):
         moving.see(garbage(k), slow_drive.T_map_body[4])
-    assert moving.update(garbage(3), slow_drive.T_map_body[4]).score > judgement.score
+    assert moving.update(garbage(3), slow_drive.T_map_body[4]).score > verdict.score
