@@ -156,7 +156,7 @@ def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> 
     Raises:
         InputError: the picture cannot be written.
     """
-    from coview_stream.report.style import TRUTH, figure, say
+    from coview_stream.report.style import TRUTH, draw_notice, figure
 
     nominal = np.linspace(0.0, 1.0, 201)
     with figure(path, figsize=(9.6, 5.0), ncols=2, axes={"sharey": True}) as (drawing, both):
@@ -169,7 +169,7 @@ def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> 
                 if count >= _LEAST:
                     _curve(axes, spread[part][name], name, colour, nominal)
             if count < _LEAST:
-                say(axes, "too few poses")
+                draw_notice(axes, "too few poses")
             axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="promised share", aspect="equal")
             axes.set_title(
                 f"{part} after a fix, {count} poses" if part != "later" else f"{part}, {count} poses"
