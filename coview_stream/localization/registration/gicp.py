@@ -161,7 +161,7 @@ def _pairs(
     keep: float,
 ) -> _Pairs | None:
     """Find pairs at a pose and sum up what they say, both kinds weighing the same; None where they are too few."""
-    gicp, about = library(), T[:3, :3] @ pivot + T[:3, 3]
+    gicp, moved_pivot = library(), T[:3, :3] @ pivot + T[:3, 3]
     H, b, kept, squares, weights = np.zeros((6, 6)), np.zeros(6), 0, 0.0, 0.0
     points = sum(len(kind.points) for kind in clouds)
     for kind in clouds:
@@ -176,16 +176,16 @@ def _pairs(
             max_correspondence_distance=farthest, num_threads=1, max_iterations=1,
         )  # fmt: skip
         near = np.flatnonzero(distance <= farthest)
-        there = kind.points[near] @ T[:3, :3].T + T[:3, 3]
-        gap = there - grid.points[partner[near]]
-        off = np.einsum("ij,ij->i", gap, normals[partner[near]])
-        share = min(0.5 * points / len(near), _MAX_SHARE)
-        turned, slope = about_pivot(answer.H, answer.b, T, pivot)
-        pull, drag = point_to_point_system(there, gap, about)
-        H = H + share * _INFORMATION * (turned - _ALONG * pull)
-        b = b + share * _INFORMATION * (slope - _ALONG * drag)
+        moved = kind.points[near] @ T[:3, :3].T + T[:3, 3]
+        gap = moved - grid.points[partner[near]]
+        residual = np.einsum("ij,ij->i", gap, normals[partner[near]])
+        weight = min(0.5 * points / len(near), _MAX_SHARE)
+        H_kind, b_kind = about_pivot(answer.H, answer.b, T, pivot)
+        H_along, b_along = point_to_point_system(moved, gap, moved_pivot)
+        H = H + weight * _INFORMATION * (H_kind - _ALONG * H_along)
+        b = b + weight * _INFORMATION * (b_kind - _ALONG * b_along)
         kept += len(near)
-        squares, weights = squares + share * float(off @ off), weights + share * len(near)
+        squares, weights = squares + weight * float(residual @ residual), weights + weight * len(near)
     return _Pairs(H, b, kept, float(np.sqrt(squares / weights))) if kept >= MIN_PAIRS else None
 
 
@@ -200,8 +200,8 @@ def about_pivot(H: Floats, b: Floats, T: Pose, pivot: Floats) -> tuple[Floats, F
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = R.T
     J[3:, :3] = skew(np.asarray(pivot, dtype=np.float64)) @ R.T
-    turned = J.T @ H @ J
-    return np.asarray(0.5 * (turned + turned.T)), np.asarray(J.T @ b)
+    H_pivot = J.T @ H @ J
+    return np.asarray(0.5 * (H_pivot + H_pivot.T)), np.asarray(J.T @ b)
 
 
 def fused_step(

@@ -76,7 +76,7 @@ class _Keyframe:
 
 
 class PoseGraph:
-    """Poses of a chain of keyframes, and how sure the newest is.
+    """Poses of a chain of keyframes, and the covariance of the newest.
 
     All covariances are (6, 6) over (rx, ry, rz, x, y, z), radians and metres, *along the map's axes*: the body turns
     about its own origin, then it is shifted. Poses are (4, 4) float64. Not safe for use by two threads at once.
@@ -125,7 +125,7 @@ class PoseGraph:
         self._build(prior)
 
     def move(self, T_between: Pose, covariance: Floats) -> None:
-        """Add a keyframe: odometry has moved on.
+        """Add a keyframe where odometry leads from the newest.
 
         Args:
             T_between: (4, 4) the new body in the frame of the newest keyframe's, ``inverse(T_odom_last) @ T_odom_new``.
@@ -147,7 +147,7 @@ class PoseGraph:
             self._restart()
 
     def correct(self, T_map_body: Pose, covariance: Floats) -> None:
-        """Tell where a registration found the newest keyframe, under Huber's kernel.
+        """Add a registration of the newest keyframe, under Huber's kernel.
 
         Args:
             T_map_body: (4, 4) as the map alone has it: a pose in whose search the prediction took part counts it
@@ -227,7 +227,7 @@ class PoseGraph:
         self._update()
 
     def _update(self) -> None:
-        """Hand over what has gathered since the last time, and linearise again what that moves."""
+        """Give iSAM2 the new factors and values, and linearise again what they move."""
         self._isam.update(self._factors, self._values)
         self._factors, self._values = self._gtsam.NonlinearFactorGraph(), self._gtsam.Values()
         for _ in range(_MAX_UPDATES):
