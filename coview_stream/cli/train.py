@@ -36,12 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate what is missing, train, write the weights and their card, and say how well they do."""
-    from coview_stream.training.train import SMOKE, USUAL, train_session
+    from coview_stream.training.train import DEFAULT, SMOKE, train_session
 
-    plan = SMOKE if args.smoke else USUAL
+    plan = SMOKE if args.smoke else DEFAULT
     card = train_session(
         args.out,
-        plan.changed(args.worlds, args.steps, args.first_world, args.seed),
+        plan.with_numbers(args.worlds, args.steps, args.first_world, args.seed),
         args.workers,
         args.threads,
         _say,

@@ -1,4 +1,4 @@
-"""What a simulator does not know: trees that fell, thinner clouds, layers that a sensor or a season does not show."""
+"""Augmentation of bird's-eye views: fallen trees, thinner clouds, layers that a sensor or a season does not show."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image
 
 _HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
 _TOP, _SEEN, _RELIEF = LAYERS - 3, LAYERS - 2, LAYERS - 1
-_CHANCE = 0.5  # of each change
-_FALLEN = 0.004  # disks per square metre at most: 40 a hectare
+_CHANCE = 0.5  # of each change; this and the numbers below are set by hand
+_MAX_FALLEN = 0.004  # disks per square metre: 40 a hectare
 _RADII = (1.0, 2.5)  # metres
 
 
 def augmented(image: Image, aerial: bool, rng: np.random.Generator) -> Image:
-    """Return a copy of a bird view (LAYERS, H, W), some of its trees, cells or layers gone or denser."""
+    """Return a copy of a bird's-eye view (LAYERS, H, W) with random changes to its trees, cells and layers."""
     image = image.copy()
     if rng.random() < _CHANCE:
         _fell(image, rng)
@@ -32,9 +32,9 @@ def augmented(image: Image, aerial: bool, rng: np.random.Generator) -> Image:
 
 
 def _fell(image: Image, rng: np.random.Generator) -> None:
-    """Clear disks of all that stands, as if trees were gone; where the ground was seen, and its relief, stay."""
+    """Clear disks of all height layers, as if trees were gone; the ground layers stay."""
     height, width = image.shape[1:]
-    count = rng.poisson(rng.uniform(0.0, _FALLEN) * height * width * CELL**2)
+    count = rng.poisson(rng.uniform(0.0, _MAX_FALLEN) * height * width * CELL**2)
     for row, column, radius in zip(
         rng.integers(height, size=count),
         rng.integers(width, size=count),
@@ -50,14 +50,14 @@ def _fell(image: Image, rng: np.random.Generator) -> None:
 
 
 def _thin(image: Image, rng: np.random.Generator) -> None:
-    """Lose a share of all filled cells of each layer, as a sparser scan would."""
+    """Drop a share of the filled cells of each layer, as in a sparser scan."""
     kept = rng.random(image[:_HEIGHTS].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
     image[:_HEIGHTS] *= kept
     image[_SEEN] *= rng.random(image[_SEEN].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
 
 
 def _hide(image: Image, aerial: bool, rng: np.random.Generator) -> None:
-    """Lose what lies below dense leaves (from above), or all that is higher than a sensor looks (from below)."""
+    """Drop the layers below dense leaves (from above), or those above a sensor's field of view (from below)."""
     if aerial:
         image[: int(rng.integers(1, 4))] = 0
         return

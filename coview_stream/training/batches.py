@@ -1,4 +1,4 @@
-"""Batches: pieces of maps, and what robots saw in them, turned, mirrored and spoilt at random."""
+"""Training batches: pieces of maps and queries in them, rotated, mirrored and augmented at random."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from coview_stream.training.dataset import QUERY_CELLS, WorldViews
 PIECE = 272
 """Cells of a piece of the map: 136 m."""
 
-_REACH = 36.0  # metres from a piece's middle at which queries may stand: their 30 m must lie on it
-_TURNED = 0.5  # share of the pieces that are turned by any angle, not only by quarters
-_NARROWED = 0.4  # share of the queries that lose what is beyond a random radius
-_CUT = 0.25  # share that lose a sector
-_WHOLE = 0.1  # share that are cut from the map: who was carried all around saw crowns whole as well
-_RADIUS = 30.0
+# set by hand
+_REACH = 36.0  # metres from a piece's middle within which queries stand: their 30 m must lie on it
+_ROTATED = 0.5  # share of the pieces that are rotated by any angle, not only by quarters
+_NARROWED = 0.4  # share of the queries that are cut at a random radius
+_SECTOR_LOST = 0.25  # share that lose a sector
+_FROM_MAP = (
+    0.1  # share that are cut from the map: a robot that drove all around a tree sees whole crowns as well
+)
+_RADIUS = 30.0  # metres, of a query
 _TRIES = 50
 
 
@@ -42,35 +45,35 @@ class Batch:
 
 
 def draw_batch(
-    worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator, spoil: bool = True
+    worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator, augment: bool = True
 ) -> Batch:
-    """Draw ``pieces`` maps of as many worlds, with ``each`` queries in every one; ``spoil`` augments the images."""
+    """Draw ``pieces`` maps of as many worlds, with ``each`` queries in every one; ``augment`` changes the images."""
     images, queries, owners, poses = [], [], [], []
     for owner, k in enumerate(rng.choice(len(worlds), pieces, replace=False)):
         world = worlds[int(k)]
         centre, chosen = _somewhere(world, each, rng)
-        turn = rng.uniform(-np.pi, np.pi) if rng.random() < _TURNED else 0.5 * np.pi * rng.integers(4)
+        turn = rng.uniform(-np.pi, np.pi) if rng.random() < _ROTATED else 0.5 * np.pi * rng.integers(4)
         mirrored = bool(rng.random() < 0.5)
         piece = _piece(world, centre, turn, mirrored)
-        images.append(augmented(piece, True, rng) if spoil else piece)
+        images.append(augmented(piece, True, rng) if augment else piece)
         for index in chosen:
             x, y, yaw = world.poses[index]
             at = _rotated(np.array([x, y]) - centre, -turn)
             seen = world.queries[index]
-            if rng.random() < _WHOLE:
+            if rng.random() < _FROM_MAP:
                 seen = _piece(world, world.poses[index, :2], yaw, False, QUERY_CELLS)
             image, quarter = _query(seen, mirrored, rng)
             heading = yaw - turn
             if mirrored:
                 at, heading = at * (1.0, -1.0), -heading
             poses.append([*at, heading + quarter])
-            queries.append(augmented(image, False, rng) if spoil else image)
+            queries.append(augmented(image, False, rng) if augment else image)
             owners.append(owner)
     return Batch(np.stack(images), np.stack(queries), np.array(owners), np.array(poses))
 
 
 def _somewhere(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Floats, Indices]:
-    """Middle (2,) of a piece and ``count`` queries near it; the same one twice where there are too few."""
+    """Draw the middle (2,) of a piece and ``count`` queries near it; repeated where there are too few."""
     best: tuple[Floats, Indices] | None = None
     for _ in range(_TRIES):
         centre = world.poses[rng.integers(len(world.poses)), :2] + rng.uniform(-0.7, 0.7, 2) * _REACH
@@ -88,7 +91,7 @@ def _somewhere(world: WorldViews, count: int, rng: np.random.Generator) -> tuple
 
 
 def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size: int = PIECE) -> Image:
-    """Cut a piece whose frame stands at ``centre``, turned: ``p_world = R(turn) p_piece + centre``."""
+    """Cut a piece with its middle at ``centre``: ``p_world = R(turn) p_piece + centre``."""
     at = (np.arange(size) + 0.5 - size / 2) * CELL
     x, y = np.meshgrid(at, -at if mirrored else at, indexing="xy")
     column = (np.cos(turn) * x - np.sin(turn) * y + centre[0] - world.corner[0]) / CELL
@@ -102,7 +105,7 @@ def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size:
 
 
 def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Image, float]:
-    """Mirror and turn a query by quarters, and hide some of it; the turn is what its heading gains, radians."""
+    """Mirror a query, rotate it by quarters and hide some of it; also return what its heading gains, radians."""
     if mirrored:
         image = image[:, ::-1]
     quarters = int(rng.integers(4))
@@ -110,12 +113,12 @@ def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Imag
     at = (np.arange(QUERY_CELLS) + 0.5 - QUERY_CELLS / 2) * CELL
     distance = np.hypot(at[:, None], at[None])
     hidden = distance > (rng.uniform(12.0, _RADIUS) if rng.random() < _NARROWED else _RADIUS)
-    if rng.random() < _CUT:
+    if rng.random() < _SECTOR_LOST:
         direction = np.arctan2(at[:, None], at[None]) - rng.uniform(-np.pi, np.pi)
         hidden |= np.abs((direction + np.pi) % (2 * np.pi) - np.pi) < rng.uniform(0.2, 1.0)
     image[:, hidden] = 0
     image[-1][hidden] = 128
-    # the array is turned towards lower rows, i.e. clockwise as seen from above: the heading makes up for it
+    # rot90 turns towards lower rows, i.e. clockwise as seen from above: the heading compensates
     return image, 0.5 * np.pi * quarters
 
 

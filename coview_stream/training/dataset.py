@@ -1,4 +1,4 @@
-"""Training data on disk: one file per world, with the bird views of its map and of its submaps."""
+"""Training data on disk: one file per world, with the bird's-eye views of its map and of its submaps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _KEYS = ("aerial", "corner", "queries", "poses", "sensor", "kind", "travelled", 
 
 @dataclass(frozen=True)
 class WorldViews:
-    """What a network sees of a world.
+    """Bird's-eye views of a world.
 
     Attributes:
         aerial: (LAYERS, H, W) the map.
@@ -43,7 +43,7 @@ class WorldViews:
         sensor: (K,) names.
         kind: of the world, in words.
         travelled: (K,) metres driven for each query.
-        recipe: the seed, the recipe, and what was drawn from it.
+        recipe: the seed, the recipe, and the values drawn from it.
     """
 
     aerial: Image
@@ -57,7 +57,7 @@ class WorldViews:
 
 
 def world_views(seed: int, recipe: Recipe) -> WorldViews:
-    """Draw the world of a seed and look at it.
+    """Draw the world of a seed, and its views.
 
     Raises:
         DependencyError: Open3D cannot be loaded.
@@ -96,10 +96,10 @@ def write_world(path: str | os.PathLike[str], seed: int, recipe: Recipe) -> None
 
 
 def read_world(path: str | os.PathLike[str]) -> WorldViews:
-    """Read what ``write_world`` wrote.
+    """Read a file of :func:`write_world`.
 
     Raises:
-        InputError: there is no such file, or it is none of a world's views.
+        InputError: there is no such file, or it holds no views of a world.
     """
     try:
         with np.load(Path(path), allow_pickle=False) as file:
@@ -117,14 +117,14 @@ def write_dataset(
     workers: int = 1,
     progress: Callable[[int, float], None] | None = None,
 ) -> list[Path]:
-    """Write ``SEED.npz`` for each seed into a directory; those that are there already stay.
+    """Write ``SEED.npz`` for each seed into a directory; existing files stay.
 
     Args:
-        directory: made where it is missing.
+        directory: created if it is missing.
         seeds: of the worlds.
-        recipe: what to draw from.
+        recipe: ranges to draw from.
         workers: processes.
-        progress: called with the seed and the seconds it took as each file gets ready.
+        progress: called with the seed and the seconds it took, when a file is ready.
 
     Returns:
         The files, in the order of the seeds.
@@ -148,13 +148,13 @@ def write_dataset(
         for seed in missing:
             report(seed, write(seed))
     else:
-        # a forked Open3D may hang on the threads of its parent
+        # Open3D in a forked process may hang on the threads of its parent
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             jobs = {pool.submit(write, seed): seed for seed in missing}
             try:
                 for job in as_completed(jobs):
                     report(jobs[job], job.result())
-            except BaseException:  # Ctrl-C too: or all that wait would still be made before it counts
+            except BaseException:  # Ctrl-C too: else all pending worlds would be made first
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
     return list(paths.values())

@@ -1,4 +1,4 @@
-"""What the encoders are trained for: that a query correlates with its map where it stands, and nowhere else."""
+"""Losses of the encoders: a query is to correlate with its map where it stands, and nowhere else."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from torch.nn import functional
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL
 
 _COARSE = 2  # local cells to a coarse one: the dense search runs on 2 m
+# set by hand
 _RADIUS = 29.0  # metres about a query's middle whose cells count
-_SHARP = 20.0  # scores in [-1, 1] are multiplied by this before they compete (dense search)
+_DENSE_SCALE = 20.0  # on scores in [-1, 1] before the softmax of the dense search
 _LOCAL_TEMPERATURE = 0.07
 _PLACE_TEMPERATURE = 0.08
 _SAMPLES = 128  # corresponding points of a query and its map
-_TOO_NEAR = 2.5  # metres: other points within are neither right nor wrong
+_IGNORED_RADIUS = 2.5  # metres: other points within are neither right nor wrong
 _SAME_PLACE = 12.0  # metres: likewise for global descriptors
-_LEAST_SIGMA = 0.05
-_NO = -1e4
+_MIN_SIGMA = 0.05
+_EXCLUDED = -1e4  # logit of what does not compete
 
 
 @dataclass(frozen=True)
 class Losses:
-    """The three losses (scalars), and the share of a batch's queries that the dense search puts right."""
+    """The three losses (scalars), and the share of a batch's queries that the dense search places correctly."""
 
     dense: Tensor
     local: Tensor
@@ -33,7 +34,7 @@ class Losses:
 
     @property
     def total(self) -> Tensor:
-        """What is minimised."""
+        """The loss that is minimised."""
         return self.dense + 0.5 * self.local + 0.5 * self.place
 
 
@@ -55,7 +56,7 @@ def losses(
         piece: the same of G pieces of (H, H) local cells.
         piece_of: (Q,) the piece of each query.
         poses: (Q, 3) x, y (metres), heading (radians) in the piece's frame about its middle.
-        wrong_yaws: (Q, N) headings that are wrong, radians: they compete too.
+        wrong_yaws: (Q, N) wrong headings that compete with the true one, radians.
         seen: (Q, 1, h, h) and (G, 1, H, H), 1 for local cells in which anything was seen, else 0.
     """
     dense, recall = dense_loss(query, piece, piece_of, poses, wrong_yaws)
@@ -66,9 +67,9 @@ def losses(
 def dense_loss(
     query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, wrong_yaws: Tensor
 ) -> tuple[Tensor, float]:
-    """Cross-entropy over all pieces, coarse cells and the headings tried; (Q queries, right ones' share)."""
+    """Return the cross-entropy over all pieces, coarse cells and headings tried, and the share of correct queries."""
     local, sigma, _ = query
-    weight = _round(local.shape[-1], _RADIUS).to(local) / sigma
+    weight = _disk(local.shape[-1], _RADIUS).to(local) / sigma
     coarse = functional.avg_pool2d(torch.cat([local * weight, weight], 1), _COARSE)
     yaws = torch.cat([poses[:, 2:], wrong_yaws], 1)
     count, tried = yaws.shape
@@ -82,7 +83,7 @@ def dense_loss(
     # a query whose upper left cell lies at (i, j) has its middle at the corner of cell (i + half, j + half)
     last = size - 2 * half + 1
     scores = torch.fft.irfft2(product, s=(size, size))[..., :last, :last]
-    logits = _SHARP * scores.reshape(count, -1)
+    logits = _DENSE_SCALE * scores.reshape(count, -1)
     cell = LOCAL_CELL * _COARSE
     at = poses[:, :2] / cell + (size / 2 - half)
     target = _soft_target(at, piece_of, tried, len(maps), last).to(logits)
@@ -109,34 +110,34 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
 def local_loss(
     query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Corresponding cells are alike and others are not; sigma learns how far they can be told apart.
+    """Loss that makes corresponding cells similar and others not, and sigma the error of that.
 
-    A cross-entropy e over corresponding points, each way, and e / sigma + log sigma, in which e is given: it must not
-    get cheaper to call a cell uncertain than to describe it well. Only points count that both have seen.
+    A cross-entropy e over corresponding points, each way, plus e / sigma + log sigma with e held constant, so that a
+    high uncertainty is never cheaper than a good descriptor. Only points that both have seen count.
     """
     count = len(poses)
     radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
     angle = 2 * torch.pi * torch.rand(count, _SAMPLES)
     there = torch.stack([radius * angle.cos(), radius * angle.sin()], -1)
-    here = _moved(there, poses)
+    here = _to_piece(there, poses)
     ours, sigma_q = _at(query[0], there), _at(query[1], there)[..., 0]
     theirs, sigma_p = _at(piece[0][piece_of], here), _at(piece[1][piece_of], here)[..., 0]
     similar = ours @ theirs.transpose(1, 2) / _LOCAL_TEMPERATURE
-    near = (torch.cdist(here, here) < _TOO_NEAR) & ~torch.eye(_SAMPLES, dtype=torch.bool)
-    similar = similar.masked_fill(near, _NO)
+    near = (torch.cdist(here, here) < _IGNORED_RADIUS) & ~torch.eye(_SAMPLES, dtype=torch.bool)
+    similar = similar.masked_fill(near, _EXCLUDED)
     wanted = torch.arange(_SAMPLES).expand(count, -1)
     both = (_at(seen[0], there)[..., 0] > 0.5) & (_at(seen[1][piece_of], here)[..., 0] > 0.5)
     weight = both.float() / both.sum().clamp(min=1)
     loss = torch.zeros(())
     for logits, sigma in ((similar, sigma_q), (similar.transpose(1, 2), sigma_p)):
         error = functional.cross_entropy(logits.transpose(1, 2), wanted, reduction="none")
-        sigma = sigma.clamp(min=_LEAST_SIGMA)  # beyond the images it is 0
+        sigma = sigma.clamp(min=_MIN_SIGMA)  # outside the images it is 0
         loss = loss + 0.5 * (weight * (error + error.detach() / sigma + sigma.log())).sum()
     return loss
 
 
 def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
-    """Demand that a query's global descriptor is most like that of the map around its place."""
+    """Loss that makes a query's global descriptor most similar to that of the map around its place."""
     own = _middle(query[2])
     maps = piece[2]
     size = maps.shape[-1]
@@ -151,11 +152,11 @@ def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) 
     wanted = distance.argmin(1)
     near = distance < _SAME_PLACE
     near[torch.arange(len(own)), wanted] = False
-    return functional.cross_entropy(logits.masked_fill(near, _NO), wanted)
+    return functional.cross_entropy(logits.masked_fill(near, _EXCLUDED), wanted)
 
 
 def turn(images: Tensor, yaws: Tensor) -> Tensor:
-    """Turn square images (N, C, n, n), row along y, about their middles by (N,) radians: ``p_out = R(yaw) p_in``."""
+    """Rotate square images (N, C, n, n), row along y, about their middles by (N,) radians: ``p_out = R(yaw) p_in``."""
     c, s = yaws.cos(), yaws.sin()
     zero = torch.zeros_like(c)
     inverse = torch.stack([torch.stack([c, s, zero], -1), torch.stack([-s, c, zero], -1)], 1)
@@ -163,7 +164,7 @@ def turn(images: Tensor, yaws: Tensor) -> Tensor:
     return functional.grid_sample(images, grid, align_corners=False)
 
 
-def _moved(points: Tensor, poses: Tensor) -> Tensor:
+def _to_piece(points: Tensor, poses: Tensor) -> Tensor:
     """Points (Q, K, 2) of the queries in their pieces' frames."""
     c, s = poses[:, 2].cos()[:, None], poses[:, 2].sin()[:, None]
     x, y = points[..., 0], points[..., 1]
@@ -182,7 +183,7 @@ def _middle(place: Tensor) -> Tensor:
     return functional.normalize(place[:, :, half - 1 : half + 1, half - 1 : half + 1].mean((2, 3)), dim=1)
 
 
-def _round(size: int, radius: float) -> Tensor:
-    """1 within ``radius`` metres of the middle of (size, size) local cells."""
+def _disk(size: int, radius: float) -> Tensor:
+    """Mask of the (size, size) local cells within ``radius`` metres of the middle: 1, else 0."""
     at = (torch.arange(size) + 0.5 - size / 2) * LOCAL_CELL
     return (torch.hypot(at[:, None], at[None]) < radius).float()

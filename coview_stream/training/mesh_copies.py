@@ -1,4 +1,4 @@
-"""Many deformed copies of one small mesh, each of which belongs to something that may stand or be gone."""
+"""Deformed copies of a small mesh, each with an owner (a tree, a bush) that may stand or be gone."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, copies, join
 
 
-class Part(NamedTuple):
+class MeshCopies(NamedTuple):
     """Copies of a mesh.
 
     Attributes:
         template: whose triangles all copies have.
         vertices: (M, V, 3) metres.
-        owner: (M,) index of the tree, bush or other thing that each copy is a part of.
+        owner: (M,) index of the tree, bush or other object that each copy belongs to.
     """
 
     template: Mesh
@@ -25,8 +25,8 @@ class Part(NamedTuple):
     owner: Ints
 
 
-def standing(parts: Iterable[Part], there: Bools, shift: Floats | None = None) -> Mesh:
-    """One mesh of the parts of those owners (N,) that are ``there``, moved by their ``shift`` (N, 2), metres."""
+def join_standing(parts: Iterable[MeshCopies], there: Bools, shift: Floats | None = None) -> Mesh:
+    """Join the copies of the owners (N,) that are ``there``, moved by their ``shift`` (N, 2), metres."""
     meshes = []
     for part in parts:
         kept = there[part.owner]
@@ -38,10 +38,10 @@ def standing(parts: Iterable[Part], there: Bools, shift: Floats | None = None) -
     return join(meshes)
 
 
-def shaped(
+def scaled_copies(
     rng: np.random.Generator, template: Mesh, centre: Floats, semi: Floats, rough: float, owner: Ints
-) -> Part:
-    """Copy a template to (M, 3) centres, scaled by (M, 3), each vertex ``rough`` (a share) off."""
+) -> MeshCopies:
+    """Copy a template to (M, 3) centres, scaled by (M, 3), with vertices displaced by ``rough`` (a share), 1 sigma."""
     size = (len(centre), len(template.vertices), 1)
     vertices = template.vertices[None] * (1.0 + np.clip(rng.normal(0, rough, size), -0.6, 0.6))
-    return Part(template, vertices * semi[:, None] + centre[:, None], owner)
+    return MeshCopies(template, vertices * semi[:, None] + centre[:, None], owner)

@@ -1,6 +1,4 @@
-"""The two encoders, of the map seen from above and of what a robot saw from below; PyTorch, for training only."""
-
-# FOLDED coview_stream/training/networks.py: """Trained networks as ONNX files, which need no PyTorch to run."""
+"""The two encoders, of the map seen from above and of a robot's scans, in PyTorch; and their export to ONNX."""
 
 from __future__ import annotations
 
@@ -26,17 +24,18 @@ PLACE = 128
 """Numbers in a global descriptor."""
 
 PLACE_REACH = 7
-"""Cells of 4 m about the middle that a global descriptor sums up, under a Gaussian window of 14 m: up to 28 m."""
+"""Cells of 4 m about the middle that a global descriptor pools, under a Gaussian window of 14 m: up to 28 m."""
 
-_PLACE_SIGMA = 3.5
-
-_LEAST_SIGMA = 0.05
-
-_LEAST = 1e-4  # of what is raised to GeM's power
+# set by hand
+_PLACE_SIGMA = 3.5  # cells of 4 m
+_MIN_SIGMA = 0.05
+_MIN_ACTIVATION = 1e-4  # before GeM's power
+_OPSET = 17  # of ONNX
+_SAMPLE = 128  # cells of the image that is traced; all sizes that are multiples of 8 work
 
 
 class _Conv(nn.Module):
-    """A 3 x 3 convolution that both views share, and a normalisation that they do not: their statistics differ."""
+    """A 3 x 3 convolution shared by both views, with a normalisation for each: their statistics differ."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -57,7 +56,7 @@ class _Residual(nn.Module):
 
 
 class _Entry(nn.Module):
-    """What a view does alone, at 1 m: crowns above and stems below are found differently."""
+    """The layers that each view has for itself, at 1 m: crowns from above and stems from below look different."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -69,7 +68,7 @@ class _Entry(nn.Module):
 
 
 class PlaceNet(nn.Module):
-    """Bird views in; local descriptors, their uncertainty and global descriptors out, all fully convolutional.
+    """Encoder of bird's-eye views: local descriptors, their uncertainty, global descriptors; fully convolutional.
 
     Input (B, LAYERS, H, W) in [0, 1], H and W multiples of 8; cells of 0.5 m. Output: local (B, LOCAL, H/2, W/2) of
     unit norm, sigma (B, 1, H/2, W/2) > 0, place (B, PLACE, H/8, W/8) of unit norm.
@@ -102,12 +101,12 @@ class PlaceNet(nn.Module):
         merged = self.lateral[1](at2) + _doubled(self.lateral[2](at4))
         merged = functional.relu(self.lateral[0](at1) + _doubled(merged))
         local = functional.normalize(self.local(merged), dim=1)
-        sigma = functional.softplus(self.sigma(merged)) + _LEAST_SIGMA
+        sigma = functional.softplus(self.sigma(merged)) + _MIN_SIGMA
         return local, sigma, self._place(at4)
 
     def _place(self, at4: Tensor) -> Tensor:
         """Generalised mean (GeM) under a round window about every cell, then a linear layer."""
-        raised = at4.clamp(min=_LEAST).pow(self.power)
+        raised = at4.clamp(min=_MIN_ACTIVATION).pow(self.power)
         down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
         across = self.window.transpose(2, 3)
         raised = functional.conv2d(down, across, padding=(0, PLACE_REACH), groups=4 * self.width)
@@ -115,7 +114,7 @@ class PlaceNet(nn.Module):
 
 
 class OneView(nn.Module):
-    """A network for one view, as it is exported."""
+    """The network for one view, as it is exported."""
 
     def __init__(self, net: PlaceNet, view: int) -> None:
         super().__init__()
@@ -137,15 +136,10 @@ def _window() -> Tensor:
     return (weight / weight.sum())[:, None]
 
 
-_OPSET = 17
-
-_SAMPLE = 128  # cells of the image that is traced; all sizes that are multiples of 8 work
-
-
 def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
-    """Write one ONNX file per view and the card that says how they were made; a file is complete or not there.
+    """Write one ONNX file per view and the card that records how they were made; a file is complete or absent.
 
-    The card also names the files' hashes, by which one view's weights are told from the other's.
+    The card also holds the files' hashes, which tell one view's weights from the other's.
     """
     directory.mkdir(parents=True, exist_ok=True)
     written = []
@@ -168,7 +162,7 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
 
 
 def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
-    """Return a network in training as what :class:`~.network.Network` is once it has been exported."""
+    """Return a network in training with the interface of the exported :class:`~.descriptors.network.Network`."""
 
     def encode(image: Image) -> Features:
         with torch.no_grad():

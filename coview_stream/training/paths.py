@@ -1,4 +1,4 @@
-"""Where the robot drives: smooth curves between trees, or along streets."""
+"""Paths of a robot: smooth curves between trees, or along streets."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ CLEARANCE = 0.6
 STEP = 0.1
 """Metres between the points of a path."""
 
-_CANDIDATES = 150
+# set by hand
+_CANDIDATES = 150  # random paths of which the longest free one is taken
 _COARSE = 5  # steps between the points that are tested
-_LANE = 0.7
+_LANE = 0.7  # metres to either side of a street's middle
 
 
 def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, length: float) -> Floats:
-    """Path (N, 2) of ``length`` metres, shorter where the trees leave no way, that ends within +-``extent`` metres.
+    """Path (N, 2) of ``length`` metres, shorter where trees block it, that ends within +-``extent`` metres.
 
     ``obstacles`` (K, 3) are x, y and radius, metres.
     """
@@ -43,7 +44,7 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
 
 
 def _clear(points: Floats, obstacles: Floats) -> Bools:
-    """Whether (..., 2) points are clear of all obstacles."""
+    """Mask (...) of the points (..., 2) that are clear of all obstacles."""
     if not len(obstacles):
         return np.ones(points.shape[:-1], dtype=bool)
     flat = points.reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""How often the dense search finds where a query stands, in worlds that were not trained on."""
+"""Recall of the dense search, in worlds that were not trained on."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ HEADINGS = 36
 """Headings that the dense search tries."""
 
 _CELL = 2.0  # metres of the dense search
-_BEST = 5
-_APART = 10.0  # metres between two places that are counted as two
-_RADIUS = 29.0
+_BEST = 5  # places kept
+_DISTINCT = 10.0  # metres between two places that are counted as two; set by hand
+_RADIUS = 29.0  # metres of a query that are compared; set by hand
 
 Encoder = Callable[[Image], Features]
 
 
 @dataclass(frozen=True)
-class Sought:
-    """One query and where the search put it.
+class SearchedQuery:
+    """One query and the places that the search found.
 
     Attributes:
-        world: its number among the worlds asked.
+        world: index of its world.
         sensor: of the robot.
         travelled: metres driven for it.
         found: (5, 3) x, y (metres) and heading (radians) of the best places, best first.
-        pose: (3,) the true ones.
+        pose: (3,) the true x, y and heading.
         scores: (5,) of the places.
     """
 
@@ -45,29 +45,31 @@ class Sought:
     pose: Floats
     scores: Floats
 
-    def right(self, best: int = 1, within: float = 10.0) -> bool:
+    def found_among(self, best: int = 1, within: float = 10.0) -> bool:
         """Whether one of the ``best`` places lies ``within`` metres of the truth."""
         apart = np.linalg.norm(self.found[:best, :2] - self.pose[:2], axis=1)
         return bool((apart < within).any())
 
 
-def seek(
-    worlds: Sequence[WorldViews], aerial: Encoder, ground: Encoder, most: int | None = None
-) -> list[Sought]:
-    """Search every query (at most ``most`` of a world) in its world's map, at all places and headings."""
+def search_queries(
+    worlds: Sequence[WorldViews], aerial: Encoder, ground: Encoder, max_queries: int | None = None
+) -> list[SearchedQuery]:
+    """Search every query (up to ``max_queries`` of a world) in its world's map, at all places and headings."""
     yaws = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
-    sought = []
+    results = []
     for number, world in enumerate(worlds):
-        features, _ = downsample(aerial(_even(world.aerial)).local)
-        coarse = FeatureIndex(features, world.corner, _CELL)
-        for k in range(len(world.queries))[:most]:
+        features, _ = downsample(aerial(_cropped(world.aerial)).local)
+        index = FeatureIndex(features, world.corner, _CELL)
+        for k in range(len(world.queries))[:max_queries]:
             query = ground(world.queries[k])
-            volume = correlate(*downsample(query.local, weights(query.sigma)), coarse, yaws)
+            volume = correlate(*downsample(query.local, weights(query.sigma)), index, yaws)
             found, scores = best_places(volume, yaws, world.corner)
-            sought.append(
-                Sought(number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores)
+            results.append(
+                SearchedQuery(
+                    number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores
+                )
             )
-    return sought
+    return results
 
 
 def weights(sigma: Floats32) -> Floats32:
@@ -86,10 +88,10 @@ def best_places(volume: Floats32, yaws: Floats, corner: Floats) -> tuple[Floats,
         yaw = yaws[int(volume[:, row, column].argmax())]
         places.append([*(corner + (np.array([column, row]) + 0.5) * _CELL), yaw])
         scores.append(float(top[row, column]))
-        top = np.where(np.hypot(rows - row, columns - column) * _CELL < _APART, -np.inf, top)
+        top = np.where(np.hypot(rows - row, columns - column) * _CELL < _DISTINCT, -np.inf, top)
     return np.array(places), np.array(scores)
 
 
-def _even(image: Image) -> Image:
-    """Cut an image to whole cells of 4 m."""
+def _cropped(image: Image) -> Image:
+    """Crop an image to whole cells of 4 m."""
     return image[:, : image.shape[1] // 8 * 8, : image.shape[2] // 8 * 8]

@@ -1,4 +1,4 @@
-"""What training worlds are drawn from: the range of everything that differs between them."""
+"""Recipe of training worlds: the ranges from which each world, tree and submap is drawn."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ _BOUNDS: dict[str, Range] = {
 
 @dataclass(frozen=True)
 class Recipe:
-    """Ranges (least, most) of what each world, tree or submap draws; single numbers are shares or counts.
+    """Ranges (minimum, maximum) of what each world, tree or submap draws; single numbers are shares or counts.
+
+    Set by hand.
 
     Attributes:
         built: share of worlds with buildings, of ``kinds``; the others are forests.
@@ -152,4 +154,6 @@ def _require_within(name: str, value: Any, bounds: Range) -> None:
     single = {field.name for field in fields(Recipe) if field.type in ("int", "float")}
     ends = (value, value) if name in single else tuple(value)
     if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
-        raise ConfigError(f"{name}: {value!r} is out of range; stay, least first, within {low:g} to {high:g}")
+        raise ConfigError(
+            f"{name}: {value!r} is out of range; stay, smallest first, within {low:g} to {high:g}"
+        )

@@ -1,4 +1,4 @@
-"""The inclined rotating lidar of FGLoc6D: a VLP-16 tilted by 45 degrees, turning as a whole about the vertical."""
+"""Sensors of training drives: the simulator's, and FGLoc6D's VLP-16, inclined by 45 degrees and rotating as a whole."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _COLUMNS = 1800
 _ROTATING = "vlp16-inclined"
 
 TRAINED_SENSORS = (*SENSORS, _ROTATING)
-"""Names that :func:`trained_sensor` knows."""
+"""Names for :func:`trained_sensor`."""
 
 _GROUP = {"vlp16": 16, "os64": 64, "os64-2048": 64, _ROTATING: 16}  # beams fired together
 
 
 def trained_sensor(name: str, keep: Callable[[int], int] | None = None) -> Sensor:
-    """Make a sensor by its name; ``keep`` says, from the number of its beams, every how many-th column is cast."""
+    """Make a sensor by its name; ``keep`` maps its number of beams to n: only every n-th column is cast."""
     sensor = _inclined() if name == _ROTATING else SENSORS[name]()
     every = 1 if keep is None else max(1, keep(len(sensor.beams(0))))
     if every == 1:
@@ -34,7 +34,7 @@ def trained_sensor(name: str, keep: Callable[[int], int] | None = None) -> Senso
 
     def thinned(frame: int) -> Floats:
         rays = beams(frame)
-        # another column in each frame, so that together they see what all would
+        # another column in each frame, so that together they cover all
         return np.asarray(rays[(np.arange(len(rays)) // group + frame) % every == 0])
 
     return Sensor(name, thinned, sensor.min_range, sensor.max_range)

@@ -1,4 +1,4 @@
-"""Forest stands at two epochs: when the map was flown, and when the robot comes."""
+"""Forest stands at two epochs: when the map is flown, and when the robot drives."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, join
 from coview_stream.sim.scenes import Epoch
 from coview_stream.training import tree_meshes
-from coview_stream.training.mesh_copies import Part, standing
+from coview_stream.training.mesh_copies import MeshCopies, join_standing
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.terrain import Terrain
 from coview_stream.training.trees import PATTERNS, Trees, draw_species, draw_stems, draw_trees, opened
@@ -22,11 +22,12 @@ class Stand(NamedTuple):
     """A forest.
 
     Attributes:
-        mapped, now: what stands there at the two epochs.
+        mapped: geometry when the map is flown.
+        now: geometry when the robot drives.
         terrain: the ground.
-        trees: all that stand at either epoch.
-        obstacles: (N, 3) x, y and radius of what a robot cannot drive through now, metres.
-        drawn: what was drawn for the stand, plain values.
+        trees: all trees of either epoch.
+        obstacles: (N, 3) x, y and radius of what blocks the robot, metres.
+        drawn: values that were drawn for the stand, for JSON.
     """
 
     mapped: Epoch
@@ -57,7 +58,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     solid = [terrain.mesh(), *_litter(rng, terrain)]
     woody = [
         tree_meshes.stems(trees),
-        tree_meshes.branches(rng, trees, _branchiness(rng, trees, any(winters))),
+        tree_meshes.branches(rng, trees, _branch_counts(rng, trees, any(winters))),
     ]
     there, leafed = _fates(rng, len(xy), mortality)
     shifts = (None, rng.normal(0, wind, (len(xy), 2)))
@@ -89,7 +90,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
 
 
 def tags(drawn: dict[str, Any]) -> str:
-    """Say in a few words what a stand is, for tables by forest type."""
+    """Describe a stand in a few words, for tables by forest type."""
     families = sorted({each["family"] for each in drawn["species"]})
     season = "leaf-off" if any(drawn["winter"]) else "leaf-on"
     land = "flat" if drawn["slope"] < 3 else "hilly" if drawn["slope"] < 12 else "steep"
@@ -98,7 +99,7 @@ def tags(drawn: dict[str, Any]) -> str:
 
 
 def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
-    """Whether it is winter when the map is flown, and when the robot comes: the same season in half of the cases."""
+    """Draw whether it is winter at the two epochs: the same season in half of the cases."""
     first, second = (bool(each) for each in rng.random(2) < recipe.leaf_off)
     return (first, first) if rng.random() < 0.5 else (first, second)
 
@@ -106,14 +107,14 @@ def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
 def _fates(
     rng: np.random.Generator, count: int, mortality: float
 ) -> tuple[tuple[Bools, Bools], tuple[Bools, Bools]]:
-    """Which trees stand, and which of them have leaves, at each epoch; ``mortality`` is the share that differs."""
+    """Masks of the trees that stand and of those with leaves, at each epoch; ``mortality``: the share that differs."""
     fate = np.where(rng.random(count) < mortality, rng.integers(1, 4, count), 0)
     everyone = np.ones(count, dtype=bool)
     return (fate != 2, fate != 1), (everyone, fate != 3)
 
 
-def _branchiness(rng: np.random.Generator, trees: Trees, winter: bool) -> Ints:
-    """How many branches each tree (N,) shows."""
+def _branch_counts(rng: np.random.Generator, trees: Trees, winter: bool) -> Ints:
+    """Draw the number of branches (N,) of each tree."""
     living, bare = rng.integers(0, 7), rng.integers(8, 22)
     seen = trees.dead | (winter & ~trees.evergreen)
     return rng.poisson(np.where(seen, bare, living))
@@ -124,26 +125,26 @@ def _litter(rng: np.random.Generator, terrain: Terrain) -> list[Mesh]:
     many = rng.random(2) < 0.6
     logs = tree_meshes.logs(rng, terrain, int(area * rng.uniform(0, 0.006) * many[0]))
     rocks = tree_meshes.rocks(rng, terrain, int(area * rng.uniform(0, 0.006) * many[1]))
-    return [standing([logs, rocks], everything)]
+    return [join_standing([logs, rocks], everything)]
 
 
 def _epoch(
     rng: np.random.Generator,
     solid: list[Mesh],
-    woody: list[Part],
-    leaves: list[Part],
-    bushes: Part,
+    woody: list[MeshCopies],
+    leaves: list[MeshCopies],
+    bushes: MeshCopies,
     there: Bools,
     leafed: Bools,
     shift: Floats | None,
 ) -> Epoch:
     grown = rng.random(len(bushes.owner)) < 0.85  # the understory changes most
-    foliage = [standing(leaves, there & leafed, shift), standing([bushes], grown)]
-    return Epoch(join([*solid, standing(woody, there)]), join(foliage))
+    foliage = [join_standing(leaves, there & leafed, shift), join_standing([bushes], grown)]
+    return Epoch(join([*solid, join_standing(woody, there)]), join(foliage))
 
 
 def _obstacles(trees: Trees, there: Bools) -> Floats:
-    # nobody drives through leaves that hang to the ground
+    # leaves that hang to the ground block the robot as well
     low = trees.base < 1.6
     radius = np.where(low & ~trees.dead, np.maximum(0.6 * trees.crown, trees.radius), trees.radius)
     return np.column_stack([trees.x, trees.y, radius])[there]

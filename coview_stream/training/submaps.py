@@ -1,4 +1,4 @@
-"""What a robot has gathered: frames along a short drive, put together by a drifting odometry."""
+"""Submaps: frames along a short drive, put together by a drifting odometry."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ RADIUS = 30.0
 """Metres about the newest position within which points are kept."""
 
 VOXEL = 0.25
-"""Metres: clouds are thinned as those of the map are."""
+"""Metres: one point is kept per voxel, as in the map."""
 
+# set by hand
 _SPEED = 1.2  # metres per second
-_WHEELBASE = 1.0
+_WHEELBASE = 1.0  # metres
 _PAUSE = 3  # frames between two that are kept while the robot stands
-_OFTEN = {"vlp16-inclined": 0.4}  # a share of the usual step: one frame of it sees a narrow band only
-_FEWEST = {"mid360": (5, 12), "vlp16-inclined": (8, 20)}  # least frames, drawn in between
+_STEP_SHARE = {"vlp16-inclined": 0.4}  # of the usual step: one of its frames covers a narrow band only
+_MIN_FRAMES = {"mid360": (5, 12), "vlp16-inclined": (8, 20)}  # drawn in between
 
 
 class Submap(NamedTuple):
-    """A query.
+    """A robot's local cloud and its true pose: one query.
 
     Attributes:
         points: (N, 3) metres, odometry's axes, origin at the newest position of the sensor.
@@ -47,7 +48,7 @@ class Submap(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """What a robot saw along a drive, oldest first.
+    """Frames along a drive, oldest first.
 
     Attributes:
         truth: (F, 4, 4) map <- sensor.
@@ -94,7 +95,7 @@ def scanned(
 
 
 def gathered(frames: Frames) -> Submap:
-    """Put a drive's frames together by its odometry."""
+    """Put a drive's frames together by their odometry."""
     newest = frames.odometry[-1, :3, 3]
     parts = []
     for told, cloud in zip(frames.odometry, frames.clouds, strict=True):
@@ -109,12 +110,12 @@ def gathered(frames: Frames) -> Submap:
 
 
 def _moments(rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str) -> tuple[Ints, Ints]:
-    """Draw which points of the path (K,) have a frame, and the numbers of the sensor's frames (K,) there."""
-    spacing = recipe.draw(rng, "frame_step") * _OFTEN.get(sensor, 1.0)
+    """Draw the indices (K,) of the path's points that have a frame, and the sensor's frame numbers (K,) there."""
+    spacing = recipe.draw(rng, "frame_step") * _STEP_SHARE.get(sensor, 1.0)
     last = len(path) - 1
     along = last - (np.arange(0, last + 1, spacing / STEP)[::-1]).astype(np.int64)
-    # a robot that has hardly moved has looked about longer
-    stood = max(0, int(rng.integers(*_FEWEST.get(sensor, (2, 6)))) - len(along))
+    # a robot that has hardly moved has scanned for longer
+    stood = max(0, int(rng.integers(*_MIN_FRAMES.get(sensor, (2, 6)))) - len(along))
     frames = np.round((along - along[0]) * STEP / _SPEED / FRAME_PERIOD).astype(np.int64) + _PAUSE * stood
     along = np.concatenate([np.full(stood, along[0]), along])
     frames = np.concatenate([np.arange(stood) * _PAUSE, frames])
@@ -133,7 +134,7 @@ def _poses(
     heading: Floats,
     ground: Callable[[Floats, Floats], Floats],
 ) -> Floats:
-    """Poses (K, 4, 4) of the sensor at (K, 2), which leans with the ground under the robot and sways."""
+    """Poses (K, 4, 4) of the sensor at (K, 2), tilted with the ground under the robot and swaying."""
     x, y = xy.T
     cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
     ahead = ground(x + cx, y + cy) - ground(x - cx, y - cy)

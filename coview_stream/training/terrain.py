@@ -12,7 +12,7 @@ from coview_stream.sim.mesh import Mesh, height_field
 
 Field = Callable[[Floats, Floats], Floats]
 
-_STEP = 1.0
+_STEP = 1.0  # metres between grid points
 
 
 def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:
@@ -33,7 +33,7 @@ def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:
 class Terrain:
     """A square of ground, +-``half`` metres about the origin.
 
-    ``slope`` is the slope, in degrees, that only 5 % of it exceeds (roughness aside); ``roughness`` metres.
+    ``slope`` (degrees) is exceeded on 5 % of it, without the roughness; ``roughness`` is in metres.
     """
 
     def __init__(self, rng: np.random.Generator, half: float, slope: float, roughness: float) -> None:
@@ -43,7 +43,7 @@ class Terrain:
         heading, share = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.7)
         tilted = share * (X * np.cos(heading) + Y * np.sin(heading))
         z = np.zeros_like(X)
-        shortness = rng.uniform(0.7, 1.6)  # how much less the short waves rise
+        shortness = rng.uniform(0.7, 1.6)  # exponent by which longer waves are higher
         for wavelength in (220.0, 110.0, 55.0, 27.0):
             z += wavelength**shortness * rng.uniform(0.2, 1.0) * waves(rng, wavelength, 5)(X, Y)
         z = tilted + (1 - share) * z / np.quantile(_slopes(z), 0.95)

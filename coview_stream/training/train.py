@@ -1,4 +1,4 @@
-"""One training from end to end: worlds, training, weights, and a card that says what they are worth."""
+"""Training from end to end: simulated worlds, the training loop, weights, and a card with their recall."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.training_config import TrainingConfig
 from coview_stream.version import __version__
 
-_EVERY = 20  # steps from one line to the next
+_REPORT_STEPS = 20  # from one line of progress to the next
 _HELD_OUT = 19_000  # first seed of the worlds that training never sees
 
 Say = Callable[[str], None]
+"""Takes a line of progress."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to train on and how.
+    """Plan of a training: its worlds and its settings; the card next to the weights holds it.
 
     Attributes:
-        worlds: how many; their seeds follow each other from ``first``.
-        validation: worlds of other seeds, on which the result is judged.
-        most: queries judged in each of them.
-        recipe: what worlds are drawn from.
-        training: how the encoders are trained.
+        worlds: number of worlds to train on; their seeds are consecutive from ``first``.
+        first: first seed.
+        validation: number of worlds of other seeds on which the result is evaluated.
+        most: maximum of queries evaluated in each of them.
+        recipe: ranges that worlds are drawn from.
+        training: settings of the training loop.
     """
 
     worlds: int = 62
@@ -58,17 +60,17 @@ class Plan:
 
     @property
     def held_out(self) -> range:
-        """Seeds of the worlds to judge on."""
+        """Seeds of the worlds to evaluate on."""
         return range(_HELD_OUT, _HELD_OUT + self.validation)
 
-    def changed(self, worlds: int | None, steps: int | None, first: int, seed: int) -> Plan:
-        """Return the plan with other numbers; None leaves one as it is."""
+    def with_numbers(self, worlds: int | None, steps: int | None, first: int, seed: int) -> Plan:
+        """Return the plan with other numbers; None keeps the plan's own."""
         training = replace(self.training, steps=self.training.steps if steps is None else steps, seed=seed)
         return replace(self, worlds=self.worlds if worlds is None else worlds, first=first, training=training)
 
 
-USUAL = Plan()
-"""What the weights in the package were made by."""
+DEFAULT = Plan()
+"""The plan that the weights in the package were made by."""
 
 SMOKE = Plan(
     worlds=3,
@@ -87,7 +89,7 @@ SMOKE = Plan(
     ),
     training=TrainingConfig(steps=100, pieces=2, each=6, rate=1e-2, width=8, wrong=2),
 )
-"""A minute on two cores: whether everything works and something is learnt, not how well it can be."""
+"""A minute on two cores: shows that everything works and something is learnt, not how good it can get."""
 
 
 def train_session(
@@ -98,14 +100,14 @@ def train_session(
     Worlds that are in ``out / worlds`` already are not simulated again, and a training that was interrupted goes on.
 
     Raises:
-        ConfigError: a number is out of range. InputError: something cannot be written, or what is there is of
-            another recipe or another training.
+        ConfigError: a number is out of range. InputError: something cannot be written, or the directory holds
+            worlds of another recipe or the state of another training.
         DependencyError: PyTorch, ONNX or Open3D is not installed.
     """
     torch = require_library("torch", "torch==2.13.0", "training (extra learn-train)")
     require_library("onnx", "onnx>=1.16", "training (extra learn-train)")
+    from coview_stream.training.loop import train
     from coview_stream.training.networks import encoder, export
-    from coview_stream.training.training import train
 
     if threads > 0:
         torch.set_num_threads(threads)
@@ -124,15 +126,15 @@ def train_session(
 
     def report(step: int, found: Any) -> None:
         history.append([float(x.detach()) for x in (found.dense, found.local, found.place)] + [found.recall])
-        if (step + 1) % _EVERY == 0:
-            dense, local, place, recall = np.mean(history[-_EVERY:], axis=0)
+        if (step + 1) % _REPORT_STEPS == 0:
+            dense, local, place, found_share = np.mean(history[-_REPORT_STEPS:], axis=0)
             say(
-                f"step {step + 1}: dense {dense:.3f}, local {local:.3f}, place {place:.3f}, recall {recall:.2f}"
+                f"step {step + 1}: dense {dense:.3f}, local {local:.3f}, place {place:.3f}, recall {found_share:.2f}"
             )
 
     net = train(worlds[: plan.worlds], plan.training, report, out / "checkpoint.pt")
-    say("judging")
-    judged = judge(worlds[plan.worlds :], encoder(net, "aerial"), encoder(net, "ground"), plan.most)
+    say("evaluating")
+    recall = evaluate(worlds[plan.worlds :], encoder(net, "aerial"), encoder(net, "ground"), plan.most)
     card = {
         "version": __version__,
         "torch": str(torch.__version__),
@@ -140,35 +142,35 @@ def train_session(
         "data_sha256": _digest(paths[: plan.worlds]),
         "threads": int(torch.get_num_threads()),
         "parameters": sum(p.numel() for p in net.parameters()),
-        "loss": {"first": history[0][0], "last": float(np.mean([row[0] for row in history[-_EVERY:]]))}
+        "loss": {"first": history[0][0], "last": float(np.mean([row[0] for row in history[-_REPORT_STEPS:]]))}
         if history
         else {},
-        "validation": judged,
+        "validation": recall,
     }
     export(net, out, card)
     return card
 
 
-def judge(worlds: Sequence[WorldViews], aerial: Any, ground: Any, most: int) -> dict[str, Any]:
-    """Share of queries that the dense search puts right, over all and by sensor, and what chance would give."""
-    from coview_stream.training.recall import seek
+def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries: int) -> dict[str, Any]:
+    """Share of queries that the dense search places correctly, over all and by sensor, and the share by chance."""
+    from coview_stream.training.recall import search_queries
 
-    sought = seek(worlds, aerial, ground, most)
+    results = search_queries(worlds, aerial, ground, max_queries)
     area = float(np.mean([world.aerial[0].size * 0.25 for world in worlds]))
     result: dict[str, Any] = {
         "worlds": len(worlds),
-        "queries": len(sought),
-        "AR@1": float(np.mean([each.right(1) for each in sought])),
-        "AR@5": float(np.mean([each.right(5) for each in sought])),
+        "queries": len(results),
+        "AR@1": float(np.mean([each.found_among(1) for each in results])),
+        "AR@5": float(np.mean([each.found_among(5) for each in results])),
         "chance": float(np.pi * 10.0**2 / area),
     }
-    for sensor in sorted({each.sensor for each in sought}):
-        result[sensor] = float(np.mean([each.right(1) for each in sought if each.sensor == sensor]))
+    for sensor in sorted({each.sensor for each in results}):
+        result[sensor] = float(np.mean([each.found_among(1) for each in results if each.sensor == sensor]))
     return result
 
 
 def _digest(paths: Sequence[Path]) -> str:
-    """Return the hash of what the worlds hold: the files themselves differ with the compression's version."""
+    """Return the hash of the worlds' arrays: the files themselves differ with the compression's version."""
     total = hashlib.sha256()
     for path in paths:
         world = read_world(path)

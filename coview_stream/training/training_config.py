@@ -9,11 +9,17 @@ from coview_stream.config.checks import counts, positive
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How the encoders are trained.
+    """Settings of the training loop; set by hand.
 
-    ``steps`` batches of ``pieces`` maps (136 m) with ``each`` queries in every one; AdamW with a learning rate that
-    falls along a cosine from ``rate``. ``width`` is the encoder's channels at 1 m. ``wrong`` headings compete with each
-    query's true one.
+    Attributes:
+        steps: number of batches.
+        pieces: maps (136 m) in a batch.
+        each: queries in every one.
+        rate: of AdamW at first; it falls along a cosine.
+        decay: AdamW's weight decay.
+        width: the encoder's channels at 1 m.
+        wrong: headings that compete with each query's true one.
+        seed: of the weights' start and of the batches.
     """
 
     steps: int = 600

@@ -1,6 +1,4 @@
-"""Crowns of several families, and the understory: what lets some rays pass."""
-
-# FOLDED coview_stream/training/tree_meshes.py: """Wood, which stops every ray: stems, branches, logs, rocks."""
+"""Meshes of trees: crowns of several families and undergrowth, which let some rays pass, and wood, which stops all."""
 
 from __future__ import annotations
 
@@ -8,30 +6,26 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, cylinder, ellipsoid
-from coview_stream.training.mesh_copies import Part, shaped
+from coview_stream.training.mesh_copies import MeshCopies, scaled_copies
 from coview_stream.training.terrain import Terrain, waves
 from coview_stream.training.trees import FAMILIES, Trees
 
 _MAIN = ellipsoid(4, 7)
-
 _LUMP = ellipsoid(3, 5)
-
 _CONE = cylinder(1.0, 1.0, 7, top=0.08)
-
 _BUSH = ellipsoid(3, 6)
-
+_ROCK = ellipsoid(4, 6)
 _TETRAHEDRON = Mesh(
     np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]),
     np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
 )
+_MAX_CLUMPS = 110_000  # in a stand; set by hand
 
-_MOST_CLUMPS = 110_000
 
-
-def crowns(rng: np.random.Generator, trees: Trees) -> list[Part]:
+def crowns(rng: np.random.Generator, trees: Trees) -> list[MeshCopies]:
     """Leaves of all trees, each of its own family."""
     draw = (_lumpy, _cone, _storeys, _umbrella, _clumps, _column)
-    parts: list[Part] = []
+    parts: list[MeshCopies] = []
     for family, name in enumerate(FAMILIES):
         of = np.flatnonzero(trees.family == family)
         if len(of):
@@ -39,32 +33,32 @@ def crowns(rng: np.random.Generator, trees: Trees) -> list[Part]:
     return parts
 
 
-def _lumpy(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
+def _lumpy(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
     depth, wide = (trees.height - trees.base)[of] / 2, trees.crown[of]
     semi = np.column_stack([wide, wide, depth])
     rough = rng.uniform(0.05, 0.25)
-    parts = [shaped(rng, _MAIN, trees.crown_axis(trees.base[of] + depth, of), semi, rough, of)]
+    parts = [scaled_copies(rng, _MAIN, trees.crown_axis(trees.base[of] + depth, of), semi, rough, of)]
     for _ in range(int(rng.integers(0, 5))):
         parts.append(_lump(rng, trees, of, semi, rough))
     return parts
 
 
-def _lump(rng: np.random.Generator, trees: Trees, of: Ints, semi: Floats, rough: float) -> Part:
-    """One bough beside each crown's middle."""
+def _lump(rng: np.random.Generator, trees: Trees, of: Ints, semi: Floats, rough: float) -> MeshCopies:
+    """One bough beside the middle of each crown."""
     share, angle = rng.uniform(0.35, 0.65, len(of)), rng.uniform(0, 2 * np.pi, len(of))
     centre = trees.crown_axis(trees.base[of] + semi[:, 2] * rng.uniform(0.5, 1.5, len(of)), of)
     out = 0.7 * semi[:, 0] * rng.uniform(0.6, 1.2, len(of))
     centre[:, :2] += out[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    return shaped(rng, _LUMP, centre, semi * share[:, None], rough, of)
+    return scaled_copies(rng, _LUMP, centre, semi * share[:, None], rough, of)
 
 
-def _cone(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
+def _cone(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
     centre = trees.crown_axis(trees.base[of], of)
     semi = np.column_stack([trees.crown[of], trees.crown[of], (trees.height - trees.base)[of]])
-    return [_leaning(shaped(rng, _CONE, centre, semi, rng.uniform(0, 0.1), of), trees)]
+    return [_leaning(scaled_copies(rng, _CONE, centre, semi, rng.uniform(0, 0.1), of), trees)]
 
 
-def _storeys(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
+def _storeys(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
     count = int(rng.integers(2, 6))
     deep, parts = (trees.height - trees.base)[of], []
     for k in range(count):
@@ -73,19 +67,19 @@ def _storeys(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
         tall = deep / count * rng.uniform(1.1, 1.6)
         tall = np.minimum(tall, trees.height[of] - low)
         semi = np.column_stack([wide, wide, tall])
-        parts.append(_leaning(shaped(rng, _CONE, trees.crown_axis(low, of), semi, 0.06, of), trees))
+        parts.append(_leaning(scaled_copies(rng, _CONE, trees.crown_axis(low, of), semi, 0.06, of), trees))
     return parts
 
 
-def _leaning(part: Part, trees: Trees) -> Part:
-    """Shear copies that stand on their centres' height by their trees' lean."""
+def _leaning(part: MeshCopies, trees: Trees) -> MeshCopies:
+    """Shear copies, from their lowest vertex up, by their trees' lean."""
     low = part.vertices[:, :, 2].min(axis=1, keepdims=True)
     up = (part.vertices[:, :, 2] - low)[:, :, None]
     part.vertices[:, :, :2] += up * trees.lean[part.owner][:, None]
     return part
 
 
-def _umbrella(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
+def _umbrella(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
     parts, flat = [], rng.uniform(0.08, 0.3)
     for k in range(int(rng.integers(1, 4))):
         thick = np.maximum(flat * (trees.height - trees.base)[of], 0.3)
@@ -94,22 +88,22 @@ def _umbrella(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
         centre = trees.crown_axis(np.maximum(up, trees.base[of]), of)
         if k:
             centre[:, :2] += rng.normal(0, 0.4, (len(of), 2)) * trees.crown[of][:, None]
-        parts.append(shaped(rng, _MAIN, centre, np.column_stack([wide, wide, thick]), 0.12, of))
+        parts.append(scaled_copies(rng, _MAIN, centre, np.column_stack([wide, wide, thick]), 0.12, of))
     return parts
 
 
-def _column(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
+def _column(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
     depth, wide = (trees.height - trees.base)[of] / 2, trees.crown[of] * rng.uniform(0.4, 0.7)
     semi = np.column_stack([wide, wide, depth])
-    return [shaped(rng, _MAIN, trees.crown_axis(trees.base[of] + depth, of), semi, 0.12, of)]
+    return [scaled_copies(rng, _MAIN, trees.crown_axis(trees.base[of] + depth, of), semi, 0.12, of)]
 
 
-def _clumps(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
+def _clumps(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
     """Small tetrahedra of leaves at random in a profile: pointed, round or a shell."""
     size, layers = rng.uniform(0.2, 0.5), rng.uniform(1.2, 3.5)
     wanted = layers * np.pi * trees.crown[of] ** 2 / (4 * size**2)
-    wanted *= min(1.0, _MOST_CLUMPS / max(wanted.sum(), 1.0))
-    size *= np.sqrt(max(1.0, layers * np.pi * (trees.crown[of] ** 2).sum() / (4 * size**2) / _MOST_CLUMPS))
+    wanted *= min(1.0, _MAX_CLUMPS / max(wanted.sum(), 1.0))
+    size *= np.sqrt(max(1.0, layers * np.pi * (trees.crown[of] ** 2).sum() / (4 * size**2) / _MAX_CLUMPS))
     owner = np.repeat(of, np.maximum(8, rng.poisson(wanted)))
     u = rng.beta(1.3, rng.uniform(1.0, 2.0), len(owner))
     pointed, inner = rng.uniform(0, 1), rng.uniform(0.0, 0.7)
@@ -119,11 +113,11 @@ def _clumps(rng: np.random.Generator, trees: Trees, of: Ints) -> list[Part]:
     centre = trees.crown_axis(trees.base[owner] + u * (trees.height - trees.base)[owner], owner)
     centre[:, :2] += out[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     semi = size * rng.uniform(0.5, 1.5, (len(owner), 1)) * np.array([[1.0, 1.0, rng.uniform(0.3, 1.0)]])
-    return [shaped(rng, _TETRAHEDRON, centre, semi * rng.choice([-1.0, 1.0], semi.shape), 0.3, owner)]
+    return [scaled_copies(rng, _TETRAHEDRON, centre, semi * rng.choice([-1.0, 1.0], semi.shape), 0.3, owner)]
 
 
-def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> Part:
-    """Understory, owner by owner one bush: in patches, up to three metres high, ``density`` per square metre."""
+def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> MeshCopies:
+    """Draw the understory, each bush its own owner: in patches, up to 3 m high, ``density`` per square metre."""
     xy = rng.uniform(-terrain.half, terrain.half, (int(1.7 * density * (2 * terrain.half) ** 2), 2))
     patchy = rng.uniform(0, 3) * waves(rng, rng.uniform(15, 60))(*xy.T)
     xy = xy[rng.random(len(xy)) < 1 / (1 + np.exp(-0.4 - patchy))]
@@ -132,15 +126,12 @@ def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> Part:
     wide = tall * rng.uniform(0.2, 0.6, count)
     semi = np.column_stack([wide, wide, 0.55 * tall])
     centre = np.column_stack([xy, terrain.z(*xy.T) + 0.45 * tall])
-    return shaped(rng, _BUSH, centre, semi, 0.2, np.arange(count))
+    return scaled_copies(rng, _BUSH, centre, semi, 0.2, np.arange(count))
 
 
 def leafy(trees: Trees, winter: bool) -> Bools:
-    """Which trees (N,) have leaves."""
+    """Mask (N,) of the trees that have leaves."""
     return ~trees.dead & (trees.evergreen | (not winter))
-
-
-_ROCK = ellipsoid(4, 6)
 
 
 def _tube(sides: int) -> Mesh:
@@ -152,7 +143,7 @@ def _tube(sides: int) -> Mesh:
     return Mesh(np.zeros((2 * sides, 3)), np.concatenate([*side, cap]))
 
 
-def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, owner: Ints) -> Part:
+def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, owner: Ints) -> MeshCopies:
     """Tubes between (M, 3) points, their radius falling from ``radius`` to ``top`` (M,), metres."""
     axis = end - begin
     axis = axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-9)[:, None]
@@ -163,17 +154,17 @@ def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, o
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
     low, high = begin[:, None] + ring * radius[:, None, None], end[:, None] + ring * top[:, None, None]
-    return Part(_tube(sides), np.concatenate([low, high], axis=1), owner)
+    return MeshCopies(_tube(sides), np.concatenate([low, high], axis=1), owner)
 
 
-def stems(trees: Trees) -> Part:
+def stems(trees: Trees) -> MeshCopies:
     """Leaning, tapering stems, from half a metre below the ground to near the top."""
     top = trees.axis(0.93 * trees.height)
     foot = trees.axis(np.full(len(trees.x), -0.5))
     return tubes(foot, top, trees.radius, 0.25 * trees.radius, 6, np.arange(len(trees.x)))
 
 
-def branches(rng: np.random.Generator, trees: Trees, count: Ints) -> Part:
+def branches(rng: np.random.Generator, trees: Trees, count: Ints) -> MeshCopies:
     """Draw ``count`` (N,) branches of each tree: within its crown, some dead ones below."""
     owner = np.repeat(np.arange(len(trees.x)), count)
     low, height = 0.7 * trees.base[owner], trees.height[owner]
@@ -186,7 +177,7 @@ def branches(rng: np.random.Generator, trees: Trees, count: Ints) -> Part:
     return tubes(begin, begin + along * length[:, None], thick, 0.4 * thick, 3, owner)
 
 
-def logs(rng: np.random.Generator, terrain: Terrain, count: int) -> Part:
+def logs(rng: np.random.Generator, terrain: Terrain, count: int) -> MeshCopies:
     """Fallen stems."""
     xy = rng.uniform(-terrain.half + 8, terrain.half - 8, (count, 2))
     angle, length = rng.uniform(0, 2 * np.pi, count), rng.uniform(3, 14, count)
@@ -196,9 +187,9 @@ def logs(rng: np.random.Generator, terrain: Terrain, count: int) -> Part:
     return tubes(ends[0], ends[1], radius, 0.6 * radius, 5, np.zeros(count, dtype=np.int64))
 
 
-def rocks(rng: np.random.Generator, terrain: Terrain, count: int) -> Part:
+def rocks(rng: np.random.Generator, terrain: Terrain, count: int) -> MeshCopies:
     """Boulders, half buried."""
     xy = rng.uniform(-terrain.half, terrain.half, (count, 2))
     semi = rng.uniform(0.2, 1.4, (count, 1)) * rng.uniform(0.6, 1.2, (count, 3))
     centre = np.column_stack([xy, terrain.z(*xy.T) + 0.2 * semi[:, 2]])
-    return shaped(rng, _ROCK, centre, semi, 0.15, np.zeros(count, dtype=np.int64))
+    return scaled_copies(rng, _ROCK, centre, semi, 0.15, np.zeros(count, dtype=np.int64))

@@ -1,6 +1,4 @@
-"""The trees of a stand as columns, and how their sizes and species are drawn."""
-
-# FOLDED coview_stream/training/trees.py: """Where trees stand: at random, in clusters, apart from each other or in rows; gaps and a trail."""
+"""Trees of a stand: where they stand, and their species and sizes, drawn at random."""
 
 from __future__ import annotations
 
@@ -15,11 +13,23 @@ from coview_stream.training.terrain import Terrain, waves
 
 FAMILIES = ("lumpy", "cone", "storeys", "umbrella", "clumps", "column")
 
+PATTERNS = ("random", "clustered", "hard-core", "rows")
+
+# set by hand
 _EVERGREEN = {"cone": 0.9, "storeys": 0.95, "umbrella": 0.5, "column": 0.6}  # chance, else never
+_MIN_SPACING = 0.8  # metres between two stems
 
 
 class Species(NamedTuple):
-    """Its crowns' family, their width and base in shares of the height, stem thickness, and whether it keeps leaves."""
+    """A tree species of a stand.
+
+    Attributes:
+        family: shape of its crowns, one of ``FAMILIES``.
+        width: crown diameter, in shares of the height.
+        base: height of the lowest leaves, in shares of the height.
+        thick: stem radius, in shares of the height.
+        evergreen: whether it keeps its leaves in winter.
+    """
 
     family: str
     width: float
@@ -29,9 +39,21 @@ class Species(NamedTuple):
 
 
 class Trees(NamedTuple):
-    """(N,) each, metres: foot, height, stem radius, crown radius and base over the foot; family and species by index.
+    """Columns (N,) of all trees, metres.
 
-    ``lean`` (N, 2) metres per metre of height; ``offset`` (N, 2) of the crown's middle from the stem's axis.
+    Attributes:
+        x: of the foot.
+        y: of the foot.
+        z: of the foot.
+        height: of the top above the foot.
+        radius: of the stem.
+        crown: radius of the crown.
+        base: height of the lowest leaves above the foot.
+        lean: (N, 2) metres per metre of height.
+        offset: (N, 2) of the crown's middle from the stem's axis.
+        family: index into ``FAMILIES``.
+        evergreen: whether it keeps its leaves in winter.
+        dead: whether it is bare.
     """
 
     x: Floats
@@ -48,13 +70,13 @@ class Trees(NamedTuple):
     dead: Bools
 
     def axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
-        """Points (M, 3) of the stems' axes ``up`` (M,) metres over their feet; the crowns' weight bends them."""
+        """Points (M, 3) of the stems' axes ``up`` (M,) metres above their feet, bent towards their crowns."""
         bent = self.offset[of] * (0.7 * np.clip(up / self.height[of], 0, 1) ** 1.5)[:, None]
         xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + bent
         return np.column_stack([xy, self.z[of] + up])
 
     def crown_axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
-        """Points (M, 3) in the middle of the crowns, ``up`` (M,) metres over their feet."""
+        """Points (M, 3) in the middle of the crowns, ``up`` (M,) metres above their feet."""
         xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + self.offset[of]
         return np.column_stack([xy, self.z[of] + up])
 
@@ -75,7 +97,7 @@ def draw_trees(
 ) -> Trees:
     """Draw the sizes of trees that stand at (N, 2)."""
     count = len(xy)
-    kind = _mixed(rng, xy, len(species))
+    kind = _species_of(rng, xy, len(species))
     height = _heights(rng, recipe, xy)
     pick = {name: np.array([getattr(each, name) for each in species])[kind] for name in Species._fields}
     crown = _crowns(rng, recipe, pick["width"], height, (2 * terrain.half) ** 2)
@@ -110,8 +132,8 @@ def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Flo
     return np.minimum(np.clip(wide, low, high), room * rng.uniform(0.85, 1.15, len(height)))
 
 
-def _mixed(rng: np.random.Generator, xy: Floats, kinds: int) -> Indices:
-    """Species (N,) by index: in patches, or one here one there."""
+def _species_of(rng: np.random.Generator, xy: Floats, kinds: int) -> Indices:
+    """Draw the species (N,) by index: in patches, or mixed."""
     scores = [
         waves(rng, rng.uniform(30, 100))(*xy.T) * rng.uniform(0, 2) + rng.gumbel(size=len(xy)) + rng.normal()
         for _ in range(kinds)
@@ -128,11 +150,6 @@ def _heights(rng: np.random.Generator, recipe: Recipe, xy: Floats) -> Floats:
     return np.clip(height * (1 + rng.normal(0, rng.uniform(0.03, 0.12), len(xy))), low, high)
 
 
-PATTERNS = ("random", "clustered", "hard-core", "rows")
-
-_APART = 0.8  # metres: no two stems stand nearer
-
-
 def draw_stems(rng: np.random.Generator, pattern: str, per_hectare: float, half: float) -> Floats:
     """Draw positions (N, 2) of stems within +-``half`` metres, in one of ``PATTERNS``."""
     area = (2 * half) ** 2
@@ -144,10 +161,10 @@ def draw_stems(rng: np.random.Generator, pattern: str, per_hectare: float, half:
         per = rng.uniform(3, 15)
         parents = rng.uniform(-half, half, (max(1, int(count / per)), 2))
         xy = parents[rng.integers(0, len(parents), count)] + rng.normal(0, rng.uniform(1.5, 5.0), (count, 2))
-        return xy[_thinned(rng, xy, _APART) & (np.abs(xy) < half).all(axis=1)]
+        return xy[_spaced(rng, xy, _MIN_SPACING) & (np.abs(xy) < half).all(axis=1)]
     dense = rng.uniform(-half, half, (int(1.6 * count) if pattern == "hard-core" else count, 2))
-    apart = rng.uniform(0.45, 0.7) * spacing if pattern == "hard-core" else _APART
-    return dense[_thinned(rng, dense, apart)][:count]
+    apart = rng.uniform(0.45, 0.7) * spacing if pattern == "hard-core" else _MIN_SPACING
+    return dense[_spaced(rng, dense, apart)][:count]
 
 
 def _rows(rng: np.random.Generator, spacing: float, half: float) -> Floats:
@@ -162,8 +179,8 @@ def _rows(rng: np.random.Generator, spacing: float, half: float) -> Floats:
     return np.asarray(xy[kept])
 
 
-def _thinned(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
-    """Keep (N,) such that of each pair nearer than ``apart`` the one of lower rank goes."""
+def _spaced(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
+    """Mask (N,) without the lower-ranked stem of each pair nearer than ``apart``; ranks are random."""
     keep = np.ones(len(xy), dtype=bool)
     pairs = cKDTree(xy).query_pairs(apart, output_type="ndarray")
     rank = rng.random(len(xy))
@@ -172,7 +189,7 @@ def _thinned(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
 
 
 def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
-    """Which stems (N,) remain where the stand has thin parts, gaps and perhaps a trail."""
+    """Mask (N,) of the stems left by thin parts, gaps and perhaps a trail."""
     keep = np.ones(len(xy), dtype=bool)
     if rng.random() < 0.6:
         uneven = waves(rng, rng.uniform(40, 120))(xy[:, 0], xy[:, 1])
@@ -181,7 +198,7 @@ def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
         middle, radii = rng.uniform(-half, half, 2), rng.uniform(4, 16, 2)
         keep &= ((xy - middle) ** 2 / radii**2).sum(axis=1) > 1
     if rng.random() < 0.7:
-        keep &= _aside(xy, _trail(rng, half)) > rng.uniform(1.0, 2.5)
+        keep &= _distance_to(xy, _trail(rng, half)) > rng.uniform(1.0, 2.5)
     return keep
 
 
@@ -195,5 +212,5 @@ def _trail(rng: np.random.Generator, half: float) -> Floats:
     return np.asarray(np.column_stack([along, sideways]) @ np.array([[c, s], [-s, c]]))
 
 
-def _aside(xy: Floats, line: Floats) -> Floats:
+def _distance_to(xy: Floats, line: Floats) -> Floats:
     return np.asarray(cKDTree(line).query(xy)[0])

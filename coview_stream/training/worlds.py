@@ -1,4 +1,4 @@
-"""A training world: the place at two epochs, the map's scan of it, and the robot's submaps."""
+"""Training worlds: a place at two epochs, the map's scan of it, and the robot's submaps."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ _BEYOND = 8.0  # metres of forest beyond the map
 
 @dataclass(frozen=True)
 class World:
-    """A place.
+    """A training world.
 
     Attributes:
         size: side of the square map about the origin, metres.
-        kind: what it is, in words.
-        mapped, now: the place at the two epochs.
+        kind: forest type or kind of scene, in words.
+        mapped: the place when the map is scanned.
+        now: the place when the robot drives.
         ground: heights (N,) of the ground at x and y (N,), metres.
         span: lowest and highest ground, metres.
-        path: (random numbers, most distance from the origin in x and y, length) -> path (N, 2), metres.
-        drawn: what was drawn for it, plain values.
+        path: (random numbers, greatest distance from the origin in x and y, length) -> path (N, 2), metres.
+        drawn: values that were drawn for it, for JSON.
     """
 
     size: float
@@ -89,7 +90,7 @@ def _built(rng: np.random.Generator, seed: int, recipe: Recipe, size: float) -> 
 
 
 def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str, float]]:
-    """Scan the map from the air: (N, 3) float32 metres, thinned, and what was drawn for the flight."""
+    """Scan the map from the air: (N, 3) float32 metres, one point per voxel, and the values drawn for the flight."""
     rng = np.random.default_rng([seed, _FLIGHT])
     names = (
         "pulses",
@@ -135,6 +136,6 @@ def drives(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Frame
 
 
 def submaps(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Submap]]:
-    """Yield what the frames of :func:`drives` are together."""
+    """Yield the submaps of :func:`drives`, with the sensor's name."""
     for sensor, frames in drives(world, seed, recipe):
         yield sensor, gathered(frames)

@@ -47,7 +47,7 @@ def agreement(piece: np.ndarray, query: np.ndarray, pose: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_batch_poses_match_query_positions_in_map_pieces(seed: int) -> None:
     worlds = [world(k) for k in range(3)]
-    batch = draw_batch(worlds, 3, 4, np.random.default_rng(seed), spoil=False)
+    batch = draw_batch(worlds, 3, 4, np.random.default_rng(seed), augment=False)
     right = [
         agreement(batch.pieces[owner], query, pose)
         for owner, query, pose in zip(batch.piece_of, batch.queries, batch.poses, strict=True)

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict
 
 from coview_stream.descriptors.network import CARD, VIEW_NAMES, file_sha256, weights_directory, weights_name
-from coview_stream.training.train import USUAL
+from coview_stream.training.train import DEFAULT
 
 CARD_TEXT = json.loads((weights_directory() / CARD).read_text())
 
@@ -18,13 +18,13 @@ def test_weights_match_card_hashes_and_size_limit() -> None:
 
 
 def test_card_recipe_matches_train_command() -> None:
-    assert CARD_TEXT["plan"] == json.loads(json.dumps(asdict(USUAL)))
+    assert CARD_TEXT["plan"] == json.loads(json.dumps(asdict(DEFAULT)))
     assert CARD_TEXT["command"].startswith("coview-stream train")
     assert CARD_TEXT["data_sha256"]
 
 
 def test_card_reports_recall_on_held_out_worlds() -> None:
     judged = CARD_TEXT["validation"]
-    assert judged["worlds"] == USUAL.validation
-    assert judged["queries"] == USUAL.validation * USUAL.most
+    assert judged["worlds"] == DEFAULT.validation
+    assert judged["queries"] == DEFAULT.validation * DEFAULT.most
     assert judged["AR@1"] > 50 * judged["chance"]

@@ -1,4 +1,4 @@
-"""Training: batches through both encoders until the budget is spent; nothing here depends on what is in the worlds."""
+"""Training loop: batches through both encoders, with checkpoints; independent of what the worlds contain."""
 
 from __future__ import annotations
 
@@ -20,12 +20,10 @@ from coview_stream.training.losses import Losses, losses
 from coview_stream.training.networks import VIEWS, PlaceNet
 from coview_stream.training.training_config import TrainingConfig
 
+# set by hand
 _WARM_UP = 0.03  # share of the steps over which the learning rate rises
-
-_LAST = 0.01  # share of the learning rate at the end
-
-_GRADIENT = 5.0  # largest norm
-
+_FINAL_RATE = 0.01  # share of the learning rate at the end
+_MAX_GRADIENT = 5.0  # norm
 
 Report = Callable[[int, Losses], None]
 
@@ -37,10 +35,10 @@ def train(
     checkpoint: Path | None = None,
     every: int = 100,
 ) -> PlaceNet:
-    """Train from scratch, or go on from ``checkpoint`` if that file is there; it is written ``every`` so many steps.
+    """Train from scratch, or go on from the file ``checkpoint`` if it exists; it is written every ``every`` steps.
 
     Raises:
-        InputError: the loss is not finite any more, or the checkpoint is none, or one of another configuration.
+        InputError: the loss is not finite, or the checkpoint cannot be read or is of another configuration.
     """
     torch.manual_seed(config.seed)
     net: PlaceNet = PlaceNet(config.width)
@@ -51,13 +49,13 @@ def train(
     for step in range(first, config.steps):
         for group in optimiser.param_groups:
             group["lr"] = config.rate * _schedule(step, config.steps)
-        torch.manual_seed(config.seed + step)  # a training that is resumed goes on as if it had not stopped
+        torch.manual_seed(config.seed + step)  # a resumed training goes on as if it had not stopped
         found = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
         if not torch.isfinite(found.total):
             raise InputError(f"step {step}: the loss is not finite; train with a lower rate")
         optimiser.zero_grad()
         found.total.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), _GRADIENT)
+        torch.nn.utils.clip_grad_norm_(net.parameters(), _MAX_GRADIENT)
         optimiser.step()
         if report is not None:
             report(step, found)
@@ -83,7 +81,7 @@ def _step(
 
 
 def _seen(images: Any) -> torch.Tensor:
-    """Local cells (B, 1, H / 2, W / 2) in which anything but relief, which is filled in, was seen."""
+    """1 for local cells (B, 1, H / 2, W / 2) in which anything but relief was seen, else 0."""
     anything = torch.from_numpy(images[:, :-1].any(axis=1, keepdims=True)).float()
     return torch.nn.functional.max_pool2d(anything, 2)
 
@@ -95,7 +93,7 @@ def _tensor(images: Any) -> torch.Tensor:
 
 def _schedule(step: int, steps: int) -> float:
     rise = min(1.0, (step + 1) / max(1.0, _WARM_UP * steps))
-    return rise * (_LAST + (1 - _LAST) * 0.5 * (1 + math.cos(math.pi * step / steps)))
+    return rise * (_FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
 
 def _keep(
