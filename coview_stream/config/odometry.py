@@ -13,7 +13,7 @@ from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
 
 Gravity = Literal["ground", "level"] | tuple[float, float, float]
-"""Where down is: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
+"""Direction of down: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
 
 MAX_TILT = math.radians(60.0)
 """Radians from upright; a body frame has z up (x forward), so one that leans more is a mistake. Set by hand."""

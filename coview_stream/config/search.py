@@ -77,7 +77,7 @@ class ConsensusConfig:
 
 
 Reloc = Literal["auto", "coview", "learned"]
-"""What names places: the descriptors of the paper, learned features, or (auto) both where map and installation can."""
+"""Place recognition: the descriptors of the paper, learned features, or (auto) both where map and installation can."""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ class RoofEdges:
     corner: Floats
 
     def covers(self, points: Reals) -> Bools:
-        """Which of (N, 3) points stand below an edge of the map."""
+        """Tell which of (N, 3) points stand below an edge of the map."""
         cells = np.floor((points[:, :2] - self.corner) / _CELL).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.height.shape)).all(axis=1)
         cells[~inside] = 0

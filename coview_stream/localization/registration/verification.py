@@ -172,7 +172,7 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
 
 
 def _on_surface(points: Reals, partner: Ints, target: LocalMap) -> Bools:
-    """Which of (N, 3) points lie on the plane of their partner: (N,) indices of the K map points, K for none."""
+    """Tell which of (N, 3) points lie on their partner's plane; partners (N,) index the K map points, K for none."""
     has = partner < len(target.points)
     near = partner[has]
     off = np.abs(np.einsum("ij,ij->i", points[has] - target.points[near], target.normals[near]))

@@ -55,7 +55,7 @@ class DisplacementCheck:
             self.usual = share if self.usual is None else self.usual + _NEWEST_SHARE * (share - self.usual)
 
     def is_displaced(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> bool:
-        """Whether a frame lies on the map much less than usual; False if there is too little to tell by.
+        """Tell whether a frame lies on the map much less than usual; False if there is too little to tell by.
 
         Arguments are those of :meth:`learn`, ``T`` as predicted.
         """

@@ -114,5 +114,5 @@ class DriftEstimator:
 
 
 def worth_learning(driven: float, turned: float) -> bool:
-    """Whether a motion of so many metres and radians tells drift from the registrations' noise."""
+    """Tell whether a motion of so many metres and radians tells drift from the registrations' noise."""
     return driven >= _MIN_STEP or turned >= _MIN_TURN
