@@ -1,4 +1,4 @@
-"""The engine on a small world: right where it speaks, silent where it cannot know, unharmed by bad frames."""
+"""The localizer on a small world: correct poses, none where it cannot know, and bad frames that do no harm."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from coview_stream.config import RegistrationConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.registration import prepare_scan
+from coview_stream.localization.registration.prepare_scan import voxelized
+from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.state import State
-from coview_stream.localization.tracking import tracker as tracking
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 
@@ -109,7 +109,7 @@ def test_state_is_lost_when_scans_no_longer_fit(world_map, world_drive):
         fix = localizer.step(garbage(k), world_drive.T_odom_body[k], 0.5 * k)
         states.append(fix.state)
         assert (fix.T_map_body is None) == (fix.state is not State.TRACKING)
-    assert states[0] is State.AMBIGUOUS
+    assert states[0] is State.DOUBTED
     assert states[-1] is State.LOST
 
 
@@ -183,34 +183,34 @@ def test_reset_clears_all_but_the_map(world_map, world_drive, world_fixes):
 
 
 @pytest.fixture(scope="module")
-def verdicts(world_map, world_drive):
-    """What the searches of the drive say, up to the one that accepts a place; good for every fresh localizer."""
-    localizer, said = Localizer(world_map), []
+def results(world_map, world_drive):
+    """Results of the drive's searches, up to the one that accepts a place; good for every fresh localizer."""
+    localizer, results = Localizer(world_map), []
     for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
-        said.append(localizer._search.update(localizer.add_frame(cloud, T, 0.5 * k)))
-        if said[-1].accepted is not None:
-            return said
-        localizer.apply_search_result(said[-1])
+        results.append(localizer._search.update(localizer.add_frame(cloud, T, 0.5 * k)))
+        if results[-1].accepted is not None:
+            return results
+        localizer.apply_search_result(results[-1])
     raise AssertionError("no place was accepted")
 
 
-def searched(world_map, drive, verdicts):
-    """A localizer that has taken every frame up to the decisive one; its verdict is not adopted yet."""
+def searched(world_map, drive, results):
+    """A localizer that has every frame up to the decisive one; its result is not applied yet."""
     localizer = Localizer(world_map)
-    for k, verdict in enumerate(verdicts):
+    for k, result in enumerate(results):
         localizer.add_frame(drive.clouds[k], drive.T_odom_body[k], 0.5 * k)
-        if verdict.accepted is None:
-            localizer.apply_search_result(verdict)
-    return localizer, verdicts[-1], len(verdicts) - 1
+        if result.accepted is None:
+            localizer.apply_search_result(result)
+    return localizer, results[-1], len(results) - 1
 
 
-def test_add_frame_and_apply_search_result_equal_step(world_map, world_drive, world_fixes, verdicts):
+def test_add_frame_and_apply_search_result_equal_step(world_map, world_drive, world_fixes, results):
     localizer = Localizer(world_map)
     for k, reference in enumerate(world_fixes[:7]):
-        query = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-        assert (query is not None) == (k < len(verdicts))  # tracking asks for nothing
-        if query is not None:
-            localizer.apply_search_result(verdicts[k])
+        request = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+        assert (request is not None) == (k < len(results))  # tracking asks for nothing
+        if request is not None:
+            localizer.apply_search_result(results[k])
         fix = localizer.fix()
         assert fix.state is reference.state
         assert fix.evidence == reference.evidence
@@ -224,43 +224,43 @@ def test_fix_before_first_frame_raises(world_map):
         Localizer(world_map).fix()
 
 
-def test_search_result_of_old_epoch_is_ignored(world_map, world_drive, verdicts):
-    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+def test_search_result_of_old_epoch_is_ignored(world_map, world_drive, results):
+    localizer, result, k = searched(world_map, world_drive, results)
     localizer.reset()
-    localizer.apply_search_result(verdict)  # before any frame
+    localizer.apply_search_result(result)  # before any frame
     localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    localizer.apply_search_result(verdict)
+    localizer.apply_search_result(result)
     assert localizer.state is State.SEARCHING
     assert localizer.fix().T_map_body is None
     assert localizer.fix().evidence is None
 
 
-def test_search_result_from_before_a_loss_is_ignored(world_map, world_drive, verdicts):
-    localizer, verdict, k = searched(world_map, world_drive, verdicts)
-    localizer.apply_search_result(verdict)
+def test_search_result_from_before_a_loss_is_ignored(world_map, world_drive, results):
+    localizer, result, k = searched(world_map, world_drive, results)
+    localizer.apply_search_result(result)
     for n in range(1, 4):
         localizer.add_frame(garbage(n), world_drive.T_odom_body[k + n], 0.5 * (k + n))
     assert localizer.state is State.LOST
-    localizer.apply_search_result(verdict)
+    localizer.apply_search_result(result)
     assert localizer.state is State.LOST
     assert localizer.fix().T_map_body is None
 
 
-def test_search_result_while_tracking_is_ignored(world_map, world_drive, verdicts):
-    localizer, verdict, _ = searched(world_map, world_drive, verdicts)
-    localizer.apply_search_result(verdict)
+def test_search_result_while_tracking_is_ignored(world_map, world_drive, results):
+    localizer, result, _ = searched(world_map, world_drive, results)
+    localizer.apply_search_result(result)
     before = localizer.fix()
-    localizer.apply_search_result(verdict)
+    localizer.apply_search_result(result)
     np.testing.assert_array_equal(localizer.fix().T_map_body, before.T_map_body)
     np.testing.assert_array_equal(localizer.fix().covariance, before.covariance)
 
 
-def test_late_search_result_gives_the_current_pose(world_map, world_drive, verdicts):
-    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+def test_late_search_result_gives_the_current_pose(world_map, world_drive, results):
+    localizer, result, k = searched(world_map, world_drive, results)
     for n in (k + 1, k + 2):
         localizer.add_frame(world_drive.clouds[n], world_drive.T_odom_body[n], 0.5 * n)
     assert localizer.fix().T_map_body is None
-    localizer.apply_search_result(verdict)
+    localizer.apply_search_result(result)
     fix = localizer.fix()
     assert fix.state is State.TRACKING
     metres, degrees = pose_error(fix.T_map_body, world_drive.T_map_body[k + 2])
@@ -268,25 +268,25 @@ def test_late_search_result_gives_the_current_pose(world_map, world_drive, verdi
     assert degrees < 0.3
 
 
-def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, world_drive, verdicts):
-    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, world_drive, results):
+    localizer, result, k = searched(world_map, world_drive, results)
     for n in (k + 1, k + 2):
         localizer.add_frame(garbage(n), world_drive.T_odom_body[n], 0.5 * n)
-    localizer.apply_search_result(verdict)
+    localizer.apply_search_result(result)
     fix = localizer.fix()
-    assert fix.state is State.AMBIGUOUS
+    assert fix.state is State.DOUBTED
     assert fix.T_map_body is None
     # and what follows decides
     localizer.add_frame(world_drive.clouds[k + 3], world_drive.T_odom_body[k + 3], 0.5 * (k + 3))
     assert localizer.fix().state is State.TRACKING
 
 
-def test_require_verification_withholds_pose_until_verified(world_map, world_drive, verdicts):
-    localizer, verdict, k = searched(world_map, world_drive, verdicts)
-    localizer.apply_search_result(verdict)
+def test_require_verification_withholds_pose_until_verified(world_map, world_drive, results):
+    localizer, result, k = searched(world_map, world_drive, results)
+    localizer.apply_search_result(result)
     assert localizer.fix().state is State.TRACKING
     localizer.require_verification()
-    assert localizer.fix().state is State.AMBIGUOUS
+    assert localizer.state is localizer.fix().state is State.DOUBTED
     assert localizer.fix().T_map_body is None
     # the robot stands still: nothing is due, and yet it is verified
     fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
@@ -295,26 +295,28 @@ def test_require_verification_withholds_pose_until_verified(world_map, world_dri
     assert pose_error(fix.T_map_body, world_drive.T_map_body[k])[0] < 0.08
 
 
-def test_search_result_waits_for_required_verification(world_map, world_drive, verdicts):
-    localizer, verdict, k = searched(world_map, world_drive, verdicts)
+def test_search_result_waits_for_required_verification(world_map, world_drive, results):
+    localizer, result, k = searched(world_map, world_drive, results)
     localizer.require_verification()
-    localizer.apply_search_result(verdict)
+    localizer.apply_search_result(result)
     assert localizer.fix().T_map_body is None
     fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k + 0.1)
     assert fix.state is State.TRACKING
 
 
 def test_frame_is_voxelized_once_and_copied(world_map, world_drive, monkeypatch):
-    """A driver may reuse its array for the next frame; adopting a verdict later still looks at the newest one."""
-    monkeypatch.setattr(tracking, "thinned", None)
+    """A driver may reuse its array for the next frame; a search result applied later still registers this one."""
+    whole, calls = KeyframeBuffer.voxelize, []
+    monkeypatch.setattr(KeyframeBuffer, "voxelize", lambda *given: calls.append(1) or whole(*given))
     localizer = Localizer(world_map)
     array = world_drive.clouds[0].copy()
     localizer.add_frame(array, world_drive.T_odom_body[0], 0.0)
     array[:] = 0.0
     np.testing.assert_array_equal(localizer._newest.cloud, world_drive.clouds[0])
     T = pose_from(world_drive.T_odom_body[0][:3, :3], np.zeros(3))
-    made = prepare_scan.voxelized(world_drive.clouds[0], T, localizer.config.keyframe)
-    np.testing.assert_allclose(localizer._tracker._recent.window(), made, atol=1e-6)
+    made = voxelized(world_drive.clouds[0], T, localizer.config.keyframe)
+    np.testing.assert_allclose(localizer._tracker._scans.window(), made, atol=1e-6)
+    assert len(calls) == 1
 
 
 def standing(localizer, cloud, T_odom_body, seconds, start):

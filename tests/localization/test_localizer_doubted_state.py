@@ -1,4 +1,4 @@
-"""Doubt and loss: the pose is gone with the first frame that does not fit, and comes back where it is right."""
+"""DOUBTED and LOST: the pose is gone with the first frame that does not fit, and comes back where it is right."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def carried(drive, frm, to):
     return drive.seen_from(drive.T_odom_body[frm] @ inverse(drive.T_map_body[to]))
 
 
-# ---- doubt
+# ---- DOUBTED
 
 
 def test_rejected_registration_gives_doubted_state_without_pose(found, world_drive):
     doubtful = found.step(garbage(), world_drive.T_odom_body[5], 2.5)
-    assert doubtful.state is State.AMBIGUOUS
+    assert doubtful.state is State.DOUBTED
     assert doubtful.T_map_body is None
     assert doubtful.T_map_odom is None
     assert doubtful.covariance is None
@@ -63,7 +63,7 @@ def test_rejected_registration_gives_doubted_state_without_pose(found, world_dri
 def test_doubted_state_is_rechecked_while_standing(found, world_drive):
     """A covered sensor takes the pose away at once; uncovered again it is back at once, and nothing was lost."""
     covered = [found.step(garbage(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
-    assert [fix.state for fix in covered] == [State.AMBIGUOUS] * 6
+    assert [fix.state for fix in covered] == [State.DOUBTED] * 6
     assert [fix.T_map_body for fix in covered] == [None] * 6
     assert covered[-1].evidence.stamp == 8.0
     again = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 9.0)
@@ -153,7 +153,7 @@ def test_kidnapping_with_frozen_odometry_is_detected(found, world_drive):
     elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
     fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
     assert all(fix.T_map_body is None for fix in fixes)
-    assert fixes[5].state is State.AMBIGUOUS
+    assert fixes[5].state is State.DOUBTED
     assert fixes[-1].state is State.LOST
 
 
@@ -201,7 +201,7 @@ def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive
     assert all(fix.T_map_body is None for fix in fixes)
     assert fixes[0].evidence.cause is RejectionReason.BLIND
     blind = [fix for fix in fixes if fix.stamp < 2.5 + RULE.max_blind_s]
-    assert {fix.state for fix in blind} == {State.AMBIGUOUS}
+    assert {fix.state for fix in blind} == {State.DOUBTED}
     assert fixes[-1].state is State.LOST
     again = follow(found, world_drive, range(6, 10), 100.0)
     posed = [k for k, fix in enumerate(again) if fix.T_map_body is not None]
@@ -232,7 +232,7 @@ def test_pose_returns_at_once_after_short_cover_and_with_confirmations_after_lon
 def test_driving_with_covered_sensor_is_doubted(found, world_drive):
     """What was seen before is no evidence of where the robot is now."""
     first = found.step(covered(0), world_drive.T_odom_body[5], 2.5)
-    assert first.state is State.AMBIGUOUS
+    assert first.state is State.DOUBTED
     assert first.evidence.cause is RejectionReason.BLIND
     assert found.step(covered(1), world_drive.T_odom_body[6], 3.0).T_map_body is None
     known = found.step(world_drive.clouds[7], world_drive.T_odom_body[7], 3.5)
@@ -259,7 +259,7 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
 
 def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
     """What came before the pause is no doubt that has lasted: one good frame is enough, one bad one is not too much."""
-    for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.AMBIGUOUS)):
+    for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.DOUBTED)):
         localizer = Localizer(world_map)
         for k in range(5):
             fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)

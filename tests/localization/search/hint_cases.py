@@ -1,4 +1,4 @@
-"""Localizers that are told where they may be, and what comes of it."""
+"""Localizers with hints of where they may be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Global search: what its decision believes, case by case, and what each rule is good for on the small world."""
+"""Global search: its acceptance test case by case, and its rules on the small world."""
 
 from __future__ import annotations
 
@@ -25,13 +25,16 @@ from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
+from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.refinement import Candidate, gravity_information
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
 from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
-KEYFRAME = Keyframe(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), np.empty((0, 3), np.float32))
+NOTHING = np.empty((0, 3), np.float32)
+REQUEST = SearchRequest(
+    7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING, 5.5, (2, 3)
+)
 HERE = pose_from(rot_z(-0.8), [3.0, 9.0, 0.5])  # map <- odometry of all candidates that are right
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])  # of the runs through the small world
 TILT = np.radians(4.0)
@@ -40,12 +43,12 @@ SHARES = ("near", "covered", "ground", "free_space")
 
 def moved(forward=0.0, degrees=0.0):
     """``HERE`` with the robot (not the odometry's origin) moved and turned."""
-    body = HERE @ KEYFRAME.T_odom_body @ pose_from(rot_z(np.radians(degrees)), [forward, 0.0, 0.0])
-    return body @ inverse(KEYFRAME.T_odom_body)
+    body = HERE @ REQUEST.T_odom_body @ pose_from(rot_z(np.radians(degrees)), [forward, 0.0, 0.0])
+    return body @ inverse(REQUEST.T_odom_body)
 
 
 def candidate(score, T_map_odom=HERE, inside=0.9, ground=1.0):
-    """A made-up candidate: all that a judge may look at is its pose and its evidence."""
+    """A made-up candidate: all that is judged is its pose and its evidence."""
     found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
     return Candidate(
         Hypothesis(T_map_odom, 5, 2, -3.0), found, Evidence(score / ground, score, ground, 1.0, inside)
@@ -63,9 +66,9 @@ def stationary(world_map):
 
 
 def judged(search, *keyframes):
-    """Verdicts on one list of candidates (best first) per keyframe."""
+    """Results of one list of candidates (best first) per keyframe."""
     votes = len(search.coview.consensus)
-    return [search._decision.judge(candidates, KEYFRAME, votes) for candidates in keyframes]
+    return [search._acceptance.decide(candidates, REQUEST, votes) for candidates in keyframes]
 
 
 # ---- what counts against a pose
@@ -83,17 +86,18 @@ def test_inside_share_does_not_raise_the_score():
     assert Evidence(0.5, 0.5, 1.0, 1.0, 0.1).score == Evidence(0.5, 0.5, 1.0, 1.0, 1.0).score
 
 
-# ---- the judge
+# ---- acceptance
 
 
 def test_unrivalled_place_is_accepted_after_enough_confirmations(search):
     best = candidate(0.7)
-    verdicts = judged(search, *[[best, candidate(0.2, moved(20))]] * RULE.confirmations)
-    states = [v.evidence.state for v in verdicts]
+    results = judged(search, *[[best, candidate(0.2, moved(20))]] * RULE.confirmations)
+    states = [result.evidence.state for result in results]
     assert states == [State.AMBIGUOUS] * (RULE.confirmations - 1) + [State.TRACKING]
-    assert [v.accepted for v in verdicts[:-1]] == [None] * (RULE.confirmations - 1)
-    assert verdicts[-1].accepted is best
-    said = verdicts[-1].evidence
+    assert [result.accepted for result in results[:-1]] == [None] * (RULE.confirmations - 1)
+    assert results[-1].accepted is best
+    assert {(result.travelled, result.epoch) for result in results} == {(REQUEST.travelled, REQUEST.epoch)}
+    said = results[-1].evidence
     assert (said.stamp, said.station, said.shift) == (7.0, 5, 2)
     assert (said.score, said.rival) == (pytest.approx(0.7), pytest.approx(0.2))
 
@@ -115,9 +119,9 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_weak_or_rivalled_candidate_is_never_accepted(search, case):
     candidates, state = REFUSED[case]
-    for verdict in judged(search, *[candidates] * 3 * RULE.confirmations):
-        assert verdict.accepted is None
-        assert verdict.evidence.state is state
+    for result in judged(search, *[candidates] * 3 * RULE.confirmations):
+        assert result.accepted is None
+        assert result.evidence.state is state
 
 
 ACCEPTED = {
@@ -133,7 +137,9 @@ ACCEPTED = {
 def test_good_candidate_is_accepted_after_enough_evidence(search, case):
     best = ACCEPTED[case][0]
     proof = int(np.ceil(RULE.evidence_sum / (best.evidence.score - RULE.evidence_floor)))
-    accepted = [v.accepted for v in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))]
+    accepted = [
+        result.accepted for result in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))
+    ]
     assert accepted[-1] is best
     # no sooner either: weak evidence needs more driving
     assert accepted[: max(proof, RULE.confirmations) - 1] == [None] * (max(proof, RULE.confirmations) - 1)
@@ -145,10 +151,10 @@ def test_good_candidate_is_accepted_after_enough_evidence(search, case):
     ids=["elsewhere", "turned", "far"],
 )
 def test_disagreeing_keyframes_give_no_confirmation(search, other):
-    for verdict in judged(search, *[[candidate(0.7, T)] for T in [HERE, other] * RULE.confirmations]):
-        assert verdict.accepted is None
-        assert verdict.evidence.state is State.AMBIGUOUS
-        assert "confirmed by 1 keyframes" in verdict.evidence.reason
+    for result in judged(search, *[[candidate(0.7, T)] for T in [HERE, other] * RULE.confirmations]):
+        assert result.accepted is None
+        assert result.evidence.state is State.AMBIGUOUS
+        assert "confirmed by 1 keyframes" in result.evidence.reason
 
 
 def test_agreement_is_measured_at_the_robot_not_at_the_odometry_origin(search):
@@ -161,7 +167,7 @@ def test_agreement_is_measured_at_the_robot_not_at_the_odometry_origin(search):
     )
 
 
-DOUBTFUL = {
+WEAK = {
     "low": [candidate(0.1)],
     "two": [candidate(0.7), candidate(0.7, moved(20))],
     "off the survey": [candidate(0.9, inside=0.01)],
@@ -169,20 +175,20 @@ DOUBTFUL = {
 }
 
 
-@pytest.mark.parametrize("case", DOUBTFUL)
+@pytest.mark.parametrize("case", WEAK)
 def test_weak_keyframe_gives_no_confirmation(search, case):
     good = [candidate(0.7)]
-    verdicts = judged(search, *[good] * (RULE.confirmations - 1), *[DOUBTFUL[case]] * RULE.confirmations)
-    assert [v.accepted for v in verdicts] == [None] * len(verdicts)
+    results = judged(search, *[good] * (RULE.confirmations - 1), *[WEAK[case]] * RULE.confirmations)
+    assert [result.accepted for result in results] == [None] * len(results)
 
 
 @pytest.mark.parametrize("between", [[], [candidate(0.7, moved(20))]], ids=["nothing", "elsewhere"])
 def test_contradicting_keyframe_resets_confirmations(search, between):
     good = [candidate(0.7)]
     count = RULE.confirmations - 1
-    verdicts = judged(search, *[good] * count, between, *[good] * count, good)
-    assert [v.accepted for v in verdicts[:-1]] == [None] * (2 * count + 1)
-    assert verdicts[-1].accepted is good[0]
+    results = judged(search, *[good] * count, between, *[good] * count, good)
+    assert [result.accepted for result in results[:-1]] == [None] * (2 * count + 1)
+    assert results[-1].accepted is good[0]
 
 
 def test_clear_resets_confirmations(search):
@@ -193,10 +199,11 @@ def test_clear_resets_confirmations(search):
 
 
 def test_no_candidate_means_searching(search):
-    (verdict,) = judged(search, [])
-    assert verdict.accepted is None
-    assert verdict.evidence.state is State.SEARCHING
-    assert verdict.evidence.score == 0.0
+    (result,) = judged(search, [])
+    assert (result.travelled, result.epoch) == (REQUEST.travelled, REQUEST.epoch)
+    assert result.accepted is None
+    assert result.evidence.state is State.SEARCHING
+    assert result.evidence.score == 0.0
 
 
 def test_single_scan_needs_a_larger_lead(stationary):
@@ -206,9 +213,9 @@ def test_single_scan_needs_a_larger_lead(stationary):
     ahead = [candidate(0.7), candidate(0.7 - RULE.single_lead - 0.03, moved(20))]
     assert judged(stationary, ahead)[0].accepted is ahead[0]
     for behind in (0.0, RULE.lead + 0.02, RULE.single_lead - 0.03):
-        (verdict,) = judged(stationary, [candidate(0.7), candidate(0.7 - behind, moved(20))])
-        assert verdict.accepted is None
-        assert verdict.evidence.state is State.AMBIGUOUS
+        (result,) = judged(stationary, [candidate(0.7), candidate(0.7 - behind, moved(20))])
+        assert result.accepted is None
+        assert result.evidence.state is State.AMBIGUOUS
     assert judged(stationary, [candidate(RULE.single_score - 0.01)])[0].accepted is None
     assert judged(stationary, [candidate(0.9, inside=RULE.min_overlap - 0.05)])[0].accepted is None
 
@@ -238,7 +245,7 @@ def test_single_scan_is_refused_between_two_equal_places(world_map, twin_map, wo
 
 
 def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM):
-    """A query for each keyframe of the run, odometry near its origin."""
+    """A request for each keyframe of the run, odometry near its origin."""
     buffer = KeyframeBuffer(LocalizerConfig().keyframe)
     descriptor = DescriptorConfig(radius=30.0)  # the small world's
     for k in range(frames):
@@ -260,7 +267,7 @@ def test_good_candidate_is_tried_again_without_votes(search, world_drive, monkey
 
 def test_single_minimum_mode_uses_nearest_stations_only(search, world_drive, monkeypatch):
     single = replace(search.config, consensus=ConsensusConfig(mode="single"))
-    paper = GlobalSearch(search.base_map, single, search.local_maps)
+    paper = GlobalSearch(search.base_map, single, LocalMaps(search.base_map, 50.0))
     monkeypatch.setattr(paper.coview.retrieval, "distances", None)
     assert paper.update(next(run_of(world_drive, 1))).evidence.score > 0.8
 
@@ -298,8 +305,8 @@ def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, ma
 
 def test_gravity_prior_keeps_candidates_upright(world_map, world_drive, monkeypatch):
     def found(sigma_degrees):
-        verdict = with_leaning_odometry(world_map, world_drive, monkeypatch, np.radians(sigma_degrees), 1.0)
-        return tilt_of(verdict.accepted.T_map_odom)
+        result = with_leaning_odometry(world_map, world_drive, monkeypatch, np.radians(sigma_degrees), 1.0)
+        return tilt_of(result.accepted.T_map_odom)
 
     assert found(30.0) == pytest.approx(TILT, rel=0.1)
     assert found(0.01) < 0.3 * TILT
@@ -311,6 +318,6 @@ def test_gravity_prior_has_no_heading_or_position_information():
 
 @pytest.mark.parametrize("limit", [2.0, 0.5])
 def test_candidate_tilted_beyond_limit_is_dropped(world_map, world_drive, monkeypatch, limit):
-    verdict = with_leaning_odometry(world_map, world_drive, monkeypatch, np.radians(30.0), limit * TILT)
-    assert (verdict.evidence.score > 0.5) == (limit > 1)
-    assert (verdict.accepted is not None) == (limit > 1)
+    result = with_leaning_odometry(world_map, world_drive, monkeypatch, np.radians(30.0), limit * TILT)
+    assert (result.evidence.score > 0.5) == (limit > 1)
+    assert (result.accepted is not None) == (limit > 1)

@@ -1,4 +1,4 @@
-"""Suggested places: how long they are kept, how often they are tried, and when the judge believes one."""
+"""Hints: how long they are kept, how often they are tried, and when one is accepted."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import pytest
 from hint_cases import BESIDE, NEAR, RULE, follow, voteless
 from se3 import exp_se3
 from small_world import pose_error
-from test_global_search import HERE, KEYFRAME, candidate, judged
+from test_global_search import HERE, REQUEST, candidate, judged
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.search import pose_hints as suggestions
+from coview_stream.localization.search import pose_hints
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.pose_hints import HintSchedule, PoseHints
 from coview_stream.localization.search.request import same_place
@@ -27,18 +27,18 @@ from coview_stream.localization.state import State
 def test_hint_is_kept_until_accepted_or_reset(world_map, world_drive):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0])
-    queries = [
+    requests = [
         localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)
     ]
-    assert [len(q.hints) for q in queries] == [1, 1]
-    np.testing.assert_array_equal(queries[0].hints, queries[1].hints)
+    assert [len(request.hints) for request in requests] == [1, 1]
+    np.testing.assert_array_equal(requests[0].hints, requests[1].hints)
     localizer.reset()
     assert localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0).hints == ()
     localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
     assert follow(localizer, world_drive, 4, 1)[-1].state is State.TRACKING
-    assert localizer._suggested(np.eye(4)) == ()
+    assert localizer._hints.about(np.zeros(3), np.eye(4)) == ()
     localizer.hint_pose(world_drive.T_map_body[0])  # now it knows better
-    assert localizer._suggested(np.eye(4)) == ()
+    assert localizer._hints.about(np.zeros(3), np.eye(4)) == ()
 
 
 def lost(world_map, world_drive):
@@ -56,9 +56,9 @@ def lost(world_map, world_drive):
 
 def test_continuous_odometry_hints_the_place_after_loss(world_map, world_drive):
     localizer, k = lost(world_map, world_drive)
-    query = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
-    (T_map_odom,) = query.hints
-    metres, degrees = pose_error(T_map_odom @ query.T_odom_body, world_drive.T_map_body[k])
+    request = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    (T_map_odom,) = request.hints
+    metres, degrees = pose_error(T_map_odom @ request.T_odom_body, world_drive.T_map_body[k])
     assert metres < 0.3
     assert degrees < 0.5
 
@@ -94,45 +94,45 @@ def test_odometry_frame_hint_is_kept_across_anchors():
 
 
 def test_hint_is_tried_at_once_then_periodically():
-    trials = HintSchedule()
+    schedule = HintSchedule()
     tried = []
     for _ in range(100):
-        due = trials.due((np.eye(4),))
+        due = schedule.due((np.eye(4),))
         tried.append(bool(due))
         if due:
-            trials.tried(refuted=True)
-    assert tried[: suggestions._TRIES] == [True] * suggestions._TRIES
-    gaps = np.diff(np.flatnonzero(tried))[suggestions._TRIES - 1 :]
-    assert set(gaps) == {suggestions._PAUSE + 1}
+            schedule.tried(refuted=True)
+    assert tried[: pose_hints._TRIES] == [True] * pose_hints._TRIES
+    gaps = np.diff(np.flatnonzero(tried))[pose_hints._TRIES - 1 :]
+    assert set(gaps) == {pose_hints._PAUSE + 1}
 
 
 def test_unrefuted_keyframe_resets_hint_tries():
-    trials = HintSchedule()
-    for refuted in [*[True] * (suggestions._TRIES - 1), False] * 3:
-        assert trials.due((np.eye(4),))
-        trials.tried(refuted)
-    assert trials.due((np.eye(4),))
+    schedule = HintSchedule()
+    for refuted in [*[True] * (pose_hints._TRIES - 1), False] * 3:
+        assert schedule.due((np.eye(4),))
+        schedule.tried(refuted)
+    assert schedule.due((np.eye(4),))
 
 
 def test_new_hint_is_tried_at_once():
-    trials = HintSchedule()
-    for _ in range(suggestions._TRIES):
-        trials.due((np.eye(4),))
-        trials.tried(refuted=True)
-    assert not trials.due((np.eye(4),))
-    assert trials.due((pose_from(rot_z(0.1), [0, 0, 0]),))
+    schedule = HintSchedule()
+    for _ in range(pose_hints._TRIES):
+        schedule.due((np.eye(4),))
+        schedule.tried(refuted=True)
+    assert not schedule.due((np.eye(4),))
+    assert schedule.due((pose_from(rot_z(0.1), [0, 0, 0]),))
 
 
 def counted(localizer, monkeypatch):
-    """Suggestions that went through registration, keyframe by keyframe."""
+    """Hints that went through registration, keyframe by keyframe."""
     made = []
-    whole = localizer._search._refinement.refine
+    whole = localizer._search._refinement.coarse
 
-    def refine(hypotheses, source, query):
+    def coarse(hypotheses, scan):
         made.append(sum(h.station is None for h in hypotheses))
-        return whole(hypotheses, source, query)
+        return whole(hypotheses, scan)
 
-    monkeypatch.setattr(localizer._search._refinement, "refine", refine)
+    monkeypatch.setattr(localizer._search._refinement, "coarse", coarse)
     return made
 
 
@@ -141,7 +141,7 @@ def test_refuted_hint_is_rarely_tried_again(world_map, world_drive, monkeypatch)
     made = counted(localizer, monkeypatch)
     localizer.hint_pose(world_drive.T_map_body[0] @ BESIDE)
     follow(localizer, world_drive, 10)
-    assert made == [1] * suggestions._TRIES + [0] * 4 + [1]
+    assert made == [1] * pose_hints._TRIES + [0] * 4 + [1]
 
 
 def test_hint_outside_the_map_is_not_refuted(world_map, world_drive, monkeypatch):
@@ -160,7 +160,7 @@ def test_remembered_hint_is_registered_once_per_keyframe(world_map, world_drive,
     assert made == [1] * 4
 
 
-# ---- the judge
+# ---- acceptance
 
 
 @pytest.mark.parametrize("votes", [0, 1, RULE.confirmations - 1, RULE.confirmations])
@@ -170,14 +170,14 @@ def test_hint_is_accepted_only_after_rivals_had_votes(world_map, votes):
         search.coview.consensus._votes.append(None)
     best = candidate(0.7)
     alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
-    assert same_place(HERE, HERE, KEYFRAME)
-    verdicts = judged(search, *[[alone, candidate(0.2, BESIDE @ HERE)]] * 5)
-    accepted = [v.accepted is not None for v in verdicts]
+    assert same_place(HERE, HERE, REQUEST)
+    results = judged(search, *[[alone, candidate(0.2, BESIDE @ HERE)]] * 5)
+    accepted = [result.accepted is not None for result in results]
     assert accepted == ([False] * 2 + [True] * 3 if votes == RULE.confirmations else [False] * 5)
     # a vote for the same place is worth as much as any
     search.clear()
     both = [alone, candidate(0.69)]
-    assert [v.accepted is not None for v in judged(search, *[both] * 3)] == [False, False, True]
+    assert [result.accepted is not None for result in judged(search, *[both] * 3)] == [False, False, True]
 
 
 def test_single_scan_never_accepts_hint_without_votes(world_map):
@@ -190,7 +190,7 @@ def test_single_scan_never_accepts_hint_without_votes(world_map):
 
 
 def test_hint_places_the_robot_for_any_odometry_pose():
-    """The robot at the suggested place, whatever odometry says where it is."""
+    """The robot is at the hinted place at any odometry pose."""
     kept = PoseHints()
     T_map_body, T_odom_body = pose_from(rot_z(2.5), [40, -7, 3]), pose_from(rot_z(-1.0), [5, 6, 0.2])
     kept.robot_at(T_map_body)

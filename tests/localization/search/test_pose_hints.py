@@ -1,4 +1,4 @@
-"""Suggested places: verified and judged as what the votes find, never trusted, and not in the way when wrong."""
+"""Hints: verified and judged like what the votes find, never trusted, and harmless when wrong."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
     T = world_drive.T_odom_body[0] @ pose_from(np.eye(3), [0.1, 0.0, 0.0])
     localizer.hint_pose(world_drive.T_map_body[0])
     assert localizer.add_frame(world_drive.clouds[0], T, 0.1) is None  # no keyframe: it has hardly moved
-    query = localizer.add_frame(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
-    (T_map_odom,) = query.hints
-    metres, degrees = pose_error(T_map_odom @ query.T_odom_body, world_drive.T_map_body[1])
+    request = localizer.add_frame(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
+    (T_map_odom,) = request.hints
+    metres, degrees = pose_error(T_map_odom @ request.T_odom_body, world_drive.T_map_body[1])
     assert metres == pytest.approx(0.1, abs=1e-6)
     assert degrees < 1e-3
     assert tilt_of(T_map_odom) < 1e-9
@@ -169,7 +169,7 @@ def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_d
 )
 def test_invalid_hint_pose_is_refused(world_map, bad):
     with pytest.raises(RunError, match="T_map_body"):
-        Localizer(world_map).suggest(bad)
+        Localizer(world_map).hint_pose(bad)
 
 
 def test_farthest_accepted_hint_does_no_harm(world_map, world_drive, world_fixes):

@@ -1,4 +1,4 @@
-"""Sources of hypotheses side by side: which are asked, what each names, and that judging does not care."""
+"""Place recognizers side by side: which are used, what each names, and that acceptance treats them alike."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def knowing(monkeypatch, world_drive):
     local = pose_from(np.eye(3), -first[:3, 3]) @ first  # as the localizer has it, about its anchor
     T_map_local = world_drive.T_map_body[0] @ inverse(local)
 
-    def distances(self, view, suggested):
+    def distances(self, view, near):
         rng = np.random.default_rng(0)
         found = rng.normal(1.0, 0.1, (len(self.stations), self.config.yaws)).astype(np.float32)
         there = transform(T_map_local, view.centre[None])[0, :2]
@@ -117,7 +117,7 @@ def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, w
     """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
     named = []
 
-    def distances(self, view, suggested):
+    def distances(self, view, near):
         found = np.random.default_rng(0).normal(1.0, 0.1, (len(self.stations), self.config.yaws))
         away = np.hypot(*(self.stations[:, :2] - self.stations[:, :2].mean(axis=0)).T)
         wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
@@ -136,15 +136,16 @@ def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, w
 def test_hypothesis_of_both_recognizers_is_registered_once(learned_map, world_drive, knowing, monkeypatch):
     localizer = Localizer(learned_map)
     search = localizer._search
-    query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
-    search.update(query)
+    request = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    search.update(request)
     rough = search.learned.hypotheses()[0]
     exact = replace(rough, exact=True)
     monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [rough])
     monkeypatch.setattr(search.learned, "hypotheses", lambda: [exact])
-    assert search._voted(query) == [exact]
+    assert search._propose(request)[0] == [exact, *search._remembered]
     monkeypatch.setattr(search.learned, "hypotheses", lambda: [rough])
-    assert search._voted(query) == [rough, rough]  # neither is better, so neither makes way
+    # neither is better, so neither makes way
+    assert search._propose(request)[0] == [rough, rough, *search._remembered]
 
 
 def test_too_few_points_cast_no_vote(learned_map, world_drive):
@@ -156,23 +157,23 @@ def test_too_few_points_cast_no_vote(learned_map, world_drive):
 
 def test_search_request_holds_only_needed_clouds(world_map, learned_map, world_drive):
     first = world_drive.clouds[0], world_drive.T_odom_body[0], 0.0
-    usual = Localizer(world_map).take(*first)
+    usual = Localizer(world_map).add_frame(*first)
     assert len(usual.surroundings) == 0
-    both = Localizer(learned_map).take(*first)
+    both = Localizer(learned_map).add_frame(*first)
     np.testing.assert_array_equal(usual.scan, both.scan)
     away = np.hypot(*(both.surroundings[:, :2] - both.position[:2]).T)
     assert away.max() < 30.0
     assert len(both.surroundings) > 300
-    assert len(Localizer(learned_map, LocalizerConfig(reloc="learned")).take(*first).scan) == 0
+    assert len(Localizer(learned_map, LocalizerConfig(reloc="learned")).add_frame(*first).scan) == 0
 
 
 def test_robots_share_the_search_index_of_the_map(learned_map, world_drive):
     engine = SearchEngine(learned_map, LocalizerConfig(reloc="learned"))
     engine.prepare()
     localizer = Localizer(learned_map, LocalizerConfig(reloc="learned"))
-    query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
+    request = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
     for robot in ("one", "other"):
-        assert engine.run(SearchJob(robot, 1, query)).evidence.stamp == 0.0
-    searches = [search for _, search in engine._robots.values()]
+        assert engine.run(SearchJob(robot, request)).evidence.stamp == 0.0
+    searches = list(engine._searches.values())
     assert searches[0].learned.learned is searches[1].learned.learned
     assert searches[0].learned.consensus is not searches[1].learned.consensus
