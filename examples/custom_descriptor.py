@@ -1,4 +1,4 @@
-"""Which descriptor finds the place? Compare the channels that may vote, each on its own, against the truth.
+"""Comparison of the descriptor channels that may vote, each on its own, with the truth.
 
     coview-stream demo && python examples/custom_descriptor.py coview-demo/world
 
@@ -19,7 +19,7 @@ from coview_stream.config import Channel, KeyframeConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.retrieval import Retrieval
-from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings import open_run
 
 NEAR = 3.0  # metres: the station found counts as right
 
@@ -42,7 +42,7 @@ def main(world: Path) -> dict[str, float]:
         centre = keyframe.position.copy()
         centre[2] = ground_below(scan, keyframe.position)  # both sides measure heights from the ground
         for name, distance in retrieval.distances(describe(scan, centre, settings)).items():
-            station = stations[distance.min(axis=1).argmin()]  # (stations, shifts): smallest over all shifts
+            station = stations[distance.min(axis=1).argmin()]  # (stations, shifts): the smallest over all shifts
             miss = np.linalg.norm(station[:2] - truth[frame.index, :2, 3])
             found[name].append(bool(miss < NEAR))
     shares = {name: float(np.mean(right)) for name, right in found.items()}

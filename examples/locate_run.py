@@ -1,4 +1,4 @@
-"""Build a base map, save it, load it, and localize a run on it frame by frame.
+"""A base map built, saved and loaded, and a run localized on it frame by frame.
 
     coview-stream demo && python examples/locate_run.py coview-demo/world
 
@@ -14,13 +14,13 @@ import numpy as np
 
 from coview_stream import BaseMap, Localizer, State
 from coview_stream.clouds import read_tum
-from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings import open_run
 
 
 def main(world: Path) -> list[float]:
     """Print what the localizer says and return the position errors of all frames that got a pose, metres."""
     site = world.parent / "site.coview"
-    BaseMap.build(world / "base.laz").save(site)  # once per site; loading is a matter of milliseconds
+    BaseMap.build(world / "base.laz").save(site)  # once per site; loading takes milliseconds
     localizer = Localizer(BaseMap.load(site))
 
     stamps, truth = read_tum(world / "truth.tum")
@@ -30,7 +30,7 @@ def main(world: Path) -> list[float]:
         fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         if fix.state is not state:
             reason = fix.evidence.reason if fix.evidence else "no keyframe yet"
-            print(f"t = {fix.stamp:.1f} s: {fix.state.value} ({reason})")
+            print(f"t = {fix.stamp:.1f} s: {fix.state.reported} ({reason})")
             state = fix.state
         if fix.state is State.TRACKING:  # only then is there a pose
             true_position = truth[np.abs(stamps - fix.stamp).argmin(), :3, 3]

@@ -1,4 +1,4 @@
-"""A robot without ROS: send clouds and odometry, read poses.
+"""A robot without ROS: clouds and odometry sent, poses read.
 
     coview-stream demo                                               # makes a site and a run
     coview-stream serve coview-demo/site.coview --robot rover1       # in another terminal
@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from coview_stream import RobotClient
-from coview_stream.recordings.open_run import open_run
-from coview_stream.recordings.run import Frame
+from coview_stream.recordings import Frame, open_run
 
 
 def drive(robot: RobotClient, frames: Iterable[Frame], seconds: float) -> None:
-    """Send a recorded frame every so many seconds, as a lidar driver would."""
+    """Send a recorded frame every ``seconds``, as a lidar driver would."""
     for frame in frames:
         robot.send_odometry(frame.T_odom_body, frame.stamp)  # before the cloud of the same stamp
         robot.send_cloud(frame.points, frame.stamp)
@@ -34,7 +33,7 @@ def main(run: Path, name: str, endpoint: str | None = None, seconds: float = 0.1
     count, frames = 0, open_run(run)
     with RobotClient(name, endpoint, **options) as robot:
         if not robot.wait_for_node(10.0):
-            print("no node listens to this robot; is `coview-stream serve` running?")
+            print("no node subscribes to this robot; is `coview-stream serve` running?")
         driver = threading.Thread(target=drive, args=(robot, frames, seconds), daemon=True)
         driver.start()
         driving = True

@@ -1,9 +1,9 @@
-"""Localize one scan, without odometry: a terrestrial scanner on its tripod, or a robot that stands still.
+"""Localization of one scan, without odometry: a terrestrial scanner on its tripod, or a robot that stands still.
 
     coview-stream simulate world --scene campus --sensor os64 --length 0
     python examples/single_scan.py world/base.laz world/run/frames/000000.pcd
 
-One scan has no second opinion from other keyframes, so the evidence has to be stronger than on a drive.
+One scan has no other keyframes to agree with it, so its evidence has to be stronger than on a drive.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from pathlib import Path
 
 from coview_stream import BaseMap, Fix
 from coview_stream.localization.offline import locate
-from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings import open_run
 
 
 def main(base: Path, scan: Path) -> Fix:
     """Print the scan's pose in the map, or why there is none; return the fix."""
     base_map = BaseMap.build(base, preset="tls")  # descriptors reach 100 m, as terrestrial scanners do
-    # one cloud file is a run of one frame, which takes the stationary path; z has to point up, no more
+    # one cloud file is a run of one frame, localized as a stationary scan; its z axis has to point up
     fix = locate(base_map, open_run(scan)).fixes[-1]
     if fix.T_map_body is None:
-        print(f"{fix.state.value}: {fix.evidence.reason if fix.evidence else 'nothing to go by'}")
+        print(f"{fix.state.reported}: {fix.evidence.reason if fix.evidence else 'no evidence'}")
     else:
-        print(f"{fix.state.value}, confidence {fix.confidence:.2f}; from the scan's frame into the map's:")
+        print(f"{fix.state.reported}, confidence {fix.confidence:.2f}; from the scan's frame into the map's:")
         print(fix.T_map_body.round(3))
     return fix
 
