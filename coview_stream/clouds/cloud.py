@@ -12,15 +12,13 @@ import numpy.typing as npt
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.transforms import Points
+from coview_stream.geometry.validation import MAX_COORDINATE
 
 LOCAL_LIMIT = 10_000.0
 """Coordinates below this (metres) keep a zero origin: float32 still resolves 1 mm there."""
 
 ORIGIN_STEP = 100.0
 """An origin is a multiple of this (metres), so that neighbouring tiles have readable, exact offsets."""
-
-MAX_COORDINATE = 1e8
-"""No coordinate on Earth, geocentric ones included, reaches this (metres): such a row is damaged."""
 
 COARSE_FLOAT32 = 1e6
 """From here on (metres) float32 is coarser than 6 cm; a file that stores it has lost precision already."""

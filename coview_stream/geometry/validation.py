@@ -16,11 +16,14 @@ from coview_stream.geometry.transforms import Points, Pose, is_pose, orthonormal
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
+MAX_COORDINATE = 1e8
+"""No coordinate on Earth, geocentric ones included, reaches this (metres); squares of it stay finite."""
+
 # set by hand, all of them
 _MIN_POINTS = 10
 _SAMPLED_POINTS = 2000  # of a frame, to see how far they lie
 _MAX_DISTANCE = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
-_MAX_COORDINATE = 1e7  # metres from the map's origin: no place on this planet
+_MAX_FROM_MAP = 1e7  # metres from the map's origin: no place on this planet
 _MIN_EIGENVALUE = 1e-12  # of a correlation matrix
 
 
@@ -93,7 +96,7 @@ def validate_pose(T_map_body: npt.ArrayLike, origin: Floats) -> Pose:
     """
     T = check_rigid(T_map_body, "T_map_body", RunError)
     local = pose_from(T[:3, :3], T[:3, 3] - origin)
-    if np.abs(local[:3, 3]).max() > _MAX_COORDINATE:
+    if np.abs(local[:3, 3]).max() > _MAX_FROM_MAP:
         raise RunError("T_map_body lies 10,000 km off the map; is it in the frame of the map's sources?")
     return local
 

@@ -1,4 +1,4 @@
-"""Bytes to messages and back: one table of codecs for each channel.
+"""Messages from bytes and back: one table of codecs for each channel.
 
 ============  ===========================================  ===================================================
 codec         in                                           out
@@ -13,7 +13,7 @@ codec         in                                           out
 ============  ===========================================  ===================================================
 
 Stamps are nanoseconds of the sensor's clock, lengths metres; poses are 4x4 and map the body into odometry or map.
-Whatever bytes come in, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too
+For any bytes, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too
 large, :class:`EncodingError` if no codec knows the encoding or it cannot carry what the channel needs). An ``option``
 or ``hint`` that names no codec of the channel is a :class:`ConfigError`.
 """

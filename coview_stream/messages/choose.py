@@ -1,4 +1,4 @@
-"""Which codec reads a sample: option > Encoding > key > hint of the preset > what the bytes look like."""
+"""Choice of the codec that reads a sample: option > Encoding > key > hint of the preset > first bytes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from coview_stream.messages.types import Sample
 
 Channel = Literal["cloud", "odometry", "pose"]
 
-_MIMES: dict[
-    str, tuple[str, ...]
-] = {  # the codecs that a MIME type may stand for; the first if no schema is named
+# the codecs that a MIME type may stand for; the first if no schema is named
+_MIMES: dict[str, tuple[str, ...]] = {
     "": (),
     "application/octet-stream": ("xyz", "xyzi"),
     "zenoh/bytes": ("xyz", "xyzi"),
@@ -45,13 +44,13 @@ _KEELSON: dict[str, tuple[Channel, ...]] = {
 _MAGIC = ((b"\0\0\0\0", "cdr"), (b"\0\1\0\0", "cdr"), (b"{", "json"))
 _RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
 _KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
-_LONGEST = 256  # characters of an encoding that are looked at
+_MAX_ENCODING = 256  # characters
 
 
 def codec_for(
     channel: Channel, names: Collection[str], sample: Sample, option: str | None, hint: str | None
 ) -> str:
-    """Name of the codec, one of ``names``; ConfigError for a wrong option or hint, EncodingError if none fits."""
+    """Choose one of the codecs ``names``; ConfigError for a wrong option or hint, EncodingError if none fits."""
     for setting, name in (("option", option), ("hint", hint)):
         if name is not None and name not in names:
             raise ConfigError(
@@ -59,9 +58,9 @@ def codec_for(
             )
     if option is not None:
         return option
-    said, by_key = _claims(channel, sample.encoding[: _LONGEST + 1], sample.key)
-    if said:
-        name = next((name for name in (by_key, hint) if name in said), said[0])
+    allowed, by_key = _claims(channel, sample.encoding[: _MAX_ENCODING + 1], sample.key)
+    if allowed:
+        name = next((name for name in (by_key, hint) if name in allowed), allowed[0])
     else:
         name = by_key or hint or _by_magic(sample)
     if name not in names:
@@ -73,10 +72,10 @@ def codec_for(
 
 @lru_cache(maxsize=256)
 def _claims(channel: Channel, encoding: str, key: str) -> tuple[tuple[str, ...], str]:
-    """Codecs that the encoding allows, best first (none: it says nothing), and the one that the key names or ''."""
+    """Return the codecs that the encoding allows, best first (none: it says nothing), and the one of the key or ''."""
     mime, _, parameters = encoding.partition(";")
     mime = mime.strip().lower()
-    if len(encoding) > _LONGEST or mime not in _MIMES:
+    if len(encoding) > _MAX_ENCODING or mime not in _MIMES:
         raise EncodingError(f"{key}: unknown encoding {encoding[:80]!r}; see the table of encodings")
     schema = _schema(parameters)
     if schema and mime not in _WITHOUT_SCHEMA:
@@ -88,7 +87,7 @@ def _claims(channel: Channel, encoding: str, key: str) -> tuple[tuple[str, ...],
 
 
 def _schema(parameters: str) -> str:
-    """``a/msg/B``, ``a::msg::dds_::B_``, ``schema=a.B`` and the like as ``a.b``."""
+    """Normalize ``a/msg/B``, ``a::msg::dds_::B_``, ``schema=a.B`` and the like to ``a.b``."""
     text = parameters.split(";")[0].split("=")[-1].strip(" \t\"'").lower()
     parts = [part.rstrip("_") for part in re.split(r"[/:.]+", text)]
     return ".".join(part for part in parts if part not in ("msg", "dds", ""))

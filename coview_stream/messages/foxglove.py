@@ -1,6 +1,4 @@
-"""Foxglove's protobuf schemas: PointCloud; PoseInFrame and FrameTransform; rows are little-endian."""
-
-# FOLDED coview_stream/messages/foxglove.py: """Foxglove's protobuf schemas, written: PointCloud, PoseInFrame, FrameTransform."""
+"""Foxglove's protobuf schemas: PointCloud, PoseInFrame and FrameTransform; rows of points are little-endian."""
 
 from __future__ import annotations
 
@@ -16,12 +14,12 @@ from coview_stream.geometry.transforms import Pose, pose_to_tum, transform
 from coview_stream.messages import protobuf_wire
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
-from coview_stream.messages.validation import bare_pose, pose_checked, stamp_join, stamp_split
+from coview_stream.messages.validation import bare_pose, checked_pose, stamp_join, stamp_split
 
-KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
-
-DATA = 6  # PointCloud.data
-
+_ENCODING = "application/protobuf;foxglove."
+_KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
+_NUMBERS = {kind: number for number, kind in _KINDS.items()}
+_DATA = 6  # PointCloud.data
 _ROTATION = 5  # FrameTransform.rotation; PoseInFrame ends before
 
 
@@ -53,14 +51,14 @@ def _stamp(message: Any) -> int:
 
 
 def _pose(p: Any, q: Any) -> Pose:
-    return pose_checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    return checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
 
 def read_cloud(payload: bytes | memoryview) -> CloudMessage:
-    """PointCloud; ``pose``, where it is set, is applied to the points. They are a view where packed and unmoved."""
-    head, data = protobuf_wire.split(payload, DATA, MAX_FIELDS)
+    """Read a PointCloud and apply its ``pose``, if set, to the points; they are a view where packed and unmoved."""
+    head, data = protobuf_wire.split(payload, _DATA, MAX_FIELDS)
     cloud = _parse(schemas().PointCloud, head)
-    fields = tuple((f.name, KINDS[f.type], f.offset) for f in cloud.fields if f.type in KINDS)
+    fields = tuple((f.name, _KINDS[f.type], f.offset) for f in cloud.fields if f.type in _KINDS)
     step = cloud.point_stride
     if step == 0 or len(data) % step:
         raise MessageError(f"{len(data)} bytes of points are no whole number of rows of {step} bytes")
@@ -75,7 +73,7 @@ def read_cloud(payload: bytes | memoryview) -> CloudMessage:
 
 
 def read_pose(payload: bytes | memoryview) -> tuple[int, Pose, str]:
-    """Stamp, pose and name of the parent frame of a PoseInFrame or a FrameTransform, told apart by what is in them."""
+    """Read stamp, pose and parent frame of a PoseInFrame or a FrameTransform, told apart by their fields."""
     numbers = {entry.number for entry in protobuf_wire.entries(payload, MAX_FIELDS)}
     if _ROTATION in numbers:
         moved = _parse(schemas().FrameTransform, bytes(payload))
@@ -100,11 +98,6 @@ def decode_pose(sample: Sample) -> PoseMessage:
     return bare_pose(*read_pose(sample.payload))
 
 
-_ENCODING = "application/protobuf;foxglove."
-
-_NUMBERS = {kind: number for number, kind in KINDS.items()}
-
-
 def _fill(message: Any, stamp_ns: int, position: Any, quaternion: Any, T: Pose) -> bytes:
     message.timestamp.seconds, message.timestamp.nanos = stamp_split(stamp_ns)
     row = pose_to_tum(T).tolist()
@@ -121,7 +114,7 @@ def write_cloud(message: CloudMessage, frame_id: str = "base_link") -> bytes:
     cloud.timestamp.seconds, cloud.timestamp.nanos = stamp_split(message.stamp_ns)
     for name, kind, offset in table.fields:
         cloud.fields.add(name=name, offset=offset, type=_NUMBERS[kind])
-    return bytes(cloud.SerializeToString()) + protobuf_wire.sized_field(DATA, bytes(table.data))
+    return bytes(cloud.SerializeToString()) + protobuf_wire.sized_field(_DATA, bytes(table.data))
 
 
 def write_transform(stamp_ns: int, T: Pose, parent: str, child: str) -> bytes:

@@ -1,7 +1,7 @@
-"""JSON odometry and poses, strictly read: what is not exactly right is refused, extra fields are ignored."""
+"""JSON odometry, poses and statuses, strictly read.
 
-# FOLDED coview_stream/messages/json_messages.py: """JSON objects from strangers: every value is checked, and what is wrong is a MessageError that names the field."""
-# FOLDED coview_stream/messages/json_messages.py: """Poses and statuses as plain JSON data, for whoever passes them on."""
+Every value is checked, and what is wrong is a MessageError that names the field; extra fields are ignored.
+"""
 
 from __future__ import annotations
 
@@ -14,24 +14,22 @@ import numpy as np
 from coview_stream.errors import MessageError
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 from coview_stream.messages.types import Encoded, OdometryMessage, PoseMessage, Sample
-from coview_stream.messages.validation import check_size, pose_checked, stamp_from
+from coview_stream.messages.validation import check_size, checked_pose, stamp_from
 
 _ENCODING = "application/json"
-
-
-def _pose(fields: dict[str, Any]) -> Pose:
-    return pose_checked(numbers(fields, "position", 3), numbers(fields, "orientation", 4))
+_MAX_BYTES = 64 * 1024  # a pose has 0.8 kB
+_MAX_STATUS_BYTES = 1024 * 1024  # a status has a few kB for each robot
 
 
 def decode_odometry(sample: Sample) -> OdometryMessage:
     """Read ``{"stamp_ns", "position": [x, y, z], "orientation": [qx, qy, qz, qw]}``, odometry <- body, metres."""
-    fields = load(sample.payload)
+    fields = read_object(sample.payload)
     return OdometryMessage(stamp_from(fields.get("stamp_ns")), _pose(fields))
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
     """Read what :func:`encode_pose` writes; ``age_s`` and ``frame_id`` may be missing."""
-    fields = load(sample.payload)
+    fields = read_object(sample.payload)
     return PoseMessage(
         stamp_ns=stamp_from(fields.get("stamp_ns")),
         robot=text(fields, "robot"),
@@ -43,15 +41,6 @@ def decode_pose(sample: Sample) -> PoseMessage:
         age=number(fields.get("age_s", 0.0), "age_s"),
         frame_id=text(fields, "frame_id", "map"),
     )
-
-
-def _dump(stamp_ns: int, T: Pose, before: dict[str, Any], after: dict[str, Any]) -> Encoded:
-    row = pose_to_tum(T).tolist()
-    fields = {"stamp_ns": int(stamp_ns), **before, "position": row[:3], "orientation": row[3:], **after}
-    try:
-        return Encoded(json.dumps(fields, allow_nan=False, separators=(",", ":")).encode(), _ENCODING)
-    except ValueError as error:
-        raise MessageError("JSON cannot say NaN or infinity: leave such a pose out") from error
 
 
 def encode_odometry(message: OdometryMessage) -> Encoded:
@@ -76,23 +65,43 @@ def encode_pose(message: PoseMessage) -> Encoded:
     return _dump(message.stamp_ns, message.T_map_body, before, after)
 
 
-_MAX_BYTES = 64 * 1024  # a pose has 0.8 kB
+def read_status(sample: Sample) -> dict[str, Any]:
+    """Read a node's status, a JSON object; no field of it is required.
+
+    Raises:
+        MessageError: it is none.
+    """
+    try:
+        return read_object(sample.payload, _MAX_STATUS_BYTES)
+    except MessageError as error:
+        raise MessageError(f"{sample.key}: the status is no JSON object ({error})") from error
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise MessageError(f"{name} is no JSON number")
+def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
+    """Return a pose's fields as in the native JSON, null where its format does not carry one.
+
+    A sample that is JSON is returned as it came, with any fields that a newer node added.
+    """
+    if sample.payload[:1] == b"{":
+        return read_object(sample.payload)
+    row = pose_to_tum(pose.T_map_body).tolist()
+    return {
+        "stamp_ns": pose.stamp_ns,
+        "robot": pose.robot,
+        "state": pose.state,
+        "position": row[:3],
+        "orientation": row[3:],
+        "covariance": None if np.isnan(pose.covariance).any() else pose.covariance.ravel().tolist(),
+        "confidence": _known(pose.confidence),
+        "map_sha256": pose.map_sha256 or None,
+        "age_s": _known(pose.age),
+        "frame_id": pose.frame_id,
+    }
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise MessageError("a field occurs twice")
-    return found
-
-
-def load(payload: bytes) -> dict[str, Any]:
-    """Fields of a JSON object; no field twice, no NaN."""
-    check_size(payload, _MAX_BYTES)
+def read_object(payload: bytes, limit: int = _MAX_BYTES) -> dict[str, Any]:
+    """Read the fields of a JSON object of at most ``limit`` bytes; no field twice, no NaN, else MessageError."""
+    check_size(payload, limit)
     try:
         found = json.loads(payload, parse_constant=_no_constant, object_pairs_hook=_unique)
     except MessageError:
@@ -115,7 +124,7 @@ def number(value: object, name: str) -> float:
 
 
 def numbers(fields: dict[str, Any], name: str, count: int) -> list[float]:
-    """Field ``name``, a list of ``count`` finite numbers."""
+    """Return field ``name``, a list of ``count`` finite numbers."""
     values = fields.get(name)
     if not isinstance(values, list) or len(values) != count:
         raise MessageError(f"{name}: write a list of {count} numbers")
@@ -123,54 +132,36 @@ def numbers(fields: dict[str, Any], name: str, count: int) -> list[float]:
 
 
 def text(fields: dict[str, Any], name: str, default: str | None = None) -> str:
-    """Field ``name``, a text that can be written as UTF-8."""
+    """Return field ``name``, a text that can be written as UTF-8."""
     value = fields.get(name, default)
     if not isinstance(value, str) or any("\ud800" <= letter <= "\udfff" for letter in value):
         raise MessageError(f"{name}: write a text")
     return value
 
 
-def read_status(sample: Sample) -> dict[str, Any]:
-    """Status of a node, a JSON object; no field of it is required.
+def _pose(fields: dict[str, Any]) -> Pose:
+    return checked_pose(numbers(fields, "position", 3), numbers(fields, "orientation", 4))
 
-    Raises:
-        MessageError: it is none.
-    """
+
+def _dump(stamp_ns: int, T: Pose, before: dict[str, Any], after: dict[str, Any]) -> Encoded:
+    row = pose_to_tum(T).tolist()
+    fields = {"stamp_ns": int(stamp_ns), **before, "position": row[:3], "orientation": row[3:], **after}
     try:
-        status = json.loads(sample.payload, parse_constant=_reject_constant)
-    except (ValueError, RecursionError) as error:
-        raise MessageError(f"{sample.key}: the status is no JSON ({error})") from error
-    if not isinstance(status, dict):
-        raise MessageError(f"{sample.key}: the status is no JSON object")
-    return status
+        return Encoded(json.dumps(fields, allow_nan=False, separators=(",", ":")).encode(), _ENCODING)
+    except ValueError as error:
+        raise MessageError("JSON cannot say NaN or infinity: leave such a pose out") from error
 
 
-def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
-    """Fields of a pose as in the native JSON, null where its format does not carry one.
+def _no_constant(name: str) -> NoReturn:
+    raise MessageError(f"{name} is no JSON number")
 
-    A sample that is JSON is given as it came, with whatever fields a newer node added.
-    """
-    if sample.payload[:1] == b"{":
-        found: dict[str, Any] = json.loads(sample.payload)
-        return found
-    row = pose_to_tum(pose.T_map_body).tolist()
-    return {
-        "stamp_ns": pose.stamp_ns,
-        "robot": pose.robot,
-        "state": pose.state,
-        "position": row[:3],
-        "orientation": row[3:],
-        "covariance": None if np.isnan(pose.covariance).any() else pose.covariance.ravel().tolist(),
-        "confidence": _known(pose.confidence),
-        "map_sha256": pose.map_sha256 or None,
-        "age_s": _known(pose.age),
-        "frame_id": pose.frame_id,
-    }
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise MessageError("a field occurs twice")
+    return found
 
 
 def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
-
-
-def _reject_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON number")

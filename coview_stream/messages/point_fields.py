@@ -1,6 +1,7 @@
-"""When and by which beam each point was measured: per-point fields of the usual lidar drivers.
+"""Points in packed rows of fields, as PointCloud2 and foxglove.PointCloud have them, read and written.
 
-The meaning of a time follows from its type and size:
+Fields of the usual lidar drivers say when and by which beam each point was measured. The meaning of a time follows from
+its type and size:
 
 ================================  =========  ==================================================
 name, and who writes it           type       meaning
@@ -15,10 +16,8 @@ name, and who writes it           type       meaning
 ================================  =========  ==================================================
 
 Any of the time names may carry any of these types (int32 as uint32). Times farther than 1 s from the stamp, or spanning
-more than 1 s, are not understood, and none are better than wrong ones.
+more than 1 s, are dropped: no times are better than wrong ones.
 """
-
-# FOLDED coview_stream/messages/point_fields.py: """Points out of packed rows, and back: what PointCloud2 and foxglove.PointCloud have in common."""
 
 from __future__ import annotations
 
@@ -34,52 +33,13 @@ from coview_stream.geometry.transforms import Points
 from coview_stream.messages.types import CloudMessage
 from coview_stream.messages.validation import check_points
 
-Rings = npt.NDArray[np.uint16]
-
 TIME_NAMES = ("time", "t", "time_offset", "offset_time", "timestamp")
-
 RING_NAMES = ("ring", "line", "channel")
-
-_LONGEST = 1.0  # seconds: no lidar frame lasts longer
-
-
-def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floats | None:
-    """(N,) seconds after ``stamp_ns``; 0 where a point is not finite. None if they make no sense."""
-    measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])  # many times faster than all(axis=1)
-    complete = bool(measured.all())
-    if not measured.any():
-        return None
-    for candidate in _meanings(values, stamp_ns):
-        seen = candidate if complete else candidate[measured]
-        low, high = float(seen.min()), float(seen.max())  # NaN fails the comparisons below
-        if low >= -_LONGEST and high <= _LONGEST and high - low <= _LONGEST:
-            return candidate if complete else np.where(measured, candidate, 0.0)
-    return None
-
-
-def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Floats]:
-    """Seconds after the stamp in every sense that the type allows, likeliest first."""
-    seconds = values.astype(np.float64)
-    if values.dtype.kind in "ui":
-        return [1e-9 * seconds] if values.dtype.itemsize == 4 else []
-    if values.dtype.itemsize == 4:
-        return [seconds]
-    return [seconds - 1e-9 * stamp_ns, 1e-9 * (seconds - stamp_ns), seconds]
-
-
-def rings_from(values: npt.NDArray[Any]) -> Rings | None:
-    """(N,) beam numbers; None if they are no whole numbers in the uint16 range."""
-    if values.dtype.kind == "f" and not np.array_equal(values, np.trunc(values)):  # NaN fails it as well
-        return None
-    if len(values) and (values.min() < 0 or values.max() > np.iinfo(np.uint16).max):
-        return None
-    return values.astype(np.uint16)
-
-
 MAX_FIELDS = 256
 """Fields of a point beyond which a message is taken for an attack; real ones have four to ten."""
 
 _KNOWN = frozenset(("x", "y", "z", *TIME_NAMES, *RING_NAMES))
+_MAX_SWEEP = 1.0  # seconds, set by hand: no lidar frame lasts longer
 
 Field = tuple[str, str, int]
 """Name, NumPy type such as ``<f4``, and offset in bytes from the start of a point."""
@@ -97,7 +57,7 @@ class Table:
     row_step: int = 0
 
     def column(self, field: Field, count: int = 1) -> npt.NDArray[Any]:
-        """(N, count) of ``count`` neighbouring values in every point; a view wherever strides can say it."""
+        """Return (N, count) of ``count`` neighbouring values in every point; a view where strides allow it."""
         _, kind, offset = field
         strides = (self.row_step, self.step, np.dtype(kind).itemsize)
         shape = (self.height, self.width, count)
@@ -106,7 +66,7 @@ class Table:
 
 
 def read_table(table: Table, stamp_ns: int) -> CloudMessage:
-    """Cloud of a table; points are a view where they are packed float32 x y z. MessageError if it does not fit."""
+    """Read the cloud in a table; packed float32 x y z stay a view. MessageError if the fields do not fit the data."""
     known = _known_fields(table)
     if not table.width * table.height:
         return CloudMessage(stamp_ns, np.zeros((0, 3), np.float32))
@@ -163,7 +123,7 @@ def _points(table: Table, known: dict[str, Field]) -> Points:
 
 
 def write_table(message: CloudMessage) -> Table:
-    """Packed little-endian rows: x y z float32, ``time`` float32 and ``ring`` uint16 where the message has them."""
+    """Pack little-endian rows: x y z float32, ``time`` float32 and ``ring`` uint16 where the message has them."""
     columns: list[tuple[str, str, npt.NDArray[Any]]]
     columns = [(name, "<f4", message.points[:, axis]) for axis, name in enumerate("xyz")]
     if message.times is not None:
@@ -178,3 +138,36 @@ def write_table(message: CloudMessage) -> Table:
         fields.append((name, kind, offset))
         offset += np.dtype(kind).itemsize
     return Table(rows.tobytes(), tuple(fields), offset, len(rows))
+
+
+def times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floats | None:
+    """Return (N,) seconds after ``stamp_ns``, 0 where a point is not finite; None if they make no sense."""
+    measured = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])  # many times faster than all(axis=1)
+    complete = bool(measured.all())
+    if not measured.any():
+        return None
+    for candidate in _meanings(values, stamp_ns):
+        seen = candidate if complete else candidate[measured]
+        low, high = float(seen.min()), float(seen.max())  # NaN fails the comparisons below
+        if low >= -_MAX_SWEEP and high <= _MAX_SWEEP and high - low <= _MAX_SWEEP:
+            return candidate if complete else np.where(measured, candidate, 0.0)
+    return None
+
+
+def _meanings(values: npt.NDArray[Any], stamp_ns: int) -> list[Floats]:
+    """Return seconds after the stamp in every sense that the type allows, likeliest first."""
+    seconds = values.astype(np.float64)
+    if values.dtype.kind in "ui":
+        return [1e-9 * seconds] if values.dtype.itemsize == 4 else []
+    if values.dtype.itemsize == 4:
+        return [seconds]
+    return [seconds - 1e-9 * stamp_ns, 1e-9 * (seconds - stamp_ns), seconds]
+
+
+def rings_from(values: npt.NDArray[Any]) -> npt.NDArray[np.uint16] | None:
+    """Return (N,) beam numbers; None if they are no whole numbers in the uint16 range."""
+    if values.dtype.kind == "f" and not np.array_equal(values, np.trunc(values)):  # NaN fails it as well
+        return None
+    if len(values) and (values.min() < 0 or values.max() > np.iinfo(np.uint16).max):
+        return None
+    return values.astype(np.uint16)

@@ -1,4 +1,4 @@
-"""The protobuf wire format, one level deep: finds the bytes of a field without copying or believing sizes.
+"""Protobuf wire format, one level deep: the bytes of a field, found without copies and with every size checked.
 
 The schema classes would copy a cloud's data once more, and build an object for each of the millions of empty fields
 that a hostile payload can announce.
@@ -16,17 +16,17 @@ _LENGTH = 2
 
 @dataclass(frozen=True)
 class Entry:
-    """One field on the wire: its number, whether it has a length, and where tag, value and end lie."""
+    """One field on the wire; offsets in bytes from the start of the message."""
 
     number: int
-    sized: bool
-    start: int
+    sized: bool  # it has a length
+    start: int  # of its tag
     value: int
     end: int
 
 
 def entries(payload: bytes | memoryview, limit: int) -> list[Entry]:
-    """Top-level fields in order; MessageError if they overrun the payload or are more than ``limit``."""
+    """List the top-level fields in order; MessageError if they overrun the payload or are more than ``limit``."""
     found: list[Entry] = []
     position = 0
     while position < len(payload):

@@ -1,4 +1,4 @@
-"""Raw layouts: little-endian float32 rows, the stamp beside them. What a microcontroller can send without a library.
+"""Raw layouts, which a microcontroller can send without a library: little-endian float32 rows, the stamp beside them.
 
 ``xyz``: 12 bytes a point. ``xyzi``: 16 bytes, the fourth number (intensity) is skipped. Attachment: see
 :func:`coview_stream.messages.validation.read_attachment`.
@@ -32,7 +32,6 @@ def _decode(sample: Sample, columns: int) -> CloudMessage:
 
 
 def _encode(message: CloudMessage, layout: str, rows: Floats32) -> Encoded:
-
     stamp = int(message.stamp_ns).to_bytes(8, "little", signed=True)
     return Encoded(rows.astype("<f4", copy=False).tobytes(), _ENCODING + layout, stamp)
 

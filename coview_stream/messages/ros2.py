@@ -1,9 +1,7 @@
-"""ROS 2 messages as CDR with its 4-byte encapsulation header, through rosbags; both byte orders.
+"""ROS 2 messages as CDR with its 4-byte encapsulation header, through rosbags.
 
-The layouts of these types are the same from Humble to Rolling.
+Both byte orders are read, little-endian is written. The layouts of these types are the same from Humble to Rolling.
 """
-
-# FOLDED coview_stream/messages/ros2.py: """ROS 2 messages written as little-endian CDR, through rosbags."""
 
 from __future__ import annotations
 
@@ -17,15 +15,14 @@ from coview_stream.errors import MessageError
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
-from coview_stream.messages.validation import bare_pose, pose_checked, stamp_join, stamp_split
+from coview_stream.messages.validation import bare_pose, checked_pose, stamp_join, stamp_split
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
-
 ODOMETRY = "nav_msgs/msg/Odometry"
-
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
-KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_NUMBERS = {f"<{kind}": number for number, kind in _KINDS.items()}
 
 
 @lru_cache(maxsize=1)
@@ -52,11 +49,11 @@ def _stamp(message: Any) -> int:
 
 def _pose(message: Any) -> Pose:
     p, q = message.pose.pose.position, message.pose.pose.orientation
-    return pose_checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    return checked_pose((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
 
 def _refuse_many_fields(payload: bytes) -> None:
-    """Look ahead at the number of PointFields: rosbags would build millions of objects for a hostile one."""
+    """Check the number of PointFields before parsing: rosbags would build millions of objects for a hostile one."""
     order = "<" if payload[1:2] == b"\1" else ">"
     try:
         (name,) = struct.unpack_from(order + "I", payload, 12)
@@ -72,13 +69,15 @@ def decode_cloud(sample: Sample) -> CloudMessage:
     _refuse_many_fields(sample.payload)
     cloud = _read(sample.payload, CLOUD)
     order = ">" if cloud.is_bigendian else "<"
-    fields = tuple((f.name, order + KINDS[f.datatype], f.offset) for f in cloud.fields if f.datatype in KINDS)
+    fields = tuple(
+        (f.name, order + _KINDS[f.datatype], f.offset) for f in cloud.fields if f.datatype in _KINDS
+    )
     table = Table(cloud.data, fields, cloud.point_step, cloud.width, cloud.height, cloud.row_step)
     return read_table(table, _stamp(cloud))
 
 
 def decode_odometry(sample: Sample) -> OdometryMessage:
-    """Read an Odometry; its frames and covariances are not looked at."""
+    """Read an Odometry; its frames and covariances are ignored."""
     message = _read(sample.payload, ODOMETRY)
     return OdometryMessage(_stamp(message), _pose(message))
 
@@ -88,9 +87,6 @@ def decode_pose(sample: Sample) -> PoseMessage:
     message = _read(sample.payload, POSE)
     covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     return bare_pose(_stamp(message), _pose(message), message.header.frame_id, covariance)
-
-
-_NUMBERS = {f"<{kind}": number for number, kind in KINDS.items()}
 
 
 def _new(type_name: str, /, **fields: Any) -> Any:

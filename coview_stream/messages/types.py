@@ -1,4 +1,4 @@
-"""What crosses the wire, as plain data; :mod:`coview_stream.messages` turns it into bytes and back."""
+"""Messages as plain data; :mod:`coview_stream.messages` turns them into bytes and back."""
 
 from __future__ import annotations
 
@@ -32,7 +32,13 @@ class Sample:
 
 @dataclass(frozen=True)
 class Encoded:
-    """A message ready to be published: payload, encoding and attachment as in :class:`Sample`."""
+    """A message ready to be published.
+
+    Attributes:
+        payload: its bytes.
+        encoding: MIME type with its schema, empty for none.
+        attachment: bytes beside the payload, None for none.
+    """
 
     payload: bytes
     encoding: str = ""
@@ -61,7 +67,12 @@ class CloudMessage:
 
 @dataclass(frozen=True)
 class OdometryMessage:
-    """One odometry sample: sensor time in nanoseconds and (4, 4) odometry <- body, metres, gravity aligned."""
+    """One odometry sample.
+
+    Attributes:
+        stamp_ns: sensor time, nanoseconds.
+        T_odom_body: (4, 4) odometry <- body, metres, gravity aligned.
+    """
 
     stamp_ns: int
     T_odom_body: Pose

@@ -1,4 +1,4 @@
-"""What no payload is believed without: sizes, stamps, numbers and rotations."""
+"""Checks of every payload: sizes, stamps, numbers and rotations."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from coview_stream.errors import MessageError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages.types import PoseMessage
 
 MAX_PAYLOAD = 64 * 2**20
-"""Bytes of the largest payload that is looked at."""
+"""Bytes of the largest payload that is decoded."""
 
 MAX_POINTS = 4_000_000
-"""Points of the largest cloud that is taken."""
+"""Points of the largest cloud that is decoded."""
 
-_FARTHEST = 1e8  # metres: no place on Earth is farther from another, and squares of it stay finite
 _NANO = 1_000_000_000
 
 
@@ -51,26 +51,26 @@ def stamp_from(value: object) -> int:
 
 
 def stamp_join(seconds: int, nanos: int) -> int:
-    """Nanoseconds of a stamp in two parts, ``nanos`` in [0, 1e9); MessageError if they are out of range."""
+    """Join a stamp of two parts to nanoseconds, ``nanos`` in [0, 1e9); MessageError if they are out of range."""
     if not 0 <= nanos < _NANO:
         raise MessageError(f"the stamp has {nanos} nanoseconds beside its seconds; they must be below 1e9")
     return stamp_from(seconds * _NANO + nanos)
 
 
 def stamp_split(stamp_ns: int) -> tuple[int, int]:
-    """Seconds and nanoseconds, the latter in [0, 1e9)."""
+    """Split into seconds and nanoseconds, the latter in [0, 1e9)."""
     return divmod(stamp_ns, _NANO)
 
 
-def pose_checked(position: Sequence[float], quaternion: Sequence[float]) -> Pose:
-    """Pose from x y z (metres) and qx qy qz qw; MessageError if not finite, absurdly far, or no rotation.
+def checked_pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose:
+    """Return the pose of x y z (metres) and qx qy qz qw; MessageError if not finite, absurdly far, or no rotation.
 
     The norm of the quaternion may be off by 1e-2 (float32 senders); it is normalised.
     """
     if not all(map(math.isfinite, (*position, *quaternion))):
         raise MessageError("the pose is not finite")
-    if max(map(abs, position)) > _FARTHEST:
-        raise MessageError(f"the position lies more than {_FARTHEST:.0e} m from its origin")
+    if max(map(abs, position)) > MAX_COORDINATE:
+        raise MessageError(f"the position lies more than {MAX_COORDINATE:.0e} m from its origin")
     norm = math.hypot(*quaternion)
     if abs(norm - 1.0) > 1e-2:
         raise MessageError(f"the orientation (qx, qy, qz, qw) has norm {norm:.3g}; a rotation has 1")
@@ -90,7 +90,7 @@ def _pose(x: float, y: float, z: float, a: float, b: float, c: float, w: float) 
 
 
 def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
-    """Stamp in ns and running number beside a payload; None for what is not there or not understood.
+    """Read the stamp in ns and the running number beside a payload; None for what is absent or not understood.
 
     8 bytes: int64 LE ns. 33 bytes: as rmw_zenoh writes it, int64 LE number, int64 LE ns, 0x10 and 16 bytes of gid.
     """
@@ -103,6 +103,6 @@ def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
 
 
 def bare_pose(stamp_ns: int, T: Pose, frame_id: str, covariance: Floats | None = None) -> PoseMessage:
-    """Pose message of a format that says little else: what it leaves out is NaN or empty, not a guess."""
+    """Return the message of a format that carries a pose and little else: what it leaves out is NaN or empty."""
     unknown = np.full((6, 6), np.nan) if covariance is None else covariance
     return PoseMessage(stamp_ns, "", "TRACKING", T, unknown, math.nan, "", math.nan, frame_id)

@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.clouds.cloud import MAX_COORDINATE, Cloud, CloudBuilder
+from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.errors import CloudError, MessageError, RunError
 from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.transforms import Points, Poses
+from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages import ros2
 from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.deskew import deskew

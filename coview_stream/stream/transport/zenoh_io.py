@@ -10,7 +10,8 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
-from coview_stream.errors import TransportError
+from coview_stream.errors import MessageError, TransportError
+from coview_stream.messages.json_messages import read_object
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Urgency
@@ -144,19 +145,16 @@ def first_reply(session: Any, key: str, parameters: dict[str, str], timeout: flo
 
 def _json_object(key: str, payload: bytes) -> dict[str, Any]:
     try:
-        answer = json.loads(payload)
-    except (ValueError, RecursionError) as error:
+        return read_object(payload)
+    except MessageError as error:
         raise TransportError(
-            f"{key}: the answer is no JSON ({error}); is this a coview_stream node?"
+            f"{key}: the answer is no JSON object ({error}); is this a coview_stream node?"
         ) from error
-    if not isinstance(answer, dict):
-        raise TransportError(f"{key}: the answer is no JSON object; is this a coview_stream node?")
-    return answer
 
 
 def _error_of(payload: bytes) -> str:
     """Text of an error reply: the ``error`` of its JSON, or the bytes as text."""
     try:
-        return str(json.loads(payload)["error"])
-    except (ValueError, KeyError, TypeError, RecursionError):
+        return str(read_object(payload)["error"])
+    except (MessageError, KeyError):
         return payload[:200].decode("utf-8", "replace")
