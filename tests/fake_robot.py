@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 
@@ -86,13 +87,14 @@ def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT, covariance=None
 def unknown(job, state=State.SEARCHING, reason="no place fits", ask=None):
     """The engine's answer: no idea."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, state, reason)
-    return FrameResult(Fix(job.stamp_ns * 1e-9, state, evidence=evidence), ask, 0.01)
+    request = None if ask is None else replace(ask, epoch=(job.epoch, 1))
+    return FrameResult(Fix(job.stamp_ns * 1e-9, state, evidence=evidence), request, 0.01)
 
 
 def doubted(job, cause=RejectionReason.BLIND, reason="only 0 points to register"):
     """The engine's answer: here you were, but what is seen now does not show it."""
-    evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.AMBIGUOUS, reason, cause=cause)
-    return FrameResult(Fix(job.stamp_ns * 1e-9, State.AMBIGUOUS, evidence=evidence), None, 0.01)
+    evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.DOUBTED, reason, cause=cause)
+    return FrameResult(Fix(job.stamp_ns * 1e-9, State.DOUBTED, evidence=evidence), None, 0.01)
 
 
 class Robot:
@@ -128,7 +130,7 @@ class Robot:
         self.moved(seconds + 0.01)
         job = self.session.take_frame()
         assert job is not None
-        self.session.frame_done(job, answer(job, **more), self.now)
+        self.session.handle_result(job, answer(job, **more), self.now)
         return job
 
     def localized(self, seconds=0.0, **more):

@@ -14,7 +14,7 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry
 from coview_stream.messages.choose import Channel, codec_for
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
-from coview_stream.stream.node.decoding import received
+from coview_stream.stream.node.decoding import decode_sample
 from coview_stream.stream.transport.keys import RobotKeys
 
 _MAX_COORDINATE = (
@@ -120,7 +120,7 @@ def _capture(
     option: str | None,
     hint: str | None,
 ) -> tuple[CapturedMessage, Any]:
-    message, counter, reason = received(sample, decode, option, hint, NodeConfig().max_payload)
+    message, counter, reason = decode_sample(sample, decode, option, hint, NodeConfig().max_payload)
     captured = CapturedMessage(
         arrived, sample.key, sample.encoding, len(sample.payload), counter=counter, reason=reason
     )

@@ -89,8 +89,8 @@ def pairing_finding(
             ] += 1
         else:
             pairing.add(_without_points(message), message.arrived)
-        paired += sum(1 for _ in pairing.paired(message.arrived))
-    paired += sum(1 for _ in pairing.paired(ended + config.pairing_wait))
+        paired += sum(1 for _ in pairing.take_paired(message.arrived))
+    paired += sum(1 for _ in pairing.take_paired(ended + config.pairing_wait))
     found = f"{paired} of {len(clouds)} clouds find odometry around their stamps"
     dropped = [f"{getattr(counters, name)} {name}" for name in _DROP_COUNTERS if getattr(counters, name)]
     if dropped:

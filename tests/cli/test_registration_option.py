@@ -32,10 +32,10 @@ def test_serve_passes_registration_option_to_engines(world_file, monkeypatch, gi
 def test_registration_option_reaches_engine_process(world_file):
     """Which refuses what is no method."""
     wrong = {"registration": "guesswork"}
-    lane = EngineProcess("track", str(world_file), "0" * 64, **wrong)
+    process = EngineProcess("track", str(world_file), "0" * 64, **wrong)
     try:
-        lane.start()
+        process.start()
         with pytest.raises(CoViewError, match="'guesswork'"):
-            lane.wait_ready()
+            process.wait_ready()
     finally:
-        lane.close()
+        process.close()

@@ -44,13 +44,13 @@ def test_serve_passes_reloc_option_to_engines(world_file, monkeypatch, given, wa
 @pytest.mark.slow
 def test_reloc_option_reaches_engine_process(world_file):
     """Which refuses what is none."""
-    lane = EngineProcess("search", str(world_file), "0" * 64, reloc="guesswork")
+    process = EngineProcess("search", str(world_file), "0" * 64, reloc="guesswork")
     try:
-        lane.start()
+        process.start()
         with pytest.raises(CoViewError, match="'guesswork'"):
-            lane.wait_ready()
+            process.wait_ready()
     finally:
-        lane.close()
+        process.close()
 
 
 @pytest.mark.slow
@@ -58,13 +58,13 @@ def test_search_engine_process_uses_learned_features(learned_file, world_drive):
     base_map = BaseMap.load(learned_file)
     localizer = Localizer(base_map, LocalizerConfig(reloc="learned"))
     query = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
-    lane = EngineProcess("search", str(learned_file), base_map.sha256, reloc="learned")
+    process = EngineProcess("search", str(learned_file), base_map.sha256, reloc="learned")
     try:
-        lane.start()
-        lane.wait_ready()
-        assert lane.run(SearchJob("r1", 0, query)).evidence.reason.endswith(BY_FEATURES)
+        process.start()
+        process.wait_ready()
+        assert process.run(SearchJob("r1", query)).evidence.reason.endswith(BY_FEATURES)
     finally:
-        lane.close()
+        process.close()
 
 
 def test_build_learned_names_missing_library(tmp_path, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from coview_stream.stream.node import serve as opening
 from coview_stream.stream.node.engine_process import EngineProcess
 from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 
 def folder(*args):
@@ -88,8 +88,8 @@ def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, ca
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_serve_runs_last_pose_keeper_unless_no_state(monkeypatch, world_file, tmp_path, kept):
-    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: FakeTransport())
-    monkeypatch.setattr(opening, "warn_of_others", lambda *args: None)
+    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: MemoryTransport())
+    monkeypatch.setattr(opening, "warn_if_served_already", lambda *args: None)
     for name in ("start", "wait_ready", "close"):
         monkeypatch.setattr(EngineProcess, name, lambda self, *args: None)
     options = opening.ServeOptions(

@@ -1,19 +1,24 @@
-"""What a robot's messages came to, and how long they took."""
+"""Accounts of a robot's messages: counters, errors, percentiles of their latency, and those that never arrived."""
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
-_STRAY_NS = 5_000_000_000  # a stamp that lies farther back than this is a new beginning
-_REMEMBERED = 600  # a minute of frames at 10 Hz
+_RESTART_NS = 5_000_000_000  # a stamp that lies farther back than this is a restarted clock; set by hand
+_MAX_DURATIONS = 600  # a minute of frames at 10 Hz
+_MAX_ERRORS = 10  # different ones that are kept
+_MAX_LOGGED = 20  # errors of one robot's input that are logged, ever: its sender may invent new ones
+
+log = logging.getLogger("coview_stream.node")
 
 
 @dataclass
 class Counters:
-    """Everything that can happen to a message; each is counted once, where it ends.
+    """Counts of all that can happen to a message; each message is counted once, where it ends.
 
     ``received`` clouds end as ``processed``, ``rejected`` (the engine could not use it), ``dropped`` (a newer one came
     before its turn), ``late`` (older than the odometry that is remembered), ``out_of_order``, ``duplicate``,
@@ -61,14 +66,36 @@ class Counters:
         return asdict(self)
 
 
-class Latency:
-    """Percentiles of the newest durations, in milliseconds."""
+class ErrorLog:
+    """The newest different errors of one robot's input, each once; the first few are logged as well."""
 
     def __init__(self) -> None:
-        self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
+        self.texts: deque[str] = deque(maxlen=_MAX_ERRORS)
+        self._logged = 0
+
+    def add(self, text: str, logged: bool = True) -> None:
+        """Keep an error unless it is known; ``logged`` is whether this class logs it."""
+        if text not in self.texts:
+            self.texts.append(text)
+            if logged and self._logged < _MAX_LOGGED:
+                self._logged += 1
+                log.warning("%s", text)
+
+    def add_first(self, kind: str, text: str) -> None:
+        """Keep only the first error of a kind, where every one would be worded differently."""
+        start = f"{kind}; the first: "
+        if not any(known.startswith(start) for known in self.texts):
+            self.add(start + text)
+
+
+class Latency:
+    """Percentiles of the newest durations."""
+
+    def __init__(self) -> None:
+        self._seconds: deque[float] = deque(maxlen=_MAX_DURATIONS)
 
     def add(self, seconds: float) -> None:
-        """Take in one duration."""
+        """Take in one duration, seconds."""
         self._seconds.append(seconds)
 
     def to_json(self) -> dict[str, float | None]:
@@ -79,17 +106,17 @@ class Latency:
         return {"p50": round(p50, 2), "p95": round(p95, 2), "p99": round(p99, 2)}
 
 
-class Missing:
-    """Estimates how many frames never arrived."""
+class MissingFrames:
+    """Estimate of the frames that never arrived, by the sender's numbers or the usual gap between stamps."""
 
     def __init__(self) -> None:
         self._gaps: deque[int] = deque(maxlen=15)
         self._last: tuple[int, int | None] | None = None
 
-    def after(self, stamp_ns: int, sequence: int | None) -> int:
-        """Return the number of frames that seem to lie between the last one and this one."""
+    def add(self, stamp_ns: int, sequence: int | None) -> int:
+        """Take in a frame; return how many seem to be missing between the last one and this one."""
         last = self._last
-        if last is not None and last[0] - _STRAY_NS < stamp_ns <= last[0]:
+        if last is not None and last[0] - _RESTART_NS < stamp_ns <= last[0]:
             return 0
         self._last = stamp_ns, sequence
         if last is None or stamp_ns < last[0]:
@@ -102,3 +129,8 @@ class Missing:
         if len(self._gaps) < 5 or not 1.5 < gap / usual < 100:
             return 0
         return round(gap / usual) - 1
+
+
+def last_line(text: str) -> str:
+    """Return the last line of a traceback."""
+    return (text.strip() or "unknown failure").splitlines()[-1]

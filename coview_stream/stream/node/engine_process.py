@@ -1,11 +1,9 @@
-"""A lane to an engine: in this process, or in a process of its own that is started again when it dies.
+"""Engine in a process of its own, which is started again when it dies, and a watchdog that ends one that hangs.
 
 Native code (registration, BLAS, tree building) may hold the interpreter lock for long; a process of its own is the only
 thing that keeps the pose clock of this one steady. The child is started anew rather than forked or spawned by
 multiprocessing: a fork after zenoh has been opened deadlocks, and a spawn would import the host's main module.
 """
-
-# FOLDED coview_stream/stream/node/engine_process.py: """Acts when something takes too long, whatever the thread that does it is stuck in."""
 
 from __future__ import annotations
 
@@ -29,8 +27,7 @@ if TYPE_CHECKING:
     from coview_stream.stream.node.engines import Engine
     from coview_stream.stream.node.jobs import Job, Result
 
-
-_GLANCE = 0.1  # seconds between two looks at whether the opening has been cancelled
+_POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been cancelled
 
 
 class RejectedError(Exception):
@@ -46,11 +43,11 @@ class DiedError(Exception):
 
 
 class CancelledError(Exception):
-    """Whoever waited for the engine no longer wants it."""
+    """The engine is no longer waited for."""
 
 
-class Lane(Protocol):
-    """Runs jobs one at a time. Raises RejectedError, FailedError or DiedError."""
+class EngineRunner(Protocol):
+    """Runs an engine's jobs one at a time. Raises RejectedError, FailedError or DiedError."""
 
     def run(self, job: Job) -> Result:
         """Do one job and wait for it."""
@@ -62,17 +59,17 @@ class Lane(Protocol):
 
 
 class EngineProcess:
-    """Runs jobs in a child process. A child that hangs, wherever, is killed.
+    """Runs an engine's jobs in a child process. A child that hangs is killed.
 
     Args:
         kind: ``track``, ``search`` or ``odometry``.
         map_path: the map's file, which every process maps for itself.
-        sha256: what the map has to be; if the file was replaced meanwhile, poses would be of another map than is said.
-        nice: how far the child stands back from us, so that the clock here is never late.
+        sha256: of the map; a file that was replaced meanwhile is refused, or poses would be of another map than said.
+        nice: added to the child's niceness, so that the clock here is never late.
         registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
-        reloc: who names the places that a search looks at.
-        patience: seconds after which a job counts as hung.
-        opening: seconds after which opening the map, or preparing for the first job, does.
+        reloc: recognizers that propose the places to search at.
+        job_timeout: seconds after which a job counts as hung; set by hand.
+        open_timeout: seconds after which opening the map, or preparing for the first job, does; set by hand.
     """
 
     def __init__(
@@ -81,8 +78,8 @@ class EngineProcess:
         map_path: str,
         sha256: str,
         nice: int = 0,
-        patience: float = 30.0,
-        opening: float = 120.0,
+        job_timeout: float = 30.0,
+        open_timeout: float = 120.0,
         registration: RegistrationMethod = "trimmed-icp",
         reloc: Reloc = "auto",
     ) -> None:
@@ -90,15 +87,15 @@ class EngineProcess:
         self.map_path = map_path
         self.sha256 = sha256
         self.nice = nice
-        self.patience = patience
-        self.opening = opening
+        self.job_timeout = job_timeout
+        self.open_timeout = open_timeout
         self.registration = registration
         self.reloc = reloc
         self._closed = False
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
-        self._awaited: list[str] = []  # what a fresh child has yet to say
+        self._awaited: list[str] = []  # messages that a fresh child has yet to send
         self._watchdog = Watchdog(f"coview-watch-{kind}", self._kill)
 
     @property
@@ -129,7 +126,7 @@ class EngineProcess:
         """Wait until the child has opened the map.
 
         Args:
-            cancelled: asked ten times a second whether to give up.
+            cancelled: asked ten times a second; True gives up.
 
         Raises:
             CoViewError: it could not, and says why. DiedError: it died or hung. CancelledError: as asked.
@@ -142,12 +139,12 @@ class EngineProcess:
         if self._pipe is None:
             self.start()
         try:
-            for word in list(self._awaited):
-                self._await(word)
+            for message in list(self._awaited):
+                self._await(message)
         except CoViewError as error:
             self._end()
             raise DiedError(str(error)) from error
-        return unwrap(*self._exchange(lambda pipe: pipe.send(job), self.patience))
+        return unwrap(*self._exchange(lambda pipe: pipe.send(job), self.job_timeout))
 
     def close(self) -> None:
         """Kill the child at once; it keeps nothing that would have to be saved."""
@@ -156,16 +153,16 @@ class EngineProcess:
         self._end()
         self._watchdog.close()
 
-    def _await(self, word: str, cancelled: Callable[[], bool] = lambda: False) -> None:
-        def look(pipe: Connection) -> None:
-            while not pipe.poll(_GLANCE):
+    def _await(self, message: str, cancelled: Callable[[], bool] = lambda: False) -> None:
+        def wait(pipe: Connection) -> None:
+            while not pipe.poll(_POLL_INTERVAL):
                 if cancelled():
                     raise CancelledError(f"the {self.kind} engine is no longer wanted")
 
-        kind, value = self._exchange(look, self.opening)
+        kind, value = self._exchange(wait, self.open_timeout)
         if kind == "error":
             raise CoViewError(value)
-        self._awaited.remove(word)
+        self._awaited.remove(message)
 
     def _exchange(self, begin: Callable[[Connection], object], seconds: float) -> tuple[str, Any]:
         """Do ``begin`` and receive; sending, waiting and receiving may all hang, and together have ``seconds``."""
@@ -201,7 +198,7 @@ class EngineProcess:
 
 
 def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
-    """Do a job; say how it went: ``done`` and the result, or ``rejected`` or ``failed`` and why."""
+    """Do a job; return ``done`` and the result, or ``rejected`` or ``failed`` and why."""
     try:
         return "done", engine.run(job)
     except CoViewError as error:
@@ -221,17 +218,17 @@ def unwrap(kind: str, value: Any) -> Result:
 
 
 def _environment() -> dict[str, str]:
-    """Ours, with this package in reach and one BLAS thread: two engines share the cores."""
+    """Return our environment, with this package in reach and one BLAS thread: two engines share the cores."""
     paths = [p for p in sys.path if p]
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
 
 
 class Watchdog:
-    """Guards one thing at a time, with one thread that sleeps through all that goes well.
+    """Time limit of one block at a time, kept by one thread that sleeps as long as all goes well.
 
     Args:
         name: of its thread.
-        act: called, once, when the time of what is guarded is over; meanwhile the guarded block cannot end.
+        act: called, once, when the time of the block is over; meanwhile the block cannot end.
     """
 
     def __init__(self, name: str, act: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""Frames wait here until odometry has come for their stamps."""
+"""Lidar frames paired with the odometry at their stamps, which may come after them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from coview_stream.odometry.buffer import OdometryBuffer, Segment
 from coview_stream.stream.node.counters import Counters
 
 _NS = 1_000_000_000
-_WAITING = 8  # frames at most
-_SWEEP_WAIT = 0.15  # seconds that a frame waits for the odometry of its sweep's end
+_MAX_WAITING = 8  # frames; set by hand
+_END_WAIT = 0.15  # seconds that a frame waits for odometry up to its last point; set by hand
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,15 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class Paired:
-    """A frame, the local time at which it came, its odometry (4, 4), and the sweep's if it is to be deskewed."""
+class PairedFrame:
+    """A lidar frame with its odometry.
+
+    Attributes:
+        message: the frame.
+        received: local time at which it came, seconds.
+        T_odom_body: (4, 4) odometry at its stamp.
+        segment: odometry while it was measured; None if it is not to be deskewed.
+    """
 
     message: CloudMessage
     received: float
@@ -35,7 +42,7 @@ class Paired:
 
 
 class FrameSync:
-    """Keeps frames in order of their stamps until odometry covers them; counts those that end here."""
+    """Keeps frames in the order of their stamps until odometry covers them; counts those that end here."""
 
     def __init__(self, config: NodeConfig, odometry: OdometryBuffer, counters: Counters) -> None:
         self.config = config
@@ -59,19 +66,19 @@ class FrameSync:
         else:
             self._waiting.append(_Frame(message, now))
             self._waiting.sort(key=lambda f: f.message.stamp_ns)
-            if len(self._waiting) > _WAITING:
+            if len(self._waiting) > _MAX_WAITING:
                 # the one that came first, not the oldest stamp: a stray stamp must not stay for ever
                 self._waiting.remove(min(self._waiting, key=lambda f: f.received))
                 self.counters.dropped += 1
 
-    def paired(self, now: float) -> Iterator[Paired]:
-        """Frames that have their odometry, oldest first; those that it did not come for in time are counted."""
+    def take_paired(self, now: float) -> Iterator[PairedFrame]:
+        """Hand out the frames that have their odometry, oldest first; count those for which none came in time."""
         for frame in list(self._waiting):
             where = self.odometry.covers(frame.message.stamp_ns)
             waited = now - frame.received
             if where > 0 and waited < self.config.pairing_wait:
                 return
-            unfinished = waited < _SWEEP_WAIT and self.odometry.covers(self._span(frame.message)[1]) > 0
+            unfinished = waited < _END_WAIT and self.odometry.covers(self._span(frame.message)[1]) > 0
             if where == 0 and unfinished:
                 return
             self._waiting.remove(frame)
@@ -80,9 +87,9 @@ class FrameSync:
                 self.counters.count("late" if where < 0 else "no_odometry")
                 continue
             self._passed_ns = frame.message.stamp_ns
-            swept = self.config.deskew and frame.message.times is not None
-            segment = self.odometry.around(*self._span(frame.message)) if swept else None
-            yield Paired(frame.message, frame.received, pose, segment)
+            deskewed = self.config.deskew and frame.message.times is not None
+            segment = self.odometry.around(*self._span(frame.message)) if deskewed else None
+            yield PairedFrame(frame.message, frame.received, pose, segment)
 
     def _span(self, message: CloudMessage) -> tuple[int, int]:
         """First and last stamp (ns) at which the frame's points were measured."""

@@ -1,4 +1,4 @@
-"""What goes to the engine and what comes back: plain data that crosses a process boundary."""
+"""Jobs for the engines and their results: plain data that crosses a process boundary."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from coview_stream.odometry.buffer import Segment
 
 @dataclass(frozen=True)
 class FrameJob:
-    """One frame for the tracking engine.
+    """One lidar frame for the tracking engine.
 
     Attributes:
         robot: name.
-        epoch: of the robot's odometry frame; a new one makes the engine forget what it knew.
+        epoch: number of the robot's odometry frame; a new one makes the engine forget the robot's place.
         stamp_ns: sensor time, nanoseconds.
         points: (N, 3) float32 body frame, metres.
         T_odom_body: (4, 4) odometry at the stamp.
         times: (N,) seconds after the stamp at which each point was measured, None if not to be deskewed.
-        segment: odometry during the sweep; goes with ``times``.
-        suspect: give no pose before this frame has verified the place.
-        verdict: of an earlier search, to be taken note of first.
-        hurry: the engine is behind with its work: leave what can wait.
-        suggested: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like anything else.
+        segment: odometry while the frame was measured; goes with ``times``.
+        require_verification: give no pose before this frame has verified the place.
+        search_result: of an earlier search, to be applied first.
+        defer: frames wait for the engine: put off what need not be done at this one.
+        hint: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis.
     """
 
     robot: str
@@ -39,37 +39,41 @@ class FrameJob:
     T_odom_body: Pose
     times: Floats | None = None
     segment: Segment | None = None
-    suspect: bool = False
-    verdict: SearchResult | None = None
-    hurry: bool = False
-    suggested: Pose | None = None
+    require_verification: bool = False
+    search_result: SearchResult | None = None
+    defer: bool = False
+    hint: Pose | None = None
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """The fix after a frame, what has to be searched for (if anything), and the seconds it took."""
+    """Fix after a frame, what has to be searched for (if anything), and the seconds that the engine took."""
 
     fix: Fix
-    query: SearchRequest | None
+    request: SearchRequest | None
     seconds: float
 
 
 @dataclass(frozen=True)
 class SearchJob:
-    """One keyframe to search the map for; ``epoch`` as in :class:`FrameJob`."""
+    """One keyframe for the search engine; its request has the epoch of the frame's job."""
 
     robot: str
-    epoch: int
-    query: SearchRequest
+    request: SearchRequest
+
+    @property
+    def epoch(self) -> int:
+        """As in :class:`FrameJob`."""
+        return self.request.epoch[0]
 
 
 @dataclass(frozen=True)
 class OdometryJob:
-    """One frame to make odometry of, for robots that send none.
+    """One lidar frame for the odometry engine, of a robot that sends no odometry.
 
     Attributes:
         robot: name.
-        generation: of its odometry; with a new one it begins anew.
+        epoch: number of its lidar odometry; a new one makes the engine begin it again.
         stamp_ns: sensor time, nanoseconds.
         points: (N, 3) float32 body frame, metres.
         times: (N,) seconds after the stamp at which each point was measured, None if not to be deskewed.
@@ -77,7 +81,7 @@ class OdometryJob:
     """
 
     robot: str
-    generation: int
+    epoch: int
     stamp_ns: int
     points: Points
     times: Floats | None
@@ -86,18 +90,18 @@ class OdometryJob:
 
 @dataclass(frozen=True)
 class OdometryResult:
-    """Where a frame was taken.
+    """Lidar odometry at a frame.
 
     Attributes:
         T_odom_body: (4, 4) odometry at its stamp.
         points: (N, 3) deskewed; None if nothing was to be deskewed.
-        begun: the pose has nothing to do with those before it.
-        seconds: that it took.
+        restarted: the pose is not connected to those before it.
+        seconds: that the engine took.
     """
 
     T_odom_body: Pose
     points: Points | None
-    begun: bool
+    restarted: bool
     seconds: float
 
 

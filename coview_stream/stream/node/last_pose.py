@@ -1,6 +1,4 @@
-"""The last known pose of a robot on a map, on disk: what the next start tries first, and never trusts."""
-
-# FOLDED coview_stream/stream/node/last_pose.py: """Where a robot was last known to be, and whether its engine has yet to hear of it; its session holds the lock."""
+"""Last known pose of a robot on a map: its file, and the hint that the next start and each new epoch make of it."""
 
 from __future__ import annotations
 
@@ -26,15 +24,13 @@ log = logging.getLogger(__name__)
 VERSION = 1
 
 _FORMAT = "coview_stream last pose"
-
-_LARGEST = 65_536  # bytes; what we write has 500
-
-_LONGEST_NAME = 60
+_MAX_BYTES = 65_536  # of a file; what we write has 500
+_MAX_NAME = 60  # characters of a robot's name in that of its file
 
 
 @dataclass(frozen=True)
 class LastPose:
-    """Where a robot was when it was last known.
+    """Pose of a robot on a map, as its file has it.
 
     Attributes:
         robot: its name.
@@ -50,7 +46,7 @@ class LastPose:
 
 
 def save(folder: Path, last: LastPose) -> Path:
-    """Write ``last`` for its robot and map, and return the file; what was there before stays whole until it is done.
+    """Write ``last`` for its robot and map, and return the file; the one before stays whole until then.
 
     Raises:
         OSError: the directory cannot be made or written.
@@ -92,7 +88,7 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPose | None:
     path = file_of(folder, robot, map_sha256)
     try:
         with path.open("rb") as file:
-            last = _parsed(file.read(_LARGEST + 1))
+            last = _parsed(file.read(_MAX_BYTES + 1))
         if (last.robot, last.map_sha256) != (robot, map_sha256):
             raise ValueError("it is of another robot or map")
     except FileNotFoundError:
@@ -112,28 +108,28 @@ def forget(folder: Path, robot: str, map_sha256: str) -> None:
 
 
 def file_of(folder: Path, robot: str, map_sha256: str) -> Path:
-    """Return where the pose of a robot on a map is kept: its name, made safe for every file system, and 16 digits."""
+    """Return the file of a robot's pose on a map: the robot's name, safe for every file system, and 16 digits."""
     name = quote(robot, safe="")
-    if name != robot.lower() or len(name) > _LONGEST_NAME:  # 'R1' and 'r1' are one file on some systems
-        name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
+    if name != robot.lower() or len(name) > _MAX_NAME:  # 'R1' and 'r1' are one file on some systems
+        name = f"{name[:_MAX_NAME]}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
     return folder / f"{name}-{map_sha256[:16]}.json"
 
 
 def default_folder() -> Path:
-    """Return where programs of this user keep what they know from one run to the next.
+    """Return the directory in which programs of this user keep their state from one run to the next.
 
     Raises:
         ConfigError: the user has no home directory.
     """
     if sys.platform == "win32":
-        place = os.environ.get("LOCALAPPDATA", "")
-        behind_home = "AppData/Local"
+        folder = os.environ.get("LOCALAPPDATA", "")
+        below_home = "AppData/Local"
     else:
-        place = os.environ.get("XDG_STATE_HOME", "")
-        behind_home = ".local/state"
+        folder = os.environ.get("XDG_STATE_HOME", "")
+        below_home = ".local/state"
     try:
         # the specification says that a relative one is to be ignored
-        root = Path(place) if place and Path(place).is_absolute() else Path.home() / behind_home
+        root = Path(folder) if folder and Path(folder).is_absolute() else Path.home() / below_home
     except RuntimeError as error:
         raise ConfigError(
             f"cannot tell where to keep the last poses ({error}); use --state DIR or --no-state"
@@ -142,9 +138,9 @@ def default_folder() -> Path:
 
 
 def _parsed(data: bytes) -> LastPose:
-    """ValueError, TypeError, KeyError, OverflowError or RecursionError if it is not what :func:`save` writes."""
-    if len(data) > _LARGEST:
-        raise ValueError(f"longer than {_LARGEST} bytes")
+    """Parse a file; ValueError, TypeError, KeyError, OverflowError or RecursionError if :func:`save` wrote it not."""
+    if len(data) > _MAX_BYTES:
+        raise ValueError(f"longer than {_MAX_BYTES} bytes")
     document: Any = json.loads(data.decode("utf-8"))
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
         raise ValueError("it is something else")
@@ -158,11 +154,11 @@ def _parsed(data: bytes) -> LastPose:
 
 @dataclass(frozen=True)
 class LastKnownPose:
-    """What a session knows of a robot's place, to be kept for the next start.
+    """Pose of a robot as its session knows it, to be kept for the next start.
 
     Attributes:
-        forgotten: how often somebody has asked to forget it.
-        stamp_ns: sensor time, nanoseconds; None unless the robot is being tracked.
+        forgotten: how often a client has asked to forget it.
+        stamp_ns: sensor time, nanoseconds; None unless the robot is TRACKING.
         T_map_body: (4, 4) in the frame of the map's sources; None likewise.
     """
 
@@ -172,46 +168,47 @@ class LastKnownPose:
 
 
 class PoseHint:
-    """A place that is suggested to the engine once in every odometry frame, until somebody asks to forget it.
+    """Last known pose as a hint for the engine: once in every odometry epoch, until a client asks to forget it.
 
-    The engine treats it as a hypothesis (:meth:`coview_stream.localization.localizer.Localizer.suggest`).
+    The engine verifies it like any hypothesis (:meth:`coview_stream.localization.localizer.Localizer.hint_pose`). The
+    session holds the lock.
 
     Attributes:
-        forgotten: how often somebody has asked.
+        forgotten: how often a client has asked.
     """
 
     def __init__(self) -> None:
         self.forgotten = 0
-        self._place: Pose | None = None
-        self._owed = False
+        self._T_map_body: Pose | None = None
+        self._pending = False
 
     @property
-    def due(self) -> Pose | None:
-        """What goes with the next frame, if anything: ``T_map_body`` (4, 4)."""
-        return self._place if self._owed else None
+    def pending(self) -> Pose | None:
+        """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
+        return self._T_map_body if self._pending else None
 
-    def seen(self, T_map_body: Pose) -> None:
-        """Take note of a verified place, which the engine knows of course."""
-        self._place, self._owed = T_map_body, False
+    def update(self, T_map_body: Pose) -> None:
+        """Take over a pose that the engine itself has verified."""
+        self._T_map_body, self._pending = T_map_body, False
 
-    def suggest(self, T_map_body: Pose) -> None:
-        """Take note of a place from before this session."""
-        self._place, self._owed = T_map_body, True
+    def offer(self, T_map_body: Pose) -> None:
+        """Take over a pose from before this session, which the engine does not know."""
+        self._T_map_body, self._pending = T_map_body, True
 
-    def begin_anew(self) -> None:
-        """Owe the place again: the engine forgets all with the odometry frame, but the robot stands where it stood."""
-        self._owed = self._place is not None
+    def begin_epoch(self) -> None:
+        """Offer the pose again: the engine forgets all with an odometry frame, but the robot stands where it stood."""
+        self._pending = self._T_map_body is not None
 
-    def told(self, suggested: Pose | None) -> None:
-        """Take note of what the engine has heard of with a frame, if anything."""
-        if suggested is self._place:
-            self._owed = False
+    def delivered(self, hint: Pose | None) -> None:
+        """Offer the pose no more if it is the one that went with a frame."""
+        if hint is self._T_map_body:
+            self._pending = False
 
     def drop(self) -> None:
-        """Never suggest this place again; only a new one."""
-        self._place, self._owed = None, False
+        """Never offer this pose again; only a new one."""
+        self._T_map_body, self._pending = None, False
 
     def forget(self) -> None:
-        """Do so because somebody asks, and what is kept for the next start is to go as well."""
+        """Drop the pose because a client asks; the file for the next start is to go as well."""
         self.drop()
         self.forgotten += 1

@@ -1,11 +1,10 @@
-"""What a node knows of its robots' places from one start to the next: files, and a thread that may wait for a disk."""
+"""Keeper of the robots' last known poses: files, written by a thread of its own, for a disk may hang."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,13 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.node")
 
-_INTERVAL = 5.0  # seconds between two looks
-_MOVED = 0.1  # metres; a robot that stands shall not wear its card out
-_TURNED = float(np.radians(1.0))
+_INTERVAL = 5.0  # seconds between two rounds; set by hand
+_MIN_MOVE = 0.1  # metres: a robot that stands still must not wear its card out; set by hand
+_MIN_TURN = float(np.radians(1.0))  # likewise
 
 
 class LastPoseKeeper:
-    """Suggests to every robot at start where it was last known to be, and writes down where it is.
+    """Hints to every robot at start where it was last known to be, and writes down where it is.
 
     Args:
         folder: made if it is not there.
@@ -35,45 +34,47 @@ class LastPoseKeeper:
         self.folder = folder
         self._sessions = sessions
         self._interval = interval
-        self._guard = RateLimitedErrors(log)
+        self._errors = RateLimitedErrors(log)
         self._kept: dict[str, Pose] = {}
         self._forgotten: dict[str, int] = {}
         self._failing = False
 
     def run(self, stopping: threading.Event) -> None:
-        """Suggest, then write until ``stopping`` is set, and once more."""
-        self.suggest()
+        """Hint, then write until ``stopping`` is set, and once more."""
+        self.hint()
         while not stopping.wait(self._interval):
             self.keep()
         self.keep()
 
-    def suggest(self) -> None:
-        """Hand every session what is known from before."""
+    def hint(self) -> None:
+        """Hand every session the pose that is known from before."""
         for session in self._sessions:
-            self._guard.run(f"{session.keys.robot}: its last pose", partial(self._suggest, session))
+            with self._errors.catch(f"{session.keys.robot}: its last pose"):
+                self._hint(session)
 
     def keep(self) -> None:
-        """Write down where each robot is that is being tracked; delete what somebody has asked to forget."""
+        """Write the pose of each robot that is TRACKING; delete those that a client has asked to forget."""
         for session in self._sessions:
-            self._guard.run(f"{session.keys.robot}: its last pose", partial(self._keep, session))
+            with self._errors.catch(f"{session.keys.robot}: its last pose"):
+                self._keep(session)
 
-    def _suggest(self, session: Session) -> None:
+    def _hint(self, session: Session) -> None:
         robot = session.keys.robot
         last = load(self.folder, robot, session.map_sha256)
         if last is not None:
             x, y = last.T_map_body[:2, 3]
             log.info("%s: was last at %.1f, %.1f on this map: tried first, as a hypothesis", robot, x, y)
-            session.suggest(last.T_map_body)
+            session.hint_pose(last.T_map_body)
 
     def _keep(self, session: Session) -> None:
         robot, sha256 = session.keys.robot, session.map_sha256
-        now = session.recall()
+        now = session.last_known_pose()
         try:
             if now.forgotten != self._forgotten.get(robot, 0):
                 forget(self.folder, robot, sha256)
                 self._forgotten[robot] = now.forgotten
                 self._kept.pop(robot, None)
-            if now.T_map_body is None or now.stamp_ns is None or self._stands(robot, now.T_map_body):
+            if now.T_map_body is None or now.stamp_ns is None or self._stands_still(robot, now.T_map_body):
                 return
             save(self.folder, LastPose(robot, sha256, now.stamp_ns, now.T_map_body))
             self._kept[robot] = now.T_map_body
@@ -84,10 +85,10 @@ class LastPoseKeeper:
         else:
             self._failing = False
 
-    def _stands(self, robot: str, T_map_body: Pose) -> bool:
+    def _stands_still(self, robot: str, T_map_body: Pose) -> bool:
         """Whether the robot is where it was when its pose was written."""
         kept = self._kept.get(robot)
         if kept is None:
             return False
         moved = inverse(kept) @ T_map_body
-        return float(np.linalg.norm(moved[:3, 3])) < _MOVED and rotation_angle(moved) < _TURNED
+        return float(np.linalg.norm(moved[:3, 3])) < _MIN_MOVE and rotation_angle(moved) < _MIN_TURN

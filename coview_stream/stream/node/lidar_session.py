@@ -1,6 +1,4 @@
-"""A robot that sends nothing but clouds: its odometry is made of them here, and then taken in as if it had sent it."""
-
-# FOLDED coview_stream/stream/node/lidar_session.py: """Frames that odometry is to be made of: in the order of their stamps, and never many at once."""
+"""Session of a robot that sends nothing but clouds: its odometry is made of them here."""
 
 from __future__ import annotations
 
@@ -13,17 +11,18 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.messages.types import CloudMessage, OdometryMessage
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
-from coview_stream.stream.node.counters import Counters
-from coview_stream.stream.node.decoding import last_line
-from coview_stream.stream.node.jobs import OdometryJob, OdometryResult
+from coview_stream.stream.node.counters import Counters, last_line
+from coview_stream.stream.node.jobs import Job, OdometryJob, OdometryResult, Result
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.keys import RobotKeys
 
+_MAX_WAITING = 2  # frames: odometry wants every one, and yet none that is old; set by hand
+
 
 class LidarSession(Session):
-    """A session whose frames go through lidar odometry before they are paired with it.
+    """Session whose frames go through lidar odometry before they are paired with it.
 
-    Whenever lidar odometry begins anew, the robot does: what it drove in between is not known.
+    Whenever lidar odometry restarts, so does the search: what the robot drove in between is not known.
     """
 
     odometry_source = "kiss-icp"
@@ -33,93 +32,91 @@ class LidarSession(Session):
         keys: RobotKeys,
         map_sha256: str,
         config: NodeConfig | None = None,
-        options: tuple[str | None, str | None] = (None, None),
+        codecs: tuple[str | None, str | None] = (None, None),
         lidar: LidarOdometryConfig | None = None,
     ) -> None:
         """As of a :class:`Session`; ``lidar`` says how odometry is made."""
         self.lidar = lidar or LidarOdometryConfig()
-        self._generation = 0
-        super().__init__(keys, map_sha256, config, options)
+        self._odometry_epoch = 0  # number of the lidar odometry, counted through all resets
+        super().__init__(keys, map_sha256, config, codecs)
 
     def _clear(self) -> None:
         super()._clear()
-        self._generation += 1
-        self._first_generation = self._generation  # what was under way before is nobody's
-        self._sweeps = LidarFrameQueue(self.keys.robot, self.config, self.lidar, self.counters)
-        self._seen = float("-inf")  # local time of the newest readable cloud
+        self._odometry_epoch += 1
+        self._first_odometry_epoch = self._odometry_epoch  # jobs from before a reset are ignored
+        self._lidar_frames = LidarFrameQueue(self.keys.robot, self.config, self.lidar, self.counters)
+        self._cloud_at = float("-inf")  # local time of the newest readable cloud
 
-    def _take_in(self, message: CloudMessage, now: float) -> None:
-        """Have a cloud's odometry made first."""
-        self._seen = now
-        if self._sweeps.put(message, now) is SampleKind.RESTART:
+    def _add_cloud(self, message: CloudMessage, now: float) -> None:
+        """Queue a cloud for the odometry engine."""
+        self._cloud_at = now
+        if self._lidar_frames.put(message, now) is SampleKind.RESTART:
             self.counters.clock_restarts += 1
-            self._odometry_anew("the sender's clock started anew")
+            self._restart_odometry("the sender's clock started anew")
 
-    def take_sweep(self) -> OdometryJob | None:
-        """Hand out a frame to make odometry of; its result or failure must be reported before the next one."""
+    def take_lidar_frame(self) -> OdometryJob | None:
+        """Hand the oldest frame to the odometry engine."""
         with self._lock:
-            return self._sweeps.take(self._generation)
+            return self._lidar_frames.take(self._odometry_epoch)
 
-    def sweep_done(self, job: OdometryJob, result: OdometryResult, now: float) -> None:
-        """Take in the odometry of a frame, and the frame."""
+    def handle_result(self, job: Job, result: Result, now: float) -> None:
+        """As of a session; the odometry of a frame is added like odometry that was sent, and the frame after it."""
+        if not (isinstance(job, OdometryJob) and isinstance(result, OdometryResult)):
+            super().handle_result(job, result, now)
+            return
         with self._lock:
-            if job.generation < self._first_generation:
+            if job.epoch < self._first_odometry_epoch:
                 return
-            sweep = self._sweeps.over()
-            if sweep is None or job.generation != self._generation:
+            frame = self._lidar_frames.take_under_way()
+            if frame is None or job.epoch != self._odometry_epoch:
                 self.counters.dropped += 1
                 return
-            if result.begun and self.odometry.newest is not None:
+            if result.restarted and self.odometry.newest is not None:
                 self.odometry.clear()
-                self.begin_anew("lidar odometry began anew")
-            made = OdometryMessage(job.stamp_ns, result.T_odom_body)
+                self.restart_search("lidar odometry began anew")
             self.counters.odometry_received += 1
-            self._continue(self.odometry.add(made, now), made)
-            self._pairing.add(_placed(sweep.message, result), sweep.received)
-            self._pair(now)
+            self._add_odometry(OdometryMessage(job.stamp_ns, result.T_odom_body), now)
+            self._frame_sync.add(_deskewed(frame.message, result), frame.received)
+            self._queue_paired(now)
 
-    def sweep_failed(self, job: OdometryJob, reason: str, rejected: bool) -> None:
-        """Take note that no odometry could be made of a frame; if not ``rejected``, the robot's has been forgotten."""
+    def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
+        """As of a session."""
+        if not isinstance(job, OdometryJob):
+            super().handle_failure(job, reason, rejected)
+            return
         with self._lock:
-            if job.generation < self._first_generation:
+            if job.epoch < self._first_odometry_epoch:
                 return
-            self._sweeps.over()
+            self._lidar_frames.take_under_way()
             self.counters.count("rejected" if rejected else "engine_errors")
-            kind = (
-                "frames that lidar odometry cannot place"
-                if rejected
-                else "frames that lidar odometry failed at"
-            )
-            self.complaints.add_first(f"{self.keys.robot}: {kind}", last_line(reason))
-            if not rejected and job.generation == self._generation:
-                self._odometry_anew("lidar odometry failed on a frame")
+            how = "cannot place" if rejected else "failed at"
+            self.errors.add_first(f"{self.keys.robot}: frames that lidar odometry {how}", last_line(reason))
+            if not rejected and job.epoch == self._odometry_epoch:
+                self._restart_odometry("lidar odometry failed on a frame")
 
-    def engine_restarted(self, kind: str = "track", why: str = "it died") -> None:
-        """As of a session; that of ``odometry`` knew where odometry had come to."""
+    def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
+        """As of a session; the engine of ``odometry`` knew where odometry had come to."""
         with self._lock:
-            super().engine_restarted(kind, why)
-            if kind == "odometry":
-                self._odometry_anew(f"lidar odometry was started again: {why}")
+            super().engine_restarted(engine, why)
+            if engine == "odometry":
+                self._restart_odometry(f"lidar odometry was started again: {why}")
 
-    def _odometry_anew(self, reason: str) -> None:
-        self._generation += 1
+    def _restart_odometry(self, reason: str) -> None:
+        self._odometry_epoch += 1
         self.odometry.clear()
-        self.begin_anew(reason)
+        self.restart_search(reason)
 
-    def _silence(self, now: float) -> str:
+    def _silence_reason(self, now: float) -> str:
         timeout = self.config.odometry_timeout
-        if now - self._seen > timeout:
+        if now - self._cloud_at > timeout:
             return f"no clouds for {timeout:g} s"
         return f"lidar odometry has placed no frame for {timeout:g} s; see errors and counters"
 
 
-def _placed(message: CloudMessage, result: OdometryResult) -> CloudMessage:
-    """Return the frame as odometry left it: with nothing to be deskewed any more."""
+def _deskewed(message: CloudMessage, result: OdometryResult) -> CloudMessage:
+    """Return the frame as lidar odometry left it: with nothing to be deskewed any more."""
     points = message.points if result.points is None else result.points
     return replace(message, points=points, times=None, rings=None)
-
-
-_WAITING = 2  # frames at most: odometry wants every one, and yet none that is old
 
 
 @dataclass(frozen=True)
@@ -131,10 +128,10 @@ class LidarFrame:
 
 
 class LidarFrameQueue:
-    """Keeps a robot's newest frames until their turn, one of which is under way; counts those that end here.
+    """Frames for the odometry engine, in the order of their stamps; one is under way, and few wait.
 
-    What a stamp is to those before it is asked of an :class:`OdometryBuffer`: the same strays, pauses and clocks that
-    start anew, only that nothing is known of the motion yet.
+    An :class:`OdometryBuffer` classifies their stamps: the same strays, pauses and restarted clocks, only that nothing
+    is known of the motion yet. Frames that end here are counted.
     """
 
     def __init__(
@@ -146,35 +143,35 @@ class LidarFrameQueue:
         self.counters = counters
         self._stamps = OdometryBuffer(config)
         self._waiting: deque[LidarFrame] = deque()
-        self._busy: LidarFrame | None = None
+        self._under_way: LidarFrame | None = None
 
     def put(self, message: CloudMessage, now: float) -> SampleKind:
-        """Take in a frame that came at local time ``now``, and say what it was to those before it."""
-        intake = self._stamps.add(OdometryMessage(message.stamp_ns, np.eye(4)), now)
-        if intake is SampleKind.DUPLICATE:
+        """Take in a frame that came at local time ``now``, and return what it is to those before it."""
+        kind = self._stamps.add(OdometryMessage(message.stamp_ns, np.eye(4)), now)
+        if kind is SampleKind.DUPLICATE:
             self.counters.duplicate += 1
-        elif intake is SampleKind.OUT_OF_ORDER:
+        elif kind is SampleKind.OUT_OF_ORDER:
             self.counters.out_of_order += 1
         else:
-            if intake is SampleKind.RESTART:
+            if kind is SampleKind.RESTART:
                 self.counters.dropped += len(self._waiting)
                 self._waiting.clear()
-            elif len(self._waiting) == _WAITING:
+            elif len(self._waiting) == _MAX_WAITING:
                 self.counters.dropped += 1
                 self._waiting.popleft()
             self._waiting.append(LidarFrame(message, now))
-        return intake
+        return kind
 
-    def take(self, generation: int) -> OdometryJob | None:
+    def take(self, epoch: int) -> OdometryJob | None:
         """Hand out the oldest frame; None while one is under way."""
-        if self._busy is not None or not self._waiting:
+        if self._under_way is not None or not self._waiting:
             return None
-        self._busy = self._waiting.popleft()
-        message = self._busy.message
+        self._under_way = self._waiting.popleft()
+        message = self._under_way.message
         times = message.times if self.config.deskew else None
-        return OdometryJob(self.robot, generation, message.stamp_ns, message.points, times, self.lidar)
+        return OdometryJob(self.robot, epoch, message.stamp_ns, message.points, times, self.lidar)
 
-    def over(self) -> LidarFrame | None:
-        """Return what was under way."""
-        busy, self._busy = self._busy, None
-        return busy
+    def take_under_way(self) -> LidarFrame | None:
+        """Return the frame under way, which has come back."""
+        frame, self._under_way = self._under_way, None
+        return frame

@@ -1,178 +1,194 @@
-"""What is known of a robot's place, and what can be said of it right now; its session holds the lock."""
-
-# FOLDED coview_stream/stream/node/robot_state.py: """What is known of a robot's place between two lidar frames: a verified correction of its odometry."""
-# FOLDED coview_stream/stream/node/robot_state.py: """The newest changes of a robot's state, with what led to each: a status a second would not show them all."""
+"""State of one robot as its node publishes it: what is known of its place, why, and how that has changed."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
-from coview_stream.localization.result import Fix, KeyframeEvidence, State
+from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.state import Event, State, next_state
 from coview_stream.localization.tracking.odometry_noise import Drift
 from coview_stream.messages.types import PoseMessage
 from coview_stream.odometry.buffer import OdometryBuffer
 from coview_stream.stream.node.counters import Counters
-from coview_stream.stream.node.engine_queue import Ready
+from coview_stream.stream.node.engine_queue import QueuedFrame
 from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
+
+_NS = 1_000_000_000
+_MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all
+
+_EVENT_OF_FIX = {
+    State.SEARCHING: Event.NO_PLACE,
+    State.AMBIGUOUS: Event.PLACE_PROPOSED,
+    State.DOUBTED: Event.MATCH_REJECTED,
+    State.LOST: Event.PLACE_GIVEN_UP,
+}
+"""Event that a fix without a pose stands for."""
 
 
 class RobotState:
-    """State and correction of a robot, from one reset of its session to the next, and the reasons for them.
+    """State and odometry correction of one robot, from one reset of its session to the next; the session locks it.
+
+    The newest fix is what the tracking engine holds in this odometry epoch. The state follows from the fixes and from
+    what only the session sees: odometry that pauses, restarts or stays away.
 
     Attributes:
-        evidence: of the newest keyframe, if there is any in this odometry frame.
+        state: of the robot; there is a pose while it is TRACKING.
         last_frame_ns: stamp of the newest processed frame; None before the first.
-        suspect: whether a frame has to verify the place before there is a pose again.
     """
 
-    def __init__(self, robot: str, map_sha256: str, counters: Counters, place: PoseHint) -> None:
-        """Know nothing, but keep account of ``place``, which outlives resets."""
+    def __init__(self, robot: str, map_sha256: str, counters: Counters, hint: PoseHint) -> None:
+        """Begin in SEARCHING; ``hint`` outlives resets."""
         self.robot = robot
         self.map_sha256 = map_sha256
-        self._place = place
-        self._counters = counters
+        self.state = State.SEARCHING
         self.last_frame_ns: int | None = None
-        self._fix_state = State.SEARCHING
-        self._doubted = False  # whether the engine's AMBIGUOUS is a doubt of a place that it has found
-        self._lost: str | None = None
-        self._begun = ""  # why the search began anew
-        self._forget_frame()
+        self._hint = hint
+        self._counters = counters
+        self._loss_reason = ""
+        self._restart_reason = ""
+        self._forget_epoch()
 
-    def _forget_frame(self) -> None:
-        """Forget all that refers to the odometry frame, which is no more."""
-        self._place.begin_anew()
-        self.evidence: KeyframeEvidence | None = None
+    def _forget_epoch(self) -> None:
+        """Forget all that refers to the odometry frame, which has ended."""
+        self._hint.begin_epoch()
+        self._fix: Fix | None = None
         self._correction: OdomCorrection | None = None
-        self.suspect = self._doubted = False
-        self._trusted_from = -(1 << 63)
+        self._verify_from_ns: int | None = (
+            None  # a frame of this stamp or a later one has to verify the place
+        )
         self._published: PoseMessage | None = None
-        if self._fix_state is not State.LOST:
-            self._fix_state = State.SEARCHING
 
     @property
-    def known(self) -> bool:
-        """Whether there is a correction of odometry, and so a pose."""
-        return self._correction is not None
+    def evidence(self) -> KeyframeEvidence | None:
+        """Evidence of the newest keyframe, if there is any in this odometry epoch."""
+        return None if self._fix is None else self._fix.evidence
 
     @property
-    def found(self) -> bool:
-        """Whether the engine has found the place, even if there is no pose because it has to be verified."""
-        return self._correction is not None or self._fix_state is State.TRACKING or self._doubted
+    def engine_has_place(self) -> bool:
+        """Whether the engine holds a place, even if there is no pose because it has to be verified."""
+        return self._fix is not None and self._fix.state.has_place
 
     @property
-    def at_stake(self) -> bool:
-        """Whether there is a place that silence would lose."""
-        return self.found and self._lost is None
+    def has_candidate(self) -> bool:
+        """Whether the search has proposed a place that only needs confirmation."""
+        return self._fix is not None and self._fix.state is State.AMBIGUOUS
 
     @property
-    def hopeful(self) -> bool:
-        """Whether the search has come up with a place that only needs confirmation."""
-        return self._fix_state is State.AMBIGUOUS and not self._doubted
+    def requires_verification(self) -> bool:
+        """Whether a frame has to verify the place before there is a pose again."""
+        return self._verify_from_ns is not None
 
-    # ---- what happens to it
+    # ---- events
 
-    def note(self, fix: Fix, ready: Ready, suspected: bool) -> None:
-        """Take note of the fix after a frame; ``suspected`` is what its job said."""
-        stamp_ns = self.last_frame_ns = ready.job.stamp_ns
-        self.evidence = fix.evidence
-        if suspected and stamp_ns >= self._trusted_from:
-            self.suspect = False
-        was, self._fix_state, self._doubted = self._fix_state, fix.state, fix.doubted
-        if fix.T_map_odom is None:
-            if fix.state is State.LOST and was is not State.LOST:
-                self._lose(fix.evidence.reason if fix.evidence else "evidence gone")
-            self._correction = None
-        elif not self.suspect and stamp_ns >= self._trusted_from:
-            self._counters.fixes += self._correction is None
-            self._lost = None
-            self._correction = OdomCorrection.of(fix, stamp_ns, ready.travelled, ready.turned)
-            if fix.T_map_body is not None:
-                self._place.seen(fix.T_map_body)
+    def add_fix(self, fix: Fix, frame: QueuedFrame) -> None:
+        """Apply the fix after a frame."""
+        stamp_ns = self.last_frame_ns = frame.job.stamp_ns
+        before, self._fix = self._fix, fix
+        asked = frame.job.require_verification
+        if asked and self._verify_from_ns is not None and stamp_ns >= self._verify_from_ns:
+            self._verify_from_ns = None  # from here on a doubt is the engine's own
+        if fix.state is State.TRACKING:
+            if self._verify_from_ns is None:
+                self._correct(OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned))
+            return
+        given_up = fix.state is State.LOST or (self.state.has_place and not fix.state.has_place)
+        if (given_up or fix.state.has_place) and self.state is not State.LOST:
+            self._apply(Event.PLACE_ACCEPTED)  # with this frame, and doubted or given up at once
+        if not given_up:
+            self._apply(_EVENT_OF_FIX[fix.state])
+        elif before is None or before.state is not State.LOST:
+            self._lose(Event.PLACE_GIVEN_UP, fix.evidence.reason if fix.evidence else "evidence gone")
 
-    def begin_anew(self, reason: str) -> None:
-        """Know nothing in an odometry frame that is another one."""
-        if self.found:
-            self._lose(reason)
-        self._begun = f"searching anew: {reason}"
-        self._forget_frame()
+    def restart_search(self, reason: str) -> None:
+        """Forget the place: there is another odometry frame."""
+        if self.engine_has_place:
+            self._loss_reason = reason
+        self._apply(Event.ODOMETRY_RESTARTED)
+        self._restart_reason = f"searching anew: {reason}"
+        self._forget_epoch()
 
-    def doubt(self, from_ns: int) -> None:
-        """No pose until a frame stamped ``from_ns`` or later has verified the place."""
-        self.suspect = True
-        self._trusted_from = max(self._trusted_from, from_ns)
-        self._correction = None
+    def require_verification(self, from_ns: int) -> None:
+        """Give no pose until a frame stamped ``from_ns`` or later has verified the place."""
+        self._verify_from_ns = from_ns if self._verify_from_ns is None else max(self._verify_from_ns, from_ns)
+        self._apply(Event.VERIFICATION_REQUIRED)
 
-    def stop(self, reason: str, newest_ns: int) -> None:
-        """Lose the place until a frame from after odometry of ``newest_ns`` has verified it."""
-        self.suspect = True
-        self._trusted_from = newest_ns + 1
-        self._lose(reason)
+    def on_silence(self, reason: str, newest_ns: int) -> None:
+        """Lose the place until a frame from after the odometry of ``newest_ns`` has verified it."""
+        self._verify_from_ns = newest_ns + 1
+        self._lose(Event.SILENCE, reason)
 
-    def explain(self, reason: str) -> None:
+    def explain_loss(self, reason: str) -> None:
         """Give a newer reason for a loss, if the place is lost: why it does not come back."""
-        if self._lost is not None:
-            self._lost = reason
+        if self.state is State.LOST:
+            self._loss_reason = reason
 
-    def _lose(self, reason: str) -> None:
-        """Give the newest reason, but count once what is lost for two."""
-        if self._lost is None:
-            self._counters.losses += 1
-        self._lost = reason
-        self._correction = None
+    def _correct(self, correction: OdomCorrection) -> None:
+        self._counters.fixes += self.state is not State.TRACKING
+        self._correction = correction
+        self._hint.update(correction.T_map_body)
+        self._apply(Event.MATCH_VERIFIED if self.state.has_place else Event.PLACE_ACCEPTED)
 
-    # ---- what can be said of it
+    def _lose(self, event: Event, reason: str) -> None:
+        """Lose the place for a reason, which replaces that of a loss before; a loss for two reasons counts once."""
+        self._loss_reason = reason
+        self._apply(event)
 
-    def state(self, why_nothing: Callable[[], str]) -> tuple[State, str]:
-        """Return the state and one clause that gives its reason; ``why_nothing`` knows it before the first frame."""
+    def _apply(self, event: Event) -> None:
+        before, self.state = self.state, next_state(self.state, event)
+        self._counters.losses += self.state is State.LOST and before is not State.LOST
+
+    # ---- what is published
+
+    def reason(self) -> str | None:
+        """Return one clause that gives the reason of the state; None before the first frame has been processed."""
         evidence = self.evidence.reason if self.evidence else ""
-        if self._correction is not None:
-            return State.TRACKING, evidence
-        if self._lost is not None:
-            return State.LOST, self._lost
-        if self._fix_state is State.TRACKING:
-            return State.AMBIGUOUS, "verifying the place after a pause of odometry"
+        if self.state is State.TRACKING:
+            return evidence
+        if self.state is State.LOST:
+            return self._loss_reason
+        if self._fix is not None and self._fix.state is State.TRACKING:
+            return "verifying the place after a pause of odometry"
         if self.last_frame_ns is None:
-            return self._fix_state, why_nothing()
-        return self._fix_state, evidence or self._begun or "too little has been seen"
+            return None
+        return evidence or self._restart_reason or "too little has been seen"
+
+    @property
+    def correction(self) -> OdomCorrection | None:
+        """Correction of odometry that is in force; None unless TRACKING."""
+        return self._correction if self.state is State.TRACKING else None
 
     def pose(self, odometry: OdometryBuffer) -> PoseMessage | None:
         """Newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING."""
-        if self._correction is None:
-            return None
-        pose = self._correction.pose(odometry, self.robot, self.map_sha256)
-        before = self._published
+        correction, before = self.correction, self._published
+        pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
         if pose is None or (before is not None and pose.stamp_ns < before.stamp_ns):
             return None
         if before is not None and pose.stamp_ns == before.stamp_ns:
-            pose = before  # what has been said of a time is not said otherwise later
+            pose = before  # never publish two different poses for one stamp
         self._published = pose
         self._counters.poses += 1
         return pose
 
     def age(self, odometry: OdometryBuffer) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
-        newest, known = odometry.newest, self._correction
-        return None if newest is None or known is None else known.age(newest.stamp_ns)
+        newest, correction = odometry.newest, self.correction
+        return None if newest is None or correction is None else correction.age(newest.stamp_ns)
 
-    def recall(self, odometry: OdometryBuffer) -> LastKnownPose:
-        """Say where the robot is, if that is known, for the next start."""
-        forgotten, known = self._place.forgotten, self._correction
-        pose = known and known.pose(odometry, self.robot, self.map_sha256)
+    def last_known_pose(self, odometry: OdometryBuffer) -> LastKnownPose:
+        """Return where the robot is, if that is known, for the next start of the node."""
+        correction, forgotten = self.correction, self._hint.forgotten
+        pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
         return LastKnownPose(forgotten, pose.stamp_ns, pose.T_map_body) if pose else LastKnownPose(forgotten)
-
-
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class OdomCorrection:
-    """The newest ``T_map_odom``, and how far odometry had driven when it was right.
+    """Correction of odometry: the newest verified ``T_map_odom``, and how far odometry had driven at its frame.
 
     Attributes:
         T_map_odom: (4, 4) map <- odometry, source frame of the map.
@@ -196,7 +212,7 @@ class OdomCorrection:
 
     @classmethod
     def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> OdomCorrection:
-        """Take over a fix that has a pose; ``stamp_ns`` is its frame's."""
+        """Make it of a fix that has a pose; ``stamp_ns`` is its frame's."""
         if fix.T_map_odom is None or fix.T_map_body is None or fix.covariance is None or fix.drift is None:
             raise ValueError("a fix without a pose corrects nothing")
         verified = stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS))
@@ -230,15 +246,12 @@ class OdomCorrection:
         )
 
 
-_KEPT = 5
-
-
 @dataclass(frozen=True)
 class Transition:
     """One change of state, or LOST for another reason than before: the robot is then searched for otherwise.
 
     Attributes:
-        number: counted from 1 since the session began; a gap tells who listens what was missed.
+        number: counted from 1 since the session began; a gap tells how many were missed.
         stamp_ns: of the robot's newest processed frame, nanoseconds; None before the first.
         before: the state that ended.
         state: the state that began.
@@ -258,32 +271,30 @@ class Transition:
         return {
             "number": self.number,
             "stamp_ns": self.stamp_ns,
-            "from": self.before.value,
-            "to": self.state.value,
+            "from": self.before.reported,
+            "to": self.state.reported,
             "reason": self.reason,
             "evidence": None if self.evidence is None else self.evidence.to_json(),
         }
 
 
 class StateHistory:
-    """Takes note of states and keeps the newest changes."""
+    """The newest changes of a robot's reported state, with what led to each."""
 
     def __init__(self) -> None:
         self._state = State.SEARCHING
         self._reason = ""
-        self._kept: deque[Transition] = deque(maxlen=_KEPT)
+        self._newest: deque[Transition] = deque(maxlen=_MAX_TRANSITIONS)
         self._count = 0
 
-    def note(
-        self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None
-    ) -> None:
-        """Take note of the present state; a transition if it is another than before, or lost for another reason."""
-        if state is not self._state or (state is State.LOST and reason != self._reason):
+    def add(self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None) -> None:
+        """Record the present state: a transition if it is reported as another one, or lost for another reason."""
+        lost_again = state is State.LOST and reason != self._reason
+        if state.reported != self._state.reported or lost_again:
             self._count += 1
-            change = Transition(self._count, stamp_ns, self._state, state, reason, evidence)
-            self._kept.append(change)
+            self._newest.append(Transition(self._count, stamp_ns, self._state, state, reason, evidence))
             self._state, self._reason = state, reason
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return the newest ones, oldest first."""
-        return [change.to_json() for change in tuple(self._kept)]
+        return [transition.to_json() for transition in tuple(self._newest)]

@@ -1,51 +1,40 @@
-"""Whose turn it is: robots take turns at an engine, and none is passed over for long."""
-
-# FOLDED coview_stream/stream/node/scheduling.py: """When something regular is due. Pure: the time is given, so that a test can play it."""
+"""Scheduling of regular and of shared work. Pure: the time is given, so that a test can play it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar
-
-Robot = TypeVar("Robot")
-
-Job = TypeVar("Job")
+from collections.abc import Sequence
 
 
 class RoundRobin:
-    """Serves who has waited longest; every second time, who is urgent comes first.
+    """Order in which robots are served by one engine: who has waited longest first.
+
+    Every second time the urgent ones come first; no robot is passed over for long.
 
     Args:
         count: of robots; they are numbered from 0.
     """
 
     def __init__(self, count: int) -> None:
-        self._served = [0] * count
-        self._clock = 0
+        self._last_turn = [0] * count
+        self._turns = 0
 
-    def next(
-        self,
-        robots: Sequence[Robot],
-        job_of: Callable[[Robot], Job | None],
-        urgent: Callable[[Robot], bool] = lambda robot: False,
-    ) -> tuple[Robot, Job] | None:
-        """Return the robot to be served now and its job; None if nobody has one."""
-        prefer = self._clock % 2 == 0
+    def order(self, urgent: Sequence[bool] | None = None) -> list[int]:
+        """Return the robots in the order in which they may be served now."""
+        preferred = urgent if self._turns % 2 == 0 else None
 
-        def waiting(k: int) -> tuple[bool, int]:
-            return not (prefer and urgent(robots[k])), self._served[k]
+        def rank(k: int) -> tuple[bool, int]:
+            return preferred is not None and not preferred[k], self._last_turn[k]
 
-        for k in sorted(range(len(robots)), key=waiting):
-            job = job_of(robots[k])
-            if job is not None:
-                self._clock += 1
-                self._served[k] = self._clock
-                return robots[k], job
-        return None
+        return sorted(range(len(self._last_turn)), key=rank)
+
+    def serve(self, k: int) -> None:
+        """Count the turn that robot ``k`` has now."""
+        self._turns += 1
+        self._last_turn[k] = self._turns
 
 
 class Rate:
-    """Absolute deadlines: what takes long delays one beat, not all the later ones.
+    """Absolute deadlines of something regular: one late beat does not delay the later ones.
 
     Args:
         rate: beats per second.

@@ -1,4 +1,4 @@
-"""From a map file and options to a running node."""
+"""Start of a node: a map file and options in, a running node out."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SEARCH_NICE = 10
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """What ``serve`` was asked for.
+    """Options of ``serve``.
 
     Attributes:
         map_path: a ``.coview`` file.
@@ -40,13 +40,13 @@ class ServeOptions:
         listen: endpoints to listen on.
         zenoh_config: a zenoh JSON5 file, or None.
         node: rates and limits.
-        cloud_codec: of all clouds, whatever they say; None believes them.
+        cloud_codec: of all clouds, against what they say themselves; None believes them.
         odometry_codec: likewise.
         pose_codec: of the poses; None is the preset's.
         lidar: how odometry is made of the clouds; None if the robots send theirs.
         registration: how scans are registered to the map.
-        state: directory that keeps where robots were last known to be; None for none.
-        reloc: who names the places that a search looks at.
+        state: directory that keeps the last known poses; None for none.
+        reloc: recognizers that propose the places to search at.
     """
 
     map_path: Path
@@ -69,7 +69,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
 
     Args:
         options: what to serve, and where.
-        cancelled: asked now and then whether to give up.
+        cancelled: asked now and then; True gives up.
 
     Raises:
         MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
@@ -84,7 +84,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         log.warning("%s: %s", options.map_path, missing)
     path, method = str(options.map_path), options.registration
     reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
-    lanes = [
+    engines = [
         track := EngineProcess("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
         search := EngineProcess(
             "search", path, base_map.sha256, _SEARCH_NICE, registration=method, reloc=reloc
@@ -93,11 +93,11 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     odometry = None
     if options.lidar is not None:
         odometry = EngineProcess("odometry", path, base_map.sha256, _ODOMETRY_NICE)
-        lanes.append(odometry)
+        engines.append(odometry)
     transport = None
     try:
-        for lane in lanes:
-            lane.start()
+        for engine in engines:
+            engine.start()
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
@@ -107,7 +107,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload
         )
-        warn_of_others(transport, options.keys)
+        warn_if_served_already(transport, options.keys)
         sessions = make_sessions(options, base_map.sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
         if odometry is not None:
@@ -115,12 +115,14 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         track.wait_ready(cancelled)  # the other one has until the first keyframe
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        aside = {} if options.state is None else {"memory": LastPoseKeeper(options.state, sessions).run}
-        node = Node(sessions, transport, track, search, options.node, options.pose_codec, odometry, aside)
+        background = {} if options.state is None else {"memory": LastPoseKeeper(options.state, sessions).run}
+        node = Node(
+            sessions, transport, track, search, options.node, options.pose_codec, odometry, background
+        )
         node.start()
     except BaseException as error:
-        for lane in lanes:
-            lane.close()
+        for engine in engines:
+            engine.close()
         if transport is not None:
             transport.close()
         if isinstance(error, DiedError):
@@ -133,25 +135,25 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
 
 
 def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
-    """Return a session for each robot, that makes its odometry if that is asked for."""
+    """Return a session for each robot, which makes its odometry if the options ask for that."""
     from coview_stream.stream.node.lidar_session import LidarSession
     from coview_stream.stream.node.session import Session
 
     codecs = (options.cloud_codec, options.odometry_codec)
     if options.lidar is None:
-        return [Session(keys, map_sha256, options.node, options=codecs) for keys in options.keys]
+        return [Session(keys, map_sha256, options.node, codecs=codecs) for keys in options.keys]
     return [
-        LidarSession(keys, map_sha256, options.node, options=codecs, lidar=options.lidar)
+        LidarSession(keys, map_sha256, options.node, codecs=codecs, lidar=options.lidar)
         for keys in options.keys
     ]
 
 
-def warn_of_others(transport: Transport, keys: Sequence[RobotKeys]) -> None:
-    """Say which of the robots another node serves as well, as far as can be seen from here."""
+def warn_if_served_already(transport: Transport, keys: Sequence[RobotKeys]) -> None:
+    """Log which of the robots another node serves too, as far as can be seen from here."""
     try:
         # one question for all robots of a base: chunks of the key are base, name and "alive"
-        everybody = {k.alive.rsplit("/", 2)[0] + "/*/alive" for k in keys}
-        held = {token for expression in everybody for token in transport.tokens(expression)}
+        expressions = {k.alive.rsplit("/", 2)[0] + "/*/alive" for k in keys}
+        held = {token for expression in expressions for token in transport.tokens(expression)}
     except TransportError as error:
         log.warning("cannot see whether another node is there: %s", error)
         return

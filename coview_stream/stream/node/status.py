@@ -1,7 +1,4 @@
-"""The statuses of all robots: when they go out, and what of a state has been told already."""
-
-# FOLDED coview_stream/stream/node/status.py: """Who is connected, and what of a change concerns people. Pure: fed with what the transport says."""
-# FOLDED coview_stream/stream/node/status.py: """The status document: what an operator, or a program, wants to know of one robot."""
+"""Statuses of all robots: the document, when it goes out, and the connection that it tells of."""
 
 from __future__ import annotations
 
@@ -11,12 +8,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
-from coview_stream.localization.result import State
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
-from coview_stream.stream.node import status as statuses
 from coview_stream.stream.node.scheduling import Rate
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
@@ -26,8 +21,8 @@ from coview_stream.version import __version__
 log = logging.getLogger("coview_stream.node")
 
 _JSON = "application/json"
-
-_BREATH = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
+_MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
+_RATE_WINDOW = 30  # poses over which their rate is taken
 
 
 class Reporter:
@@ -36,31 +31,35 @@ class Reporter:
     Args:
         sessions: one per robot.
         transport: where statuses go to.
-        guard: logs what goes wrong.
+        errors: logs what goes wrong.
 
     Attributes:
         changed: set it when a state may have changed.
-        rates: of each robot's poses; whoever publishes them adds to it.
+        rates: of each robot's poses; add to it when one goes out.
     """
 
-    def __init__(self, sessions: Sequence[Session], transport: Transport, guard: RateLimitedErrors) -> None:
+    def __init__(self, sessions: Sequence[Session], transport: Transport, errors: RateLimitedErrors) -> None:
         self.changed = threading.Event()
-        self.rates = {s.keys.robot: statuses.PoseRate() for s in sessions}
+        self.rates = {s.keys.robot: PoseRate() for s in sessions}
         self._sessions = sessions
         self._transport = transport
-        self._guard = guard
+        self._errors = errors
         self._started = time.monotonic()
-        self._link = ConnectionMonitor()
-        self._told: dict[str, State] = {}
+        self._connection = ConnectionMonitor()
+        self._reported: dict[str, str] = {}  # states, as in the statuses
         self._publishers: dict[str, Publisher] = {}
 
     def declare(self, session: Session) -> None:
         """Declare a robot's status."""
         self._publishers[session.keys.robot] = self._transport.publisher(session.keys.status, "report")
 
-    def has_news(self, session: Session) -> bool:
-        """Whether a robot's state is another than was told last."""
-        return session.state()[0] is not self._told.get(session.keys.robot)
+    def report_change(self, session: Session) -> None:
+        """Have the status published at once if the robot's state is another than its last status says."""
+        if self._has_changed(session):
+            self.changed.set()
+
+    def _has_changed(self, session: Session) -> bool:
+        return session.state()[0].reported != self._reported.get(session.keys.robot)
 
     def run(self, rate: float, stopping: threading.Event) -> None:
         """Publish at ``rate``, and at once what has changed, until ``stopping``; set ``changed`` as well, to end."""
@@ -71,103 +70,45 @@ class Reporter:
             if stopping.is_set():
                 return
             now = time.monotonic()
-            self.publish(now, everyone=clock.beat(now))
-            stopping.wait(_BREATH)
+            self.publish(now, all_robots=clock.beat(now))
+            stopping.wait(_MIN_INTERVAL)
 
-    def publish(self, now: float, everyone: bool = True) -> None:
+    def publish(self, now: float, all_robots: bool = True) -> None:
         """Publish the status of every robot, or of those whose state has changed."""
-        if everyone:
-            self._guard.run("connection", partial(self._look, now))
+        if all_robots:
+            with self._errors.catch("connection"):
+                self._check_connection(now)
         for session in self._sessions:
-            self._guard.run(f"{session.keys.robot}: status", partial(self._report, session, now, everyone))
+            with self._errors.catch(f"{session.keys.robot}: status"):
+                if all_robots or self._has_changed(session):
+                    self._publish_status(session, now)
 
-    def _look(self, now: float) -> None:
-        self._link.look(self._transport.connection())
-        if not (self._link.connection.routers or self._link.connection.peers):
+    def publish_last(self, now: float) -> None:
+        """Publish that the node ends, and no robot is tracked any more."""
+        for session in self._sessions:
+            with self._errors.catch(f"{session.keys.robot}: status"):
+                self._publish_status(session, now, closing=True)
+
+    def _check_connection(self, now: float) -> None:
+        self._connection.update(self._transport.connection())
+        if not (self._connection.connection.routers or self._connection.connection.peers):
             for session in self._sessions:
-                session.unreachable(now)
+                session.on_disconnected(now)
 
-    def say_goodbye(self, now: float) -> None:
-        """Publish that nobody tracks the robots any more."""
-        for session in self._sessions:
-            self._guard.run(f"{session.keys.robot}: status", partial(self._tell, session, now, closing=True))
-
-    def _report(self, session: Session, now: float, anyway: bool) -> None:
-        if anyway or self.has_news(session):
-            self._tell(session, now)
-
-    def _tell(self, session: Session, now: float, closing: bool = False) -> None:
+    def _publish_status(self, session: Session, now: float, closing: bool = False) -> None:
         robot = session.keys.robot
         state, reason = session.state()
-        known, self._told[robot] = self._told.get(robot), state  # told or not: it is not tried again at once
-        if state is not known and not closing:
-            log.info("%s: %s (%s)", robot, state.value, reason)
-        link, rate = self._link, self.rates[robot].rate(now)
-        document = statuses.status(session, link.connection, link.reconnects, rate, now - self._started)
+        before = self._reported.get(robot)
+        self._reported[robot] = state.reported  # published or not: it is not tried again at once
+        if state.reported != before and not closing:
+            log.info("%s: %s (%s)", robot, state.reported, reason)
+        rate, uptime = self.rates[robot].rate(now), now - self._started
+        document = status(session, self._connection.connection, self._connection.reconnects, rate, uptime)
         if closing:
             document["reason"] = "the node is shutting down"
             if state is State.TRACKING:
-                document["state"] = State.LOST.value
+                document["state"] = State.LOST.reported
         self._publishers[robot].put(Encoded(json.dumps(document).encode(), _JSON))
-
-
-class ConnectionMonitor:
-    """Compares whom we are connected to with whom we were.
-
-    Attributes:
-        connection: at the last look.
-        reconnects: how often a router came back, or another took its place. Peers come and go as they like.
-    """
-
-    def __init__(self) -> None:
-        self.connection = Connection()
-        self.reconnects = 0
-        self._missed: set[str] = set()  # routers that were there once and have not been replaced
-
-    def look(self, connection: Connection) -> None:
-        """Take in whom we are connected to now, and log what has changed."""
-        before, self.connection = self.connection, connection
-        self._look_at_routers(set(before.routers), set(connection.routers))
-        for zid in sorted(set(connection.peers) - set(before.peers)):
-            log.info("peer %s is connected", zid)
-        for zid in sorted(set(before.peers) - set(connection.peers)):
-            log.info("peer %s is gone", zid)
-
-    def _look_at_routers(self, before: set[str], now: set[str]) -> None:
-        gone, come = before - now, now - before
-        self._missed |= gone
-        if come and self._missed:
-            self.reconnects += 1
-            for zid in sorted(come):
-                how = "again" if zid in self._missed else f"instead of {', '.join(sorted(self._missed))}"
-                log.info("connected to router %s %s", zid, how)
-            # one that took another's place need not go for the other to be missed no more
-            self._missed = self._missed - come if come & self._missed else set()
-        elif come:
-            log.info("connected to router %s", ", ".join(sorted(come)))
-        elif gone:
-            log.warning("router %s is gone%s", ", ".join(sorted(gone)), "" if now else ": nobody can hear us")
-
-
-_RATE_WINDOW = 30  # poses over which the rate is taken
-
-
-class PoseRate:
-    """How often poses go out."""
-
-    def __init__(self) -> None:
-        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
-
-    def add(self, now: float) -> None:
-        """Take note of a pose at local time ``now``."""
-        self._times.append(now)
-
-    def rate(self, now: float) -> float:
-        """Return poses per second; 0 if the newest is older than two seconds."""
-        span = self._times[-1] - self._times[0] if self._times else 0.0
-        if span <= 0.0 or now - self._times[-1] > 2.0:
-            return 0.0
-        return round((len(self._times) - 1) / span, 2)
 
 
 def status(
@@ -177,31 +118,87 @@ def status(
     rate: float,
     uptime: float,
 ) -> dict[str, Any]:
-    """Plain data for ``out/status``. ``stamp_ns`` is the wall clock of the node; all other stamps are the robot's."""
+    """Return the plain data of ``out/status``; its ``stamp_ns`` is the node's wall clock, all others the robot's."""
     state, reason = session.state()
     age = session.age()
-    evidence = session.whereabouts.evidence
+    known, queue = session.robot_state, session.queue
     return {
         "robot": session.keys.robot,
         "stamp_ns": time.time_ns(),
-        "state": state.value,
+        "state": state.reported,
         "reason": reason,
         "version": __version__,
         "map_sha256": session.map_sha256,
         "odometry": session.odometry_source,
         "uptime_s": round(uptime, 1),
-        "last_frame_ns": session.whereabouts.last_frame_ns,
-        "evidence": None if evidence is None else evidence.to_json(),
-        "transitions": session.transitions.to_json(),
+        "last_frame_ns": known.last_frame_ns,
+        "evidence": None if known.evidence is None else known.evidence.to_json(),
+        "transitions": session.history.to_json(),
         "pose": {"rate_hz": rate, "age_s": None if age is None else round(age, 3)},
-        "latency_ms": session.work.latency.to_json(),
-        "engine_ms": session.work.engine_latency.to_json(),
-        "longest_wait_s": round(session.work.longest_wait, 3),
+        "latency_ms": queue.latency.to_json(),
+        "engine_ms": queue.engine_latency.to_json(),
+        "longest_wait_s": round(queue.longest_wait, 3),
         "counters": session.counters.to_json(),
         "connection": {
             "routers": list(connection.routers),
             "peers": list(connection.peers),
             "reconnects": reconnects,
         },
-        "errors": list(session.complaints.texts),
+        "errors": list(session.errors.texts),
     }
+
+
+class ConnectionMonitor:
+    """Routers and peers that the node is connected to, and what has changed of them. Pure.
+
+    Attributes:
+        connection: at the last update.
+        reconnects: how often a router came back, or another took its place. Peers come and go as they like.
+    """
+
+    def __init__(self) -> None:
+        self.connection = Connection()
+        self.reconnects = 0
+        self._missing: set[str] = set()  # routers that were there once and have not been replaced
+
+    def update(self, connection: Connection) -> None:
+        """Take in the connection as it is now, and log what has changed."""
+        before, self.connection = self.connection, connection
+        self._update_routers(set(before.routers), set(connection.routers))
+        for zid in sorted(set(connection.peers) - set(before.peers)):
+            log.info("peer %s is connected", zid)
+        for zid in sorted(set(before.peers) - set(connection.peers)):
+            log.info("peer %s is gone", zid)
+
+    def _update_routers(self, before: set[str], now: set[str]) -> None:
+        gone, come = before - now, now - before
+        self._missing |= gone
+        if come and self._missing:
+            self.reconnects += 1
+            for zid in sorted(come):
+                how = "again" if zid in self._missing else f"instead of {', '.join(sorted(self._missing))}"
+                log.info("connected to router %s %s", zid, how)
+            # one that took another's place need not go for the other to be missed no more
+            self._missing = self._missing - come if come & self._missing else set()
+        elif come:
+            log.info("connected to router %s", ", ".join(sorted(come)))
+        elif gone:
+            log.warning("router %s is gone%s", ", ".join(sorted(gone)), "" if now else ": nobody can hear us")
+
+
+class PoseRate:
+    """Rate at which poses go out."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
+
+    def add(self, now: float) -> None:
+        """Count a pose at local time ``now``."""
+        self._times.append(now)
+
+    def rate(self, now: float) -> float:
+        """Return poses per second; 0 if the newest is older than two seconds."""
+        span = self._times[-1] - self._times[0] if self._times else 0.0
+        if span <= 0.0 or now - self._times[-1] > 2.0:
+            return 0.0
+        return round((len(self._times) - 1) / span, 2)

@@ -1,4 +1,4 @@
-"""The child process of a lane; not for people.
+"""Child process of an :class:`~coview_stream.stream.node.engine_process.EngineProcess`; not for people.
 
 ``python -m coview_stream.stream.node.worker FD KIND MAP SHA256 NICE METHOD RELOC``, the last two being those of
 registration and of the search.

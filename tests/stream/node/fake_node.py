@@ -14,7 +14,7 @@ from coview_stream.stream.node.jobs import FrameJob
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 STEP = 0.05
 PATIENT = NodeConfig(
@@ -41,7 +41,7 @@ class Engine:
         pass
 
 
-class InlineLane:
+class InlineRunner:
     """Runs jobs on the caller's thread."""
 
     def __init__(self, engine):
@@ -54,12 +54,12 @@ class InlineLane:
         pass
 
 
-def publish_statuses(node, now, everyone=True):
+def publish_statuses(node, now, all_robots=True):
     """Publish the status of every robot, or of those whose state has changed."""
-    node._reporter.publish(now, everyone)
+    node._reporter.publish(now, all_robots)
 
 
-class Lane(InlineLane):
+class Runner(InlineRunner):
     """An engine that dies when it is told to."""
 
     def __init__(self, engine):
@@ -81,10 +81,10 @@ class Site:
     """A node without threads, its robots, and the network between them."""
 
     def __init__(self, *names, preset="native", engines=None, config=PATIENT, **more):
-        self.net = FakeTransport()
+        self.net = MemoryTransport()
         self.engine = Engine()
         track, search = engines or (self.engine, self.engine)
-        self.track, self.search = Lane(track), Lane(search)
+        self.track, self.search = Runner(track), Runner(search)
         self.keys = {name: robot_keys(preset, "coview", name) for name in names}
         sessions = [Session(keys, SHA, config) for keys in self.keys.values()]
         self.sessions = dict(zip(names, sessions, strict=True))
@@ -101,9 +101,9 @@ class Site:
     def work(self, name):
         """Let the engines do what there is to do for a robot."""
         session = self.sessions[name]
-        for lane, take in (("track", session.take_frame), ("search", session.take_search)):
+        for engine, take in (("track", session.take_frame), ("search", session.take_search_request)):
             if (job := take()) is not None:
-                self.node.work(lane, session, job)
+                self.node.work(engine, session, job)
 
     def frame(self, name, seconds, **fields):
         self.sees(name, seconds, **fields)

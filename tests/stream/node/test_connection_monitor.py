@@ -12,7 +12,7 @@ from coview_stream.stream.transport.transport import Connection
 
 def looks(link, *connections):
     for routers, peers in connections:
-        link.look(Connection(tuple(routers), tuple(peers)))
+        link.update(Connection(tuple(routers), tuple(peers)))
     return link.reconnects
 
 

@@ -6,15 +6,15 @@ import json
 
 import pytest
 
-from coview_stream.stream.node.counters import Counters, Latency, Missing
+from coview_stream.stream.node.counters import Counters, Latency, MissingFrames
 
 FRAME = 100_000_000  # ns
 
 
 def missing(*messages):
     """Estimates after messages (frame number, sequence), 10 Hz."""
-    estimate = Missing()
-    return [estimate.after(round(k * FRAME), sequence) for k, sequence in messages]
+    estimate = MissingFrames()
+    return [estimate.add(round(k * FRAME), sequence) for k, sequence in messages]
 
 
 def unnumbered(*frames):

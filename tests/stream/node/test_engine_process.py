@@ -1,4 +1,4 @@
-"""Lanes: what a job may come to, and an engine in a process of its own that dies and comes back."""
+"""Engine runners: results and failures of jobs, and an engine in a process of its own that dies and comes back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 import pytest
-from fake_node import InlineLane
+from fake_node import InlineRunner
 from fake_robot import tracking
 from sockets import until
 
@@ -54,26 +54,26 @@ class Engine:
 
 def test_completed_job_returns_its_result():
     engine = Engine()
-    assert InlineLane(engine).run(job()).fix.state is State.TRACKING
+    assert InlineRunner(engine).run(job()).fix.state is State.TRACKING
     assert engine.forgotten == []
 
 
 def test_rejected_job_keeps_the_engine_state():
     engine = Engine(CloudError("cloud has 3 finite points"))
     with pytest.raises(RejectedError, match="3 finite points"):
-        InlineLane(engine).run(job())
+        InlineRunner(engine).run(job())
     assert engine.forgotten == []
 
 
 def test_failed_engine_forgets_the_robot_and_returns_traceback():
     engine = Engine(ZeroDivisionError("by nothing"))
     with pytest.raises(FailedError) as caught:
-        InlineLane(engine).run(job(robot="r7"))
+        InlineRunner(engine).run(job(robot="r7"))
     assert engine.forgotten == ["r7"]
     assert str(caught.value).strip().splitlines()[-1] == "ZeroDivisionError: by nothing"
     assert "Traceback" in str(caught.value)
     engine.error = None
-    assert InlineLane(engine).run(job()).fix.state is State.TRACKING
+    assert InlineRunner(engine).run(job()).fix.state is State.TRACKING
 
 
 def alive(pid):
@@ -86,51 +86,51 @@ def alive(pid):
 
 @pytest.mark.slow
 def test_killed_engine_process_is_restarted(world_file, world_drive):
-    lane = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
+    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
     good = job(world_drive.clouds[0])
     try:
-        lane.start()
-        lane.wait_ready()
-        first = lane.pid
-        result = lane.run(good)
+        process.start()
+        process.wait_ready()
+        first = process.pid
+        result = process.run(good)
         assert result.fix.state is State.SEARCHING
-        assert result.query is not None
-        np.testing.assert_array_equal(result.query.cloud, world_drive.clouds[0])
+        assert result.request is not None
+        np.testing.assert_array_equal(result.request.cloud, world_drive.clouds[0])
         with pytest.raises(RejectedError, match="finite points"):
-            lane.run(job(np.zeros((3, 3), np.float32)))
+            process.run(job(np.zeros((3, 3), np.float32)))
         assert (
-            lane.run(good).query is None
+            process.run(good).request is None
         )  # the same child, and it remembers: no keyframe without driving on
-        assert lane.pid == first
+        assert process.pid == first
 
         os.kill(first, signal.SIGKILL)
         with pytest.raises(DiedError, match="track engine died"):
-            lane.run(good)
-        result = lane.run(good)
-        assert lane.pid != first
-        assert result.query is not None  # and this one remembers nothing
+            process.run(good)
+        result = process.run(good)
+        assert process.pid != first
+        assert result.request is not None  # and this one remembers nothing
     finally:
-        second = lane.pid
-        lane.close()
-    assert lane.pid is None
+        second = process.pid
+        process.close()
+    assert process.pid is None
     until(lambda: not alive(second), 5.0)
     with pytest.raises(DiedError, match="closed"):
-        lane.run(good)
-    lane.close()
+        process.run(good)
+    process.close()
 
 
 @pytest.mark.slow
 def test_unreadable_map_fails_wait_ready(tmp_path):
     broken = tmp_path / "broken.coview"
     broken.write_bytes(b"no map at all")
-    lane = EngineProcess("search", str(broken), "0" * 64)
+    process = EngineProcess("search", str(broken), "0" * 64)
     try:
-        lane.start()
+        process.start()
         with pytest.raises(CoViewError, match=r"broken\.coview"):
-            lane.wait_ready()
+            process.wait_ready()
     finally:
-        lane.close()
-    assert lane.pid is None
+        process.close()
+    assert process.pid is None
 
 
 def test_engine_that_cannot_prepare_reports_why_each_time(monkeypatch):
@@ -145,78 +145,78 @@ def test_engine_that_cannot_prepare_reports_why_each_time(monkeypatch):
     monkeypatch.setattr("coview_stream.stream.node.engines.open_engine", lambda *given: Unprepared())
     ended = []
 
-    def start(lane):
+    def start(process):
         ours, theirs = socket.socketpair()
         given = [str(theirs.detach()), "search", "unused", "0" * 64, "0", "trimmed-icp", "auto"]
         threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
-        lane._pipe, lane._awaited = Connection(ours.detach()), ["ready", "prepared"]
+        process._pipe, process._awaited = Connection(ours.detach()), ["ready", "prepared"]
 
     monkeypatch.setattr(EngineProcess, "start", start)
-    lane = EngineProcess("search", "unused", "0" * 64)
+    process = EngineProcess("search", "unused", "0" * 64)
     for times in (1, 2):
         with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):
-            lane.run(job())
+            process.run(job())
         until(lambda times=times: ended == [1] * times, 5.0)
-    lane.close()
+    process.close()
 
 
 @pytest.mark.slow
 def test_replaced_map_is_reported_each_time(world_file):
-    lane = EngineProcess("track", str(world_file), "0" * 64)
+    process = EngineProcess("track", str(world_file), "0" * 64)
     try:
         for _ in range(2):
             with pytest.raises(
                 DiedError, match=r"has been replaced by another map; start the node \(serve\) again"
             ):
-                lane.run(job())
+                process.run(job())
     finally:
-        lane.close()
+        process.close()
 
 
 @pytest.mark.slow
 def test_hung_worker_is_killed_during_send(world_file, world_drive):
-    lane = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, patience=30.0)
+    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, job_timeout=30.0)
     good = job(world_drive.clouds[0])
     try:
-        lane.start()
-        lane.run(good)
-        first = lane.pid
+        process.start()
+        process.run(good)
+        first = process.pid
         os.kill(first, signal.SIGSTOP)
-        lane.patience = 0.3
+        process.job_timeout = 0.3
         with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
-            lane.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
+            process.run(job(np.zeros((1_000_000, 3), np.float32)))  # far more than a pipe holds
         until(lambda: not alive(first), 5.0)
-        lane.patience = 30.0
-        assert lane.run(good).query is not None
+        process.job_timeout = 30.0
+        assert process.run(good).request is not None
     finally:
-        lane.close()
+        process.close()
 
 
-def with_child(lane, program):
-    """Give a lane a child that runs ``program``, which finds its end of the pipe as ``fd``."""
+def with_child(process, program):
+    """Give a process a child that runs ``program``, which finds its end of the pipe as ``fd``."""
     ours, theirs = socket.socketpair()
     with theirs:
         code = f"import os, time; fd = {theirs.fileno()}\n{program}"
-        lane._child = subprocess.Popen([sys.executable, "-c", code], pass_fds=[theirs.fileno()])
-    lane._pipe = Connection(ours.detach())
+        process._child = subprocess.Popen([sys.executable, "-c", code], pass_fds=[theirs.fileno()])
+    process._pipe = Connection(ours.detach())
 
 
 @pytest.mark.slow
 def test_truncated_answer_kills_the_worker():
-    lane = EngineProcess("search", "unused", "0" * 64, patience=0.3)
-    with_child(lane, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
-    child = lane.pid
+    process = EngineProcess("search", "unused", "0" * 64, job_timeout=0.3)
+    with_child(process, "os.write(fd, (1000).to_bytes(4, 'big') + b'half'); time.sleep(60)")
+    child = process.pid
     with pytest.raises(DiedError, match=r"search engine had no answer for 0\.3 s"):
-        lane.run(job())
+        process.run(job())
     until(lambda: not alive(child), 5.0)
-    lane.close()
+    process.close()
 
 
 @pytest.mark.slow
 def test_opening_has_its_own_timeout_and_can_be_cancelled():
-    lane = EngineProcess("track", "unused", "0" * 64, patience=0.01, opening=0.3)
-    with_child(lane, "time.sleep(60)")
-    lane._awaited = ["ready", "prepared"]
+    process = EngineProcess("track", "unused", "0" * 64, job_timeout=0.01, open_timeout=0.3)
+    with_child(process, "time.sleep(60)")
+    process._awaited = ["ready", "prepared"]
     asked = []
 
     def cancelled():
@@ -224,19 +224,19 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled():
         return len(asked) == 2
 
     with pytest.raises(CancelledError, match="track"):
-        lane.wait_ready(cancelled)
+        process.wait_ready(cancelled)
     with pytest.raises(DiedError, match=r"no answer for 0\.3 s"):
-        lane.wait_ready()
-    lane.close()
+        process.wait_ready()
+    process.close()
 
 
 @pytest.mark.slow
 def test_close_ends_a_running_job():
-    lane = EngineProcess("track", "unused", "0" * 64)
-    with_child(lane, "time.sleep(60)")
-    timer = threading.Timer(0.2, lane.close)
+    process = EngineProcess("track", "unused", "0" * 64)
+    with_child(process, "time.sleep(60)")
+    timer = threading.Timer(0.2, process.close)
     timer.start()
     with pytest.raises(DiedError, match="died"):
-        lane.run(job())
+        process.run(job())
     timer.join()
     until(lambda: "coview-watch-track" not in [thread.name for thread in threading.enumerate()])

@@ -28,24 +28,24 @@ class Follower:
 
     def __init__(self, track, search, robot="r1", epoch=1):
         self.track, self.search, self.robot, self.epoch = track, search, robot, epoch
-        self.verdict = None
+        self.search_result = None
         self.fixes = []
         self.verdicts = []
 
     def job(self, drive, k):
         stamp, cloud, T = round(5e8 * k), drive.clouds[k], drive.T_odom_body[k]
-        return FrameJob(self.robot, self.epoch, stamp, cloud, T, verdict=self.verdict)
+        return FrameJob(self.robot, self.epoch, stamp, cloud, T, search_result=self.search_result)
 
     def follow(self, drive, frames, known=()):
         """Track frames; ``known`` verdicts spare the search."""
         for k in frames:
             result = self.track.run(self.job(drive, k))
-            self.verdict = None
-            if result.query is not None and k < len(known):
-                self.verdict = known[k]
-            elif result.query is not None:
-                self.verdict = self.search.run(SearchJob(self.robot, self.epoch, result.query))
-                self.verdicts.append(self.verdict)
+            self.search_result = None
+            if result.request is not None and k < len(known):
+                self.search_result = known[k]
+            elif result.request is not None:
+                self.search_result = self.search.run(SearchJob(self.robot, result.request))
+                self.verdicts.append(self.search_result)
             self.fixes.append(result.fix)
         return self.fixes
 
@@ -152,7 +152,9 @@ def test_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_dri
     for k in range(FRAMES):
         for points, T, error in bad:
             with pytest.raises(error):
-                engines[0].run(FrameJob("careless", 1, round(5e8 * k), points, T, verdict=follower.verdict))
+                engines[0].run(
+                    FrameJob("careless", 1, round(5e8 * k), points, T, search_result=follower.search_result)
+                )
         follower.follow(world_drive, [k], reference.verdicts)
     for fix, undisturbed in zip(follower.fixes, reference.fixes, strict=True):
         same(fix, undisturbed)
@@ -161,7 +163,7 @@ def test_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_dri
 def test_new_epoch_resets_both_engines(engines, alone, world_drive):
     follower = Follower(*engines, "restarted")
     follower.follow(world_drive, range(2))
-    follower.epoch, follower.verdict, follower.fixes = 2, None, []
+    follower.epoch, follower.search_result, follower.fixes = 2, None, []
     # another odometry frame: votes of the old one would speak for places that are not
     follower.follow(world_drive.seen_from(OTHER_ODOMETRY), range(FRAMES))
     assert [fix.state for fix in follower.fixes] == [fix.state for fix in alone]
@@ -174,7 +176,7 @@ def test_forgotten_robot_starts_from_scratch(engines, alone, world_drive):
     for engine in engines:
         engine.forget("forgotten")
         engine.forget("never seen")
-    follower.verdict, follower.fixes = None, []
+    follower.search_result, follower.fixes = None, []
     follower.follow(world_drive, range(3))
     for fix, first in zip(follower.fixes, alone, strict=False):
         assert fix.state is first.state
@@ -187,7 +189,7 @@ def test_frame_marked_for_verification_is_verified(engines, reference, world_dri
     assert fix.state is State.TRACKING
     last = follower.job(world_drive, FRAMES - 1)  # at the same place: without suspicion nothing is looked at
     for later, suspect in ((10**8, False), (2 * 10**8, True)):
-        again = replace(last, stamp_ns=last.stamp_ns + later, suspect=suspect)
+        again = replace(last, stamp_ns=last.stamp_ns + later, require_verification=suspect)
         fix = engines[0].run(again).fix
         assert fix.state is State.TRACKING
         assert (fix.evidence.stamp == pytest.approx(again.stamp_ns * 1e-9)) == suspect
@@ -214,9 +216,9 @@ def test_job_of_the_other_engine_is_refused(engines, world_drive):
     frame = FrameJob("r1", 1, 0, world_drive.clouds[0], world_drive.T_odom_body[0])
     with pytest.raises(TypeError, match="FrameJob"):
         search.run(frame)
-    asked = track.run(FrameJob("asking", 1, 0, world_drive.clouds[0], world_drive.T_odom_body[0])).query
+    asked = track.run(FrameJob("asking", 1, 0, world_drive.clouds[0], world_drive.T_odom_body[0])).request
     with pytest.raises(TypeError, match="SearchJob"):
-        track.run(SearchJob("asking", 1, asked))
+        track.run(SearchJob("asking", asked))
 
 
 def test_engines_open_from_a_map_file(world_file, tmp_path):

@@ -31,15 +31,15 @@ def robot():
 
 
 def jobs_of(robot, count=3, answer=unknown, begin=0.1):
-    """What the next frames take to the engine as a suggestion."""
-    return [robot.frame(begin + 0.1 * k, answer).suggested for k in range(count)]
+    """What the next frames take to the engine as a hint."""
+    return [robot.frame(begin + 0.1 * k, answer).hint for k in range(count)]
 
 
 # ---- a session
 
 
 def test_pose_hint_goes_with_one_frame(robot):
-    robot.session.suggest(BEFORE)
+    robot.session.hint_pose(BEFORE)
     first, *others = jobs_of(robot)
     assert first is BEFORE
     assert others == [None, None]
@@ -49,29 +49,29 @@ def test_pose_hint_waits_while_a_frame_is_running(robot):
     robot.saw(0.0)
     robot.moved(0.05)
     job = robot.session.take_frame()
-    robot.session.suggest(BEFORE)
-    robot.session.frame_done(job, unknown(job), robot.now)
+    robot.session.hint_pose(BEFORE)
+    robot.session.handle_result(job, unknown(job), robot.now)
     assert jobs_of(robot) == [BEFORE, None, None]
 
 
 def test_pose_hint_is_kept_when_frame_is_rejected(robot):
-    robot.session.suggest(BEFORE)
+    robot.session.hint_pose(BEFORE)
     robot.saw(0.0)
     robot.moved(0.05)
-    robot.session.frame_failed(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
+    robot.session.handle_failure(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
     assert jobs_of(robot) == [BEFORE, None, None]
 
 
 def test_pose_hint_is_dropped_when_engine_fails(robot):
-    robot.session.suggest(BEFORE)
+    robot.session.hint_pose(BEFORE)
     robot.saw(0.0)
     robot.moved(0.05)
-    robot.session.frame_failed(robot.session.take_frame(), "boom", rejected=False)
+    robot.session.handle_failure(robot.session.take_frame(), "boom", rejected=False)
     assert jobs_of(robot) == [None, None, None]
 
 
 def test_pose_hint_is_sent_again_after_engine_restart(robot):
-    robot.session.suggest(BEFORE)
+    robot.session.hint_pose(BEFORE)
     jobs_of(robot, 1)
     robot.session.engine_restarted("search")
     assert jobs_of(robot, 1, begin=0.2) == [None]
@@ -81,7 +81,7 @@ def test_pose_hint_is_sent_again_after_engine_restart(robot):
 
 def test_pose_hint_is_ignored_while_tracking(robot):
     robot.localized(0.1)
-    robot.session.suggest(BEFORE)
+    robot.session.hint_pose(BEFORE)
     assert jobs_of(robot, 2, tracking, 0.2) == [None, None]
     robot.session.engine_restarted()
     np.testing.assert_allclose(jobs_of(robot, 1, begin=0.4)[0], T_MAP_ODOM @ pose(0.6), atol=1e-9)
@@ -95,40 +95,40 @@ def test_odometry_jump_hints_the_last_pose(robot):
     robot.moved(0.35, x=500.1)
     robot.saw(0.4, now=robot.now)
     robot.moved(0.45, x=500.2)
-    np.testing.assert_allclose(robot.session.take_frame().suggested, place, atol=1e-9)
+    np.testing.assert_allclose(robot.session.take_frame().hint, place, atol=1e-9)
 
 
 @pytest.mark.parametrize("ask", ["relocalize", "reset"])
 def test_reset_or_relocalize_drops_pose_hints(robot, ask):
-    robot.session.suggest(BEFORE)
+    robot.session.hint_pose(BEFORE)
     robot.localized(0.1)
     getattr(robot.session, ask)()
-    assert robot.session.recall().T_map_body is None
+    assert robot.session.last_known_pose().T_map_body is None
     robot.moved(0.2)
     robot.session.engine_restarted()
-    robot.session.suggest(BEFORE)  # by a disk that has been slow
+    robot.session.hint_pose(BEFORE)  # by a disk that has been slow
     robot.moved(0.25)
     assert jobs_of(robot, 3, begin=0.3) == [None] * 3
     # but what has been found since then is known
     robot.frame(0.8)
-    assert robot.session.recall().stamp_ns == ns(0.81)
+    assert robot.session.last_known_pose().stamp_ns == ns(0.81)
     robot.session.engine_restarted()
     assert jobs_of(robot, 1, begin=0.9)[0] is not None
 
 
 def test_last_known_pose_is_the_newest(robot):
-    assert robot.session.recall().T_map_body is None
+    assert robot.session.last_known_pose().T_map_body is None
     robot.frame(0.1, unknown)
-    assert robot.session.recall().T_map_body is None
+    assert robot.session.last_known_pose().T_map_body is None
     robot.localized(0.2)
     robot.moved(0.4)
     poses = robot.counters.poses
-    now = robot.session.recall()
+    now = robot.session.last_known_pose()
     assert now.stamp_ns == ns(0.4)
     np.testing.assert_allclose(now.T_map_body, T_MAP_ODOM @ pose(0.8), atol=1e-9)
     assert robot.counters.poses == poses  # nothing has been published
     robot.session.tick(robot.now + 60.0)
-    assert robot.session.recall().T_map_body is None
+    assert robot.session.last_known_pose().T_map_body is None
 
 
 # ---- the engine
@@ -138,17 +138,15 @@ def test_pose_hint_reaches_the_localizer(world_map, world_drive):
     engine = TrackEngine(world_map)
     there = world_drive.T_map_body[0]
 
-    def job(k, suggested=None):
-        return FrameJob(
-            "r1", 1, ns(0.5 * k), world_drive.clouds[k], world_drive.T_odom_body[k], suggested=suggested
-        )
+    def job(k, hint=None):
+        return FrameJob("r1", 1, ns(0.5 * k), world_drive.clouds[k], world_drive.T_odom_body[k], hint=hint)
 
-    (T_map_odom,) = engine.run(job(0, there)).query.suggested
-    assert [len(engine.run(job(k)).query.suggested) for k in (1, 2)] == [1, 1]
+    (T_map_odom,) = engine.run(job(0, there)).request.hints
+    assert [len(engine.run(job(k)).request.hints) for k in (1, 2)] == [1, 1]
     engine.forget("r1")
-    query = engine.run(job(0, pose_from(np.eye(3), [1e9, 0.0, 0.0]))).query  # of no use, but the frame is
-    assert query.suggested == ()
-    assert query is not None
+    request = engine.run(job(0, pose_from(np.eye(3), [1e9, 0.0, 0.0]))).request  # of no use, but the frame is
+    assert request.hints == ()
+    assert request is not None
     assert T_map_odom.shape == (4, 4)
 
 
@@ -164,7 +162,7 @@ def remembering(folder, *names, **more):
 def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     site, kept = remembering(tmp_path, "r1", "r2")
-    kept.suggest()
+    kept.hint()
     kept.keep()
     assert not list(tmp_path.iterdir())  # nobody knows anything yet
     site.frame("r1", 0.0)
@@ -174,11 +172,11 @@ def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
     assert load(tmp_path, "r2", SHA) is None
 
     again, other = remembering(tmp_path, "r1", "r2")
-    other.suggest()
+    other.hint()
     assert "r1: was last at 100.0, -20.0" in caplog.text
     for name, place in (("r1", saved.T_map_body), ("r2", None)):
         again.sees(name, 5.0)
-        suggested = again.sessions[name].take_frame().suggested
+        suggested = again.sessions[name].take_frame().hint
         assert suggested is None if place is None else np.array_equal(suggested, place)
     assert again.status("r1")["state"] == "SEARCHING"  # it is never trusted
 
@@ -186,20 +184,20 @@ def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
 def test_last_pose_of_another_map_is_ignored(tmp_path):
     save(tmp_path, LastPose("r1", "cd" * 32, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1")
-    kept.suggest()
+    kept.hint()
     site.sees("r1", 0.0)
-    assert site.sessions["r1"].take_frame().suggested is None
+    assert site.sessions["r1"].take_frame().hint is None
 
 
 def test_damaged_last_pose_file_is_a_warning_and_replaced(tmp_path, caplog):
     file_of(tmp_path, "r1", SHA).write_text("{")
     save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1", "r2")
-    kept.suggest()
+    kept.hint()
     (line,) = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
     assert str(file_of(tmp_path, "r1", SHA)) in line
     site.sees("r2", 0.0)
-    assert site.sessions["r2"].take_frame().suggested is not None
+    assert site.sessions["r2"].take_frame().hint is not None
     site.frame("r1", 0.0)
     kept.keep()
     assert load(tmp_path, "r1", SHA) is not None
@@ -232,7 +230,7 @@ def test_reset_or_relocalize_deletes_saved_pose(tmp_path, ask):
     save(tmp_path, LastPose("r1", SHA, 5, BEFORE))
     save(tmp_path, LastPose("r2", SHA, 5, BEFORE))
     site, kept = remembering(tmp_path, "r1", "r2")
-    kept.suggest()
+    kept.hint()
     site.net.query(f"coview/r1/rpc/{ask}")
     kept.keep()
     assert load(tmp_path, "r1", SHA) is None
@@ -268,20 +266,20 @@ def test_failing_disk_logs_one_warning(tmp_path, caplog, monkeypatch):
 
 
 def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, caplog):
-    def recall():
+    def fail():
         raise RuntimeError("nobody thought of this")
 
     site, kept = remembering(tmp_path, "r1", "r2")
     for name in ("r1", "r2"):
         site.frame(name, 0.0)
-    monkeypatch.setattr(site.sessions["r1"], "recall", recall)
+    monkeypatch.setattr(site.sessions["r1"], "last_known_pose", fail)
     kept.keep()
     assert load(tmp_path, "r2", SHA) is not None
     assert "nobody thought of this" in caplog.text
 
 
 def running(site, kept):
-    site.node._aside = {"memory": kept.run}
+    site.node._background = {"memory": kept.run}
     site.node.start()
     return site
 
@@ -344,4 +342,4 @@ def test_last_pose_is_hinted_after_engine_death(tmp_path):
     site.track.dead = True
     site.frame("r1", STEP)
     site.sees("r1", 2 * STEP)
-    np.testing.assert_allclose(site.sessions["r1"].take_frame().suggested, T_MAP_ODOM @ pose(0.0), atol=1e-9)
+    np.testing.assert_allclose(site.sessions["r1"].take_frame().hint, T_MAP_ODOM @ pose(0.0), atol=1e-9)

@@ -21,7 +21,7 @@ from coview_stream.stream.node.engine_process import DiedError, EngineProcess, R
 from coview_stream.stream.node.jobs import OdometryJob, OdometryResult
 from coview_stream.stream.node.lidar_session import LidarSession
 from coview_stream.stream.node.node import Node
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 LEVEL = LidarOdometryConfig(gravity="level", level_with_walls=False)
 CLOUD = np.random.default_rng(0).uniform(-30, 30, (500, 3)).astype(np.float32)
@@ -61,7 +61,7 @@ def sweep(points, seconds, times=None, config=LEVEL):
     return OdometryJob("r1", 1, ns(seconds), points, times, config)
 
 
-class Lane:
+class Runner:
     """Plays an engine; dies when it is told to."""
 
     def __init__(self, answer):
@@ -84,16 +84,16 @@ def placing(job):
 
 @pytest.fixture
 def quiet():
-    net = FakeTransport()
+    net = MemoryTransport()
     session = LidarSession(KEYS, SHA, NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0))
-    track, lane = Lane(tracking), Lane(placing)
-    made = Node([session], net, track, track, session.config, odometry=lane)
+    track, engine = Runner(tracking), Runner(placing)
+    made = Node([session], net, track, track, session.config, odometry=engine)
     made.declare()
-    return made, net, lane
+    return made, net, engine
 
 
-def worked(node, *lanes):
-    for name in lanes:
+def worked(node, *engines):
+    for name in engines:
         found = node.next_job(name)
         if found is not None:
             node.work(name, *found)
@@ -118,11 +118,11 @@ def test_lidar_node_subscribes_to_clouds_only(quiet):
 
 
 def test_odometry_engine_death_loses_the_place_but_not_the_node(quiet):
-    node, net, lane = quiet
+    node, net, engine = quiet
     node._stopping.wait = lambda seconds: None  # the pause after a death
     net.publish(cloud(0.0))
     worked(node, "odometry", "track")
-    lane.dead = True
+    engine.dead = True
     net.publish(cloud(0.1))
     worked(node, "odometry", "track")
     said = status(node, net)
@@ -145,33 +145,33 @@ def test_reset_request_resets_lidar_odometry(quiet):
     assert net.query(KEYS.reset)["state"] == "SEARCHING"
     net.publish(cloud(0.0))
     _, job = node.next_job("odometry")
-    assert job.generation == 2
+    assert job.epoch == 2
 
 
 @pytest.mark.slow
 def test_aborted_odometry_engine_is_restarted(stand_in):
-    lane = EngineProcess("odometry", "unused", "")
+    engine = EngineProcess("odometry", "unused", "")
     try:
-        assert lane.run(sweep(CLOUD, 0.0)).begun
-        assert not lane.run(sweep(CLOUD, 0.1)).begun
-        first = lane.pid
+        assert engine.run(sweep(CLOUD, 0.0)).restarted
+        assert not engine.run(sweep(CLOUD, 0.1)).restarted
+        first = engine.pid
         with pytest.raises(RejectedError, match="does not come after"):
-            lane.run(sweep(CLOUD, 0.1))
+            engine.run(sweep(CLOUD, 0.1))
         with pytest.raises(DiedError, match="odometry engine died"):
-            lane.run(sweep(FATAL, 0.2))
-        assert lane.run(sweep(CLOUD, 0.3)).begun
-        assert lane.pid not in (None, first)
+            engine.run(sweep(FATAL, 0.2))
+        assert engine.run(sweep(CLOUD, 0.3)).restarted
+        assert engine.pid not in (None, first)
     finally:
-        lane.close()
+        engine.close()
 
 
 @pytest.mark.slow
 def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
-    net = FakeTransport()
+    net = MemoryTransport()
     config = NodeConfig(odometry_timeout=30.0, dead_reckoning_timeout=30.0, max_outage=30.0, pose_rate=50.0)
     session = LidarSession(KEYS, SHA, config, lidar=LEVEL)
-    track, lane = Lane(tracking), EngineProcess("odometry", "unused", "")
-    node = Node([session], net, track, track, config, odometry=lane)
+    track, engine = Runner(tracking), EngineProcess("odometry", "unused", "")
+    node = Node([session], net, track, track, config, odometry=engine)
     node.start()
     stamps = iter(0.1 * k for k in range(100_000))
 
@@ -181,10 +181,10 @@ def test_node_survives_killed_and_aborted_odometry_engine(stand_in):
 
     try:
         until(tracked, 20.0)
-        first = lane.pid
+        first = engine.pid
         os.kill(first, signal.SIGKILL)
         until(lambda: tracked() and session.counters.engine_restarts == 1, 20.0)
-        assert lane.pid not in (None, first)
+        assert engine.pid not in (None, first)
         until(lambda: tracked(FATAL) or session.counters.engine_restarts == 2, 20.0)
         until(lambda: session.counters.engine_restarts >= 2, 20.0)
         until(tracked, 20.0)
@@ -201,27 +201,27 @@ def test_missing_kiss_icp_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "kiss_icp").mkdir()
     (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")
     monkeypatch.syspath_prepend(tmp_path)
-    lane = EngineProcess("odometry", "unused", "")
+    engine = EngineProcess("odometry", "unused", "")
     try:
-        lane.start()
+        engine.start()
         with pytest.raises(CoViewError, match="pip install 'kiss-icp>=") as caught:
-            lane.wait_ready()
+            engine.wait_ready()
     finally:
-        lane.close()
+        engine.close()
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow
 def test_odometry_engine_process_with_kiss_icp(world_drive):
     pytest.importorskip("kiss_icp.kiss_icp", reason="kiss-icp is not installed")
-    lane = EngineProcess("odometry", "unused", "")
+    engine = EngineProcess("odometry", "unused", "")
     try:
         poses = []
         for k in range(3):
             times = np.zeros(len(world_drive.clouds[k]))  # what ends the interpreter if kiss-icp sees it
             job = sweep(world_drive.clouds[k], 0.5 * k, times, LidarOdometryConfig(gravity="level"))
-            poses.append(lane.run(job).T_odom_body)
+            poses.append(engine.run(job).T_odom_body)
     finally:
-        lane.close()
+        engine.close()
     assert all(np.isfinite(pose).all() for pose in poses)
     assert np.linalg.norm((inverse(poses[0]) @ poses[2])[:3, 3]) > 0.5

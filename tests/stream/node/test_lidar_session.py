@@ -1,4 +1,4 @@
-"""A robot that sends clouds only: what its session makes of them, with an odometry lane that the test plays."""
+"""A robot that sends clouds only: what its session makes of them, with an odometry engine that the test plays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TIMES = np.linspace(0.0, 0.1, len(POINTS))
 
 
 class Robot:
-    """A session and the two lanes that work for it, at 10 Hz."""
+    """A session and the two engines that work for it, at 10 Hz."""
 
     def __init__(self, config=None):
         self.session = LidarSession(KEYS, SHA, config)
@@ -31,22 +31,22 @@ class Robot:
         self.now = 1000.0 + seconds
         self.session.on_cloud(cloud(seconds, codec="foxglove", **fields), self.now)
 
-    def placed(self, begun=None, **place):
-        """Play the odometry lane for one frame; it drives 2 m/s."""
-        job = self.session.take_sweep()
+    def placed(self, restarted=None, **place):
+        """Play the odometry engine for one frame; it drives 2 m/s."""
+        job = self.session.take_lidar_frame()
         if job is None:
             return None
-        begun, self.first = (self.first if begun is None else begun), False
+        restarted, self.first = (self.first if restarted is None else restarted), False
         pose = message((job.stamp_ns - ns(0)) * 1e-9, **place).T_odom_body
         deskewed = None if job.times is None else job.points + np.float32(1.0)
-        self.session.sweep_done(job, OdometryResult(pose, deskewed, begun, 0.01), self.now + 0.04)
+        self.session.handle_result(job, OdometryResult(pose, deskewed, restarted, 0.01), self.now + 0.04)
         return job
 
     def tracked(self):
-        """Play the tracking lane for one frame."""
+        """Play the tracking engine for one frame."""
         job = self.session.take_frame()
         if job is not None:
-            self.session.frame_done(job, tracking(job), self.now + 0.06)
+            self.session.handle_result(job, tracking(job), self.now + 0.06)
         return job
 
     def frame(self, seconds, **more):
@@ -111,8 +111,8 @@ def test_one_odometry_job_at_a_time():
     robot = Robot()
     robot.saw(0.0)
     robot.saw(0.1)
-    assert robot.session.take_sweep() is not None
-    assert robot.session.take_sweep() is None
+    assert robot.session.take_lidar_frame() is not None
+    assert robot.session.take_lidar_frame() is None
 
 
 def test_missing_clouds_and_rejected_clouds_have_different_reasons():
@@ -123,14 +123,14 @@ def test_missing_clouds_and_rejected_clouds_have_different_reasons():
     assert state(robot) is State.TRACKING  # verified by a frame after the pause
     for k in range(6):
         robot.saw(1.8 + 0.1 * k)
-        job = robot.session.take_sweep()
-        robot.session.sweep_failed(job, "frame has 3 of 9 points between 1 and 100 m", rejected=True)
+        job = robot.session.take_lidar_frame()
+        robot.session.handle_failure(job, "frame has 3 of 9 points between 1 and 100 m", rejected=True)
     robot.session.tick(robot.now)
     state_now, reason = robot.session.state()
     assert state_now is State.LOST
     assert reason.startswith("lidar odometry has placed no frame for 0.5 s")
     assert robot.counters.rejected == 6
-    assert robot.session.complaints.texts[-1].endswith("3 of 9 points between 1 and 100 m")
+    assert robot.session.errors.texts[-1].endswith("3 of 9 points between 1 and 100 m")
 
 
 def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
@@ -138,14 +138,16 @@ def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
     assert robot.session.state()[1] == "waiting for clouds on coview/r1/in/cloud"
     robot.saw(0.0)
     assert robot.session.state()[1] == "no frame has been processed yet"
-    robot.session.sweep_failed(robot.session.take_sweep(), "no ground to take gravity from", rejected=True)
+    robot.session.handle_failure(
+        robot.session.take_lidar_frame(), "no ground to take gravity from", rejected=True
+    )
     assert robot.session.state()[1] == "1 frames were of no use; see errors"
 
 
 def test_lidar_odometry_restart_restarts_search():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    robot.placed(begun=True, x=0.0)
+    robot.placed(restarted=True, x=0.0)
     assert robot.session.state() == (State.LOST, "lidar odometry began anew")
     assert robot.session.pose() is None
     assert robot.tracked().epoch > 1
@@ -157,10 +159,10 @@ def test_lidar_odometry_restart_restarts_search():
 def test_failed_or_restarted_odometry_engine_starts_new_epoch(kind):
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    job = robot.session.take_sweep()
+    job = robot.session.take_lidar_frame()
     if kind == "restarted":
         robot.session.engine_restarted("odometry")
-    robot.session.sweep_failed(job, "Traceback\nBoom", rejected=False)
+    robot.session.handle_failure(job, "Traceback\nBoom", rejected=False)
     said = {
         "failed": "lidar odometry failed on a frame",
         "restarted": "lidar odometry was started again: it died",
@@ -169,38 +171,38 @@ def test_failed_or_restarted_odometry_engine_starts_new_epoch(kind):
     assert robot.counters.engine_errors == 1
     assert robot.session.odometry.newest is None
     robot.saw(1.2)
-    again = robot.session.take_sweep()
-    assert again.generation == job.generation + 1
+    again = robot.session.take_lidar_frame()
+    assert again.epoch == job.epoch + 1
     assert ends(robot.counters) == robot.counters.received - 1
 
 
 def test_odometry_result_of_old_epoch_is_dropped():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    job = robot.session.take_sweep()
+    job = robot.session.take_lidar_frame()
     robot.session.engine_restarted("odometry")
-    robot.session.sweep_done(job, OdometryResult(np.eye(4), None, True, 0.0), robot.now)
+    robot.session.handle_result(job, OdometryResult(np.eye(4), None, True, 0.0), robot.now)
     assert robot.session.odometry.newest is None
     assert robot.counters.dropped == 1
-    assert robot.frame(1.2, begun=True) is not None
+    assert robot.frame(1.2, restarted=True) is not None
 
 
 def test_reset_drops_odometry_and_running_job():
     robot = Robot().drive(0.0, 1.0)
     robot.saw(1.1)
-    job = robot.session.take_sweep()
+    job = robot.session.take_lidar_frame()
     robot.session.reset()
-    robot.session.sweep_done(job, OdometryResult(np.eye(4), None, False, 0.0), robot.now)
+    robot.session.handle_result(job, OdometryResult(np.eye(4), None, False, 0.0), robot.now)
     assert counted(robot) == {}
     robot.saw(0.3)  # whatever the stamp
-    assert robot.session.take_sweep().generation > job.generation
+    assert robot.session.take_lidar_frame().epoch > job.epoch
 
 
 def test_restart_search_keeps_lidar_odometry():
     robot = Robot().drive(0.0, 1.0)
-    robot.session.begin_anew("asked to search again")
+    robot.session.restart_search("asked to search again")
     robot.saw(1.1)
-    assert robot.session.take_sweep().generation == 1
+    assert robot.session.take_lidar_frame().epoch == 1
     assert robot.session.odometry.newest.stamp_ns == ns(1.0)
 
 
@@ -210,20 +212,20 @@ def test_stray_stamps_are_counted_and_restarted_clock_is_followed():
     robot.now += 0.1
     robot.session.on_cloud(cloud(2.0), robot.now)
     assert (robot.counters.duplicate, robot.counters.out_of_order) == (1, 1)
-    before = robot.session.take_sweep()
+    before = robot.session.take_lidar_frame()
     assert before is None
     for k in range(1, 16):
         robot.session.on_cloud(cloud(0.1 * k), 1006.0 + 0.1 * k)
     assert robot.counters.clock_restarts == 1
     assert robot.session.state() == (State.LOST, "the sender's clock started anew")
-    job = robot.session.take_sweep()
-    assert job.generation == 2
+    job = robot.session.take_lidar_frame()
+    assert job.epoch == 2
     assert job.stamp_ns < ns(2.0)
 
 
 def test_long_pause_restarts_lidar_odometry():
     robot = Robot().drive(0.0, 1.0)
-    robot.frame(9.0, begun=True)  # as lidar odometry says after a gap
+    robot.frame(9.0, restarted=True)  # as lidar odometry says after a gap
     assert counted(robot)["losses"] == 1
     assert state(robot) is State.TRACKING
 
@@ -231,5 +233,5 @@ def test_long_pause_restarts_lidar_odometry():
 def test_undecodable_cloud_is_only_counted():
     robot = Robot()
     robot.session.on_cloud(Sample(KEYS.cloud, b"rubbish", "video/raw"), 1000.0)
-    assert robot.session.take_sweep() is None
+    assert robot.session.take_lidar_frame() is None
     assert counted(robot) == {"received": 1, "unknown_encoding": 1}

@@ -67,7 +67,7 @@ def test_status_has_all_documented_fields(site):
     assert set(status["counters"]) == set(Counters().to_json())
     assert status["counters"]["unknown_encoding"] == 1
     assert any("video/raw" in text for text in status["errors"])
-    assert status["connection"] == {"routers": ["fake"], "peers": [], "reconnects": 0}
+    assert status["connection"] == {"routers": ["memory"], "peers": [], "reconnects": 0}
 
 
 def test_status_is_plain_json(site):
@@ -92,11 +92,11 @@ def test_pose_rate_in_status(site):
 def test_only_state_changes_are_published_between_regular_statuses(pair):
     now = time.monotonic()
     publish_statuses(pair.node, now)
-    publish_statuses(pair.node, now, everyone=False)
+    publish_statuses(pair.node, now, all_robots=False)
     assert (len(pair.statuses("r1")), len(pair.statuses("r2"))) == (1, 1)
     pair.frame("r1", 0.0)
-    publish_statuses(pair.node, now, everyone=False)
-    publish_statuses(pair.node, now, everyone=False)
+    publish_statuses(pair.node, now, all_robots=False)
+    publish_statuses(pair.node, now, all_robots=False)
     assert [s["state"] for s in pair.statuses("r1")] == ["SEARCHING", "TRACKING"]
     assert len(pair.statuses("r2")) == 1
 
@@ -110,7 +110,7 @@ def test_router_reconnection_is_counted(site):
         publish_statuses(site.node, time.monotonic())
         site.net.come_back()
         status = site.status("r1")
-        assert status["connection"] == {"routers": ["fake"], "peers": [], "reconnects": times}
+        assert status["connection"] == {"routers": ["memory"], "peers": [], "reconnects": times}
     assert status["state"] == "TRACKING"  # what was known is still known
 
 
@@ -197,12 +197,12 @@ def test_close_does_not_wait_for_stuck_network():
     stuck = threading.Event()
     site.net.close = stuck.wait
     begin = time.monotonic()
-    assert site.node.close(patience=0.6) is False
+    assert site.node.close(timeout=0.6) is False
     assert time.monotonic() - begin < 5.0
     assert (site.track.closed, site.search.closed) == (1, 1)
     assert "shutting down" in site.statuses("r1")[-1]["reason"]
     stuck.set()
-    until(lambda: site.node.close(patience=0.0))
+    until(lambda: site.node.close(timeout=0.0))
 
 
 def test_close_does_not_wait_for_stuck_publisher():
@@ -211,9 +211,9 @@ def test_close_does_not_wait_for_stuck_publisher():
     stuck = threading.Event()
     for publisher in site.net.publishers:
         publisher.put = lambda message: stuck.wait()
-    assert site.node.close(patience=0.3) is False
+    assert site.node.close(timeout=0.3) is False
     stuck.set()
-    until(lambda: site.node.close(patience=0.0))
+    until(lambda: site.node.close(timeout=0.0))
     assert site.net.closed
 
 

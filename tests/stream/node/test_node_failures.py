@@ -12,6 +12,8 @@ from sockets import until
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import CloudError
+from coview_stream.localization.result import Fix
+from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.engine_process import DiedError
 
@@ -89,26 +91,27 @@ def test_dead_track_engine_loses_all_robots(pair):
 REPLACED = "site.coview: has been replaced by another map; start the node (serve) again"
 
 
-@pytest.mark.parametrize("lane", ["track", "search"])
-def test_repeated_engine_restart_reason_is_reported(pair, lane, caplog):
+@pytest.mark.parametrize("engine", ["track", "search"])
+def test_repeated_engine_restart_reason_is_reported(pair, engine, caplog):
     def die(text):
         def run(job):
             raise DiedError(text)
 
         return run
 
-    for name in ("r1", "r2"):
-        pair.frame(name, 0.0)
+    if engine == "track":
+        for name in ("r1", "r2"):
+            pair.frame(name, 0.0)
     pair.engine.answer = lambda job: unknown(job, ask=query())
     pair.node._stopping.wait = lambda seconds: True  # no pauses
     for k, text in enumerate(["it died", REPLACED, REPLACED, REPLACED], 1):
-        getattr(pair, lane).run = die(text)
+        getattr(pair, engine).run = die(text)
         pair.frame("r1", STEP * k)
     for name in ("r1", "r2"):
         status = pair.status(name)
-        assert f"the {lane} engine is started again: {REPLACED}" in status["errors"]
-        assert (REPLACED in status["reason"]) == (lane == "track")
-        assert status["counters"]["losses"] == (lane == "track")
+        assert f"the {engine} engine is started again: {REPLACED}" in status["errors"]
+        assert (REPLACED in status["reason"]) == (engine == "track")
+        assert status["counters"]["losses"] == (engine == "track")
     lines = [r.getMessage() for r in caplog.records if "is started again" in r.getMessage()]
     assert len(lines) == 2  # each text once, for all robots
     assert "it died" in lines[0]
@@ -190,22 +193,22 @@ def test_repeated_failures_are_rate_limited_in_the_log(site, caplog):
     assert len([r for r in caplog.records if "unexpected" in r.getMessage()]) == 1
 
 
-class Unsayable:
+class UnwritableEvidence:
     """Evidence that cannot be written."""
 
     reason = "none"
 
     def to_json(self):
-        raise RuntimeError("cannot be said")
+        raise RuntimeError("cannot be written")
 
 
 def test_failing_status_of_one_robot_does_not_affect_others(pair):
-    pair.sessions["r1"].whereabouts.evidence = Unsayable()
+    pair.sessions["r1"].robot_state._fix = Fix(0.0, State.SEARCHING, evidence=UnwritableEvidence())
     for _ in range(3):
         publish_statuses(pair.node, time.monotonic())
     assert len(pair.statuses("r2")) == 3
     assert pair.statuses("r1") == []
-    pair.sessions["r1"].whereabouts.evidence = None
+    pair.sessions["r1"].robot_state._fix = None
     assert pair.status("r1")["robot"] == "r1"
 
 
@@ -224,12 +227,12 @@ def test_failing_status_is_not_retried_in_a_loop():
     site = Site("r1", config=config)
     asked = []
 
-    class Counting(Unsayable):
+    class Counting(UnwritableEvidence):
         def to_json(self):
             asked.append(time.monotonic())
             return super().to_json()
 
-    site.sessions["r1"].whereabouts.evidence = Counting()
+    site.sessions["r1"].robot_state._fix = Fix(0.0, State.SEARCHING, evidence=Counting())
     site.node.start()
     try:
         until(lambda: len(asked) >= 3)

@@ -14,8 +14,9 @@ from small_world import pose_error
 from coview_stream.geometry.transforms import inverse, pose_from
 from coview_stream.messages import decode_pose, encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
+from coview_stream.messages.validation import read_attachment
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine
-from coview_stream.stream.transport.rmw import NO_HASH, gid_of, read_attachment
+from coview_stream.stream.transport.rmw import NO_HASH, gid_of
 
 
 @pytest.fixture
@@ -79,12 +80,12 @@ def test_poses_follow_rmw_zenoh_conventions():
         site.node.publish_poses(time.monotonic())
     sent = site.net.samples(keys.pose)
     assert [s.encoding for s in sent] == ["", ""]
-    assert [read_attachment(s.attachment)[0] for s in sent] == [1, 2]
+    assert [read_attachment(s.attachment)[1] for s in sent] == [1, 2]
     nodes = [t for t in site.net.announced if "/NN/" in t]
     publishers = [t for t in site.net.announced if "/MP/" in t]
     assert (len(nodes), len(publishers)) == (1, 1)
     assert "%r1%coview%pose" in publishers[0]
-    assert read_attachment(sent[0].attachment)[2] == gid_of(publishers[0])
+    assert sent[0].attachment[-16:] == gid_of(publishers[0])
     np.testing.assert_allclose(
         decode_pose(sent[1]).T_map_body, T_MAP_ODOM @ pose_from(np.eye(3), [2 * STEP, 0, 0]), atol=1e-6
     )

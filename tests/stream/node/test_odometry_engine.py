@@ -27,8 +27,8 @@ def moved(x, yaw=0.0):
     return pose_from(rot_z(yaw), [x, 0.0, 0.0])
 
 
-def job(cloud, seconds, robot="r1", generation=1, times=None, config=LEVEL):
-    return OdometryJob(robot, generation, round(1e9 * seconds), cloud, times, config)
+def job(cloud, seconds, robot="r1", epoch=1, times=None, config=LEVEL):
+    return OdometryJob(robot, epoch, round(1e9 * seconds), cloud, times, config)
 
 
 def engine_of(*poses):
@@ -42,22 +42,22 @@ def test_each_robot_has_its_own_odometry(cloud):
     other = engine.run(job(cloud, 7.0, "r2"))
     assert [r.T_odom_body[0, 3] for r in one] == pytest.approx([0.0, 1.0, 2.0])
     assert other.T_odom_body[0, 3] == 0.0
-    assert [r.begun for r in (*one, other)] == [True, False, False, True]
+    assert [r.restarted for r in (*one, other)] == [True, False, False, True]
     assert all(r.points is None for r in one)
 
 
-@pytest.mark.parametrize("bring_about", ["generation", "gap", "forget"])
+@pytest.mark.parametrize("bring_about", ["epoch", "gap", "forget"])
 def test_odometry_restart_is_reported(cloud, bring_about):
     engine = engine_of(np.eye(4), moved(1.0), moved(2.0))
     for k in range(2):
         engine.run(job(cloud, 0.1 * k))
     if bring_about == "forget":
         engine.forget("r1")
-    again = {"generation": job(cloud, 0.05, generation=2), "gap": job(cloud, 9.0), "forget": job(cloud, 0.0)}
+    again = {"epoch": job(cloud, 0.05, epoch=2), "gap": job(cloud, 9.0), "forget": job(cloud, 0.0)}
     result = engine.run(again[bring_about])
-    assert result.begun
+    assert result.restarted
     stamp = again[bring_about].stamp_ns * 1e-9
-    assert not engine.run(job(cloud, stamp + 0.1, generation=again[bring_about].generation)).begun
+    assert not engine.run(job(cloud, stamp + 0.1, epoch=again[bring_about].epoch)).restarted
 
 
 def test_implausible_motion_restarts_odometry(cloud):
@@ -65,7 +65,7 @@ def test_implausible_motion_restarts_odometry(cloud):
     engine.run(job(cloud, 0.0))
     with pytest.raises(CloudError, match="lost its way"):
         engine.run(job(cloud, 0.1))
-    assert [engine.run(job(cloud, 0.1 * k)).begun for k in (2, 3)] == [True, False]
+    assert [engine.run(job(cloud, 0.1 * k)).restarted for k in (2, 3)] == [True, False]
 
 
 def test_frames_come_back_deskewed(cloud):
@@ -87,7 +87,7 @@ def test_invalid_frames_and_jobs_are_refused(cloud):
     engine.run(job(cloud, 0.1))
     with pytest.raises(RunError, match="does not come after"):
         engine.run(job(cloud, 0.1))
-    with pytest.raises(TypeError, match="FrameJob is no sweep"):
+    with pytest.raises(TypeError, match="FrameJob"):
         engine.run(FrameJob("r1", 1, 0, cloud, np.eye(4)))
 
 

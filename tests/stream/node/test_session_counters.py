@@ -38,20 +38,18 @@ def test_processed_frame_is_counted(robot):
 def test_rejected_frame_is_counted(robot):
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
-    robot.session.frame_failed(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
+    robot.session.handle_failure(robot.session.take_frame(), "cloud has 3 finite points", rejected=True)
     assert counted(robot) == {"received": 1, "rejected": 1, "odometry_received": 5}
-    assert list(robot.session.complaints.texts) == [
-        "r1: frames of no use; the first: cloud has 3 finite points"
-    ]
+    assert list(robot.session.errors.texts) == ["r1: frames of no use; the first: cloud has 3 finite points"]
 
 
 def test_engine_error_is_reported_by_its_last_line(robot):
     robot.drive(-0.1, 0.1)
     robot.saw(0.0)
     trace = "Traceback:\n  somewhere\nValueError: boom\n"
-    robot.session.frame_failed(robot.session.take_frame(), trace, rejected=False)
+    robot.session.handle_failure(robot.session.take_frame(), trace, rejected=False)
     assert counted(robot) == {"received": 1, "engine_errors": 1, "odometry_received": 5}
-    assert list(robot.session.complaints.texts) == [
+    assert list(robot.session.errors.texts) == [
         "r1: frames that the engine failed at; the first: ValueError: boom"
     ]
 
@@ -74,7 +72,7 @@ def test_running_frame_is_not_dropped(robot):
     robot.saw(0.4, now=1001.0)
     assert robot.session.take_frame() is None  # one at a time
     assert robot.counters.dropped == 1
-    robot.session.frame_done(busy, tracking(busy), 1001.1)
+    robot.session.handle_result(busy, tracking(busy), 1001.1)
     assert robot.session.take_frame().stamp_ns == ns(0.4)
 
 
@@ -137,7 +135,7 @@ def test_malformed_oversized_and_unknown_clouds_are_counted(robot):
     assert (robot.counters.received, robot.counters.malformed) == (2, 2)
     robot.session.on_cloud(Sample(KEYS.cloud, good.payload, "video/raw", good.attachment), 0.0)
     assert robot.counters.unknown_encoding == 1
-    assert any("video/raw" in text for text in robot.session.complaints.texts)
+    assert any("video/raw" in text for text in robot.session.errors.texts)
     small = Robot(NodeConfig(max_payload=len(good.payload)))
     small.saw(0.0)
     assert small.counters.oversized == 0
@@ -182,17 +180,17 @@ def test_missing_frames_by_sequence_number_are_counted(robot):
 
 def test_searches_and_skipped_searches_are_counted(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
-    job = robot.session.take_search()
-    assert job.query.stamp == 0.0
+    job = robot.session.take_search_request()
+    assert job.request.stamp == 0.0
     robot.frame(0.1, unknown, ask=query(0.1))
-    assert robot.session.take_search() is None  # one at a time
+    assert robot.session.take_search_request() is None  # one at a time
     assert robot.counters.searches_skipped == 0
     robot.frame(0.2, unknown, ask=query(0.2))
     assert (robot.counters.searches_skipped, robot.counters.searches) == (1, 0)
-    robot.session.search_done(job, verdict())
+    robot.session.handle_result(job, verdict(), robot.now)
     assert robot.counters.searches == 1
-    assert robot.session.take_search().query.stamp == 0.2
-    assert robot.session.take_search() is None
+    assert robot.session.take_search_request().request.stamp == 0.2
+    assert robot.session.take_search_request() is None
 
 
 def test_fixes_poses_and_losses_are_counted(robot):

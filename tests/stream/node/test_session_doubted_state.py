@@ -6,9 +6,7 @@ import pytest
 from fake_robot import Robot, counted, doubted, ns, reason, state, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import State
-from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.stream.node.status import status
 from coview_stream.stream.transport.transport import Connection
 
@@ -18,7 +16,7 @@ def covered():
     """A robot whose sensor has been covered after it was found."""
     robot = Robot().localized(0.0)
     robot.frame(0.1, doubted)
-    assert robot.session.state() == (State.AMBIGUOUS, "only 0 points to register")
+    assert robot.session.state() == (State.DOUBTED, "only 0 points to register")
     return robot
 
 
@@ -27,29 +25,22 @@ def changes(robot):
     return [(c["from"], c["to"], c["reason"]) for c in told]
 
 
-def test_doubted_state_differs_from_ambiguous_search():
-    def fix(state, cause):
-        return Fix(0.0, state, evidence=KeyframeEvidence(0.0, state, "so", cause=cause))
-
-    assert fix(State.AMBIGUOUS, RejectionReason.BLIND).doubted
-    assert fix(State.AMBIGUOUS, RejectionReason.VERIFIED).doubted  # a long doubt takes more than one
-    assert not fix(State.AMBIGUOUS, None).doubted
-    assert not fix(State.TRACKING, RejectionReason.VERIFIED).doubted
-    assert not fix(State.LOST, RejectionReason.FITNESS).doubted
-    assert not Fix(0.0, State.AMBIGUOUS).doubted
+def test_doubted_state_is_reported_as_ambiguous(covered):
+    assert state(covered) is State.DOUBTED
+    assert changes(covered)[-1] == ("TRACKING", "AMBIGUOUS", "only 0 points to register")
 
 
 def test_odometry_pause_while_doubted_keeps_the_place(covered):
     epoch = covered.frame(0.2, doubted).epoch
     covered.moved(0.9, x=0.4)
     assert covered.counters.odometry_gaps == 1
-    assert state(covered) is State.AMBIGUOUS
+    assert state(covered) is State.DOUBTED
     assert covered.counters.losses == 0
     covered.moved(1.0, x=0.5)
     covered.saw(0.95)
     job = covered.session.take_frame()
-    assert (job.epoch, job.suspect) == (epoch, True)
-    covered.session.frame_done(job, tracking(job), covered.now)
+    assert (job.epoch, job.require_verification) == (epoch, True)
+    covered.session.handle_result(job, tracking(job), covered.now)
     assert covered.session.pose() is not None
 
 
@@ -61,8 +52,8 @@ def test_odometry_timeout_while_doubted_keeps_the_place(covered):
     covered.moved(1.0, x=0.5)
     covered.saw(0.95)
     job = covered.session.take_frame()
-    assert (job.epoch, job.suspect) == (epoch, True)
-    covered.session.frame_done(job, tracking(job), covered.now)
+    assert (job.epoch, job.require_verification) == (epoch, True)
+    covered.session.handle_result(job, tracking(job), covered.now)
     assert state(covered) is State.TRACKING
     assert covered.counters.losses == 1
 
@@ -82,13 +73,13 @@ def test_odometry_jump_while_doubted_is_a_loss(covered):
     covered.moved(0.2, x=900.0)
     covered.moved(0.8, x=900.1)  # nothing is known there that could be verified
     assert reason(covered) == "odometry jumped"
-    assert not covered.session.whereabouts.found
+    assert not covered.session.robot_state.engine_has_place
     assert covered.counters.losses == 1
 
 
 def test_odometry_timeout_while_doubted_is_a_loss(covered):
     covered.session.tick(covered.now + 0.4)
-    assert state(covered) is State.AMBIGUOUS
+    assert state(covered) is State.DOUBTED
     covered.session.tick(covered.now + 3600.0)
     assert covered.session.state() == (State.LOST, "no odometry for 0.5 s")
     assert covered.counters.losses == 1
@@ -111,15 +102,15 @@ def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(an
     for k in range(80, 84):  # while the frame is under way
         robot.moved(0.05 * k, x=0.3)
         robot.session.tick(robot.now)
-    robot.session.frame_done(job, tracking(job), robot.now)
+    robot.session.handle_result(job, tracking(job), robot.now)
     assert state(robot) is State.TRACKING
 
 
 def test_doubted_state_gets_no_search_priority(covered):
-    assert not covered.session.hopeful()
+    assert not covered.session.has_candidate()
     searching = Robot()
     searching.frame(0.0, unknown, state=State.AMBIGUOUS)
-    assert searching.session.hopeful()
+    assert searching.session.has_candidate()
 
 
 def test_loss_has_newest_reason_and_is_counted_once():
@@ -131,7 +122,7 @@ def test_loss_has_newest_reason_and_is_counted_once():
         robot.saw(stamp - 0.01, now=silent + stamp)
         job = robot.session.take_frame()
         more = {"state": State.LOST, "reason": "in doubt for 60 s"} if answer is unknown else {}
-        robot.session.frame_done(job, answer(job, **more), silent + stamp)
+        robot.session.handle_result(job, answer(job, **more), silent + stamp)
         if answer is doubted:
             assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
     assert robot.session.state() == (State.LOST, "in doubt for 60 s")

@@ -17,7 +17,7 @@ def robot():
 def test_restart_search_drops_the_place(robot):
     robot.localized(0.0)
     before = robot.frame(0.1)
-    robot.session.begin_anew("asked to search again")
+    robot.session.restart_search("asked to search again")
     assert robot.session.state() == (State.LOST, "asked to search again")
     assert robot.session.pose() is None
     assert robot.counters.received == 2  # nothing is forgotten but the place
@@ -28,7 +28,7 @@ def test_restart_search_drops_the_place(robot):
 
 def test_restart_search_before_a_fix_is_not_a_loss(robot):
     robot.frame(0.0, unknown)
-    robot.session.begin_anew("asked to search again")
+    robot.session.restart_search("asked to search again")
     assert state(robot) is State.SEARCHING
     assert robot.counters.losses == 0
 
@@ -38,11 +38,11 @@ def test_reset_clears_the_session(robot):
     robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
     robot.session.reset()
     assert counted(robot) == {}
-    assert not robot.session.complaints.texts
+    assert not robot.session.errors.texts
     assert robot.session.pose() is None
-    assert robot.session.whereabouts.evidence is None
-    assert robot.session.whereabouts.last_frame_ns is None
-    assert robot.session.work.latency.to_json()["p50"] is None
+    assert robot.session.robot_state.evidence is None
+    assert robot.session.robot_state.last_frame_ns is None
+    assert robot.session.queue.latency.to_json()["p50"] is None
     assert robot.session.state() == (State.SEARCHING, f"waiting for clouds on {KEYS.cloud}")
     assert robot.frame(0.2, unknown).epoch != epoch
 
@@ -50,77 +50,77 @@ def test_reset_clears_the_session(robot):
 @pytest.mark.parametrize("how", ["begin_anew", "reset", "jump"])
 def test_results_of_old_epoch_are_ignored(robot, how):
     robot.frame(0.0, unknown, ask=query(0.0))
-    searching = robot.session.take_search()
+    searching = robot.session.take_search_request()
     robot.drive(0.05, 0.2)
     robot.saw(0.15)
     busy = robot.session.take_frame()
     if how == "begin_anew":
-        robot.session.begin_anew("asked to")
+        robot.session.restart_search("asked to")
     elif how == "reset":
         robot.session.reset()
     else:
         robot.moved(0.25, x=500.0)
-    robot.session.frame_done(busy, tracking(busy), robot.now)
+    robot.session.handle_result(busy, tracking(busy), robot.now)
     assert robot.session.pose() is None
-    robot.session.search_done(searching, verdict(accepted="a place"))
+    robot.session.handle_result(searching, verdict(accepted="a place"), robot.now)
     far = 500.0 if how == "jump" else 0.6
     robot.moved(0.3, x=far)
     robot.moved(0.35, x=far)
     robot.saw(0.33)
     job = robot.session.take_frame()
-    assert job.verdict is None
+    assert job.search_result is None
     assert job.epoch > busy.epoch
     # the old frame's end does not end the new one
-    robot.session.frame_done(job, unknown(job, ask=query(1.0)), robot.now)
-    assert robot.session.take_search().epoch == job.epoch
+    robot.session.handle_result(job, unknown(job, ask=query(1.0)), robot.now)
+    assert robot.session.take_search_request().epoch == job.epoch
 
 
 def test_failure_of_old_epoch_does_not_end_running_frame(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15)
     old = robot.session.take_frame()
-    robot.session.begin_anew("asked to")
+    robot.session.restart_search("asked to")
     robot.saw(0.18)
     busy = robot.session.take_frame()
     assert busy is not None
-    robot.session.frame_failed(old, "boom", rejected=False)
+    robot.session.handle_failure(old, "boom", rejected=False)
     robot.saw(0.19)
     assert robot.session.take_frame() is None
-    robot.session.frame_done(busy, tracking(busy), robot.now)
+    robot.session.handle_result(busy, tracking(busy), robot.now)
     assert robot.session.pose() is not None
 
 
 def test_search_result_goes_with_the_next_frame_once(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
     said = verdict()
-    robot.session.search_done(robot.session.take_search(), said)
-    assert robot.frame(0.1, unknown).verdict is said
-    assert robot.frame(0.2, unknown).verdict is None
+    robot.session.handle_result(robot.session.take_search_request(), said, robot.now)
+    assert robot.frame(0.1, unknown).search_result is said
+    assert robot.frame(0.2, unknown).search_result is None
 
 
 def test_search_result_is_kept_when_frame_is_rejected(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
     said = verdict()
-    robot.session.search_done(robot.session.take_search(), said)
+    robot.session.handle_result(robot.session.take_search_request(), said, robot.now)
     robot.drive(0.05, 0.2)
     robot.saw(0.1)
-    robot.session.frame_failed(robot.session.take_frame(), "too few points", rejected=True)
+    robot.session.handle_failure(robot.session.take_frame(), "too few points", rejected=True)
     robot.saw(0.15)
-    assert robot.session.take_frame().verdict is said
+    assert robot.session.take_frame().search_result is said
 
 
 def test_failed_search_skips_only_its_keyframe(robot):
     robot.frame(0.0, unknown, ask=query(0.0))
-    robot.session.search_done(robot.session.take_search(), None)
-    assert robot.frame(0.1, unknown, ask=query(0.1)).verdict is None
-    assert robot.session.take_search() is not None
+    robot.session.handle_failure(robot.session.take_search_request(), "boom")
+    assert robot.frame(0.1, unknown, ask=query(0.1)).search_result is None
+    assert robot.session.take_search_request() is not None
 
 
 def test_engine_failure_starts_new_epoch(robot):
     epoch = robot.localized(0.0).frame(0.1).epoch
     robot.drive(0.15, 0.3)
     robot.saw(0.25)
-    robot.session.frame_failed(robot.session.take_frame(), "boom", rejected=False)
+    robot.session.handle_failure(robot.session.take_frame(), "boom", rejected=False)
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
     assert robot.frame(0.4, unknown).epoch != epoch

@@ -121,36 +121,36 @@ def test_reason_is_taken_from_evidence(robot):
 def test_error_log_is_deduplicated_and_bounded(robot):
     for _ in range(50):
         robot.session.on_cloud(Sample(KEYS.cloud, b"x", "video/raw"), 0.0)
-    assert len(robot.session.complaints.texts) == 1
+    assert len(robot.session.errors.texts) == 1
     for k in range(50):
         robot.session.on_cloud(Sample(KEYS.cloud, b"x", f"video/{k}"), 0.0)
-    assert len(robot.session.complaints.texts) <= 10
-    assert any("video/49" in text for text in robot.session.complaints.texts)
+    assert len(robot.session.errors.texts) <= 10
+    assert any("video/49" in text for text in robot.session.errors.texts)
 
 
 def test_latency_is_measured_from_cloud_to_result(robot):
     robot.drive(0.0, 0.2)
     robot.saw(0.15, now=1000.2)
     job = robot.session.take_frame()
-    robot.session.frame_done(job, tracking(job), 1000.26)
-    assert robot.session.work.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
-    assert robot.session.work.engine_latency.to_json()["p50"] == 10.0
+    robot.session.handle_result(job, tracking(job), 1000.26)
+    assert robot.session.queue.latency.to_json()["p50"] == pytest.approx(60.0, abs=0.1)
+    assert robot.session.queue.engine_latency.to_json()["p50"] == 10.0
 
 
 def test_longest_wait_excludes_sender_pauses(robot):
     robot.frame(0.0)
     robot.frame(60.0)  # a minute without clouds
-    assert robot.session.work.longest_wait < 0.1
+    assert robot.session.queue.longest_wait < 0.1
     robot.drive(60.1, 60.4)
     robot.saw(60.2)
     robot.saw(60.3)  # takes the place of the other, which has waited since 60.2
     job = robot.session.take_frame()
-    robot.session.frame_done(job, tracking(job), 1061.0)
-    assert robot.session.work.longest_wait == pytest.approx(0.8, abs=0.01)
+    robot.session.handle_result(job, tracking(job), 1061.0)
+    assert robot.session.queue.longest_wait == pytest.approx(0.8, abs=0.01)
 
 
 def test_codec_options_override_encoding():
-    session = Session(KEYS, SHA, options=("xyz", "json"))
+    session = Session(KEYS, SHA, codecs=("xyz", "json"))
     sample, moved = cloud(0.0), odometry(0.0)
     session.on_cloud(Sample(sample.key, sample.payload, "video/raw", sample.attachment), 0.0)
     session.on_odometry(Sample(moved.key, moved.payload, "video/raw"), 0.0)
@@ -163,7 +163,7 @@ def test_frame_that_replaced_another_defers_registration():
     robot.saw(0.0)
     robot.saw(0.1)
     job = robot.session.take_frame()
-    assert (job.stamp_ns, job.hurry) == (ns(0.1), True)
-    robot.session.frame_done(job, tracking(job), robot.now)
+    assert (job.stamp_ns, job.defer) == (ns(0.1), True)
+    robot.session.handle_result(job, tracking(job), robot.now)
     robot.saw(0.2)
-    assert not robot.session.take_frame().hurry
+    assert not robot.session.take_frame().defer

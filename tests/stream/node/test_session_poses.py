@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, ns, pose, reason, state, tracking, unknown
+from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, doubted, ns, pose, reason, state, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.localization.state import State
@@ -85,7 +85,7 @@ def test_correction_does_not_change_published_stamps(robot):
         if k % 2 == 0:
             robot.saw(0.05 * k - 0.02)
             job = robot.session.take_frame()
-            robot.session.frame_done(job, tracking(job, T_MAP_ODOM @ pose(0.01 * k)), robot.now)
+            robot.session.handle_result(job, tracking(job, T_MAP_ODOM @ pose(0.01 * k)), robot.now)
         sent = robot.session.pose()
         stamps.append(sent.stamp_ns)
         newest = k if k % 2 == 0 else k - 1
@@ -106,9 +106,9 @@ def test_new_correction_replaces_the_old(robot):
 
 def test_doubted_state_has_no_pose(robot):
     robot.localized(0.0)
-    robot.frame(0.1, unknown, state=State.AMBIGUOUS, reason="evidence gone, 1 times in a row")
+    robot.frame(0.1, doubted, reason="rays pass through the map")
     assert robot.session.pose() is None
-    assert robot.session.state() == (State.AMBIGUOUS, "evidence gone, 1 times in a row")
+    assert robot.session.state() == (State.DOUBTED, "rays pass through the map")
     robot.frame(0.2)
     assert state(robot) is State.TRACKING
 
@@ -133,18 +133,18 @@ def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
     assert state(robot) is State.LOST
     robot.saw(0.19, now=silent + 0.02)
     job = robot.session.take_frame()
-    assert job.suspect
-    robot.session.frame_done(job, unknown(job, State.AMBIGUOUS), silent + 0.05)
+    assert job.require_verification
+    robot.session.handle_result(job, unknown(job, State.AMBIGUOUS), silent + 0.05)
     assert robot.session.pose() is None
     robot.moved(0.3, now=silent + 0.1)
     robot.saw(0.29, now=silent + 0.1)
     job = robot.session.take_frame()
-    robot.session.frame_done(job, tracking(job), silent + 0.15)
+    robot.session.handle_result(job, tracking(job), silent + 0.15)
     assert state(robot) is State.TRACKING
     assert robot.session.pose() is not None
     robot.moved(0.4, now=silent + 0.2)
     robot.saw(0.39, now=silent + 0.2)
-    assert not robot.session.take_frame().suspect
+    assert not robot.session.take_frame().require_verification
 
 
 def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
@@ -153,7 +153,7 @@ def test_frame_from_before_odometry_timeout_does_not_restore_the_pose(robot):
     robot.saw(0.25)
     job = robot.session.take_frame()
     robot.session.tick(robot.now + 0.6)
-    robot.session.frame_done(job, tracking(job), robot.now + 0.7)
+    robot.session.handle_result(job, tracking(job), robot.now + 0.7)
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
 
@@ -178,7 +178,7 @@ def test_dead_reckoning_ends_after_timeout():
     assert robot.session.pose() is None
     assert robot.session.state() == (State.LOST, "no usable frame for 2 s")
     robot.saw(2.19)
-    assert robot.session.take_frame().suspect
+    assert robot.session.take_frame().require_verification
 
 
 def test_rejected_frames_do_not_extend_dead_reckoning():
@@ -187,7 +187,7 @@ def test_rejected_frames_do_not_extend_dead_reckoning():
         robot.moved(0.05 * k)
         robot.saw(0.05 * k - 0.01)
         job = robot.session.take_frame()
-        robot.session.frame_failed(job, "too few points", rejected=True)
+        robot.session.handle_failure(job, "too few points", rejected=True)
         robot.session.tick(robot.now)
     assert state(robot) is State.LOST
 
@@ -202,8 +202,8 @@ def test_odometry_gap_ends_pose_until_a_frame_is_verified(robot):
     robot.moved(0.9, x=0.0, now=1000.2)
     robot.saw(0.85, now=1000.2)
     job = robot.session.take_frame()
-    assert job.suspect
-    robot.session.frame_done(job, tracking(job), 1000.3)
+    assert job.require_verification
+    robot.session.handle_result(job, tracking(job), 1000.3)
     assert robot.session.pose() is not None
 
 
@@ -216,8 +216,8 @@ def test_odometry_jump_restarts_search(robot):
     robot.saw(0.18)
     job = robot.session.take_frame()
     assert job.epoch != first.epoch
-    assert not job.suspect  # the engine begins anew as well
-    assert job.verdict is None
+    assert not job.require_verification  # the engine begins anew as well
+    assert job.search_result is None
 
 
 def test_restarted_sender_clock_may_publish_older_stamps():
@@ -228,5 +228,5 @@ def test_restarted_sender_clock_may_publish_older_stamps():
     assert robot.session.state() == (State.LOST, "the sender's clock started anew")
     robot.saw(1.42, now=1102.0)
     job = robot.session.take_frame()
-    robot.session.frame_done(job, tracking(job), 1102.0)
+    robot.session.handle_result(job, tracking(job), 1102.0)
     assert robot.session.pose().stamp_ns == ns(1.45)

@@ -71,16 +71,19 @@ class Chaos:
             if (job := session.take_frame()) is not None:
                 self.jobs.append(job)
         elif event == "take search":
-            if (search := session.take_search()) is not None:
+            if (search := session.take_search_request()) is not None:
                 self.searches.append(search)
         elif event == "searched" and self.searches:
-            session.search_done(self.searches.pop(0), verdict() if value else None)
+            if value:
+                session.handle_result(self.searches.pop(0), verdict(), self.now)
+            else:
+                session.handle_failure(self.searches.pop(0), "boom")
         elif event == "done" and self.jobs:
             self.answer(self.jobs.pop(0), value)
         elif event == "failed" and self.jobs:
-            session.frame_failed(self.jobs.pop(0), "boom", rejected=value)
+            session.handle_failure(self.jobs.pop(0), "boom", rejected=value)
         elif event == "ask again":
-            session.begin_anew("asked to search again")
+            session.restart_search("asked to search again")
         elif event == "engine died":
             session.engine_restarted()
         elif event == "reset":
@@ -89,7 +92,9 @@ class Chaos:
 
     def answer(self, job, state):
         known = state is State.TRACKING
-        self.session.frame_done(job, tracking(job) if known else unknown(job, state, ask=query()), self.now)
+        self.session.handle_result(
+            job, tracking(job) if known else unknown(job, state, ask=query()), self.now
+        )
 
     def hold(self):
         counters = self.session.counters

@@ -29,16 +29,16 @@ def test_frame_result_of_before_reset_is_ignored():
     robot.saw(0.0)
     job = robot.session.take_frame()
     robot.session.reset()
-    robot.session.frame_done(job, tracking(job), robot.now)
+    robot.session.handle_result(job, tracking(job), robot.now)
     assert robot.counters.received == robot.counters.processed == 0
 
 
 def test_search_result_of_before_reset_is_ignored():
     robot = Robot()
     robot.frame(0.0, unknown, ask=query(0.0))
-    job = robot.session.take_search()
+    job = robot.session.take_search_request()
     robot.session.reset()
-    robot.session.search_done(job, verdict())
+    robot.session.handle_result(job, verdict(), robot.now)
     assert robot.counters.searches == 0
 
 
@@ -58,14 +58,14 @@ def test_frame_from_before_gap_does_not_count_as_verification():
     robot.saw(0.2)
     robot.session.tick(robot.now + 0.6)  # silence: LOST, the next frame is suspect
     busy = robot.session.take_frame()
-    assert busy.suspect
+    assert busy.require_verification
     robot.moved(2.0, x=0.6, now=robot.now + 1.7)  # the robot was carried away meanwhile
     assert robot.counters.odometry_gaps == 1
-    robot.session.frame_done(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
+    robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
     robot.saw(2.05)
     job = robot.session.take_frame()
-    assert job.suspect
+    assert job.require_verification
 
 
 def test_odometry_gap_during_first_fix_restarts_search():
@@ -76,7 +76,7 @@ def test_odometry_gap_during_first_fix_restarts_search():
     busy = robot.session.take_frame()  # carries the verdict that will be accepted
     robot.moved(2.0, x=0.6, now=robot.now + 0.02)
     assert robot.counters.odometry_gaps == 1
-    robot.session.frame_done(busy, tracking(busy), robot.now + 0.01)
+    robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)
     assert robot.session.pose() is None
     robot.moved(2.1, x=0.6, now=robot.now + 0.1)
     robot.saw(2.05)
@@ -92,19 +92,19 @@ def test_long_odometry_outage_loses_the_place():
     assert robot.session.state() == (State.LOST, "odometry was away for too long")
 
 
-@pytest.mark.parametrize(("seconds", "state"), [(6.0, State.AMBIGUOUS), (12.0, State.LOST)])
+@pytest.mark.parametrize(("seconds", "state"), [(6.0, State.DOUBTED), (12.0, State.LOST)])
 def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
     robot = Robot().localized(0.0)
     robot.drive(0.05, 0.3)
-    robot.session.unreachable(robot.now + 1.0)
+    robot.session.on_disconnected(robot.now + 1.0)
     robot.moved(0.3 + seconds, x=0.6, now=robot.now + seconds)
     assert robot.session.pose() is None
     assert robot.session.state()[0] is state
     robot.moved(0.4 + seconds, x=0.6, now=robot.now + 0.1)
     robot.saw(0.35 + seconds)
     job = robot.session.take_frame()
-    assert job.suspect or state is State.LOST
-    robot.session.frame_done(job, tracking(job), robot.now + 0.01)
+    assert job.require_verification or state is State.LOST
+    robot.session.handle_result(job, tracking(job), robot.now + 0.01)
     assert robot.session.pose() is not None
 
 
@@ -116,7 +116,7 @@ def test_one_stamp_never_gets_two_poses():
     robot.saw(0.1)
     job = robot.session.take_frame()
     before = robot.session.pose()
-    robot.session.frame_done(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
+    robot.session.handle_result(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
     assert robot.session.pose() is before
     robot.drive(0.15, 0.2)
     after = robot.session.pose()
@@ -131,7 +131,7 @@ def test_late_cloud_covariance_includes_odometry_since():
     robot.drive(0.0, 3.0)  # 2 m/s
     robot.saw(1.0, now=1003.0)  # two seconds in the network
     job = robot.session.take_frame()
-    robot.session.frame_done(job, tracking(job, drift=drift, covariance=known), 1003.0)
+    robot.session.handle_result(job, tracking(job, drift=drift, covariance=known), 1003.0)
     grown = robot.session.pose().covariance - known
     np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)
 
@@ -140,12 +140,12 @@ def test_late_cloud_covariance_includes_odometry_since():
 def test_accepted_search_result_is_not_replaced(second):
     robot = Robot()
     robot.frame(0.0, unknown, ask=query(0.0))
-    first = robot.session.take_search()
+    first = robot.session.take_search_request()
     robot.frame(0.1, unknown, ask=query(0.1))
     accepted = verdict(0.0, accepted="a place")
-    robot.session.search_done(first, accepted)
-    robot.session.search_done(robot.session.take_search(), second)
-    assert robot.frame(0.2, unknown).verdict is accepted
+    robot.session.handle_result(first, accepted, robot.now)
+    robot.session.handle_result(robot.session.take_search_request(), second, robot.now)
+    assert robot.frame(0.2, unknown).search_result is accepted
 
 
 def test_frame_without_odometry_is_not_counted_missing():
@@ -186,7 +186,7 @@ def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(world_map, world_d
     for k in range(6):
         fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
     assert fix.state is State.TRACKING
-    localizer.suspect()
+    localizer.require_verification()
     fixes = [localizer.step(world_drive.clouds[0], world_drive.T_odom_body[5], 2.6)]
     ahead = world_drive.T_odom_body[5]
     for k in range(1, 4):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from fake_robot import Robot, ns, unknown
+from fake_robot import Robot, doubted, ns, unknown
 
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.state import State
@@ -23,7 +23,7 @@ def test_fix_and_loss_are_in_the_state_history():
     robot = Robot()
     assert told(robot) == []
     robot.localized(0.0)
-    robot.frame(0.1, unknown, state=State.AMBIGUOUS, reason="rays pass through the map")
+    robot.frame(0.1, doubted, reason="rays pass through the map")
     robot.frame(0.2, unknown, state=State.LOST, reason="2 registrations rejected")
     changes = told(robot)
     assert [(c["from"], c["to"]) for c in changes] == [
@@ -61,8 +61,8 @@ def test_state_history_keeps_newest_five_with_running_numbers():
     )
     for k in range(9):
         state = (State.TRACKING, State.AMBIGUOUS)[k % 2]
-        changes.note(state, f"reason {k}", k, evidence)
-        changes.note(state, "again", k, evidence)
+        changes.add(state, f"reason {k}", k, evidence)
+        changes.add(state, "again", k, evidence)
     kept = changes.to_json()
     assert [c["number"] for c in kept] == [5, 6, 7, 8, 9]
     assert [c["reason"] for c in kept] == [f"reason {k}" for k in range(4, 9)]
