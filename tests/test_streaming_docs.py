@@ -19,7 +19,7 @@ from coview_stream.stream.client import client
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.robot_state import Transition
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TEXT = (DOCS / "streaming.md").read_text(encoding="utf-8")
@@ -66,7 +66,7 @@ def test_docs_list_every_transition_field():
 
 def test_docs_list_every_evidence_field():
     text = (DOCS / "method.md").read_text(encoding="utf-8")
-    table = text.split("### Fields of the evidence")[1].split("\n## ")[0]
+    table = text.split("## Fields of the evidence")[1].split("\n## ")[0]
     named = [
         name
         for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
@@ -110,7 +110,7 @@ def test_documented_fields_missing_in_smaller_pose_formats():
 
 
 def test_documented_client_example_runs(monkeypatch, capsys):
-    net = FakeTransport()
+    net = MemoryTransport()
     monkeypatch.setattr(client, "open_client", lambda *endpoints: net)
 
     def answer(sample):

@@ -115,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
     given = (args.cloud_key, args.odometry_key, args.pose_key, args.domain, args.humble)
     keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
+    if not 0 < args.coast < float("inf"):  # the configuration names the field otherwise
+        raise ConfigError(f"--coast is {args.coast}; it must be a positive, finite number of seconds")
     by_default = not (args.connect or args.listen or args.config)
     node = NodeConfig(
         pose_rate=args.pose_rate,
