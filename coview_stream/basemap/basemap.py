@@ -128,7 +128,7 @@ class BaseMap:
         return self._arrays["points"]
 
     def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
-        """Descriptors (M, R, S) of one channel."""
+        """Return the descriptors (M, R, S) of one channel."""
         return self._arrays[f"descriptor.{name}"]
 
     @cached_property
@@ -142,13 +142,13 @@ class BaseMap:
         return FeatureMap(self._arrays, parameters)
 
     def crop(self, centre: Floats, radius: float) -> tuple[Points, Points]:
-        """Points and unit normals (K, 3) within ``radius`` metres of ``centre``, both relative to :attr:`origin`."""
+        """Return points and unit normals (K, 3) within ``radius`` metres of ``centre``, relative to :attr:`origin`."""
         return tiles.crop(
             self.points, self._arrays["normals"], self._arrays["tile_index"], self.config.tile, centre, radius
         )
 
     def surveyed(self, xy: Reals) -> Bools:
-        """Whether the map has points around each of (K, 2) positions, relative to :attr:`origin`."""
+        """Tell of (K, 2) positions, relative to :attr:`origin`, whether the map has points around them."""
         grid, corner = self._arrays["surveyed"], self._arrays["surveyed_corner"]
         index = np.floor((xy - corner) / self.config.block).astype(np.int64)
         inside = ((index >= 0) & (index < np.array(grid.shape)[::-1])).all(axis=1)

@@ -120,7 +120,7 @@ def _read(path: Path, done: int, total: int, step: Progress) -> Any:
 
 
 def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
-    """Block-sized cells (H, W) that hold points or neighbour on cells that do, and the lower left corner (2,).
+    """Mask block-sized cells (H, W) that hold points or neighbour on cells that do; also the lower left corner (2,).
 
     The neighbours bridge the shadows of buildings, which have no points but were surveyed.
     """
@@ -150,7 +150,7 @@ def _sha256(path: Path) -> str:
 
 @contextmanager
 def _progress_bar(show: bool, title: str) -> Iterator[Progress]:
-    """Progress bar on stderr with an ETA, if ``show``."""
+    """Draw a progress bar on stderr with an ETA, if ``show``."""
     from tqdm import tqdm
 
     with tqdm(total=1, desc=title, unit="", disable=not show, leave=False) as bar:

@@ -47,7 +47,7 @@ def cloth_ground(
     iterations: int,
     threshold: float,
 ) -> Bools:
-    """Mask of the points (N, 3), metres, that the cloth comes to lie on, dropped on the upturned cloud.
+    """Mask the points (N, 3), metres, on which the cloth comes to lie, dropped on the upturned cloud.
 
     Raises:
         DependencyError: the wheel is not installed.

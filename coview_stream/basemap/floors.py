@@ -51,7 +51,7 @@ def ground_levels(
     ground_config: GroundConfig | None = None,
     floors: Points | None = None,
 ) -> Points:
-    """Centres (K, 3) of all walkable ``cell``-sized squares, one for each level, metres.
+    """Find the centres (K, 3) of all walkable ``cell``-sized squares, one for each level, metres.
 
     The lowest level is the ground itself (``ground_mask``). A higher one counts only where it is a floor
     *indoors*: flat, extended, with headroom, and covered by something flat within ``config.cover``. So an
@@ -82,7 +82,7 @@ def ground_levels(
 
 
 def below_another(stations: Points, cell: float) -> Bools:
-    """Mask of the stations (M, 3) that have another one above them in their ``cell``-sized square."""
+    """Mask the stations (M, 3) that have another one above them in their ``cell``-sized square."""
     if not len(stations):
         return np.zeros(0, dtype=bool)
     _, _, flat = cells(stations, cell)
@@ -93,7 +93,7 @@ def below_another(stations: Points, cell: float) -> Bools:
 
 
 def indoor_floors(points: Points, config: LevelConfig) -> Points:
-    """Half-metre cells (K, 3) of all covered floors, the lowest storey included, metres."""
+    """Find the half-metre cells (K, 3) of all covered floors, the lowest storey included, metres."""
     corner, shape, flat = cells(points, _SUBCELL)
     level = np.floor(points[:, 2] / np.float32(_STEP)).astype(np.int64)
     base = int(level.min())
@@ -118,7 +118,7 @@ def _flat_and_wide(
     shape: tuple[int, int],
     config: LevelConfig,
 ) -> Bools:
-    """Mask of the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
+    """Mask the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
     kept = np.zeros(len(column), dtype=bool)
     steps = max(1, round(config.flatness / _STEP))
     # candidates of one column differ by the headroom at least, so each slab holds one of a column
@@ -165,7 +165,7 @@ def _one_slab(
 
 
 def _squares(ground: Points, cell: float) -> Points:
-    """Cell centre and median height of the ground in each cell, one height per cell."""
+    """Return the cell centre and median height of the ground in each cell, one height per cell."""
     if not len(ground):
         return ground.reshape(0, 3)
     corner, shape, flat = cells(ground, cell)
@@ -179,7 +179,7 @@ def _squares(ground: Points, cell: float) -> Points:
 
 
 def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
-    """Squares of floors that lie above the base level of their cell and cover a quarter of it."""
+    """Find the squares of floors that lie above the base level of their cell and cover a quarter of it."""
     if not len(floors):
         return floors.reshape(0, 3)
     corner, shape, flat = cells(np.concatenate([floors, base]), cell)

@@ -93,7 +93,7 @@ class GroundRaster:
     cell: float
 
     def height_at(self, xy: Reals) -> Floats32:
-        """Ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
+        """Interpolate the ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
 
         Bilinear between cell centres; unknown neighbours carry no weight.
         """
@@ -118,7 +118,7 @@ class GroundRaster:
 
 
 def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal["cloth", "morphological"]:
-    """Name of the filter that finds the ground of these (N, 3) points, metres.
+    """Choose the filter for these (N, 3) points, metres.
 
     With ``auto`` it is the cloth, but the morphological filter where the cloth's wheel is not installed (there is none
     for Python 3.13 and for ARM) and where the points are too narrow for the cloth to hang.
@@ -138,7 +138,7 @@ def ground_filter(points: Points, config: GroundConfig | None = None) -> Literal
 
 
 def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
-    """Mask of the points that lie on the ground.
+    """Mask the points that lie on the ground.
 
     The lowest point of each cell goes through the filter; then all points are classified by their height
     above the raster of the lowest points that were ground.
@@ -170,7 +170,7 @@ def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
 
 
 def ground_surface(points: Points, config: GroundConfig | None = None) -> GroundRaster:
-    """Lowest ground of all cells of the cloud's extent, interpolated under buildings and trees, without NaN.
+    """Raster the lowest ground of the cloud's extent, interpolated under buildings and trees, without NaN.
 
     Arguments and errors as ``ground_mask``; ``points`` must not be empty.
     """
@@ -197,7 +197,7 @@ def _cells_within(points: Points, config: GroundConfig) -> tuple[Floats, tuple[i
 
 
 def _stray_low(z: Floats32) -> Bools:
-    """Cells more than 1 m below all but three of their 9 x 9 neighbours: echoes from below the ground."""
+    """Mask cells more than 1 m below all but three of their 9 x 9 neighbours: echoes from below the ground."""
     high = np.where(np.isnan(z), np.float32(np.inf), z)
     fourth = ndimage.rank_filter(high, rank=3, size=9, mode="nearest")
     return np.asarray(np.isfinite(fourth) & (high < fourth - 1.0))
@@ -211,7 +211,7 @@ def _filtered(
     config: GroundConfig,
     method: Literal["cloth", "morphological"],
 ) -> Bools:
-    """Mask of the lowest points that are ground; all of them if they are too few for a filter."""
+    """Mask the lowest points that are ground; all of them if they are too few for a filter."""
     if len(lowest) < _MIN_CELLS:
         return np.ones(len(lowest), dtype=bool)
     if method == "cloth":
@@ -237,7 +237,7 @@ def _refined(
     config: GroundConfig,
     cell: float,
 ) -> Floats32:
-    """Raster of the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
+    """Raster the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
     heights = z.flat[occupied]
     for _ in range(config.refinements + 1):
         kept = np.full(z.shape, np.nan, dtype=np.float32)
@@ -267,7 +267,7 @@ def _slope(surface: GroundRaster) -> Floats32:
 
 
 def morphological_ground(z: Floats32, cell: float) -> Bools:
-    """Mask of the ground cells of a raster of lowest heights (H, W; NaN where empty; metres): a progressive filter.
+    """Mask the ground cells of a raster of lowest heights (H, W; NaN where empty; metres): a progressive filter.
 
     Openings with growing windows remove what is narrower than the window and stands out of the opened surface
     by more than a slope of 0.3 explains.

@@ -33,7 +33,7 @@ _CEILING = 6.0  # metres: as LevelConfig.cover
 
 
 def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:
-    """Stations (M, 3): one per ``block``-sized cell that has ground, at its centre and median ground height.
+    """Put stations (M, 3), one per ``block``-sized cell that has ground, at its centre and median ground height.
 
     With ``levels`` there is one more for every floor of a building above it. (The paper's centroids of 3-D voxels put
     two stations into some cells.)
@@ -53,7 +53,7 @@ def describe_storeys(
     config: DescriptorConfig,
     progress: Progress | None = None,
 ) -> Described:
-    """Descriptor channels (M, R, S) of all stations, those with a storey above them storey by storey.
+    """Describe all stations by channels (M, R, S), those with a storey above them storey by storey.
 
     A robot below another floor sees up to it, not the roof: such stations of similar height share a raster of the
     points from a metre below their floor up to the highest ceiling that counts as one.
@@ -91,7 +91,7 @@ def describe_stations(
     config: DescriptorConfig,
     progress: Progress | None = None,
 ) -> Described:
-    """Descriptor channels (M, R, S) float16 of the virtual reference scans at ``stations`` (M, 3).
+    """Describe the virtual reference scans at ``stations`` (M, 3) by channels (M, R, S), float16.
 
     Stations are described in portions: the descriptors of all of them are in memory, their points never. float16 keeps
     2 cm at 30 m height, far below the noise of a maximum over a bin.
@@ -144,13 +144,13 @@ class HeightRaster:
         return self.top.shape[0], self.top.shape[1]
 
     def cells_of(self, xy: Reals) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-        """Row and column (M,) of the cells that hold (M, 2) positions."""
+        """Return row and column (M,) of the cells that hold (M, 2) positions."""
         index = np.floor((np.asarray(xy, dtype=np.float64) - self.corner) / self.cell).astype(np.int32)
         return index[:, 1], index[:, 0]
 
 
 def aligned_corner(points: Points, block: float, cell: float) -> Floats:
-    """Lower left corner (2,) of a raster in which the centres of ``block``-sized grid cells are cell centres.
+    """Return the lower left corner (2,) of a raster whose cells have the centres of ``block``-sized cells among theirs.
 
     Stations stand at ``(k + 1/2) * block``; a half-cell shift lets one offset table serve them all. Needs
     ``block`` to be a multiple of ``cell``.
@@ -167,7 +167,7 @@ def rasterise(
     margin: int = 0,
     extent: Points | None = None,
 ) -> HeightRaster:
-    """Raster of (N, 3) map-frame points.
+    """Raster (N, 3) map-frame points.
 
     The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of raw points depend on the scan
     pattern. The raster reaches to the farthest of ``extent`` (by default the points) and ``margin`` empty cells beyond.

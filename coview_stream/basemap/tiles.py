@@ -14,7 +14,7 @@ _NORMAL_SCALE = 127.0
 
 
 def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, Int8s, Ints]:
-    """Points (N, 3), normals (N, 3) as int8, and the index (T, 4) of their tiles.
+    """Return points (N, 3), normals (N, 3) as int8, and the index (T, 4) of their tiles.
 
     An index row is (column, row, begin, end): the tile covers ``[column, column + 1) * tile`` in x, likewise in y.
     A normal in int8 is off by less than 0.5 degrees.
@@ -37,7 +37,7 @@ def crop(
     centre: Floats,
     radius: float,
 ) -> tuple[Points, Points]:
-    """Points and unit normals (K, 3) float32 within ``radius`` metres (horizontal) of ``centre``."""
+    """Return points and unit normals (K, 3) float32 within ``radius`` metres (horizontal) of ``centre``."""
     low = np.floor((centre[:2] - radius) / tile)
     high = np.floor((centre[:2] + radius) / tile)
     wanted = ((index[:, :2] >= low) & (index[:, :2] <= high)).all(axis=1)

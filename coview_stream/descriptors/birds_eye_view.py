@@ -92,7 +92,7 @@ def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
 
 
 def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
-    """Height of the ground (h, w) by coarse cells, and its height above the mean around, 0 where it was not seen."""
+    """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 where it was not seen."""
     flat = index[:, 1] * shape[1] + index[:, 0]
     least = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
     np.minimum.at(least, flat, points[:, 2])
@@ -119,5 +119,5 @@ def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats
 
 
 def _interpolate(values: Floats32, at: Reals) -> Floats32:
-    """Bilinear values (N,) of an image (h, w) at (N, 2) columns and rows."""
+    """Interpolate an image (h, w) bilinearly at (N, 2) columns and rows."""
     return np.asarray(ndimage.map_coordinates(values, at.T[::-1], order=1, mode="nearest", output=np.float32))

@@ -21,7 +21,7 @@ _GROUND_RADIUS = 6.0  # metres around a keyframe in which its virtual scan shows
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
-    """One descriptor channel (..., R, S) of polar bins; metres above the ground.
+    """Compute one descriptor channel (..., R, S) of polar bins; metres above the ground.
 
     Heights below the zero carry no shape (they are ground in a hollow) and count as zero.
     """
@@ -32,7 +32,7 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:
-    """Descriptor channels, (R, S) each, of the virtual local scan around ``centre``.
+    """Describe the virtual local scan around ``centre`` by channels, (R, S) each.
 
     Args:
         points: (N, 3) gravity-aligned points, metres, one per voxel.
@@ -58,7 +58,7 @@ def ring_key(descriptor: Descriptor) -> Floats32:
 
 
 def ground_below(points: Points, position: Floats) -> float:
-    """Height of the ground below ``position`` (3,), from the points around it, metres in their frame.
+    """Estimate the height of the ground below ``position`` (3,) from the points around it, metres in their frame.
 
     The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and independent of the sensor's
     mounting height. Without points below the sensor there, the sensor's own height.

@@ -67,7 +67,7 @@ def feature_arrays(
 
 
 def _drawn(points: Points, low: Ints, high: Ints, window: int) -> Windows:
-    """Bird's-eye views of the windows that have points, by column and row."""
+    """Draw bird's-eye views of the windows that have points, by column and row."""
     columns, rows = (-(-(high - low) // window)).tolist()
     views: Windows = {}
     for row in range(rows):
@@ -116,7 +116,7 @@ def _clipped(begin: int, length: int, size: int) -> tuple[slice, slice]:
 def _stored(
     features: Features, image: Image, corner: Ints, shape: tuple[int, int]
 ) -> dict[str, npt.NDArray[Any]]:
-    """Features without their margin, as they are stored: those of the tiles that have points."""
+    """Quantize the features without their margin, of the tiles that have points."""
     height, width = shape
     known = _known(image)
     core = (slice(_NET_MARGIN, _NET_MARGIN + height), slice(_NET_MARGIN, _NET_MARGIN + width))
@@ -136,7 +136,7 @@ def _stored(
 
 
 def _known(image: Image) -> Bools:
-    """Which 1 m cells (H, W) of an image are near points."""
+    """Mask the 1 m cells (H, W) of an image that are near points."""
     filled = image[:-1].any(axis=0)
     rows, columns = (n // _CELLS for n in filled.shape)
     coarse = filled.reshape(rows, _CELLS, columns, _CELLS).any(axis=(1, 3))
@@ -146,14 +146,14 @@ def _known(image: Image) -> Bools:
 
 
 def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Cells (H, W, ...) as tiles (T, 32, 32, ...), row by row."""
+    """Cut cells (H, W, ...) into tiles (T, 32, 32, ...), row by row."""
     height, width, *rest = values.shape
     blocks = values.reshape(height // TILE, TILE, width // TILE, TILE, *rest)
     return np.asarray(blocks.swapaxes(1, 2).reshape(-1, TILE, TILE, *rest))
 
 
 def _places(place: Floats32, known: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
-    """Global descriptors (K, P) of squares of 8 m, made as a query's is of its four middle cells, and their middles."""
+    """Pool global descriptors (K, P) over squares of 8 m, as a query does its four middle cells; also their middles."""
     edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
     height, width = (n // side for n in shape)
     inner = place[:, edge : edge + _PER_PLACE * height, edge : edge + _PER_PLACE * width]

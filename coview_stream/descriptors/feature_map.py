@@ -141,7 +141,7 @@ class FeatureMap:
 
 
 def means(tile: Int8s, ratio: int) -> Floats32:
-    """Means (C, h, w) of stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells."""
+    """Average stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells: (C, h, w)."""
     height, width, channels = (tile.shape[0] // ratio, tile.shape[1] // ratio, tile.shape[2])
     blocks = tile.reshape(height, ratio, width, ratio, channels).astype(np.float32)
     return np.ascontiguousarray(blocks.mean(axis=(1, 3)).transpose(2, 0, 1) * np.float32(1.0 / 127.0))
@@ -158,7 +158,7 @@ def weights_sha256(directory: Path | None = None) -> str:
 
 
 def quantized(vectors: Floats32) -> Int8s:
-    """Numbers of magnitude 1 at most (any shape) as bytes; off by 0.004 each."""
+    """Store numbers of magnitude 1 at most (any shape) as bytes; off by 0.004 each."""
     return np.asarray(np.rint(vectors * np.float32(_SCALE)), dtype=np.int8)
 
 
@@ -168,7 +168,7 @@ def dequantized(vectors: Int8s) -> Floats32:
 
 
 def quantized_sigma(sigma: Floats32) -> npt.NDArray[np.uint8]:
-    """Positive sigmas (any shape) as bytes on a logarithmic scale; off by 1.5 % between 0.02 and 50."""
+    """Store positive sigmas (any shape) as bytes on a logarithmic scale; off by 1.5 % between 0.02 and 50."""
     steps = np.log(np.clip(sigma, _MIN_SIGMA, _MAX_SIGMA) / _MIN_SIGMA) * _STEPS
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
@@ -205,6 +205,6 @@ class TileIndex:
 
 
 def _overlap(begin: int, size: int) -> tuple[slice, slice]:
-    """Slices of an axis of ``size`` cells and of a tile that begins at its cell ``begin``, where they overlap."""
+    """Return slices of an axis of ``size`` cells and of a tile that begins at its cell ``begin``: their overlap."""
     low, high = max(0, begin), min(size, begin + TILE)
     return slice(low, high), slice(low - begin, high - begin)

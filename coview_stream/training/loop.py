@@ -81,7 +81,7 @@ def _step(
 
 
 def _seen(images: Any) -> torch.Tensor:
-    """1 for local cells (B, 1, H / 2, W / 2) in which anything but relief was seen, else 0."""
+    """Mark local cells (B, 1, H / 2, W / 2) in which anything but relief was seen: 1, else 0."""
     anything = torch.from_numpy(images[:, :-1].any(axis=1, keepdims=True)).float()
     return torch.nn.functional.max_pool2d(anything, 2)
 

@@ -94,7 +94,7 @@ def dense_loss(
 
 
 def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: int) -> Tensor:
-    """Weights (Q, tried, G, size, size) of the four cells about ``at`` (Q, 2) x, y; the first heading is true."""
+    """Return weights (Q, tried, G, size, size) of the four cells about ``at`` (Q, 2) x, y; heading 0 is true."""
     target = torch.zeros(len(at), tried, pieces, size, size)
     low = at.floor()
     rows = torch.arange(len(at))
@@ -110,7 +110,7 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
 def local_loss(
     query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]
 ) -> Tensor:
-    """Loss that makes corresponding cells similar and others not, and sigma the error of that.
+    """Make corresponding cells similar and others not, and sigma the error of that.
 
     A cross-entropy e over corresponding points, each way, plus e / sigma + log sigma with e held constant, so that a
     high uncertainty is never cheaper than a good descriptor. Only points that both have seen count.
@@ -137,7 +137,7 @@ def local_loss(
 
 
 def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
-    """Loss that makes a query's global descriptor most similar to that of the map around its place."""
+    """Make a query's global descriptor most similar to that of the map around its place."""
     own = _middle(query[2])
     maps = piece[2]
     size = maps.shape[-1]
@@ -165,25 +165,25 @@ def turn(images: Tensor, yaws: Tensor) -> Tensor:
 
 
 def _to_piece(points: Tensor, poses: Tensor) -> Tensor:
-    """Points (Q, K, 2) of the queries in their pieces' frames."""
+    """Transform points (Q, K, 2) of the queries to their pieces' frames."""
     c, s = poses[:, 2].cos()[:, None], poses[:, 2].sin()[:, None]
     x, y = points[..., 0], points[..., 1]
     return torch.stack([c * x - s * y, s * x + c * y], -1) + poses[:, None, :2]
 
 
 def _at(images: Tensor, points: Tensor) -> Tensor:
-    """Bilinear values (Q, K, C) of local images (Q, C, n, n) at (Q, K, 2) metres about their middles."""
+    """Interpolate local images (Q, C, n, n) bilinearly at (Q, K, 2) metres about their middles: (Q, K, C)."""
     grid = (points / (0.5 * LOCAL_CELL * images.shape[-1]))[:, :, None]
     return functional.grid_sample(images, grid, align_corners=False)[..., 0].transpose(1, 2)
 
 
 def _middle(place: Tensor) -> Tensor:
-    """Global descriptor (Q, P) of the four middle cells."""
+    """Pool the global descriptor (Q, P) of the four middle cells."""
     half = place.shape[-1] // 2
     return functional.normalize(place[:, :, half - 1 : half + 1, half - 1 : half + 1].mean((2, 3)), dim=1)
 
 
 def _disk(size: int, radius: float) -> Tensor:
-    """Mask of the (size, size) local cells within ``radius`` metres of the middle: 1, else 0."""
+    """Mask (size, size) local cells within ``radius`` metres of the middle: 1, else 0."""
     at = (torch.arange(size) + 0.5 - size / 2) * LOCAL_CELL
     return (torch.hypot(at[:, None], at[None]) < radius).float()

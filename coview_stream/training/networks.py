@@ -105,7 +105,7 @@ class PlaceNet(nn.Module):
         return local, sigma, self._place(at4)
 
     def _place(self, at4: Tensor) -> Tensor:
-        """Generalised mean (GeM) under a round window about every cell, then a linear layer."""
+        """Pool by the generalised mean (GeM) under a round window about every cell, then apply a linear layer."""
         raised = at4.clamp(min=_MIN_ACTIVATION).pow(self.power)
         down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
         across = self.window.transpose(2, 3)

@@ -21,7 +21,7 @@ _LANE = 0.7  # metres to either side of a street's middle
 
 
 def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, length: float) -> Floats:
-    """Path (N, 2) of ``length`` metres, shorter where trees block it, that ends within +-``extent`` metres.
+    """Draw a path (N, 2) of ``length`` metres, shorter where trees block it, that ends within +-``extent`` metres.
 
     ``obstacles`` (K, 3) are x, y and radius, metres.
     """
@@ -44,7 +44,7 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
 
 
 def _clear(points: Floats, obstacles: Floats) -> Bools:
-    """Mask (...) of the points (..., 2) that are clear of all obstacles."""
+    """Mask (...) the points (..., 2) that are clear of all obstacles."""
     if not len(obstacles):
         return np.ones(points.shape[:-1], dtype=bool)
     flat = points.reshape(-1, 2)
@@ -59,7 +59,7 @@ def _clear(points: Floats, obstacles: Floats) -> Bools:
 
 
 def along_streets(rng: np.random.Generator, layout: Layout, extent: float, length: float) -> Floats:
-    """Path (N, 2) of up to ``length`` metres in a street, that ends within +-``extent`` metres."""
+    """Draw a path (N, 2) of up to ``length`` metres in a street, that ends within +-``extent`` metres."""
     streets = [line for line in (layout.route, *layout.streets) if (np.abs(line) < extent).all(axis=1).any()]
     line = streets[int(rng.integers(len(streets)))]
     line = line if rng.random() < 0.5 else line[::-1]

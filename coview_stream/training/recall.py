@@ -46,7 +46,7 @@ class SearchedQuery:
     scores: Floats
 
     def found_among(self, best: int = 1, within: float = 10.0) -> bool:
-        """Whether one of the ``best`` places lies ``within`` metres of the truth."""
+        """Tell whether one of the ``best`` places lies ``within`` metres of the truth."""
         apart = np.linalg.norm(self.found[:best, :2] - self.pose[:2], axis=1)
         return bool((apart < within).any())
 
@@ -73,13 +73,13 @@ def search_queries(
 
 
 def weights(sigma: Floats32) -> Floats32:
-    """Weight (h, h) of a query's cells from their uncertainty (h, h): 1 / sigma within 29 m of the middle."""
+    """Weigh a query's cells (h, h) by their uncertainty (h, h): 1 / sigma within 29 m of the middle."""
     at = np.arange(len(sigma)) + 0.5 - len(sigma) / 2
     return np.asarray((np.hypot(at[:, None], at[None]) < _RADIUS) / sigma, dtype=np.float32)
 
 
 def best_places(volume: Floats32, yaws: Floats, corner: Floats) -> tuple[Floats, Floats]:
-    """Places (5, 3) and scores (5,) of the highest peaks of (K, H, W), 10 m or more apart."""
+    """Find the highest peaks of (K, H, W), 10 m or more apart: places (5, 3) and scores (5,)."""
     top = volume.max(axis=0)
     places, scores = [], []
     rows, columns = np.indices(top.shape)

@@ -144,7 +144,7 @@ class Recipe:
         return float(rng.uniform(low, high))
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as plain values, for JSON."""
+        """Return all fields as plain values, for JSON."""
         return asdict(self)
 
 

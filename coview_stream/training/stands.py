@@ -107,7 +107,7 @@ def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
 def _fates(
     rng: np.random.Generator, count: int, mortality: float
 ) -> tuple[tuple[Bools, Bools], tuple[Bools, Bools]]:
-    """Masks of the trees that stand and of those with leaves, at each epoch; ``mortality``: the share that differs."""
+    """Draw masks of the trees that stand and of those with leaves, at each epoch; a share of ``mortality`` differs."""
     fate = np.where(rng.random(count) < mortality, rng.integers(1, 4, count), 0)
     everyone = np.ones(count, dtype=bool)
     return (fate != 2, fate != 1), (everyone, fate != 3)

@@ -123,7 +123,7 @@ def _moments(rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str
 
 
 def _headings(path: Floats, rng: np.random.Generator) -> Floats:
-    """Headings (N,) of a path (N, 2), radians."""
+    """Return the headings (N,) of a path (N, 2), radians."""
     return directions(path) if len(path) > 2 else np.full(len(path), rng.uniform(0, 2 * np.pi))
 
 
@@ -134,7 +134,7 @@ def _poses(
     heading: Floats,
     ground: Callable[[Floats, Floats], Floats],
 ) -> Floats:
-    """Poses (K, 4, 4) of the sensor at (K, 2), tilted with the ground under the robot and swaying."""
+    """Draw poses (K, 4, 4) of the sensor at (K, 2), tilted with the ground under the robot and swaying."""
     x, y = xy.T
     cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
     ahead = ground(x + cx, y + cy) - ground(x - cx, y - cy)

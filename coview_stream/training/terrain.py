@@ -16,7 +16,7 @@ _STEP = 1.0  # metres between grid points
 
 
 def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:
-    """Random smooth function of x and y (N,) with mean 0, variance 1 and about this wavelength, metres."""
+    """Draw a smooth function of x and y (N,) with mean 0, variance 1 and about this wavelength, metres."""
     heading, phase = rng.uniform(0, 2 * np.pi, (2, count))
     number = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.4, count))
     kx, ky = number * np.cos(heading), number * np.sin(heading)
@@ -52,7 +52,7 @@ class Terrain:
         self._heights: Floats = z - z.mean() + roughness * bumps / bumps.std()
 
     def z(self, x: Floats, y: Floats) -> Floats:
-        """Height of the ground (N,) at (N,) coordinates, metres."""
+        """Return the height of the ground (N,) at (N,) coordinates, metres."""
         scale = (len(self._axis) - 1) / (2 * self.half)
         at = (np.stack([np.asarray(x), np.asarray(y)]) + self.half) * scale
         return np.asarray(map_coordinates(self._heights, at, order=1, mode="nearest"))
@@ -63,7 +63,7 @@ class Terrain:
         return float(self._heights.min()), float(self._heights.max())
 
     def mesh(self) -> Mesh:
-        """Mesh of the ground."""
+        """Return a mesh of the ground."""
         return height_field(self._axis, self._heights)
 
 

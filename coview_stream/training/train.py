@@ -152,7 +152,7 @@ def train_session(
 
 
 def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries: int) -> dict[str, Any]:
-    """Share of queries that the dense search places correctly, over all and by sensor, and the share by chance."""
+    """Evaluate the share of queries found, over all and by sensor, and the share by chance."""
     from coview_stream.training.recall import search_queries
 
     results = search_queries(worlds, aerial, ground, max_queries)

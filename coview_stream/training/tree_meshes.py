@@ -23,7 +23,7 @@ _MAX_CLUMPS = 110_000  # in a stand; set by hand
 
 
 def crowns(rng: np.random.Generator, trees: Trees) -> list[MeshCopies]:
-    """Leaves of all trees, each of its own family."""
+    """Draw the leaves of all trees, each of its own family."""
     draw = (_lumpy, _cone, _storeys, _umbrella, _clumps, _column)
     parts: list[MeshCopies] = []
     for family, name in enumerate(FAMILIES):
@@ -44,7 +44,7 @@ def _lumpy(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]
 
 
 def _lump(rng: np.random.Generator, trees: Trees, of: Ints, semi: Floats, rough: float) -> MeshCopies:
-    """One bough beside the middle of each crown."""
+    """Draw one bough beside the middle of each crown."""
     share, angle = rng.uniform(0.35, 0.65, len(of)), rng.uniform(0, 2 * np.pi, len(of))
     centre = trees.crown_axis(trees.base[of] + semi[:, 2] * rng.uniform(0.5, 1.5, len(of)), of)
     out = 0.7 * semi[:, 0] * rng.uniform(0.6, 1.2, len(of))
@@ -99,7 +99,7 @@ def _column(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies
 
 
 def _clumps(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]:
-    """Small tetrahedra of leaves at random in a profile: pointed, round or a shell."""
+    """Draw small tetrahedra of leaves in a profile: pointed, round or a shell."""
     size, layers = rng.uniform(0.2, 0.5), rng.uniform(1.2, 3.5)
     wanted = layers * np.pi * trees.crown[of] ** 2 / (4 * size**2)
     wanted *= min(1.0, _MAX_CLUMPS / max(wanted.sum(), 1.0))
@@ -130,12 +130,12 @@ def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> MeshCo
 
 
 def leafy(trees: Trees, winter: bool) -> Bools:
-    """Mask (N,) of the trees that have leaves."""
+    """Mask (N,) the trees that have leaves."""
     return ~trees.dead & (trees.evergreen | (not winter))
 
 
 def _tube(sides: int) -> Mesh:
-    """Triangles of a tube of two rings, closed at its far end."""
+    """Make the triangles of a tube of two rings, closed at its far end."""
     i = np.arange(sides)
     j = (i + 1) % sides
     side = [np.column_stack([i, j, j + sides]), np.column_stack([i, j + sides, i + sides])]
@@ -144,7 +144,7 @@ def _tube(sides: int) -> Mesh:
 
 
 def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, owner: Ints) -> MeshCopies:
-    """Tubes between (M, 3) points, their radius falling from ``radius`` to ``top`` (M,), metres."""
+    """Make tubes between (M, 3) points, their radius falling from ``radius`` to ``top`` (M,), metres."""
     axis = end - begin
     axis = axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-9)[:, None]
     aside = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
@@ -158,7 +158,7 @@ def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, o
 
 
 def stems(trees: Trees) -> MeshCopies:
-    """Leaning, tapering stems, from half a metre below the ground to near the top."""
+    """Make leaning, tapering stems, from half a metre below the ground to near the top."""
     top = trees.axis(0.93 * trees.height)
     foot = trees.axis(np.full(len(trees.x), -0.5))
     return tubes(foot, top, trees.radius, 0.25 * trees.radius, 6, np.arange(len(trees.x)))
@@ -178,7 +178,7 @@ def branches(rng: np.random.Generator, trees: Trees, count: Ints) -> MeshCopies:
 
 
 def logs(rng: np.random.Generator, terrain: Terrain, count: int) -> MeshCopies:
-    """Fallen stems."""
+    """Draw fallen stems."""
     xy = rng.uniform(-terrain.half + 8, terrain.half - 8, (count, 2))
     angle, length = rng.uniform(0, 2 * np.pi, count), rng.uniform(3, 14, count)
     reach = 0.5 * length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -188,7 +188,7 @@ def logs(rng: np.random.Generator, terrain: Terrain, count: int) -> MeshCopies:
 
 
 def rocks(rng: np.random.Generator, terrain: Terrain, count: int) -> MeshCopies:
-    """Boulders, half buried."""
+    """Draw boulders, half buried."""
     xy = rng.uniform(-terrain.half, terrain.half, (count, 2))
     semi = rng.uniform(0.2, 1.4, (count, 1)) * rng.uniform(0.6, 1.2, (count, 3))
     centre = np.column_stack([xy, terrain.z(*xy.T) + 0.2 * semi[:, 2]])

@@ -70,13 +70,13 @@ class Trees(NamedTuple):
     dead: Bools
 
     def axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
-        """Points (M, 3) of the stems' axes ``up`` (M,) metres above their feet, bent towards their crowns."""
+        """Return points (M, 3) of the stems' axes ``up`` (M,) metres above their feet, bent towards their crowns."""
         bent = self.offset[of] * (0.7 * np.clip(up / self.height[of], 0, 1) ** 1.5)[:, None]
         xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + bent
         return np.column_stack([xy, self.z[of] + up])
 
     def crown_axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
-        """Points (M, 3) in the middle of the crowns, ``up`` (M,) metres above their feet."""
+        """Return points (M, 3) in the middle of the crowns, ``up`` (M,) metres above their feet."""
         xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + self.offset[of]
         return np.column_stack([xy, self.z[of] + up])
 
@@ -122,7 +122,7 @@ def draw_trees(
 
 
 def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Floats, area: float) -> Floats:
-    """Radii (N,) of crowns, metres, from their usual ``share`` of the height; half of the stands are closed."""
+    """Draw radii (N,) of crowns, metres, from their usual ``share`` of the height; half of the stands are closed."""
     low, high = (each * height / 2 for each in recipe.crown_width)
     wide = share * rng.lognormal(0, 0.15, len(height)) * height / 2
     if rng.random() < 0.5:
@@ -180,7 +180,7 @@ def _rows(rng: np.random.Generator, spacing: float, half: float) -> Floats:
 
 
 def _spaced(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
-    """Mask (N,) without the lower-ranked stem of each pair nearer than ``apart``; ranks are random."""
+    """Mask (N,) out the lower-ranked stem of each pair nearer than ``apart``; ranks are random."""
     keep = np.ones(len(xy), dtype=bool)
     pairs = cKDTree(xy).query_pairs(apart, output_type="ndarray")
     rank = rng.random(len(xy))
@@ -189,7 +189,7 @@ def _spaced(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
 
 
 def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
-    """Mask (N,) of the stems left by thin parts, gaps and perhaps a trail."""
+    """Mask (N,) the stems left by thin parts, gaps and perhaps a trail."""
     keep = np.ones(len(xy), dtype=bool)
     if rng.random() < 0.6:
         uneven = waves(rng, rng.uniform(40, 120))(xy[:, 0], xy[:, 1])

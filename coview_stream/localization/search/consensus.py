@@ -147,19 +147,19 @@ class Consensus:
         return found
 
     def _hypothesis(self, station: int, shift: int, score: float, centre: Floats) -> Hypothesis:
-        """Eq. 12, corrected: the rotation is about the keyframe's centre, not about the odometry frame's origin."""
+        """Apply eq. 12, corrected: the rotation is about the keyframe's centre, not the odometry frame's origin."""
         turn = rot_z(float(yaw_of_shift(shift, self._votes[-1].sectors)))
         T = pose_from(turn, self.stations[station].astype(np.float64)) @ pose_from(np.eye(3), -centre)
         return Hypothesis(T, station, shift, score)
 
 
 def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> Floats:
-    """Eq. 9: heading of the odometry frame's x axis in the map for shift n (any shape), radians."""
+    """Return the heading of the odometry frame's x axis in the map for shift n (any shape), radians (eq. 9)."""
     return np.asarray(shift, dtype=np.float64) * (-2.0 * np.pi / sectors)
 
 
 def robust_zscore(volume: ScoreVolume) -> ScoreVolume:
-    """Robust standard deviations (M, S) by which each distance lies above the median of all: negative is better."""
+    """Return by how many robust standard deviations (M, S) each distance exceeds the median; negative is better."""
     sample = _sample(volume)
     if not len(sample):
         return np.zeros_like(volume)
@@ -172,7 +172,7 @@ def robust_zscore(volume: ScoreVolume) -> ScoreVolume:
 
 
 def _sample(volume: ScoreVolume) -> Floats32:
-    """Distances (K,) at every shift of every so many stations, without stations that were not scored."""
+    """Draw distances (K,) at every shift of every so many stations, without stations that were not scored."""
     every = max(1, volume.size // _SAMPLE)
     for rows in (volume[::every], volume):  # the paper's mode leaves most stations at 1, unscored
         scored = rows[(rows != 1.0).any(axis=1)]
@@ -236,7 +236,7 @@ class StationGrid:
         return grid
 
     def shifted_index(self, step: Ints, rise: float) -> Indices:
-        """Index (M,) of the station ``step`` (2,) cells away from each station, -1 where there is none.
+        """Return the index (M,) of the station ``step`` (2,) cells away from each station, -1 where there is none.
 
         ``rise`` is the height gained on the way, metres; it picks the storey.
         """

@@ -87,12 +87,12 @@ class KeyframeBuffer:
         return keyframe
 
     def recent(self, count: int) -> Points:
-        """Points (N, 3) of the newest ``count`` keyframes and of the frames since."""
+        """Return the points (N, 3) of the newest ``count`` keyframes and of the frames since."""
         parts = [k.points for k in list(self.keyframes)[-count:]] + self._pending
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
-        """Virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel."""
+        """Make a virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel."""
         points = np.concatenate([k.points for k in self.keyframes])
         near = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) < radius
         return self._unique(points[near], voxel)
@@ -157,6 +157,6 @@ class OdometryCheck:
 
 
 def _voxel_keys(points: Points) -> Ints:
-    """One integer (N,) for the cubic metre that each point lies in."""
+    """Return the number (N,) of the cubic metre that each point (N, 3) lies in."""
     cell = np.floor(points / np.float32(_VOXEL)).astype(np.int64) + (1 << (_BITS - 1))
     return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])

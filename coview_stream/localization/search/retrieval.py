@@ -50,14 +50,14 @@ class Retrieval:
         self._indices: dict[Channel, kernels.MatchIndex] = {}
 
     def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, ScoreVolume]:
-        """Eqs 7-9 for each channel: (M, S) distances in [0, 2]; shift n means yaw -2 pi n / S.
+        """Return the distances (M, S) in [0, 2] of each channel (eqs 7-9); shift n means yaw -2 pi n / S.
 
         In ``ring_key`` mode stations that are not among the candidates have distance 1 at every shift.
         """
         return {name: self._channel(name, descriptor) for name, descriptor in query.items()}
 
     def best(self, query: dict[Channel, Descriptor], k: int) -> dict[Channel, kernels.Nearest]:
-        """Eqs 7-9 for each channel: the ``k`` nearest stations, each at its best shift, nearest first.
+        """Return the ``k`` nearest stations of each channel (eqs 7-9), each at its best shift, nearest first.
 
         The same stations as :meth:`distances` would give, at a fraction of its time and memory: bounds rule most of
         the stations out. An index of 1.3 kB per station is made at the first query.
@@ -71,7 +71,7 @@ class Retrieval:
                 next(self._blocks(name))
 
     def _cached(self) -> bool:
-        """Whether the spectra of all stations fit in memory."""
+        """Tell whether the spectra of all stations fit in memory."""
         config = self.stations.descriptor_config
         size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
         return size <= _CACHE_BYTES

@@ -77,7 +77,7 @@ def relaxed_clique(weights: Floats32) -> Ints:
 
 
 def _climb(matrix: Floats32, u: Floats32) -> Floats32:
-    """Projected gradient ascent of ``u^T matrix u`` over unit vectors u >= 0 (N,)."""
+    """Climb ``u^T matrix u`` over unit vectors u >= 0 (N,) by projected gradients."""
     gradient = matrix @ u
     value, step = float(u @ gradient), 1.0
     for _ in range(_INNER):
@@ -140,7 +140,7 @@ def largest_clique(adjacent: Bools, start: Ints, nodes: int) -> Clique:
 
 
 def _core(edges: Bools, size: int) -> Ints:
-    """Nodes with at least ``size`` neighbours among themselves: a clique of more than ``size`` is made of these."""
+    """Find the nodes with ``size`` or more neighbours among themselves: larger cliques consist of these."""
     kept = np.arange(len(edges))
     while len(kept):
         enough = edges[np.ix_(kept, kept)].sum(axis=1) >= size
@@ -230,6 +230,6 @@ def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) 
 
 
 def _distances(xy: Floats) -> Floats32:
-    """Distances (N, N) between points, subtracted in double precision."""
+    """Return the distances (N, N) between points, subtracted in double precision."""
     step = [(xy[:, None, k] - xy[None, :, k]).astype(np.float32) for k in (0, 1)]
     return np.asarray(np.hypot(*step))

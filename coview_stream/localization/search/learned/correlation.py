@@ -26,7 +26,7 @@ def correlate(
     blocks: Ints | None = None,
     min_coverage: float | None = MIN_COVERAGE,
 ) -> Floats32:
-    """Mean inner product of a query's cells with the map's, for its middle at every cell's centre, at every heading.
+    """Average a query's cells' inner products with the map's, for its middle at every cell, at every heading.
 
     A query that reaches beyond the map has less to be compared with. A mean over all weights would count unsurveyed
     cells as dissimilar ones, and lose the right place at the map's edge to a wrong one inside. So the mean is over the
@@ -74,7 +74,7 @@ class _Wave:
 def _waves(
     query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats
 ) -> tuple[_Wave] | tuple[_Wave, _Wave]:
-    """Spectra of the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
+    """Transform the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
     half, size = len(weight) // 2, len(yaws) // 2
     # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
     twice = len(yaws) == 2 * size and np.allclose(
@@ -122,7 +122,7 @@ def _score(
 
 
 def _back(product: Complexes, index: FeatureIndex, wave: _Wave) -> Floats32:
-    """Correlations (valid, valid, blocks, K) from products of spectra (bins, blocks, K)."""
+    """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
     size, last = index.block, wave.first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
     rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=index.workers)[wave.first : last]
@@ -130,7 +130,7 @@ def _back(product: Complexes, index: FeatureIndex, wave: _Wave) -> Floats32:
 
 
 def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:
-    """Mean of ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and of the weights.
+    """Average ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and the weights.
 
     Returns:
         (C, H / ratio, W / ratio), (H / ratio, W / ratio): what :func:`correlate` takes.

@@ -101,17 +101,17 @@ class FeatureIndex:
         return half_spectra(cut, self.block, self.workers)[..., None]
 
     def gapless(self, blocks: Ints) -> Bools:
-        """Mask of the blocks whose cells have all been surveyed, margin included."""
+        """Mask the blocks whose cells have all been surveyed, margin included."""
         return self._gapless[blocks]
 
     def cells_of(self, block: int | np.integer) -> tuple[slice, slice]:
-        """Rows and columns of the map in the valid part of a block."""
+        """Return the map's rows and columns in the valid part of a block."""
         down, across = divmod(int(block), self.blocks_across)
         top, left = down * self.valid, across * self.valid
         return slice(top, min(top + self.valid, self.height)), slice(left, min(left + self.valid, self.width))
 
     def blocks_near(self, xy: npt.ArrayLike, radius: float) -> Ints:
-        """Blocks whose valid part has a cell centre within ``radius`` metres of any of the positions (N, 2)."""
+        """Find the blocks whose valid part has a cell centre within ``radius`` metres of any position (N, 2)."""
         cells = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.corner) / self.cell - 0.5
         found = []
         for block in range(len(self)):
@@ -130,7 +130,7 @@ class FeatureIndex:
         return out
 
     def _cut(self, image: npt.NDArray[np.generic], block: int | np.integer) -> Floats32:
-        """Cells (..., block, block) of a block of an image (..., H, W), 0 beyond the map."""
+        """Cut the cells (..., block, block) of a block from an image (..., H, W); 0 beyond the map."""
         rows, cols = self.cells_of(block)
         top, left = rows.start - self.margin, cols.start - self.margin
         out = np.zeros((*image.shape[:-2], self.block, self.block), dtype=np.float32)
@@ -143,7 +143,7 @@ class FeatureIndex:
 
 
 def half_spectra(images: Floats32, size: int, workers: int) -> Complexes:
-    """Half spectra (size * (size // 2 + 1), ...) of images (h, w, ...), zeros appended up to ``size``."""
+    """Transform images (h, w, ...), zero-padded to ``size``, to half spectra (size * (size // 2 + 1), ...)."""
     half = fft.rfft(images, size, axis=1, workers=workers)
     whole = fft.fft(half, size, axis=0, overwrite_x=True, workers=workers)
     return np.asarray(whole.reshape(-1, *images.shape[2:]))

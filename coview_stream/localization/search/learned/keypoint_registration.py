@@ -72,7 +72,7 @@ def refine_by_keypoints(
 
 
 def _possible_pairs(query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig) -> Bools:
-    """Mask (N, M) of the pairs that coincide in some pose that would be accepted."""
+    """Mask (N, M) the pairs that coincide in some pose that would be accepted."""
     c, s = math.cos(start[2]), math.sin(start[2])
     there = query.xy @ np.array([[c, s], [-s, c]]) + start[:2]
     gap = np.hypot(there[:, None, 0] - known.xy[None, :, 0], there[:, None, 1] - known.xy[None, :, 1])
@@ -119,7 +119,7 @@ class RigidFit2D:
 
 
 def fit_rigid_2d(query: Floats, known: Floats, weights: Floats | None = None) -> RigidFit2D:
-    """Rotation about the vertical and translation that take points to their partners: weighted least squares.
+    """Fit the rotation about the vertical and the translation that take points to their partners: least squares.
 
     Args:
         query: (N, 2) metres.

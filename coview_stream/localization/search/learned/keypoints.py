@@ -77,7 +77,7 @@ def keypoints(
 
 
 def local_minima(values: Reals) -> Bools:
-    """Mask (H, W) of finite values that none of their eight neighbours is below; of equal ones the first counts."""
+    """Mask (H, W) finite values that none of their eight neighbours is below; of equal ones the first counts."""
     height, width = values.shape
     padded = np.pad(values, 1, constant_values=np.inf)
     lowest = np.isfinite(values)

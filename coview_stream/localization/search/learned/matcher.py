@@ -138,7 +138,7 @@ class FeatureMatcher:
         return QueryFeatures(features, weight, centre)
 
     def distances(self, query: QueryFeatures, near: npt.ArrayLike = ()) -> ScoreVolume:
-        """Distances (M, S) to all stations at all headings, lower is more similar; shift n means yaw -2 pi n / S.
+        """Return distances (M, S) to all stations at all headings, lower is better; shift n means yaw -2 pi n / S.
 
         A map too large to be searched all over is searched around the tiles most similar to the query, and around
         ``near`` (N, 2), metres. The median is 1, which is also the distance where nothing was compared: no evidence.
@@ -157,7 +157,7 @@ class FeatureMatcher:
         return found
 
     def _at_stations(self, scores: Floats32) -> ScoreVolume:
-        """Best score (M, K) of the cells (K, H, W) that have their middle in a station's block, -inf off the map.
+        """Take the best score (M, K) of the cells (K, H, W) whose middle is in a station's block, -inf off the map.
 
         A block smaller than a cell has the score of the cell around its station.
         """
@@ -197,7 +197,7 @@ class FeatureMatcher:
         return replace(hypothesis, T_map_odom=there @ pose_from(np.eye(3), -centre), exact=True)
 
     def _ground(self, xy: Floats, before: Floats) -> float:
-        """Height at ``xy`` (2,) of the storey that was at ``before`` (3,), metres; unchanged where it has none."""
+        """Return the height at ``xy`` (2,) of the storey at ``before`` (3,), metres; unchanged if it has none."""
         away = np.hypot(*(self.stations[:, :2] - xy).T)
         rise = np.abs(self.stations[:, 2] - before[2])
         moved = float(np.hypot(*(xy - before[:2])))
@@ -208,7 +208,7 @@ class FeatureMatcher:
         return float(self.stations[nearest, 2])
 
     def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike) -> Ints:
-        """Blocks of the index around ``near`` (N, 2), and around the tiles most similar to the query."""
+        """Find the blocks of the index around ``near`` (N, 2) and around the tiles most similar to the query."""
         similarity = self.features.place.astype(np.float32) @ query.place
         tile = np.floor(self.features.place_at / (TILE * LOCAL_CELL)).astype(np.int64)
         found, number = np.unique(tile, axis=0, return_inverse=True)
