@@ -52,8 +52,7 @@ VARIANTS = (
 )
 """The last one is the paper's own method."""
 
-Measured = dict[str, dict[str, Any]]
-"""Variant name -> its measures in one world."""
+Measured = dict[str, dict[str, Any]]  # variant name -> its measures in one world
 
 _HEAD = (
     "variant", "top-1", f"coarse ({WINDOW} kf)", "SLR", "false frames", "e_t m", "e_r deg", "first fix m"

@@ -31,7 +31,6 @@ Lidar odometry was made looking at some of them (docs/accuracy.md names them); i
 _SIZES = (240.0, 300.0, 360.0, 420.0, 480.0, 600.0)
 _LENGTHS = (40.0, 60.0, 80.0, 100.0, 120.0)
 _CHANGED = (0.0, 0.2, 0.0, 0.3, 0.25)
-
 MOST_TRANSLATION, MOST_ROTATION, MOST_FIRST_FIX, MOST_MEGABYTES = 0.08, 0.3, 10.0, 1536.0
 """The targets: metres, degrees, metres driven, MB."""
 
@@ -40,8 +39,7 @@ _HEAD = (
     "e_r deg", "first m", "p50 ms", "locate s", "MB",
 )  # fmt: skip
 
-Run = dict[str, Any]
-"""What one run came to: the figures of ``evaluate``, and where it was."""
+Run = dict[str, Any]  # what one run came to: the figures of ``evaluate``, and where it was
 
 
 def held_out_worlds() -> list[SimulationConfig]:

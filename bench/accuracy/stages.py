@@ -26,8 +26,7 @@ from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.recordings.open_run import open_run
 
-WINDOW = 5
-"""Keyframes that vote together in the coarse measure."""
+WINDOW = 5  # keyframes that vote together in the coarse measure
 
 NEAR, ALIGNED = 3.0, float(np.radians(9.0))
 """A place is right within this, metres and radians: one and a half blocks, one and a half shifts."""

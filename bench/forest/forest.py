@@ -21,9 +21,7 @@ from bench.forest.worlds import code, noted, on_disk, place, say, weights
 from bench.harness.files import remembered
 from bench.harness.rows import Row, failed, informs
 
-FIRST_SEED = 20_000
-"""Nobody trains or tunes on the seeds from here on."""
-
+FIRST_SEED = 20_000  # nobody trains or tunes on the seeds from here on
 RADIUS = 30.0
 """Metres: virtual scans reach as far as the queries do, so that the descriptors compare like with like."""
 

@@ -29,8 +29,7 @@ Floats = npt.NDArray[np.float64]
 METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "keypoints", "verified")
 """In the tables' order."""
 
-BASELINES = ("scan context", "co-view", "both", "canopy")
-"""Whose places are registered as well."""
+BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
 
 Named = dict[str, list[Hypothesis]]
 
@@ -75,8 +74,8 @@ class Methods:
         more, metric = self._by_features(query, truth, clock)
         apart = {name: np.hypot(*(at - robot).T) for name, at in (found | more).items()}
         answer["off"] = {name: np.round(values, 2).tolist() for name, values in apart.items()}
-        moving = self._chain.source(query)
-        answer["chains"] = {name: self._chain.ask(named[name], moving, truth, query) for name in BASELINES}
+        scan = self._chain.scan(query)
+        answer["chains"] = {name: self._chain.ask(named[name], scan, truth, query) for name in BASELINES}
         return answer | metric | {"ms": {name: round(1e3 * s, 1) for name, s in clock.seconds.items()}}
 
     def _by_descriptors(self, query: SearchRequest, clock: _Clock) -> Named:
@@ -112,7 +111,7 @@ class Methods:
         with clock("keypoints"):
             sharpened = self._learned.refine(voted, view)
         with clock("registration"):
-            candidates = self._chain.register(sharpened, self._chain.source(query), query)
+            candidates = self._chain.register(sharpened, self._chain.scan(query))
         verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in candidates]
         places = {
             "global": self._by_global_descriptor(view),
@@ -157,14 +156,10 @@ class _Clock:
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-
-COARSE = 2.0
-"""Edge of a cell, metres."""
+COARSE = 2.0  # edge of a cell, metres
 HEADINGS = 72
-REACH = 30.0
-"""Metres around the robot."""
-COVERED = 0.6
-"""Share of the query's cells that the map must have for a place to be scored."""
+REACH = 30.0  # metres around the robot
+COVERED = 0.6  # share of the query's cells that the map must have for a place to be scored
 
 _RATIO = round(COARSE / CELL)
 _WINDOW, _MARGIN = 128.0, 48.0  # metres: large maps are drawn piece by piece

@@ -29,7 +29,6 @@ Floats = npt.NDArray[np.float64]
 
 TILES = ("bcts_2.laz", "bcts_3.laz")
 HEADINGS = 4
-
 _EYE = 1.5  # metres above the ground, where the robot is said to be
 _VOXEL = 0.1  # metres: the mobile scan is as dense as no robot's
 _RADIUS = 30.0

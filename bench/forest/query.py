@@ -18,14 +18,14 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan, voxelized
+from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.scan_matcher import ScanInput
 from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.refinement import Candidate, Refinement
 from coview_stream.localization.search.request import SearchRequest
 
 Floats = npt.NDArray[np.float64]
-
 _SUBMAP = 8.0  # metres driven that are registered: four keyframes, as in the search
 
 
@@ -81,10 +81,8 @@ def _once(parts: list[Points], voxel: float) -> Points:
     return points
 
 
-BEST = 5
-"""Places that each method names."""
-APART = 10.0
-"""Metres between two of them."""
+BEST = 5  # places that each method names
+APART = 10.0  # metres between two of them
 
 
 def chosen(xy: npt.NDArray[np.floating], score: npt.NDArray[np.floating], count: int = BEST) -> list[int]:
@@ -140,37 +138,36 @@ class Chain:
         registration = replace(config.registration, method="trimmed-icp")
         self.config = replace(config, registration=registration)
         self._refinement = Refinement(base_map, self.config, LocalMaps(base_map, registration.source_range))
-        self._decision = AcceptanceTest(replace(self.config, acceptance=alone))
+        self._acceptance = AcceptanceTest(replace(self.config, acceptance=alone))
 
-    def source(self, query: SearchRequest) -> RegistrationCloud:
+    def scan(self, query: SearchRequest) -> ScanInput:
         """Return what of a query is registered."""
-        return prepare_scan(query.submap, query.position, self.config.registration)
+        points = prepare_scan(query.submap, query.position, self.config.registration)
+        return ScanInput(points, query.cloud, query.T_odom_body)
 
-    def register(
-        self, named: list[Hypothesis], moving: RegistrationCloud, query: SearchRequest
-    ) -> list[Candidate]:
+    def register(self, named: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
         """Return verified candidates, best first."""
-        return self._refinement.refine(named, moving, query)
+        return self._refinement.fine(self._refinement.coarse(named, scan), scan)
 
     def metric(
         self, named: list[Hypothesis], candidates: list[Candidate], truth: Pose, query: SearchRequest
     ) -> dict[str, Any]:
         """Errors of the best hypothesis and the best candidate, and what would have been believed; plain values."""
-        self._decision.clear()
+        self._acceptance.clear()
         score = candidates[0].evidence.score if candidates else 0.0
         return {
             "before": errors(named[0].T_map_odom, truth, query)[:2] if named else None,
             "after": errors(candidates[0].T_map_odom, truth, query)[2:] if candidates else None,
             "score": score,
             "passes": bool(candidates) and score >= self.config.acceptance.score,
-            "accepted": self._decision.judge(candidates, query, 1).accepted is not None,
+            "accepted": self._acceptance.decide(candidates, query, 1).accepted is not None,
         }
 
     def ask(
-        self, named: list[Hypothesis], moving: RegistrationCloud, truth: Pose, query: SearchRequest
+        self, named: list[Hypothesis], scan: ScanInput, truth: Pose, query: SearchRequest
     ) -> dict[str, Any]:
         """Register what a method names: what :meth:`metric` says, and the milliseconds."""
         begin = time.perf_counter()
-        candidates = self.register(named, moving, query)
+        candidates = self.register(named, scan)
         spent = round(1e3 * (time.perf_counter() - begin), 1)
         return self.metric(named, candidates, truth, query) | {"ms": spent}

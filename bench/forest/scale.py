@@ -35,14 +35,9 @@ from coview_stream.localization.search.request import SearchRequest
 
 Ints = npt.NDArray[np.int64]
 
-SIDES = (10, 32)
-"""Tiles of 32 m along the edge: 0.10 and 1.05 km2."""
-LIMITS = {10: 0.4, 32: 3.0}
-"""Seconds a query that issue 6 allows."""
-
-CUT = 4
-"""Tiles along the edge of what is repeated."""
-
+SIDES = (10, 32)  # tiles of 32 m along the edge: 0.10 and 1.05 km2
+LIMITS = {10: 0.4, 32: 3.0}  # seconds a query that issue 6 allows
+CUT = 4  # tiles along the edge of what is repeated
 _SEED, _QUERIES, _REPEAT = 20_001, 4, 3
 _PARTS = ("view", "correlation", "consensus", "sharpening", "registration")
 
@@ -138,7 +133,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             ticks.append(time.perf_counter())
             named = learned.refine(named, view)
             ticks.append(time.perf_counter())
-            chain.register([home(each, query, low) for each in named], chain.source(query), query)
+            chain.register([home(each, query, low) for each in named], chain.scan(query))
             ticks.append(time.perf_counter())
             spent.append(np.diff(ticks).tolist())
         medians = np.median(np.array(spent[1:]), axis=0).tolist()  # the first one waits for memory and crops

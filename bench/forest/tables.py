@@ -13,10 +13,7 @@ from bench.harness.tables import NOTHING, number, table
 
 Answer = dict[str, Any]
 Group = tuple[str, list[Answer]]
-
-RIGHT = 10.0
-"""Metres from the truth within which a place is the right one."""
-
+RIGHT = 10.0  # metres from the truth within which a place is the right one
 NEAR_METRES, NEAR_DEGREES = 2.0, 5.0
 """A pose before registration is a success within both; after it, one that is not is false ..."""
 EXACT_METRES, EXACT_DEGREES = 0.3, 1.0

@@ -28,9 +28,7 @@ from coview_stream.sim import SimulationConfig
 from coview_stream.training.recipe import Recipe
 
 Floats = npt.NDArray[np.float64]
-
-BEHIND = 12.0
-"""Metres of a recorded run that a query is made of ..."""
+BEHIND = 12.0  # metres of a recorded run that a query is made of, and ...
 EVERY = 10.0
 """... and between two queries of it."""
 

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-REPEAT = 31
-"""Runs behind every median; an odd number, so that the median is one of them."""
+REPEAT = 31  # runs behind every median; an odd number, so that the median is one of them
 
 
 @dataclass(frozen=True)

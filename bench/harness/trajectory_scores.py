@@ -12,14 +12,11 @@ from scipy.spatial.transform import Rotation
 
 Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-
-FALSE_METRES, FALSE_DEGREES = 1.0, 5.0
-"""A pose further from the truth than either is a false one ..."""
+FALSE_METRES, FALSE_DEGREES = 1.0, 5.0  # a pose further from the truth than either is false
 DOUBTFUL_METRES = 0.5
-"""... and one further than this is counted beside them."""
+"""One further than this is counted beside them."""
 
-MOST_HELD = 0.5
-"""Seconds that a false pose counts at most: until the next frame, or so long."""
+MOST_HELD = 0.5  # seconds that a false pose counts at most: until the next frame, or so long
 
 
 @dataclass(frozen=True)

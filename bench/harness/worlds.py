@@ -75,8 +75,7 @@ def _build(out: Path) -> None:
     BaseMap.build(out / "base.laz").save(out / "site.coview")
 
 
-KEYFRAMES = 5
-"""Keyframes of a query: a drive of eight metres."""
+KEYFRAMES = 5  # keyframes of a query: a drive of eight metres
 
 WORLDS = {
     "town": SimulationConfig("town", "vlp16", seed=2201, size=240.0, length=90.0),

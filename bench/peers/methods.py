@@ -21,13 +21,12 @@ from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, t
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.verification import verify
+from coview_stream.localization.registration.verification import RangeImage, verify
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
 
-OFF, TURNED = 0.5, float(np.radians(3.0))
-"""How far from the truth tracking starts, metres and radians."""
+OFF, TURNED = 0.5, float(np.radians(3.0))  # how far from the truth tracking starts, metres and radians
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ class Tracking:
         T, newest = found.T_map_source, place.queries[-1]
         surveyed = self._site.surveyed(transform(T, source.points)[:, :2])
         T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
-        evidence = verify(source, T, newest.seen, T_map_body, target, surveyed)
+        evidence = verify(source, T, RangeImage.of(newest.cloud), T_map_body, target, surveyed)
         cause, _ = EvidenceBaseline().judge(evidence, LocalizerConfig().acceptance)
         return Answer(T, cause is RejectionReason.VERIFIED, evidence.score)
 

@@ -31,8 +31,7 @@ from bench.harness.worlds import WORLDS, map_of, places, world
 from bench.peers.methods import OUR_TRACKING, OURS, PEERS, Peer
 from coview_stream.errors import InputError
 
-NEAR, ALIGNED = 3.0, 5.0
-"""A pose is right within this, metres and degrees (the papers' success)."""
+NEAR, ALIGNED = 3.0, 5.0  # a pose is right within this, metres and degrees (the papers' success)
 
 _HEAD = (
     "peer", "world", "right < 3 m", "< 1 m", "false accepts", "found", "e_t m", "e_r deg", "query ms", "map s"

@@ -80,7 +80,6 @@ def drive(base_map: Any, run: Any, truth: np.ndarray, count: int) -> Drive:
     import psutil
 
     from coview_stream import Localizer
-    from coview_stream.localization.state import State
 
     rng = np.random.default_rng(0)
     frames = [run.read(k) for k in range(len(run))]
@@ -90,7 +89,7 @@ def drive(base_map: Any, run: Any, truth: np.ndarray, count: int) -> Drive:
     ]
     localizer, out, process = Localizer(base_map), Drive(), psutil.Process()
     for index, tick in frames_of(run, count):
-        before = localizer.state is State.TRACKING
+        before = localizer.state.has_place
         cpu, wall = time.process_time(), time.perf_counter()
         fix = localizer.step(clouds[index], frames[index].T_odom_body, tick / _RATE)
         out.wall.append(time.perf_counter() - wall)

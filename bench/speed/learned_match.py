@@ -24,9 +24,7 @@ import numpy.typing as npt
 from bench.harness.rows import Row, against, bounded, informs, medians
 
 CHANNELS, HEADINGS, QUERY = 32, 36, 32
-SIDES = {"0.1 km2": (158, 250.0), "1 km2": (500, 1500.0)}
-"""Cells on a side and the milliseconds allowed."""
-
+SIDES = {"0.1 km2": (158, 250.0), "1 km2": (500, 1500.0)}  # cells on a side and the milliseconds allowed
 PAIRS = 300
 
 F32 = npt.NDArray[np.float32]

@@ -126,9 +126,7 @@ def described_stations(asked: Namespace) -> Iterator[Row]:
         yield informs(f"{name}, {channel}: cosine distance, mean", float(1 - cosine.mean()), "")
 
 
-MOST_SECONDS, MOST_MEGABYTES = 180.0, 4096.0
-"""The target for 10 M points and 10,000 stations, on two cores."""
-
+MOST_SECONDS, MOST_MEGABYTES = 180.0, 4096.0  # the target for 10 M points and 10,000 stations, on two cores
 _COVERED = 0.2  # share of the ground below boxes: more than there is, so that no station is missing
 _BOX, _BOX_EVERY = (8.0, 20.0), 45.0  # metres
 _CROWNS_PER_M2 = 0.004

@@ -26,10 +26,8 @@ from bench.speed.engine import frames_of
 from bench.speed.match import Spectral, Turned, multiplied, town
 
 OUT = Path("docs/images")
-PERIOD_MS = 100.0
-"""Between the frames of a robot, at 10 Hz."""
-BEST = 20
-"""Stations that matching has to name."""
+PERIOD_MS = 100.0  # between the frames of a robot, at 10 Hz
+BEST = 20  # stations that matching has to name
 
 _COLOURS = ("#0072B2", "#D55E00", "#999999", "#009E73")
 _SEARCH_FRAMES = 400  # at most, until a robot is tracked

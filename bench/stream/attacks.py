@@ -14,13 +14,10 @@ from bench.stream.drive import Phase, RobotPlan, stamp_of
 from bench.stream.stage import Outcome, Setting, Stage, until
 
 FLOOD_POINTS = 166_667
-MOST_GROWTH, MOST_LOG = 200.0, 200
-"""MB, lines."""
+MOST_GROWTH, MOST_LOG = 200.0, 200  # MB, lines
 BACK_SOON, BACK_EVENTUALLY = 5.0, 20.0
 """Seconds until poses must be back: after a disturbance, and after a search."""
-LONGEST_LEFT, MOST_TERM = 1.0, 2.0
-"""Seconds of poses after the last odometry; seconds to end after SIGTERM."""
-
+LONGEST_LEFT, MOST_TERM = 1.0, 2.0  # seconds of poses after the last odometry; seconds to end after SIGTERM
 SETTLED = 20.0
 
 

@@ -20,11 +20,8 @@ from bench.stream.wire import EPOCH_NS, Points
 from coview_stream.clouds import read_tum
 from coview_stream.recordings.open_run import open_run
 
-RESTARTED = 1000.0
-"""Seconds by which a robot's clock jumps back in phase ``restart``."""
-
+RESTARTED = 1000.0  # seconds by which a robot's clock jumps back in phase ``restart``
 FAR_FUTURE = 86400.0
-
 _APART = 31  # frames between the starts of neighbouring robots
 
 What = Literal["no_clouds", "no_odometry", "late", "twice", "reversed", "future", "restart"]
@@ -66,8 +63,7 @@ class RobotPlan:
 
 _CLOUDS: dict[tuple[Path, int, int | None], Points] = {}  # shared by the robots of a process
 
-Due = tuple[float, Kind, float, float]
-"""Due, kind, content, claimed (the stamp as seconds since the epoch)."""
+Due = tuple[float, Kind, float, float]  # due, kind, content, claimed (the stamp as seconds since the epoch)
 
 
 def start_frame(robot: str) -> int:

@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from bench.stream.scores import Floats, Posed
 
 Points = npt.NDArray[np.float32]
-Message = tuple[bytes, str, bytes | None]
-"""Payload, encoding, attachment."""
+Message = tuple[bytes, str, bytes | None]  # payload, encoding, attachment
 
 CDR_CLOUD, CDR_ODOMETRY = (
     "application/cdr;sensor_msgs/msg/PointCloud2",

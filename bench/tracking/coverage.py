@@ -12,11 +12,9 @@ from scipy.stats import chi2
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Errors, Floats, Mask, Told
 
-FIRST_MINUTE = 60.0
-"""Seconds after a fix in which its covariance is judged apart."""
+FIRST_MINUTE = 60.0  # seconds after a fix in which its covariance is judged apart
 
-NOMINAL = tuple(float(p) for p in chi2.cdf([1.0, 4.0, 9.0], 1))
-"""Shares that 1, 2 and 3 sigma promise."""
+NOMINAL = tuple(float(p) for p in chi2.cdf([1.0, 4.0, 9.0], 1))  # shares that 1, 2 and 3 sigma promise
 
 AXES: dict[str, tuple[int, ...]] = {
     "x": (0,), "y": (1,), "z": (2,), "roll": (3,), "pitch": (4,), "yaw": (5,),
@@ -24,8 +22,7 @@ AXES: dict[str, tuple[int, ...]] = {
 }  # fmt: skip
 """What coverage is judged of: one axis alone, or several by their squared Mahalanobis distance."""
 
-WITHIN = 0.05
-"""Share by which an observed coverage may differ from the nominal one."""
+WITHIN = 0.05  # share by which an observed coverage may differ from the nominal one
 
 _SHOWN = {"x,y": "#0072B2", "x,y,z": "#009E73", "yaw": "#D55E00"}
 _LEAST = 20  # frames that make a curve

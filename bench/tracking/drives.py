@@ -17,10 +17,8 @@ from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 
 Floats = npt.NDArray[np.float64]
-
 PERIOD = 0.1
-SEGMENT = 100.0
-"""Metres over which drift is measured."""
+SEGMENT = 100.0  # metres over which drift is measured
 CLEAR, CLOTH, DUST = 0, 1, 2
 """What lies over the sensor: nothing; a cloth at 0.5 to 0.9 m; so much that only 20 returns of a frame are left."""
 

@@ -26,9 +26,7 @@ from bench.tracking.drives import (
 )
 from bench.tracking.worlds import World
 
-SEEDS = 5000
-"""What reported seeds follow; this one itself, of ``--quick``, is in nobody's table."""
-
+SEEDS = 5000  # what reported seeds follow; this one itself, of ``--quick``, is in nobody's table
 _EVENT_AT = 90.0  # metres
 _USUAL_DRIFT = 0.01
 _COVERED_S = 30.0

@@ -25,18 +25,13 @@ from coview_stream.sim import KINDS, SimulationConfig
 from coview_stream.sim.scenes import Scene, build_scene
 
 Floats = npt.NDArray[np.float64]
+STEP = 0.004  # metres; what frames are rounded to
 
-STEP = 0.004
-"""Metres; what frames are rounded to."""
-
-GAP = (120.0, 220.0)
-"""Metres of the drive between which the map of a gap holds nothing near the robot ..."""
+GAP = (120.0, 220.0)  # metres of the drive between which the map of a gap holds nothing near the robot
 GAP_RADIUS = 40.0
 """... within so many metres."""
 
-CHANGED = 0.3
-"""Share of the buildings, cars, poles and trees that are others in the changed map."""
-
+CHANGED = 0.3  # share of the buildings, cars, poles and trees that are others in the changed map
 _TREES, _UNDERGROWTH = 0.012, 0.008  # per square metre, of a sparse forest
 _SELF = "bench/tracking/worlds.py"
 
