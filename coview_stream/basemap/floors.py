@@ -20,7 +20,7 @@ _SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level
 
 @dataclass(frozen=True)
 class LevelConfig:
-    """What counts as an upper floor; set by hand.
+    """Criteria of an upper floor; set by hand.
 
     Attributes:
         headroom: free height above it, metres.
@@ -63,7 +63,7 @@ def ground_levels(
         points: (N, 3) float32 metres, finite, z up.
         cell: edge of the squares, whose centres are (k + 1/2) * cell.
         mask: (N,) ground points if they are known already.
-        config: what counts as a floor.
+        config: criteria of a floor.
         ground_config: for ``ground_mask`` where ``mask`` is None.
         floors: (F, 3) of :func:`indoor_floors` if they are known already; empty for the ground alone.
 

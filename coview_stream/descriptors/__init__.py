@@ -1,1 +1,1 @@
-"""What places look like: co-view context (paper, sec. 3) and learned features."""
+"""Descriptors of places: co-view context (paper, section 3) and learned features."""

@@ -94,9 +94,9 @@ def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
 def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
     """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 where it was not seen."""
     flat = index[:, 1] * shape[1] + index[:, 0]
-    least = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
-    np.minimum.at(least, flat, points[:, 2])
-    lowest = least.reshape(shape)
+    lowest = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
+    np.minimum.at(lowest, flat, points[:, 2])
+    lowest = lowest.reshape(shape)
     seen = np.isfinite(lowest)
     # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
     offsets = np.arange(-_REACH, _REACH + 1) * _GROUND_CELL

@@ -60,32 +60,44 @@ class Recipe:
     Set by hand.
 
     Attributes:
-        built: share of worlds with buildings, of ``kinds``; the others are forests.
+        built: share of worlds with buildings; the others are forests.
+        kinds: scenes of the worlds with buildings.
         size: side of the square map, metres.
         submaps: queries of a world, evenly of ``sensors``.
-        changed: built worlds: share of trees, cars and poles that are others now.
+        changed: share of trees, cars and poles that differ between the epochs, in worlds with buildings.
         stems: trees per hectare.
         tree_height: metres.
-        crown_width, crown_base: diameter, and height of the lowest leaves, in shares of the tree's height.
+        crown_width: diameter, in shares of the tree's height.
+        crown_base: height of the lowest leaves, in shares of the tree's height.
         crown_offset: metres between a crown's middle and its stem's foot.
         stem_radius: metres.
-        mortality: share of trees that stood, or had leaves, at one of the two epochs only.
+        mortality: share of trees that stand, or have leaves, at one of the two epochs only.
         dead: share of bare trees.
         leaf_off: probability that an epoch lies in winter.
         understory: bushes and saplings per square metre.
-        slope: steepest slopes of a world, degrees; roughness: of its ground, metres.
-        wind: shift of each crown between the epochs, metres, one sigma.
-        aerial_porosity, ground_porosity: probability that a pulse passes a surface of leaves.
-        leaf_depth: how far below a crown's surface leaves are hit on average, metres.
-        pulses, altitude, swath, aerial_noise: airborne pulses per square metre, metres, degrees, metres.
-        strip_shift, strip_lift: errors of a strip's position, metres, one sigma.
+        slope: steepest slopes of a world, degrees.
+        roughness: of the ground, metres.
+        wind: shift of each crown between the epochs, metres, 1 sigma.
+        aerial_porosity: probability that an airborne pulse passes a surface of leaves.
+        ground_porosity: probability that a robot's beam does.
+        leaf_depth: mean depth below a crown's surface at which leaves are hit, metres.
+        pulses: airborne, per square metre.
+        altitude: of the flight, metres.
+        swath: half angle of the scan, degrees.
+        strip_shift: error of a strip's horizontal position, metres, 1 sigma.
+        strip_lift: error of a strip's height, metres, 1 sigma.
+        aerial_noise: of airborne ranges, metres.
         ground_noise: of the robot's ranges, metres.
+        sensors: names for :func:`~coview_stream.training.sensors.trained_sensor`.
         sensor_height: metres above the ground.
-        travel: metres that the robot drives; ``standing`` is the share of submaps with less than 3 m.
+        travel: metres that the robot drives.
+        standing: share of submaps with less than 3 m.
         frame_step: metres between the frames of a submap.
-        tilt, gravity_error: degrees, one sigma: how the robot leans, and how wrong its odometry is about that.
-        scale_error, yaw_walk: odometry drift: share, degrees per square root of a metre.
-        rays: most beams cast for a submap; beams are thinned evenly where there would be more.
+        tilt: sway of the robot, degrees, 1 sigma.
+        gravity_error: error of its odometry's vertical, degrees, 1 sigma.
+        scale_error: drift of its odometry, a share.
+        yaw_walk: drift of its odometry, degrees per square root of a metre.
+        rays: maximum of beams cast for a submap, thinned evenly.
 
     Raises:
         ConfigError: a value out of its range, or an unknown kind or sensor.

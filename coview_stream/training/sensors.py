@@ -24,10 +24,10 @@ TRAINED_SENSORS = (*SENSORS, _ROTATING)
 _GROUP = {"vlp16": 16, "os64": 64, "os64-2048": 64, _ROTATING: 16}  # beams fired together
 
 
-def trained_sensor(name: str, keep: Callable[[int], int] | None = None) -> Sensor:
-    """Make a sensor by its name; ``keep`` maps its number of beams to n: only every n-th column is cast."""
+def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sensor:
+    """Make a sensor by its name; ``stride`` maps its number of beams to n: only every n-th column is cast."""
     sensor = _inclined() if name == _ROTATING else SENSORS[name]()
-    every = 1 if keep is None else max(1, keep(len(sensor.beams(0))))
+    every = 1 if stride is None else max(1, stride(len(sensor.beams(0))))
     if every == 1:
         return sensor
     group, beams = _GROUP.get(name, 1), sensor.beams

@@ -98,8 +98,8 @@ def gathered(frames: Frames) -> Submap:
     """Put a drive's frames together by their odometry."""
     newest = frames.odometry[-1, :3, 3]
     parts = []
-    for told, cloud in zip(frames.odometry, frames.clouds, strict=True):
-        points = transform(told, cloud) - newest.astype(np.float32)
+    for T_odom_sensor, cloud in zip(frames.odometry, frames.clouds, strict=True):
+        points = transform(T_odom_sensor, cloud) - newest.astype(np.float32)
         parts.append(points[(points[:, :2] ** 2).sum(axis=1) < RADIUS**2])
     leaning = Rotation.from_rotvec([*frames.lean, 0.0]).as_matrix()
     cloud = np.concatenate(parts) @ leaning.T.astype(np.float32)

@@ -56,7 +56,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class _Vote:
-    """What one keyframe says."""
+    """The vote of one keyframe."""
 
     centre: Floats  # (3,) odometry frame, z on the ground
     scores: Floats32  # z-scores (S, ...) of the distances, in the grid's layout

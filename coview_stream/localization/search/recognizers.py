@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # it imports SciPy, which takes a while
 
 
 class PlaceRecognizer(Protocol):
-    """What a global search needs of a way to recognise places."""
+    """Interface of a way to recognise places: keyframes vote, and the votes name places."""
 
     def vote(self, request: SearchRequest) -> None:
         """Add the votes of one keyframe; one with too few points has none."""
