@@ -15,7 +15,7 @@ from coview_stream.clouds import read_tum
 from coview_stream.messages import decode_cloud, encode_pose
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.sim import SimulationConfig, simulate
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -72,7 +72,7 @@ def test_example_single_scan(tmp_path, capsys):
 @pytest.mark.slow
 def test_example_robot(world_run, capsys):
     """A stand-in node answers every cloud with a pose of the same stamp."""
-    net = FakeTransport()
+    net = MemoryTransport()
 
     def answer(sample):
         pose = PoseMessage(decode_cloud(sample).stamp_ns, "r1", "TRACKING", np.eye(4), np.eye(6), 0.9, "ab")

@@ -7,7 +7,7 @@ import pytest
 from coview_stream.doctor.discovery import Candidate, discover, from_key, from_token, suggestion
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.rmw import publisher_token
 
 PC2 = "sensor_msgs::msg::dds_::PointCloud2_"
@@ -79,7 +79,7 @@ def test_unknown_tokens_are_ignored(token):
 
 
 def test_discovery_uses_keys_and_tokens():
-    net = FakeTransport()
+    net = MemoryTransport()
     net.announce(publisher_token(f"0/r3/odom/{ODOM}/x", "ab12", "driver", 5))
     net.announce("@/ab12/@ros2_lv/MP/r4\xa7points/sensor_msgs\xa7msg\xa7PointCloud2/:1:")
 

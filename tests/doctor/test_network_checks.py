@@ -10,7 +10,7 @@ from captured_robot import KEYS, cloud, odometry, steps
 from coview_stream.doctor.network_checks import connection_finding, robots_findings, try_tcp
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 
 class Time:
@@ -41,7 +41,7 @@ DRIVE = [*((t, odometry(t)) for t in steps(50)), *((t + 0.05, cloud(t)) for t in
 
 
 def test_findings_of_a_robot_and_its_node():
-    net = FakeTransport()
+    net = MemoryTransport()
     net.announce(KEYS.alive)
     status = {"state": "SEARCHING", "reason": "too few keyframes", "map_sha256": "ab"}
     said = [
@@ -66,7 +66,7 @@ def test_findings_of_a_robot_and_its_node():
 
 def test_messages_after_the_capture_are_not_counted():
     # clouds alone, so that it goes on to look for others while they still come
-    found = findings(FakeTransport(), [(t / 2, cloud(t / 2)) for t in range(10)], seconds=2.0)
+    found = findings(MemoryTransport(), [(t / 2, cloud(t / 2)) for t in range(10)], seconds=2.0)
     assert found[0].found.startswith("2.0 Hz")
     assert [f.what for f in found] == ["clouds", "cloud stamps", "odometry", "node"]
     assert "on coview/r1/in/odom" in found[2].found
@@ -74,7 +74,7 @@ def test_messages_after_the_capture_are_not_counted():
 
 def test_silent_robot_is_told_keys_of_other_robots():
     other = robot_keys("native", "coview", "r2")
-    found = findings(FakeTransport(), [(3.5, Sample(KEYS.cloud, b"x"))], keys=[other])
+    found = findings(MemoryTransport(), [(3.5, Sample(KEYS.cloud, b"x"))], keys=[other])
     assert [(f.verdict, f.what) for f in found] == [
         ("FAIL", "clouds"),
         ("FAIL", "odometry"),
@@ -85,21 +85,21 @@ def test_silent_robot_is_told_keys_of_other_robots():
 
 
 def test_robots_on_the_network_are_listed_without_robot_option():
-    found = findings(FakeTransport(), [(0.5, cloud(0.0))], keys=[])
+    found = findings(MemoryTransport(), [(0.5, cloud(0.0))], keys=[])
     assert [(f.verdict, f.found) for f in found] == [
         ("ok", "clouds come on coview/r1/in/cloud: try --robot r1")
     ]
-    assert [f.verdict for f in findings(FakeTransport(), [], keys=[])] == ["warn"]
+    assert [f.verdict for f in findings(MemoryTransport(), [], keys=[])] == ["warn"]
 
 
 def test_fault_of_one_robot_does_not_affect_another():
     other = robot_keys("native", "coview", "r2")
-    found = findings(FakeTransport(), DRIVE, keys=[KEYS, other])
+    found = findings(MemoryTransport(), DRIVE, keys=[KEYS, other])
     assert {f.robot for f in found if f.verdict == "FAIL"} == {"r2"}
 
 
 def test_connection_finding_explains_unreachable_endpoint():
-    net = FakeTransport()
+    net = MemoryTransport()
     assert connection_finding(net, []).found == "connected: 1 router"
     net.go_away()
     with socket.socket() as shut:

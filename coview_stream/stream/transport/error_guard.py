@@ -1,4 +1,4 @@
-"""Calls into handlers that must not bring a thread down, and logging that does not flood."""
+"""Guarded calls of handlers: what they raise is logged at a limited rate, and never ends a thread."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 
 def is_panic(error: BaseException) -> bool:
@@ -18,18 +17,18 @@ def is_panic(error: BaseException) -> bool:
 
 @dataclass
 class Caught:
-    """What a block of :meth:`RateLimitedErrors.catch` raised; None if it ended well."""
+    """Error of a block of :meth:`RateLimitedErrors.catch`; None if it ended without one."""
 
     error: Exception | None = None
 
 
 class RateLimitedErrors:
-    """Runs handlers and logs what they raise: the first of each kind at once, then at most one line per ``interval``.
+    """Log of errors from handlers: the first of each kind at once, then at most one line per ``interval``.
 
     Args:
-        logger: where to.
+        logger: takes the lines.
         interval: seconds between two lines about the same place.
-        clock: seconds, steady.
+        clock: seconds, monotonic.
     """
 
     def __init__(
@@ -44,11 +43,11 @@ class RateLimitedErrors:
 
     @contextmanager
     def catch(self, place: str) -> Iterator[Caught]:
-        """Log what the block raises as having happened at ``place``, and go on after it."""
+        """Log an error that the block raises as one at ``place``, and go on after the block."""
         caught = Caught()
         try:
             yield caught
-        except Exception as error:  # of any kind: the next message deserves its chance
+        except Exception as error:  # of any kind: the thread goes on with the next message
             self.report(place, error)
             caught.error = error
         except BaseException as error:
@@ -56,12 +55,6 @@ class RateLimitedErrors:
                 raise
             self.report(place, error)
             caught.error = RuntimeError(str(error))
-
-    def run(self, place: str, action: Callable[[], Any]) -> Exception | None:
-        """Call ``action``; return what it raised, after logging it as having happened at ``place``."""
-        with self.catch(place) as caught:
-            action()
-        return caught.error
 
     def report(self, place: str, error: BaseException, kind: str = "") -> None:
         """Log ``error`` unless a line about ``place``, and of this ``kind``, was logged less than the interval ago."""
@@ -79,9 +72,7 @@ class RateLimitedErrors:
             "%s: %s: %s%s",
             place,
             type(error).__name__,
-            str(
-                error
-            ),  # the error itself would keep its frames, and what they hold, alive with the log record
+            str(error),  # the error itself would keep its frames, and what they hold, alive with the record
             more,
             exc_info=self._logger.isEnabledFor(logging.DEBUG),
         )

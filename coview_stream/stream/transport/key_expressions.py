@@ -1,4 +1,4 @@
-"""Zenoh key expressions: what is a valid one, and which keys it matches."""
+"""Zenoh key expressions: their validity, with remedies for users, and the keys that they match."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
-"""Which keys a robot speaks on: presets for the conventions in use, one table.
+"""Keys of a robot's traffic: presets for the conventions in use, in one table.
 
-``native`` is ours; ``ros2dds`` follows zenoh-bridge-ros2dds, ``rmw_zenoh`` ROS 2's own zenoh middleware and
-``keelson`` RISE's maritime protocol. Status, liveliness and rpc stay native in all of them: no one else has them.
+``native`` is ours; ``ros2dds`` follows zenoh-bridge-ros2dds, ``rmw_zenoh`` ROS 2's own zenoh middleware and ``keelson``
+RISE's maritime protocol. Status, liveliness and rpc stay native in all of them: no other convention has them. No robot
+may read what another sends, and no pose may come back as input.
 """
-
-# FOLDED coview_stream/stream/transport/keys.py: """Whether robots can be told apart by their keys: what one sends must be nobody else's, and no pose anybody's input."""
 
 from __future__ import annotations
 
@@ -25,17 +24,15 @@ from coview_stream.stream.transport.rmw import dds_type, type_hash
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 _CLOUD_DDS = dds_type("sensor_msgs/msg/PointCloud2")
-
 _ODOMETRY_DDS = dds_type("nav_msgs/msg/Odometry")
-
 _POSE_DDS = dds_type(POSE_TYPE)
-
 _RMW_KEY = re.compile(r"\d+(/[^/]+)+/[^/]+/[^/]+")
+_INPUT_OPTIONS = ("--cloud-key", "--odometry-key")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Preset:
-    """One row of the table: key templates and what flows on them.
+    """One row of the table: templates of keys, and the formats on them.
 
     Attributes:
         cloud: key expression of lidar frames; here and below ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}``
@@ -45,7 +42,7 @@ class Preset:
         cloud_hint: codec to try where Encoding and key do not say; None leaves it to the payload.
         odometry_hint: the same for odometry.
         pose_hint: the same for a reader of our poses.
-        pose_format: codec that poses are written with.
+        pose_format: codec that poses are written with, unless the user asks for another.
         bare: poses go out without Encoding, as the convention does.
         rmw: poses need rmw_zenoh's attachment and liveliness tokens.
     """
@@ -104,41 +101,23 @@ PRESETS: dict[str, Preset] = {
 }
 
 
-@dataclass(frozen=True)
-class RobotKeys:
-    """Everything one robot's traffic needs: where it flows and in which format. Fields as in :class:`Preset`.
+@dataclass(frozen=True, kw_only=True)
+class RobotKeys(Preset):
+    """A preset filled in for one robot, with the keys that are native in all presets.
 
     Attributes:
         robot: its name.
-        cloud: key expression to subscribe to.
-        odometry: key expression to subscribe to.
-        pose: key to publish poses on.
         status: key to publish the status on.
         alive: key of the liveliness token.
         relocalize: key that answers queries to forget the pose and search again.
         reset: key that answers queries to forget everything.
-        cloud_hint: codec to try where Encoding and key do not say.
-        odometry_hint: the same for odometry.
-        pose_hint: the same for a reader of poses.
-        pose_format: codec to write poses with, unless the user asks for another.
-        rmw: poses need rmw_zenoh's attachment and liveliness tokens.
-        bare: poses go out without Encoding.
     """
 
     robot: str
-    cloud: str
-    odometry: str
-    pose: str
     status: str
     alive: str
     relocalize: str
     reset: str
-    cloud_hint: str | None = None
-    odometry_hint: str | None = None
-    pose_hint: str | None = None
-    pose_format: str = "json"
-    rmw: bool = False
-    bare: bool = False
 
 
 def robot_keys(
@@ -179,27 +158,24 @@ def robot_keys(
     }
     if row.rmw:
         values["pose_hash"] = type_hash(POSE_TYPE, humble)
-    own = f"{base}/{robot}"
     pose_key = _filled(pose or row.pose, values, "--pose-key", wildcards=False)
     if row.rmw and not _RMW_KEY.fullmatch(pose_key):
         raise ConfigError(
             f"--pose-key {pose_key!r} is no rmw_zenoh key: <domain>/<topic>/<type>/<hash>, such as {row.pose!r}"
         )
+    own = f"{base}/{robot}"
     return RobotKeys(
+        **vars(row)
+        | {
+            "cloud": _filled(cloud or row.cloud, values, "--cloud-key"),
+            "odometry": _filled(odometry or row.odometry, values, "--odometry-key"),
+            "pose": pose_key,
+        },
         robot=robot,
-        cloud=_filled(cloud or row.cloud, values, "--cloud-key"),
-        odometry=_filled(odometry or row.odometry, values, "--odometry-key"),
-        pose=pose_key,
         status=f"{own}/out/status",
         alive=f"{own}/alive",
         relocalize=f"{own}/rpc/relocalize",
         reset=f"{own}/rpc/reset",
-        cloud_hint=row.cloud_hint,
-        odometry_hint=row.odometry_hint,
-        pose_hint=row.pose_hint,
-        pose_format=row.pose_format,
-        rmw=row.rmw,
-        bare=row.bare,
     )
 
 
@@ -213,9 +189,6 @@ def _filled(template: str, values: dict[str, str], option: str, wildcards: bool 
         return values[name]
 
     return check_expression(re.sub(r"\{([^{}]*)\}", value, template), option, wildcards)
-
-
-_OPTIONS = ("--cloud-key", "--odometry-key")
 
 
 def check_disjoint(keys: Sequence[RobotKeys]) -> None:
@@ -237,7 +210,7 @@ def check_disjoint(keys: Sequence[RobotKeys]) -> None:
             )
     for writer in keys:
         for reader in keys:
-            for option, expression in zip(_OPTIONS, (reader.cloud, reader.odometry), strict=True):
+            for option, expression in zip(_INPUT_OPTIONS, (reader.cloud, reader.odometry), strict=True):
                 if matches(expression, writer.pose):
                     raise ConfigError(
                         f"--pose-key: the poses of robot {writer.robot} on {writer.pose!r} would be read as input of "
@@ -246,8 +219,8 @@ def check_disjoint(keys: Sequence[RobotKeys]) -> None:
 
 
 def _check_inputs(one: RobotKeys, other: RobotKeys) -> None:
-    for first, a in zip(_OPTIONS, (one.cloud, one.odometry), strict=True):
-        for second, b in zip(_OPTIONS, (other.cloud, other.odometry), strict=True):
+    for first, a in zip(_INPUT_OPTIONS, (one.cloud, one.odometry), strict=True):
+        for second, b in zip(_INPUT_OPTIONS, (other.cloud, other.odometry), strict=True):
             if matches(a, b):
                 both = first if first == second else f"{first} and {second}"
                 raise ConfigError(

@@ -1,11 +1,14 @@
-"""A network in memory: no threads, no clock, every call finished when it returns. For tests of what streams."""
+"""In-memory transport for tests of nodes and clients, as httpx's ``MockTransport`` is for HTTP.
+
+It has no threads and no clock: every call is finished when it returns. Public: pass it wherever a
+:class:`~coview_stream.stream.transport.transport.Transport` is asked for.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from coview_stream.errors import TransportError
@@ -17,10 +20,10 @@ from coview_stream.stream.transport.transport import Connection, Policy, Publish
 _log = logging.getLogger(__name__)
 
 
-class FakePublisher:
-    """Publishes on one key of a :class:`FakeTransport`."""
+class MemoryPublisher:
+    """Publishes on one key of a :class:`MemoryTransport`."""
 
-    def __init__(self, transport: FakeTransport, key: str, urgency: Urgency) -> None:
+    def __init__(self, transport: MemoryTransport, key: str, urgency: Urgency) -> None:
         self.key = key
         self.urgency = urgency
         self.closed = False
@@ -36,30 +39,30 @@ class FakePublisher:
         self.closed = True
 
 
-class FakeTransport:
-    """An in-memory transport and the network around it: the test plays robot, client and router.
+class MemoryTransport:
+    """A transport and the network around it: the test plays robot, client and router.
 
     Attributes:
         published: every sample that reached the network, in order, from publishers and from :meth:`publish`.
-        publishers: all that were declared.
+        publishers: every publisher that was declared.
         lost: number of samples published while the network was away.
-        raised: what handlers raised, in order.
+        raised: errors of handlers, in order.
         closed: whether :meth:`close` was called.
     """
 
     def __init__(self) -> None:
         self.published: list[Sample] = []
-        self.publishers: list[FakePublisher] = []
+        self.publishers: list[MemoryPublisher] = []
         self.lost = 0
         self.raised: list[Exception] = []
         self.closed = False
-        self._here = True
+        self._connected = True
         self._tokens: list[str] = []
         self._subscriptions: list[tuple[str, Callable[[Sample], None], Policy]] = []
         self._answers: dict[str, Callable[[dict[str, str]], dict[str, Any]]] = {}
         self._guard = RateLimitedErrors(_log)
 
-    # what the node under test uses
+    # for the node or client under test
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
         """Call ``handler`` within each matching publication; nothing is ever queued, so both policies are the same."""
@@ -67,7 +70,7 @@ class FakeTransport:
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher; it stays readable in :attr:`publishers`."""
-        publisher = FakePublisher(self, check_expression(key, "key", wildcards=False), urgency)
+        publisher = MemoryPublisher(self, check_expression(key, "key", wildcards=False), urgency)
         self.publishers.append(publisher)
         return publisher
 
@@ -82,14 +85,14 @@ class FakeTransport:
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
     ) -> dict[str, Any]:
-        """Ask what :meth:`answer` declared; there is nothing to wait for.
+        """Call the handler that :meth:`answer` declared; there is nothing to wait for.
 
         Raises:
-            TransportError: if nobody answers on ``key``, the network is away, or the handler raises.
+            TransportError: if no answer is declared on ``key``, the network is away, or the handler raises.
         """
         handler = next((handler for name, handler in self._answers.items() if matches(name, key)), None)
-        if handler is None or not self._here:
-            raise TransportError(f"{key}: nobody answers")
+        if handler is None or not self._connected:
+            raise TransportError(f"{key}: no answer")
         try:
             return handler(dict(parameters or {}))
         except Exception as error:
@@ -97,7 +100,7 @@ class FakeTransport:
             raise TransportError(f"{key}: the node refused: {error}") from error
 
     def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
-        """Those of :attr:`announced` that match, sorted, each once."""
+        """Return those of :attr:`announced` that match, sorted, each once."""
         return sorted({token for token in self.announced if matches(expression, token)})
 
     def await_subscriber(
@@ -107,8 +110,8 @@ class FakeTransport:
         return True
 
     def connection(self) -> Connection:
-        """One router, ``fake``, unless the network is away."""
-        return Connection(routers=("fake",)) if self._here and not self.closed else Connection()
+        """Return one router, ``memory``, unless the network is away."""
+        return Connection(routers=("memory",)) if self._connected and not self.closed else Connection()
 
     def close(self) -> None:
         """Drop subscriptions, publishers, answers and tokens."""
@@ -119,12 +122,12 @@ class FakeTransport:
         self._answers.clear()
         self._tokens.clear()
 
-    # what the test uses
+    # for the test
 
     @property
     def announced(self) -> tuple[str, ...]:
         """Liveliness tokens that others can see right now, in the order in which they were announced."""
-        return tuple(self._tokens) if self._here else ()
+        return tuple(self._tokens) if self._connected else ()
 
     @property
     def subscribed(self) -> dict[str, Policy]:
@@ -132,25 +135,26 @@ class FakeTransport:
         return {key: policy for key, _, policy in self._subscriptions}
 
     def publish(self, sample: Sample) -> None:
-        """Publish as anybody on the network: every matching handler has run when this returns."""
-        if not self._here:
+        """Publish as another member of the network: every matching handler has run when this returns."""
+        if not self._connected:
             self.lost += 1
             return
         self.published.append(sample)
         for key, handler, _ in list(self._subscriptions):
             if matches(key, sample.key):
-                error = self._guard.run(key, partial(handler, sample))
-                if error is not None:
-                    self.raised.append(error)
+                with self._guard.catch(key) as caught:
+                    handler(sample)
+                if caught.error is not None:
+                    self.raised.append(caught.error)
 
     def samples(self, key: str) -> list[Sample]:
         """Return what was published on keys that match ``key``, oldest first."""
         return [sample for sample in self.published if matches(key, sample.key)]
 
     def go_away(self) -> None:
-        """Let the router vanish: publications are lost, queries fail, tokens are gone; declarations stay."""
-        self._here = False
+        """Take the router away: publications are lost, queries fail, tokens are gone; declarations stay."""
+        self._connected = False
 
     def come_back(self) -> None:
-        """Let the router return, and with it everything declared."""
-        self._here = True
+        """Bring the router back, and with it everything declared."""
+        self._connected = True

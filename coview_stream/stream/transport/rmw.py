@@ -1,4 +1,4 @@
-"""What rmw_zenoh (ROS 2 over zenoh) expects beside the payload: type names, attachments and liveliness tokens.
+"""rmw_zenoh (ROS 2 over zenoh) beside the payload: type names, attachments and liveliness tokens.
 
 A ROS 2 subscription drops samples without the attachment, and ``ros2 topic list`` shows only topics whose publisher
 holds a token. Formats as in ROS 2 Jazzy and newer; Humble differs in the type hash alone.
@@ -23,13 +23,13 @@ _ROOT = "%"  # a '/' in a name, and so the root enclave and the root namespace
 
 
 def dds_type(name: str) -> str:
-    """``sensor_msgs/msg/PointCloud2`` as DDS spells it: ``sensor_msgs::msg::dds_::PointCloud2_``."""
+    """Spell a type such as ``sensor_msgs/msg/PointCloud2`` as DDS does: ``sensor_msgs::msg::dds_::PointCloud2_``."""
     package, kind, message = name.split("/")
     return f"{package}::{kind}::dds_::{message}_"
 
 
 def type_hash(name: str, humble: bool = False) -> str:
-    """RIHS01 hash of a ROS 2 message type, or what Humble writes instead."""
+    """Return the RIHS01 hash of a ROS 2 message type, or what Humble writes instead."""
     if humble:
         return NO_HASH
     from rosbags.typesys import Stores, get_typestore
@@ -38,16 +38,8 @@ def type_hash(name: str, humble: bool = False) -> str:
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """33 bytes: running number from 1, source time in nanoseconds, and the publisher's 16-byte identity."""
+    """Write 33 bytes: running number from 1, source time in nanoseconds, and the publisher's 16-byte identity."""
     return _ATTACHMENT.pack(sequence, stamp_ns, _GID, gid)
-
-
-def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
-    """Sequence, source time in nanoseconds and publisher identity; None if ``data`` is not such an attachment."""
-    if len(data) != _ATTACHMENT.size or data[_ATTACHMENT.size - _GID - 1] != _GID:
-        return None
-    sequence, stamp_ns, _, gid = _ATTACHMENT.unpack(data)
-    return sequence, stamp_ns, gid
 
 
 def gid_of(token: str) -> bytes:
@@ -56,22 +48,22 @@ def gid_of(token: str) -> bytes:
 
 
 def node_token(domain: int, zid: str, node: str, node_id: int = 0) -> str:
-    """Liveliness token of a ROS 2 node in the root namespace; ``zid`` is our zenoh session's identity."""
+    """Return the liveliness token of a ROS 2 node in the root namespace; ``zid`` is our zenoh session's identity."""
     return f"@ros2_lv/{domain}/{zid}/{node_id}/{node_id}/NN/{_ROOT}/{_ROOT}/{node}"
 
 
 def publisher_token(key: str, zid: str, node: str, entity_id: int, node_id: int = 0) -> str:
-    """Token of a publisher on ``key``, ``domain/topic.../type/hash``; no other entity has its ``entity_id``."""
+    """Return the token of a publisher on ``key``, ``domain/topic.../type/hash``; ``entity_id`` is its alone."""
     domain, *topic, kind, digest = key.split("/")
     name = _ROOT + _ROOT.join(topic)
     return f"@ros2_lv/{domain}/{zid}/{node_id}/{entity_id}/MP/{_ROOT}/{_ROOT}/{node}/{name}/{kind}/{digest}/{_QOS}"
 
 
 class RmwPublisher:
-    """Publishes as a ROS 2 node would: adds the attachment and takes the Encoding away, as rmw_zenoh sets none.
+    """Publisher in the way of a ROS 2 node: with the attachment, and without Encoding, as rmw_zenoh sets none.
 
     Args:
-        inner: where the messages go.
+        inner: publishes the messages.
         token: the publisher's liveliness token; its identity is derived from it.
         now_ns: wall clock, nanoseconds, for the source time that ROS tools measure latency with.
     """

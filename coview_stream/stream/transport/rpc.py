@@ -1,4 +1,4 @@
-"""How a client reaches the network: the endpoint that it looks at when nothing is said."""
+"""Connection of a client: the endpoint that it connects to by default."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from coview_stream.stream.transport.transport import Transport
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-"""Where a client looks when nothing is said: zenoh's usual port, on this machine only."""
+"""Default endpoint of a client: zenoh's usual port, on this machine only."""
 
 
 def open_client(
@@ -16,7 +16,7 @@ def open_client(
     listen: str | Sequence[str] | None = None,
     config: str | Path | None = None,
 ) -> Transport:
-    """Open a zenoh session for a client: to ``tcp/127.0.0.1:7447`` if nothing is said.
+    """Open a zenoh session for a client: to :data:`DEFAULT_ENDPOINT` unless something else is given.
 
     Raises:
         TransportError: as :func:`coview_stream.stream.transport.zenoh_transport.open_transport`.

@@ -1,4 +1,4 @@
-"""What nodes and clients need of a network: zenoh provides it, and an in-memory one without threads or time."""
+"""Interface of a network for nodes and clients; zenoh implements it, and an in-memory transport for tests."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Policy = Literal["newest", "all"]
 
 Urgency = Literal["realtime", "data", "report", "bulk"]
 """``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks rather than
-drops. ``report``: statuses: who has stopped reading misses some and holds nobody up. ``bulk``: clouds: the newest frame
-matters, one that does not fit is dropped."""
+drops. ``report``: statuses: a reader that has stopped misses some and blocks no other. ``bulk``: clouds: the newest
+frame matters, one that does not fit is dropped."""
 
 
 class Publisher(Protocol):
-    """Publishes on one key."""
+    """A publisher on one key."""
 
     def put(self, message: Encoded) -> None:
         """Publish; never raises for a peer that is gone."""
@@ -32,19 +32,24 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True)
 class Connection:
-    """Whom a transport is connected to, zenoh identities, sorted; clients of a listening session count as peers."""
+    """Zenoh identities that a transport is connected to, sorted.
+
+    Attributes:
+        routers: the routers.
+        peers: all others; clients of a listening session count as peers.
+        clients: those of the peers that are clients.
+    """
 
     routers: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()
     clients: tuple[str, ...] = ()
-    """Those of the peers that are clients."""
 
 
 class Transport(Protocol):
     """A publish/subscribe session. Handlers are called on a thread of the subscription's own, one call at a time."""
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
-        """Call ``handler`` for what is published on ``key`` (a key expression). What it raises is logged, not fatal."""
+        """Call ``handler`` for what is published on ``key`` (a key expression). Its errors are logged."""
         ...
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
@@ -62,15 +67,15 @@ class Transport(Protocol):
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
     ) -> dict[str, Any]:
-        """Ask on ``key`` and return the first JSON reply.
+        """Query ``key`` and return the first JSON reply.
 
         Raises:
-            TransportError: nobody answered within ``timeout`` seconds, or the answer was an error or no JSON object.
+            TransportError: no answer within ``timeout`` seconds, or one that is an error or no JSON object.
         """
         ...
 
     def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
-        """Keys of the liveliness tokens that match ``expression`` right now, sorted; none while not connected.
+        """List the liveliness tokens that match ``expression`` right now, sorted; none while not connected.
 
         Raises:
             TransportError: they cannot be asked for.
@@ -80,14 +85,14 @@ class Transport(Protocol):
     def await_subscriber(
         self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
     ) -> bool:
-        """Wait up to ``seconds`` until somebody subscribes to ``key``; False if nobody did.
+        """Wait up to ``seconds`` for a subscriber to ``key``; False if there is none by then.
 
-        ``wait(seconds)`` passes the time between two looks; what it returns as true ends the waiting early.
+        ``wait(seconds)`` passes the time between two looks; a true return value of it ends the waiting early.
         """
         ...
 
     def connection(self) -> Connection:
-        """Whom we are connected to right now."""
+        """Return the current connections."""
         ...
 
     def close(self) -> None:

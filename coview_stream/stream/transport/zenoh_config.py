@@ -1,6 +1,7 @@
-"""What a zenoh session is configured with: the user's file first, our defaults where it is silent."""
+"""Configuration of a zenoh session: the user's file first, our defaults where it sets nothing.
 
-# FOLDED coview_stream/stream/transport/zenoh_config.py: """What zenoh says when it refuses something, in one short line that ends with the remedy."""
+zenoh's errors become one short line that ends with the remedy.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +17,14 @@ from coview_stream.errors import TransportError
 from coview_stream.stream.transport.error_guard import is_panic
 
 _PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
-
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
-
 _HOST_PORT = re.compile(r"(\[[^\]]+\]|[^:\[\]]+):(\d+)")
 
 _DEFAULTS: dict[str, Any] = {
-    # explicit endpoints only: a robot must not join whatever the next desk is testing
+    # explicit endpoints only: a robot must not join sessions that others test on the same network
     "scouting/multicast/enabled": False,
     "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
-    # zenoh's own waits grow to 4 s; a robot that stands still waiting for poses wants its router back within 2 s
+    # zenoh's own waits grow to 4 s; a robot that stands still for want of poses needs its router back within 2 s
     "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2.0},
     # a host that is off does not refuse: each attempt waits this long, and so, at worst, does the end of the process.
     # Enough for five round trips over a satellite. connect/timeout_ms would bound the wait too, but with it a client
@@ -41,7 +40,6 @@ _DEFAULTS: dict[str, Any] = {
 _SHARED_MEMORY = "transport/shared_memory/enabled"
 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.S)
-
 _FILES = (
     *(
         f"transport/link/tls/{name}"
@@ -55,6 +53,20 @@ _FILES = (
     ),
     "transport/auth/usrpwd/dictionary_file",
 )
+
+# zenoh's words
+_REMEDIES = {
+    "Address already in use": "another node or router holds the port: --connect to it, or another --listen",
+    "Cannot assign requested address": "no address of this machine: --listen on one that it has, or --connect to the "
+    "machine that has it",
+}
+
+_MESSAGE = re.compile(
+    r'JSON error: Message \{ msg: "((?:[^"\\]|\\.)*)", location: (?:Some\(.*?line: (\d+),.*|None.*)'
+)
+_SYNTAX = re.compile(r"^--> (\d+):(\d+) \|.*\| = (.*)$")
+_FIELD = re.compile(r"unknown field `([^`]*)`(?:, (?:expected (?:one of )?)?(.*?))?(?=$| at line )")
+_PLACE = re.compile(r" at line (\d+) column \d+")
 
 
 @contextmanager
@@ -75,9 +87,9 @@ def zenoh_errors(what: str) -> Iterator[None]:
 def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path | None = None) -> Any:
     """Build a ``zenoh.Config``.
 
-    The file decides whatever it sets; ``connect`` and ``listen`` replace its endpoints. Without a mode in the file we
-    are a client if there is something to connect to and nothing to listen on, else a peer: two peers do not see each
-    other through a router, a client is seen by all.
+    Settings of the file have precedence over our defaults; ``connect`` and ``listen`` replace its endpoints. Without
+    a mode in the file we are a client if there is something to connect to and nothing to listen on, else a peer: two
+    peers do not see each other through a router, a client is seen by all.
 
     Args:
         connect: endpoints to connect to, for example ``tcp/10.0.0.1:7447``.
@@ -112,7 +124,7 @@ def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path 
 
 
 def mode_of(config: Any) -> str:
-    """``client``, ``peer`` or ``router``."""
+    """Return ``client``, ``peer`` or ``router``."""
     return str(_get(config, "mode"))
 
 
@@ -180,8 +192,8 @@ def _check_endpoint(endpoint: str, option: str) -> None:
             raise TransportError(
                 f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447"
             )
-        lowest = 0 if option == "--listen" else 1  # listening on 0 takes any that is free
-        if not lowest <= int(found.group(2)) <= 65535:
+        min_port = 0 if option == "--listen" else 1  # listening on 0 takes any that is free
+        if not min_port <= int(found.group(2)) <= 65535:
             raise TransportError(f"{option} {endpoint!r}: port must be 1..65535, such as 7447")
 
 
@@ -194,25 +206,8 @@ def _insert(config: Any, key: str, value: Any) -> None:
         config.insert_json5(key, json.dumps(value))
 
 
-_REMEDIES = {
-    "Address already in use": "another node or router holds the port: --connect to it, or another --listen",
-    "Cannot assign requested address": "no address of this machine: --listen on one that it has, or --connect to the "
-    "machine that has it",
-}
-
-_MESSAGE = re.compile(
-    r'JSON error: Message \{ msg: "((?:[^"\\]|\\.)*)", location: (?:Some\(.*?line: (\d+),.*|None.*)'
-)
-
-_SYNTAX = re.compile(r"^--> (\d+):(\d+) \|.*\| = (.*)$")
-
-_FIELD = re.compile(r"unknown field `([^`]*)`(?:, (?:expected (?:one of )?)?(.*?))?(?=$| at line )")
-
-_PLACE = re.compile(r" at line (\d+) column \d+")
-
-
 def reason(error: BaseException) -> str:
-    """Return what zenoh says, on one line, without the places in its source, with a remedy where we know one."""
+    """Return zenoh's message on one line, without the lines of its source, with a remedy where we know one."""
     text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
     text = _mistake(text.strip()) or type(error).__name__
     for cause, remedy in _REMEDIES.items():
@@ -222,7 +217,7 @@ def reason(error: BaseException) -> str:
 
 
 def _mistake(text: str) -> str:
-    """Shorten a complaint about a configuration file, which names all keys that there could have been."""
+    """Shorten an error about a configuration file, which lists all keys that there could have been."""
     if found := _MESSAGE.fullmatch(text):
         line = f"line {found[2]}: " if found[2] else ""
         return line + _field(re.sub(r"\\(.)", r"\1", found[1]))

@@ -1,12 +1,9 @@
-"""Samples in and out of zenoh's own types, and with which quality of service they travel."""
-
-# FOLDED coview_stream/stream/transport/zenoh_io.py: """Queries in zenoh: answers to those of others, for all keys on one thread, and the first reply to one of ours."""
+"""Samples and queries between zenoh's types and ours, and their quality of service."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
@@ -17,6 +14,10 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
+_JSON = "application/json"
+
+Answer = Callable[[dict[str, str]], dict[str, Any]]
+"""Handler of a query: from its parameters to the fields of the reply."""
 
 
 class ZenohPublisher:
@@ -35,28 +36,27 @@ class ZenohPublisher:
             self.close()
 
     def put(self, message: Encoded) -> None:
-        """Publish; lost while there is no session yet or nobody to send to."""
+        """Publish; lost while there is no session yet or no peer."""
         publisher = self._publisher
         if publisher is not None and not self._closed:
             encoding = message.encoding or _UNSET
-            self._guard.run(
-                self._key,
-                lambda: publisher.put(message.payload, encoding=encoding, attachment=message.attachment),
-            )
+            with self._guard.catch(self._key):
+                publisher.put(message.payload, encoding=encoding, attachment=message.attachment)
 
     def close(self) -> None:
         """Undeclare; later messages are ignored."""
         self._closed = True
         publisher, self._publisher = self._publisher, None
         if publisher is not None:
-            self._guard.run(self._key, publisher.undeclare)
+            with self._guard.catch(self._key):
+                publisher.undeclare()
 
 
 def plain(sample: Any, max_payload: int | None = None) -> Sample:
     """Return a zenoh sample as plain data. Copies the payload once: zenoh's Python types share no memory.
 
-    Payload and attachment that are together larger than ``max_payload`` are not copied, which would hold up every other
-    thread, but for their size.
+    Of payload and attachment that are together larger than ``max_payload`` only the size is returned: copying them
+    would block every other thread.
     """
     key, encoding = str(sample.key_expr), str(sample.encoding)
     encoding = "" if encoding == _UNSET else encoding
@@ -74,9 +74,7 @@ def quality(urgency: Urgency) -> dict[str, Any]:
     import zenoh
 
     congestion, priority = zenoh.CongestionControl, zenoh.Priority
-    if (
-        urgency == "realtime"
-    ):  # express: not batched; 0.2 ms beside a flood of clouds on the same link instead of 8
+    if urgency == "realtime":  # express: not batched; 0.2 ms beside clouds on the same link instead of 8
         return {"express": True, "priority": priority.REAL_TIME, "congestion_control": congestion.DROP}
     if urgency == "report":
         return {"congestion_control": congestion.DROP}
@@ -87,20 +85,15 @@ def quality(urgency: Urgency) -> dict[str, Any]:
     return {"congestion_control": getattr(congestion, "BLOCK_FIRST", congestion.DROP)}
 
 
-_JSON = "application/json"
-
-Answer = Callable[[dict[str, str]], dict[str, Any]]
-
-
 class Answers:
-    """Queries that wait for their answer, and the thread's work on them."""
+    """Queue of queries to answer, worked on by one thread for all keys."""
 
     def __init__(self, guard: RateLimitedErrors) -> None:
         self._guard = guard
         self._queries: SimpleQueue[tuple[str, Any, Answer] | None] = SimpleQueue()
 
     def callback(self, key: str, handler: Answer) -> Callable[[Any], None]:
-        """Return what zenoh is to call with queries on ``key``; it returns at once."""
+        """Return the callback for queries on ``key``: it puts them into the queue."""
 
         def enqueue(query: Any) -> None:
             self._queries.put((key, query, handler))
@@ -111,8 +104,9 @@ class Answers:
         """Answer until :meth:`end`."""
         while (entry := self._queries.get()) is not None:
             key, query, handler = entry
-            self._guard.run(key, partial(self._answer, key, query, handler))
-            del entry, query  # a query is finished for its sender when nobody holds it
+            with self._guard.catch(key):
+                self._answer(key, query, handler)
+            del entry, query  # a query is finished for its sender once no reference is left
 
     def end(self) -> None:
         """Let :meth:`run` return."""
@@ -129,7 +123,7 @@ class Answers:
 
 
 def first_reply(session: Any, key: str, parameters: dict[str, str], timeout: float) -> dict[str, Any] | None:
-    """Query ``key`` and return the first JSON reply, None where nobody answers within ``timeout`` seconds.
+    """Query ``key`` and return the first JSON reply, None without one within ``timeout`` seconds.
 
     Raises:
         TransportError: the answer is an error, or no JSON object.
@@ -153,7 +147,7 @@ def _json_object(key: str, payload: bytes) -> dict[str, Any]:
 
 
 def _error_of(payload: bytes) -> str:
-    """Text of an error reply: the ``error`` of its JSON, or the bytes as text."""
+    """Return the text of an error reply: the ``error`` of its JSON, or the bytes as text."""
     try:
         return str(read_object(payload)["error"])
     except (MessageError, KeyError):

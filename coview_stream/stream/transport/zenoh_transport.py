@@ -1,4 +1,4 @@
-"""The network: a zenoh session behind the interface of :mod:`coview_stream.stream.transport`."""
+"""Zenoh transport: a session behind the interface :class:`~coview_stream.stream.transport.transport.Transport`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -22,15 +21,16 @@ from coview_stream.stream.transport.zenoh_io import Answers, ZenohPublisher, fir
 
 _log = logging.getLogger(__name__)
 
-_POLL = 0.02  # seconds; a look at the matching status costs microseconds
-_RETRY = 0.5  # seconds between two attempts to find the first router
-_PATIENCE = 2.0  # seconds that opening waits for the first attempt: a host that is off does not even refuse
-_NO_ROUTER = (
-    "Unable to connect"  # zenoh's words; anything else at opening is a mistake that time does not heal
-)
+# zenoh's words for a missing router; any other error at opening is a mistake that waiting does not mend
+_NO_ROUTER = "Unable to connect"
+
+# set by hand; seconds unless they say otherwise
+_POLL = 0.02  # a look at the matching status costs microseconds
+_RETRY = 0.5  # between two attempts to find the first router
+_OPEN_TIMEOUT = 2.0  # of opening, for the first attempt: a host that is off does not even refuse
+_JOIN_TIMEOUT = 0.4  # for all our threads to end at close; they notice within 0.1
+_EXIT_TIMEOUT = 10.0  # for each thread to end with the process: longer than any attempt to open
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's receiving thread, for all keys
-_JOIN = 0.4  # seconds for all our threads to end at close; they notice within 0.1
-_EXIT = 10.0  # seconds for each to end when the process does: longer than any attempt to open
 
 
 def open_transport(
@@ -41,8 +41,8 @@ def open_transport(
 ) -> ZenohTransport:
     """Open a zenoh session.
 
-    As a client it may start before its router: whatever is declared meanwhile takes effect once the router is there,
-    and what is published until then is lost. It comes back by itself whenever the router does.
+    As a client it may start before its router: declarations take effect once the router is there, and samples published
+    until then are lost. After an outage the connection is restored without further calls.
 
     Args:
         connect: endpoints to connect to, for example ``tcp/127.0.0.1:7447``.
@@ -55,7 +55,7 @@ def open_transport(
     """
     import zenoh
 
-    # RUST_LOG=zenoh=warn says why a router refuses us; without it this is silent
+    # RUST_LOG=zenoh=warn prints why a router refuses us; without it this is silent
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
     return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload)
 
@@ -71,11 +71,11 @@ class ZenohTransport:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._declared: list[Any] = []  # zenoh undeclares what nobody holds
+        self._declared: list[Any] = []  # zenoh undeclares what is not referenced
         self._pending: list[Callable[[Any], None]] = []
         self._answers = Answers(self._guard)
         self._session: Any = None
-        # a thread inside zenoh while the interpreter goes down aborts the process: see that none is left
+        # a thread inside zenoh while the interpreter shuts down aborts the process: end them all before
         atexit.register(self._at_exit)
         self._open()
 
@@ -93,16 +93,18 @@ class ZenohTransport:
         def declare(session: Any) -> None:
             subscriber = session.declare_subscriber(key, channel(size))
             self._declared.append(subscriber)
-            self._start(f"subscriber {key}", lambda: self._receive(key, subscriber, handler))
+            self._start(f"subscriber {key}", self._receive, key, subscriber, handler)
 
         self._declare(key, declare)
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
         publisher = ZenohPublisher(key, self._guard)
-        self._declare(
-            key, lambda session: publisher.attach(session.declare_publisher(key, **quality(urgency)))
-        )
+
+        def declare(session: Any) -> None:
+            publisher.attach(session.declare_publisher(key, **quality(urgency)))
+
+        self._declare(key, declare)
         return publisher
 
     def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> None:
@@ -119,15 +121,19 @@ class ZenohTransport:
 
     def announce(self, key: str) -> None:
         """Hold a liveliness token until :meth:`close`. Errors as in :meth:`subscribe`."""
-        self._declare(key, lambda session: self._declared.append(session.liveliness().declare_token(key)))
+
+        def declare(session: Any) -> None:
+            self._declared.append(session.liveliness().declare_token(key))
+
+        self._declare(key, declare)
 
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
     ) -> dict[str, Any]:
-        """Ask on ``key``, where need be after waiting for the first router, and return the first JSON reply.
+        """Query ``key``, after waiting for the first router if need be, and return the first JSON reply.
 
         Raises:
-            TransportError: nobody answered within ``timeout`` seconds, or the answer was an error or no JSON object.
+            TransportError: no answer within ``timeout`` seconds, or one that is an error or no JSON object.
         """
         deadline = time.monotonic() + timeout
         while (session := self._session) is None and time.monotonic() < deadline:
@@ -137,12 +143,10 @@ class ZenohTransport:
             answer = first_reply(session, key, parameters or {}, left)
             if answer is not None:
                 return answer
-        raise TransportError(
-            f"{key}: nobody answered within {timeout:g} s; is the node running and connected?"
-        )
+        raise TransportError(f"{key}: no answer within {timeout:g} s; is the node running and connected?")
 
     def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
-        """Keys of the liveliness tokens that match right now, sorted; none while there is no session.
+        """List the liveliness tokens that match ``expression`` right now, sorted; none while there is no session.
 
         Raises:
             TransportError: if ``expression`` is no key expression or zenoh fails.
@@ -157,9 +161,9 @@ class ZenohTransport:
     def await_subscriber(
         self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
     ) -> bool:
-        """Wait up to ``seconds`` until somebody subscribes to ``key``; False if nobody did.
+        """Wait up to ``seconds`` for a subscriber to ``key``; False if there is none by then.
 
-        ``wait(seconds)`` passes the time between two looks; what it returns as true ends the waiting early.
+        ``wait(seconds)`` passes the time between two looks; a true return value of it ends the waiting early.
         """
         probe: Any = None
         deadline = time.monotonic() + seconds
@@ -181,7 +185,7 @@ class ZenohTransport:
         return self._session
 
     def connection(self) -> Connection:
-        """Whom we are connected to right now; nobody while closed or waiting for the first router."""
+        """Return the current connections; none while closed or waiting for the first router."""
         with self._lock:
             if self._session is None:
                 return Connection()
@@ -201,9 +205,10 @@ class ZenohTransport:
             session, self._session = self._session, None
             self._pending.clear()
         if session is not None:
-            self._guard.run("closing", session.close)
+            with self._guard.catch("closing"):
+                session.close()
         self._answers.end()
-        end = time.monotonic() + _JOIN
+        end = time.monotonic() + _JOIN_TIMEOUT
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(max(0.0, end - time.monotonic()))
@@ -214,7 +219,7 @@ class ZenohTransport:
     def _at_exit(self) -> None:
         self.close()
         for thread in self._threads:
-            thread.join(_EXIT)
+            thread.join(_EXIT_TIMEOUT)
 
     # opening
 
@@ -228,10 +233,10 @@ class ZenohTransport:
                 raise
             return
         first: SimpleQueue[TransportError | None] = SimpleQueue()
-        self._start("opening", lambda: self._keep_trying(first))
+        self._start("opening", self._keep_trying, first)
         where = zenoh_config.endpoints_of(self._config)
         try:
-            error = first.get(timeout=_PATIENCE)
+            error = first.get(timeout=_OPEN_TIMEOUT)
         except Empty:
             _log.warning("no answer from a router at %s yet: going on without", where)
             return
@@ -264,7 +269,8 @@ class ZenohTransport:
             if not self._closing.is_set():
                 self._session = session
                 for declare in self._pending:
-                    self._guard.run("declaring", partial(declare, session))
+                    with self._guard.catch("declaring"):
+                        declare(session)
                 self._pending.clear()
                 return
         session.close()
@@ -285,8 +291,8 @@ class ZenohTransport:
 
     # threads
 
-    def _start(self, name: str, target: Callable[[], None]) -> None:
-        thread = threading.Thread(target=target, name=f"coview {name}", daemon=True)
+    def _start(self, name: str, target: Callable[..., None], *args: Any) -> None:
+        thread = threading.Thread(target=target, args=args, name=f"coview {name}", daemon=True)
         self._threads.append(thread)
         thread.start()
 
@@ -297,9 +303,6 @@ class ZenohTransport:
             if self._closing.is_set():
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self._guard.run(key, partial(_hand, sample, self._max_payload, handler))
-            del sample  # however large, it need not live until the next one comes
-
-
-def _hand(sample: Any, max_payload: int | None, handler: Callable[[Sample], None]) -> None:
-    handler(plain(sample, max_payload))
+                with self._guard.catch(key):
+                    handler(plain(sample, self._max_payload))
+            del sample  # it may be large, and must not live until the next one comes

@@ -20,7 +20,7 @@ from coview_stream.stream.client.replay import replay
 from coview_stream.stream.client.replay_schedule import ReplayConfig, beats, frame_times, odometry_spacing
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 STAMPS = np.array([1000.0, 1000.1, 1000.2, 1000.35])
 KEYS = robot_keys("native", "coview", "r1")
@@ -62,7 +62,7 @@ def run(run_folder):
 
 def recorded(run, config, clock=None, **options):
     """(report, [(seconds after the first, key, decoded message)])."""
-    net, clock = FakeTransport(), clock or TestClock()
+    net, clock = MemoryTransport(), clock or TestClock()
     sent = []
     net.subscribe(KEYS.cloud, lambda s: sent.append((clock.now() - 50.0, "cloud", decode_cloud(s))), "newest")
     net.subscribe(
@@ -133,7 +133,7 @@ def test_loop_restarts_the_run_with_increasing_stamps(run):
 
 def test_slow_send_does_not_delay_later_deadlines(run):
     """A send that takes long delays what comes next, but not what comes after that."""
-    clock, net = TestClock(), FakeTransport()
+    clock, net = TestClock(), MemoryTransport()
     times = []
 
     def slow(sample):
@@ -239,7 +239,7 @@ def test_odometry_spacing(run, run_folder):
 
 
 def test_json_odometry_is_small_enough_for_a_microcontroller(run):
-    net = FakeTransport()
+    net = MemoryTransport()
     sender = Sender(net, KEYS)
     message = sender.odometry(run.poses[3], nanoseconds(1.7e9))
     assert set(json.loads(message.payload)) == {"stamp_ns", "position", "orientation"}

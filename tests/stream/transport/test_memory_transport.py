@@ -7,12 +7,12 @@ import pytest
 from coview_stream.errors import ConfigError, TransportError
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.transport import Transport
 
 
 def test_samples_reach_matching_handlers_before_publish_returns() -> None:
-    net = FakeTransport()
+    net = MemoryTransport()
     wild: list[Sample] = []
     exact: list[Sample] = []
     net.subscribe("coview/*/in/cloud", wild.append, "newest")
@@ -26,7 +26,7 @@ def test_samples_reach_matching_handlers_before_publish_returns() -> None:
 
 
 def test_published_samples_are_recorded_and_delivered() -> None:
-    net = FakeTransport()
+    net = MemoryTransport()
     heard: list[Sample] = []
     net.subscribe("**", heard.append, "all")
     publisher = net.publisher("a/b", "realtime")
@@ -38,7 +38,7 @@ def test_published_samples_are_recorded_and_delivered() -> None:
 
 
 def test_raising_handler_is_recorded_and_called_again(caplog: pytest.LogCaptureFixture) -> None:
-    net = FakeTransport()
+    net = MemoryTransport()
     calls: list[bytes] = []
 
     def handler(sample: Sample) -> None:
@@ -55,7 +55,7 @@ def test_raising_handler_is_recorded_and_called_again(caplog: pytest.LogCaptureF
 
 
 def test_queries_return_answers_or_raise_the_reason() -> None:
-    net = FakeTransport()
+    net = MemoryTransport()
 
     def refuse(_: dict[str, str]) -> dict[str, object]:
         raise ValueError("not now")
@@ -71,13 +71,13 @@ def test_queries_return_answers_or_raise_the_reason() -> None:
 
 
 def test_network_outage_and_return() -> None:
-    net = FakeTransport()
+    net = MemoryTransport()
     heard: list[Sample] = []
     net.subscribe("a", heard.append, "all")
     net.answer("q", lambda _: {})
     net.announce("alive")
     publisher = net.publisher("a", "data")
-    assert net.connection().routers == ("fake",)
+    assert net.connection().routers == ("memory",)
     net.go_away()
     publisher.put(Encoded(b"lost"))
     assert (net.connection().routers, net.announced, net.lost, heard) == ((), (), 1, [])
@@ -88,11 +88,11 @@ def test_network_outage_and_return() -> None:
     assert net.tokens("*") == ["alive"]
     publisher.put(Encoded(b"here"))
     assert [sample.payload for sample in heard] == [b"here"]
-    assert (net.connection().routers, net.announced, net.query("q")) == (("fake",), ("alive",), {})
+    assert (net.connection().routers, net.announced, net.query("q")) == (("memory",), ("alive",), {})
 
 
 def test_close_is_complete_and_idempotent() -> None:
-    transport: Transport = (net := FakeTransport())  # mypy: it is one
+    transport: Transport = (net := MemoryTransport())  # mypy: it is one
     heard: list[Sample] = []
     transport.subscribe("a", heard.append, "all")
     transport.announce("alive")
@@ -104,21 +104,18 @@ def test_close_is_complete_and_idempotent() -> None:
 
 def test_invalid_zenoh_key_is_refused() -> None:
     with pytest.raises(ConfigError):
-        FakeTransport().subscribe("a//b", print, "all")
+        MemoryTransport().subscribe("a//b", print, "all")
     with pytest.raises(ConfigError):
-        FakeTransport().publisher("a/*", "data")
+        MemoryTransport().publisher("a/*", "data")
 
 
 def test_rate_limited_errors_count_suppressed_messages(caplog: pytest.LogCaptureFixture) -> None:
     now = [0.0]
     guard = RateLimitedErrors(logging.getLogger("guard"), interval=10.0, clock=lambda: now[0])
 
-    def fail() -> None:
-        raise ValueError("no")
-
-    for now[0] in (0.0, 1.0, 9.0, 11.0):
-        guard.run("a/key", fail)
-    guard.run("b/key", fail)
+    for now[0], place in ((0.0, "a/key"), (1.0, "a/key"), (9.0, "a/key"), (11.0, "a/key"), (11.0, "b/key")):
+        with guard.catch(place):
+            raise ValueError("no")
     lines = [record.getMessage() for record in caplog.records]
     assert lines == [
         "a/key: ValueError: no",
@@ -131,13 +128,9 @@ def test_rate_limited_errors_catch_panics_but_not_interrupts() -> None:
     class PanicException(BaseException):
         pass
 
-    def panic() -> None:
-        raise PanicException("rust")
-
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
     guard = RateLimitedErrors(logging.getLogger("guard"))
-    assert "rust" in str(guard.run("k", panic))
-    with pytest.raises(KeyboardInterrupt):
-        guard.run("k", interrupt)
+    with guard.catch("k") as caught:
+        raise PanicException("rust")
+    assert "rust" in str(caught.error)
+    with pytest.raises(KeyboardInterrupt), guard.catch("k"):
+        raise KeyboardInterrupt

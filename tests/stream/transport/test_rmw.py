@@ -5,8 +5,9 @@ import zenoh
 from zenoh.ext import Int64, z_deserialize, z_serialize
 
 from coview_stream.messages.types import Encoded, Sample
+from coview_stream.messages.validation import read_attachment
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import FakeTransport
+from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.rmw import (
     RmwPublisher,
     attachment,
@@ -14,7 +15,6 @@ from coview_stream.stream.transport.rmw import (
     gid_of,
     node_token,
     publisher_token,
-    read_attachment,
     type_hash,
 )
 
@@ -25,7 +25,7 @@ GID = bytes(range(16))
 def test_rmw_attachment_golden_bytes() -> None:
     data = attachment(5, 1_700_000_000_123_456_789, GID)
     assert data.hex() == "0500000000000000" + "15cd853dfe9c9717" + "10" + GID.hex()
-    assert read_attachment(data) == (5, 1_700_000_000_123_456_789, GID)
+    assert read_attachment(data) == (1_700_000_000_123_456_789, 5)
 
 
 def test_rmw_attachment_equals_zenoh_serialization() -> None:
@@ -37,7 +37,7 @@ def test_rmw_attachment_equals_zenoh_serialization() -> None:
 
 @pytest.mark.parametrize("data", [b"", bytes(33), attachment(1, 2, GID)[:-1], attachment(1, 2, GID) + b"x"])
 def test_other_attachments_are_not_rmw_attachments(data: bytes) -> None:
-    assert read_attachment(data) is None
+    assert read_attachment(data) == (None, None)
 
 
 def test_dds_type_names_and_type_hashes() -> None:
@@ -65,7 +65,7 @@ def test_liveliness_tokens_match_rmw_zenoh() -> None:
 
 
 def test_rmw_publisher_adds_sequence_and_gid_without_encoding() -> None:
-    net = FakeTransport()
+    net = MemoryTransport()
     keys = [robot_keys("rmw_zenoh", "coview", name, domain=7).pose for name in ("a", "b")]
     tokens = [publisher_token(key, ZID, "coview", number) for number, key in enumerate(keys, 1)]
     for token in (*tokens, node_token(7, ZID, "coview")):
