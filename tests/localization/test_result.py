@@ -1,4 +1,4 @@
-"""What the localizer says, as plain data and back."""
+"""Evidence as plain data and back."""
 
 from __future__ import annotations
 
@@ -45,3 +45,11 @@ def test_evidence_json_always_has_the_same_keys(world_fixes):
     shares = ("near", "covered", "ground", "free_space", "inside")
     assert [blind[name] for name in shares] == [None] * 5
     assert all(0.0 <= known[name] <= 1.0 for name in shares)
+
+
+def test_doubted_evidence_is_written_as_ambiguous_with_its_cause():
+    """Files know four states."""
+    doubted = KeyframeEvidence(1.5, State.DOUBTED, "covered", cause=RejectionReason.BLIND)
+    data = doubted.to_json()
+    assert (data["state"], data["cause"]) == ("AMBIGUOUS", "blind")
+    assert KeyframeEvidence.from_json(data) == replace(doubted, state=State.AMBIGUOUS)
