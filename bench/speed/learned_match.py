@@ -1,6 +1,6 @@
 """Where a learned query fits: dense correlation with a map, and the pairs of keypoints that agree.
 
-Dense correlation: 32 channels on cells of 2 m, a query of 64 m at 36 headings, maps of 0.1 and 1 km2 of random
+Dense correlation: 32 dimensions on cells of 2 m, a query of 64 m at 36 headings, maps of 0.1 and 1 km2 of random
 features (no place is easier than another). The baselines are what one writes with SciPy, the map's spectra made
 beforehand as ours are: ``one FFT`` transforms every channel of a turned query over the whole map, multiplies, adds
 and transforms back, heading by heading; ``fftconvolve`` is ``scipy.signal.fftconvolve`` per heading with everything
@@ -54,7 +54,7 @@ class OneFft:
 
 
 def convolved(features: F32, query: F32, weight: F32, yaws: npt.NDArray[np.float64]) -> F32:
-    """Baseline: ``scipy.signal.fftconvolve`` along the map's axes, then the sum over channels (K, H, W)."""
+    """Baseline: ``scipy.signal.fftconvolve`` along the map's axes, then the sum over dimensions (K, H, W)."""
     from scipy.signal import fftconvolve
 
     grids = _turned(query, weight, yaws)[..., ::-1, ::-1]

@@ -69,7 +69,7 @@ class FeatureMap:
         self._local, self._sigma, self.place, self.place_at = local, sigma, place, np.array(place_at)
 
     @property
-    def channels(self) -> int:
+    def dimensions(self) -> int:
         """Numbers C in a local descriptor."""
         return int(self._local.shape[3])
 
@@ -103,7 +103,7 @@ class FeatureMap:
         low = np.floor((np.asarray(centre, dtype=np.float64)[:2] - reach) / LOCAL_CELL).astype(np.int64)
         high = np.ceil((np.asarray(centre, dtype=np.float64)[:2] + reach) / LOCAL_CELL).astype(np.int64)
         width, height = (int(n) for n in high - low)
-        local = np.zeros((height, width, self.channels), dtype=np.int8)
+        local = np.zeros((height, width, self.dimensions), dtype=np.int8)
         sigma = np.full((height, width), 255, dtype=np.uint8)
         self.index.gather(self._local, low, local)
         self.index.gather(self._sigma, low, sigma)
@@ -116,7 +116,7 @@ class FeatureMap:
         Cells without features count as zero.
         """
         ratio, side = round(cell / LOCAL_CELL), round(TILE * LOCAL_CELL / cell)
-        shape = (self.channels, self.index.rows * side, self.index.columns * side)
+        shape = (self.dimensions, self.index.rows * side, self.index.columns * side)
         whole = np.zeros(shape, dtype=np.float32)
         for (column, row), tile in zip(self.index.tiles - self.index.low, self._local, strict=True):
             rows, columns = (slice(n * side, (n + 1) * side) for n in (int(row), int(column)))
@@ -142,8 +142,8 @@ class FeatureMap:
 
 def means(tile: Int8s, ratio: int) -> Floats32:
     """Average stored cells (h * ratio, w * ratio, C) over squares of ``ratio`` cells: (C, h, w)."""
-    height, width, channels = (tile.shape[0] // ratio, tile.shape[1] // ratio, tile.shape[2])
-    blocks = tile.reshape(height, ratio, width, ratio, channels).astype(np.float32)
+    height, width, dimensions = (tile.shape[0] // ratio, tile.shape[1] // ratio, tile.shape[2])
+    blocks = tile.reshape(height, ratio, width, ratio, dimensions).astype(np.float32)
     return np.ascontiguousarray(blocks.mean(axis=(1, 3)).transpose(2, 0, 1) * np.float32(1.0 / 127.0))
 
 

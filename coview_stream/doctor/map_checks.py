@@ -87,5 +87,5 @@ def _learned_memory(base_map: BaseMap) -> float:
 
     features, config = base_map.learned, LearnedConfig()
     spectra = min(features.box_area * _SPECTRA_MEMORY, MAX_BYTES)
-    coarse = features.box_area / config.cell**2 * (2 * features.channels + 4 * config.yaws)
+    coarse = features.box_area / config.cell**2 * (2 * features.dimensions + 4 * config.yaws)
     return _NETWORK_MEMORY + spectra + coarse + 3 * len(base_map) * config.yaws * 4

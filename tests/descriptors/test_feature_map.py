@@ -119,7 +119,7 @@ def test_features_are_shift_equivariant_by_a_tile(points, features):
 
 def test_patch_holds_unit_vectors_or_zeros(points, features):
     patch = features.patch(np.array([60.0, 10.0]), 40.0)  # beyond a corner of the map
-    assert patch.local.shape == (features.channels, 80, 80)
+    assert patch.local.shape == (features.dimensions, 80, 80)
     assert patch.sigma.shape == (80, 80)
     np.testing.assert_array_equal(patch.corner, [20.0, -30.0])
     norms = np.linalg.norm(patch.local, axis=0)
@@ -133,7 +133,7 @@ def test_patch_holds_unit_vectors_or_zeros(points, features):
 
 def test_patch_outside_the_map_is_empty(features):
     patch = features.patch(np.array([5e3, 5e3]), 10.0)
-    assert patch.local.shape == (features.channels, 20, 20)
+    assert patch.local.shape == (features.dimensions, 20, 20)
     assert not patch.local.any()
 
 
@@ -144,7 +144,7 @@ def test_coarse_cells_are_means(features, cell):
     patch = features.patch(np.array([0.0, -32.0]), 16.0)
     column, row = ((patch.corner - corner) / cell).astype(int)
     side = 32 // cell
-    expected = patch.local.reshape(features.channels, side, cell, side, cell).mean(axis=(2, 4))
+    expected = patch.local.reshape(features.dimensions, side, cell, side, cell).mean(axis=(2, 4))
     np.testing.assert_allclose(coarse[:, row : row + side, column : column + side], expected, atol=1e-6)
 
 

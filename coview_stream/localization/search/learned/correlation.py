@@ -39,7 +39,7 @@ def correlate(
         query: (C, h, h), h even, each cell's features times its weight (see :func:`downsample`); row along
             y, column along x of the query's frame, the robot between the four cells in the middle.
         weight: (h, h) not negative. What lies more than h / 2 cells from the middle is left out.
-        index: of the same cells and channels, with a margin of at least h / 2.
+        index: of the same cells and dimensions, with a margin of at least h / 2.
         yaws: (K,) headings of the query's frame in the map, radians.
         blocks: blocks of the map to score (all); see :meth:`FeatureIndex.blocks_near`.
         min_coverage: smallest share of the weight on surveyed cells; None divides by all the weight.
@@ -95,8 +95,8 @@ def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats)
         raise ValueError(
             f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit"
         )
-    if len(query) != index.channels:
-        raise ValueError(f"the query has {len(query)} channels, the map {index.channels}")
+    if len(query) != index.dimensions:
+        raise ValueError(f"the query has {len(query)} dimensions, the map {index.dimensions}")
     if query.shape[1] > 2 * index.margin:
         raise ValueError(
             f"the query has {query.shape[1]} cells a side, the map allows for {2 * index.margin}"
@@ -138,7 +138,7 @@ def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> 
     Raises:
         ValueError: the ratio does not divide the sides, or the weights have another shape.
     """
-    channels, height, width = local.shape
+    dimensions, height, width = local.shape
     if height % ratio or width % ratio:
         raise ValueError(f"{height} x {width} cells cannot be taken together {ratio} by {ratio}")
     if weight is None:
@@ -146,7 +146,7 @@ def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> 
     if weight.shape != (height, width):
         raise ValueError(f"weights {weight.shape} for {height} x {width} cells")
     parts = (height // ratio, ratio, width // ratio, ratio)
-    weighted = (local * weight).reshape(channels, *parts).mean(axis=(2, 4), dtype=np.float32)
+    weighted = (local * weight).reshape(dimensions, *parts).mean(axis=(2, 4), dtype=np.float32)
     return np.asarray(weighted), np.asarray(weight.reshape(parts).mean(axis=(1, 3), dtype=np.float32))
 
 
@@ -164,7 +164,7 @@ def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
     Raises:
         ValueError: the images are not square, or have an odd number of cells.
     """
-    channels, size, width = images.shape
+    dimensions, size, width = images.shape
     if size != width or size % 2:
         raise ValueError(f"a query of {size} x {width} cells: it has to be square, its sides even")
     half = size // 2
@@ -174,7 +174,7 @@ def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
     col = u[..., None] * c + v[..., None] * s + (half + 0.5)
     row = v[..., None] * c - u[..., None] * s + (half + 0.5)
     inside = np.hypot(u, v) <= half
-    padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).transpose(1, 2, 0).reshape(-1, channels)
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).transpose(1, 2, 0).reshape(-1, dimensions)
     i, j = (np.clip(np.floor(each), 0, size).astype(np.intp) for each in (row, col))
     down, right = (row - i).astype(np.float32)[..., None], (col - j).astype(np.float32)[..., None]
     at = i * (size + 2) + j

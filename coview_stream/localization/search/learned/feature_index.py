@@ -25,7 +25,7 @@ class FeatureIndex:
 
     The valid part of a block is ``block - 2 margin`` cells on a side; with the margin around it, it is transformed as
     one (overlap-save). The spectra of all blocks are kept where they take ``max_bytes`` at most (75 MB per km2
-    with 32 channels on cells of 2 m), else made anew for every query.
+    with 32 dimensions on cells of 2 m), else made anew for every query.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class FeatureIndex:
         """
         if features.ndim != 3 or not features.size:
             raise ValueError(f"features of a map are (C, H, W), not {features.shape}")
-        self.channels, self.height, self.width = features.shape
+        self.dimensions, self.height, self.width = features.shape
         self.surveyed = (features != 0).any(axis=0) if surveyed is None else surveyed
         if self.surveyed.shape != (self.height, self.width):
             raise ValueError(f"surveyed is {self.surveyed.shape}, the features are {features.shape}")
@@ -74,7 +74,7 @@ class FeatureIndex:
         self._features = features
         everything = np.arange(len(self))
         bins = block * (block // 2 + 1)
-        kept = bins * self.channels * len(self) * 8 <= max_bytes
+        kept = bins * self.dimensions * len(self) * 8 <= max_bytes
         self._spectra = self._block_spectra(everything) if kept else None
         self._gapless = np.array([bool(self._cut(self.surveyed, k).all()) for k in everything])
 
@@ -123,7 +123,7 @@ class FeatureIndex:
         return np.array(found, dtype=np.int64)
 
     def _block_spectra(self, blocks: Ints) -> Complexes:
-        out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.channels), dtype=np.complex64)
+        out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.dimensions), dtype=np.complex64)
         for k, block in enumerate(blocks):  # one by one: intermediate arrays stay small
             cut = np.ascontiguousarray(self._cut(self._features, block).transpose(1, 2, 0))
             out[:, k] = half_spectra(cut, self.block, self.workers)
