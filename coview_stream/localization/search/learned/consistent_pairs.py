@@ -40,6 +40,40 @@ class Clique:
         return len(self.members)
 
 
+def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) -> Floats32:
+    """Weigh how well every two pairs of points agree: rotation about the vertical and translation keep distances.
+
+    Args:
+        query: (N, 2) metres, the pairs' points in the scan.
+        known: (N, 2) metres, the same pairs' points in the map.
+        config: tolerances.
+
+    Returns:
+        (N, N) symmetric, 0 where two pairs contradict each other, lie too close together or are the same one, else
+        exp(-d^2 / 2 spread^2) of the difference d of their distances. Mirror images keep distances too: the caller has
+        to check the residuals.
+
+    Raises:
+        ValueError: the two sides are of different numbers.
+    """
+    if query.shape != known.shape or query.shape[1:] != (2,):
+        raise ValueError(f"pairs of points {query.shape} and {known.shape}: both have to be (N, 2)")
+    here, there = _distances(query), _distances(known)
+    apart = np.minimum(here, there) >= config.min_separation
+    here -= there
+    fits = apart & (np.abs(here) < config.tolerance)
+    np.fill_diagonal(fits, False)
+    here *= here
+    here *= np.float32(-0.5 / config.spread**2)
+    return np.where(fits, np.exp(here), np.float32(0.0))
+
+
+def _distances(xy: Floats) -> Floats32:
+    """Return the distances (N, N) between points, subtracted in double precision."""
+    step = [(xy[:, None, k] - xy[None, :, k]).astype(np.float32) for k in (0, 1)]
+    return np.asarray(np.hypot(*step))
+
+
 def maximum_clique(weights: Floats32, nodes: int) -> Clique:
     """Return the maximum clique of a weighted graph (N, N): relaxed, then searched in up to ``nodes`` branches."""
     return largest_clique(weights > 0, relaxed_clique(weights), nodes)
@@ -199,37 +233,3 @@ def _coloured(candidates: int, neighbours: list[int], spare: int) -> tuple[list[
                 order.append(node)
                 colours.append(colour)
     return order, colours
-
-
-def consistency_graph(query: Floats, known: Floats, config: LearnedMatchConfig) -> Floats32:
-    """Weigh how well every two pairs of points agree: rotation about the vertical and translation keep distances.
-
-    Args:
-        query: (N, 2) metres, the pairs' points in the scan.
-        known: (N, 2) metres, the same pairs' points in the map.
-        config: tolerances.
-
-    Returns:
-        (N, N) symmetric, 0 where two pairs contradict each other, lie too close together or are the same one, else
-        exp(-d^2 / 2 spread^2) of the difference d of their distances. Mirror images keep distances too: the caller has
-        to check the residuals.
-
-    Raises:
-        ValueError: the two sides are of different numbers.
-    """
-    if query.shape != known.shape or query.shape[1:] != (2,):
-        raise ValueError(f"pairs of points {query.shape} and {known.shape}: both have to be (N, 2)")
-    here, there = _distances(query), _distances(known)
-    apart = np.minimum(here, there) >= config.min_separation
-    here -= there
-    fits = apart & (np.abs(here) < config.tolerance)
-    np.fill_diagonal(fits, False)
-    here *= here
-    here *= np.float32(-0.5 / config.spread**2)
-    return np.where(fits, np.exp(here), np.float32(0.0))
-
-
-def _distances(xy: Floats) -> Floats32:
-    """Return the distances (N, N) between points, subtracted in double precision."""
-    step = [(xy[:, None, k] - xy[None, :, k]).astype(np.float32) for k in (0, 1)]
-    return np.asarray(np.hypot(*step))

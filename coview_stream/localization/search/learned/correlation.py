@@ -52,42 +52,42 @@ def correlate(
     """
     headings = np.asarray(yaws, dtype=np.float64)
     _check(query, weight, index, headings)
-    waves = _waves(query, weight, index, headings)
+    transforms = _query_spectra(query, weight, index, headings)
     chosen = np.arange(len(index)) if blocks is None else np.unique(blocks)
     scores = np.full((index.height, index.width, len(headings)), -np.inf, dtype=np.float32)
-    per_block = 8 * len(waves[0].spectra) * len(headings)
+    per_block = 8 * len(transforms[0].spectra) * len(headings)
     for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _BATCH_BYTES))):
         if len(group):
-            for wave, part in zip(waves, np.split(scores, len(waves), axis=2), strict=True):
-                _score(part, group, index, wave, min_coverage)
+            for each, part in zip(transforms, np.split(scores, len(transforms), axis=2), strict=True):
+                _score(part, group, index, each, min_coverage)
     return np.asarray(scores.transpose(2, 0, 1))
 
 
 @dataclass(frozen=True)
-class _Wave:
+class _QuerySpectra:
     """Spectra (bins, K, C + 1) to multiply the map's with, and the row and column at which the valid part begins."""
 
     spectra: Complexes
     first: int
 
 
-def _waves(
+def _query_spectra(
     query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats
-) -> tuple[_Wave] | tuple[_Wave, _Wave]:
+) -> tuple[_QuerySpectra] | tuple[_QuerySpectra, _QuerySpectra]:
     """Transform the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
     half, size = len(weight) // 2, len(yaws) // 2
     # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
-    twice = len(yaws) == 2 * size and np.allclose(
+    in_pairs = len(yaws) == 2 * size and np.allclose(
         np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9
     )
-    images = rotate_images(np.concatenate([query, weight[None]]), yaws[:size] if twice else yaws)
+    images = rotate_images(np.concatenate([query, weight[None]]), yaws[:size] if in_pairs else yaws)
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _EPSILON).all():
         raise ValueError("no cell of the query has a weight")
     images *= (1.0 / total)[:, None]
     spectra = half_spectra(images, index.block, index.workers)
-    before = _Wave(np.conjugate(spectra), index.margin - half)
-    return (before, _Wave(spectra, index.margin + half)) if twice else (before,)
+    before = _QuerySpectra(np.conjugate(spectra), index.margin - half)
+    return (before, _QuerySpectra(spectra, index.margin + half)) if in_pairs else (before,)
 
 
 def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats) -> None:
@@ -104,15 +104,15 @@ def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats)
 
 
 def _score(
-    scores: Floats32, group: Ints, index: FeatureIndex, wave: _Wave, min_coverage: float | None
+    scores: Floats32, group: Ints, index: FeatureIndex, query: _QuerySpectra, min_coverage: float | None
 ) -> None:
     """Fill in the scores (H, W, K) of the valid parts of some blocks."""
-    spectra = wave.spectra
-    mean = _back(np.matmul(index.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), index, wave)
+    spectra = query.spectra
+    mean = _inverse(np.matmul(index.spectra(group), spectra[..., :-1].transpose(0, 2, 1)), index, query)
     if min_coverage is not None:
         gaps = np.flatnonzero(~index.gapless(group))
         if len(gaps):
-            share = _back(index.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], index, wave)
+            share = _inverse(index.surveyed_spectra(group[gaps]) * spectra[:, None, :, -1], index, query)
             # a share equal to the minimum must not depend on how the transforms round
             enough = share >= max(min_coverage - 1e-5, _EPSILON)
             mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _EPSILON), -np.inf)
@@ -121,12 +121,12 @@ def _score(
         scores[rows, cols] = mean[: rows.stop - rows.start, : cols.stop - cols.start, k]
 
 
-def _back(product: Complexes, index: FeatureIndex, wave: _Wave) -> Floats32:
+def _inverse(product: Complexes, index: FeatureIndex, query: _QuerySpectra) -> Floats32:
     """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
-    size, last = index.block, wave.first + index.valid
+    size, last = index.block, query.first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
-    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=index.workers)[wave.first : last]
-    return np.asarray(fft.irfft(rows, size, axis=1, workers=index.workers)[:, wave.first : last])
+    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=index.workers)[query.first : last]
+    return np.asarray(fft.irfft(rows, size, axis=1, workers=index.workers)[:, query.first : last])
 
 
 def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:
