@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build, save and say what came out."""
+    """Build and save the map, and print its sizes."""
     import time
 
     from coview_stream.basemap import file_format

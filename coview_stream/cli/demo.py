@@ -129,13 +129,13 @@ def _live(recorded: Run, out: Path, shown: bool) -> RunResult:
     stamps = recorded.stamps.tolist()
     with tqdm(total=len(recorded), desc="driving", unit="frame", disable=not shown, leave=False) as bar:
 
-        def heard(record: dict[str, Any]) -> None:
+        def show(record: dict[str, Any]) -> None:
             if "counters" in record:
                 bar.update(int(record["counters"]["received"]) - bar.n)
                 bar.set_postfix_str(str(record["state"]))
 
         (out / "logs").mkdir(exist_ok=True)
-        recording = record_live(out / "site.coview", recorded.path, out / "logs", heard)
+        recording = record_live(out / "site.coview", recorded.path, out / "logs", show)
     return from_stream(stamps, recording.poses, recording.statuses)
 
 

@@ -45,7 +45,10 @@ class Recording:
 
 
 def record_live(
-    map_path: Path, run_path: Path, logs: Path, heard: Callable[[dict[str, Any]], None] = lambda record: None
+    map_path: Path,
+    run_path: Path,
+    logs: Path,
+    on_record: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> Recording:
     """Serve a map, replay a run to it at its own pace, and record what is published.
 
@@ -53,7 +56,7 @@ def record_live(
         map_path: a ``.coview`` file.
         run_path: a run directory.
         logs: directory for the stderr of the three processes.
-        heard: called with every pose and status, as they come.
+        on_record: called with every pose and status, as they come.
 
     Raises:
         TransportError: a process failed; the message ends with the last line of its log.
@@ -74,7 +77,7 @@ def record_live(
             with contextlib.suppress(queue.Empty):
                 record = lines.get(timeout=0.1)
                 recording.add(record)
-                heard(record)
+                on_record(record)
             if node.poll() is not None or watcher.poll() is not None:
                 raise _failure("serve" if node.poll() is not None else "watch", logs)
         if robot.returncode:

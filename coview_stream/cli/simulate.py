@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the world and say what it holds."""
+    """Write the world and print its counts."""
     from coview_stream.sim import OdometryConfig, SimulationConfig, simulate
 
     if args.utm and args.origin:

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate what is missing, train, write the weights and their card, and say how well they do."""
+    """Simulate what is missing, train, write the weights and their card, and print their recall."""
     from coview_stream.training.train import DEFAULT, SMOKE, train_session
 
     plan = SMOKE if args.smoke else DEFAULT
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         plan.with_numbers(args.worlds, args.steps, args.first_world, args.seed),
         args.workers,
         args.threads,
-        _say,
+        _log,
     )
     recall = card["validation"]
     print(
@@ -54,5 +54,5 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _say(line: str) -> None:
+def _log(line: str) -> None:
     print(line, file=sys.stderr, flush=True)

@@ -70,7 +70,7 @@ def memory_finding(total: int | None, available: int | None) -> Finding:
 
 
 def blas_finding(threads: str) -> Finding:
-    """Judge what ``OPENBLAS_NUM_THREADS`` says."""
+    """Judge the value of ``OPENBLAS_NUM_THREADS``."""
     text = f"OPENBLAS_NUM_THREADS={threads}" if threads else "OPENBLAS_NUM_THREADS is not set"
     if threads == "1":
         return Finding("ok", "BLAS threads", text)

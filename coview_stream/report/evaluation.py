@@ -97,12 +97,12 @@ class Evaluation:
     origin_t_m: float | None = None
 
     def to_json(self) -> str:
-        """One JSON object with the attributes as keys; errors rounded to 0.1 mm and 0.0001 degree."""
+        """Return one JSON object with the attributes as keys; errors rounded to 0.1 mm and 0.0001 degree."""
         return json.dumps(_rounded(asdict(self)), indent=1)
 
 
 def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
-    """Errors of each estimated pose against the true pose with the nearest stamp.
+    """Return the errors of each estimated pose against the true pose with the nearest stamp.
 
     Raises:
         InputError: the truth holds no pose.
@@ -124,7 +124,7 @@ def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
 
 
 def driven(poses: Floats) -> Floats:
-    """(N,) metres driven up to each of the (N, 4, 4) poses."""
+    """Return (N,) metres driven up to each of the (N, 4, 4) poses."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])[: len(poses)]
 
@@ -161,7 +161,7 @@ def evaluate(
 
 
 def _angles(R: Floats) -> Floats:
-    """(K,) rotation angles of (K, 3, 3) matrices: eq. 15, in a form that keeps its precision near zero."""
+    """Return (K,) rotation angles of (K, 3, 3) matrices (eq. 15), in a form precise near zero."""
     return np.asarray(Rotation.from_matrix(R).magnitude()) if len(R) else np.zeros(0)
 
 

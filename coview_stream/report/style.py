@@ -95,7 +95,7 @@ def draw_base_map(axes: Any, points: Reals) -> Floats:
 
 
 def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
-    """Grey values [x, y] in 0..1, masked where empty, and the extent (left, right, bottom, top), metres."""
+    """Return grey values [x, y] in 0..1, masked where empty, and the extent (left, right, bottom, top), metres."""
     from scipy.ndimage import grey_closing, minimum_filter
 
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -118,7 +118,7 @@ def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
 
 
 def map_figure_size(points: Reals) -> tuple[float, float]:
-    """Width and height of a map's figure, inches: a road corridor needs less height than a square."""
+    """Return width and height of a map's figure, inches: a road corridor needs less height than a square."""
     if not len(points):
         return 8.0, 8.6
     east, north = np.maximum(np.ptp(np.asarray(points[:, :2], dtype=np.float64), axis=0), 1.0)
@@ -128,7 +128,7 @@ def map_figure_size(points: Reals) -> tuple[float, float]:
 
 
 def base_shift(points: Reals) -> Floats:
-    """(3,) round offset to subtract before drawing; zeros where coordinates are short enough to read."""
+    """Return the (3,) round offset to subtract before drawing; zeros where coordinates are short enough to read."""
     if not len(points):
         return np.zeros(3)
     middle = np.median(np.asarray(points, dtype=np.float64), axis=0)

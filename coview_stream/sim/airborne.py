@@ -68,7 +68,7 @@ def airborne_scan(
 
 
 def _lines(size: float, flight: Flight) -> Floats:
-    """Offsets of the flight lines from the middle, metres, so that strips overlap and cover the corners."""
+    """Return offsets of the flight lines from the middle, metres: strips overlap and cover the corners."""
     reach, width = size / np.sqrt(2), 2 * flight.altitude * np.tan(flight.swath) * (1 - _OVERLAP)
     count = int(np.ceil(2 * reach / width))
     return np.asarray((np.arange(count) - (count - 1) / 2) * width)

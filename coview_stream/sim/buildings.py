@@ -23,7 +23,7 @@ def _walls(w: float, d: float, h: float) -> Mesh:
 
 
 def _roof(rng: np.random.Generator, w: float, d: float, h: float) -> Mesh:
-    """Pitched roof with eaves on walls of height ``h``: gabled, hipped or mansard."""
+    """Draw a pitched roof with eaves on walls of height ``h``: gabled, hipped or mansard."""
     along_x = w >= d if rng.random() < 0.8 else w < d
     long, short = (w, d) if along_x else (d, w)
     rise = short * rng.uniform(0.25, 0.5)
@@ -38,7 +38,7 @@ def _roof(rng: np.random.Generator, w: float, d: float, h: float) -> Mesh:
 
 
 def house(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Dwelling with a pitched or flat roof, chimney, bay, porch, balcony or dormer as it falls."""
+    """Draw a dwelling: pitched or flat roof; perhaps a chimney, bay, porch, balcony or dormer."""
     h = rng.choice([3.0, 5.8, 5.8, 8.6]) + rng.uniform(-0.3, 0.6)
     parts = [_walls(w, d, h)]
     if rng.random() < 0.2:
@@ -63,7 +63,7 @@ def house(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def barn(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Long farm building under a low saddle roof, perhaps with a silo or an open shelter."""
+    """Draw a long farm building under a low saddle roof, perhaps with a silo or an open shelter."""
     h = rng.uniform(4.0, 6.5)
     parts = [_walls(w, d, h), placed(gable(w + 1.2, d + 1.2, 0.3 * d), 0, 0, h)]
     if rng.random() < 0.4:
@@ -76,7 +76,7 @@ def barn(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def _flat_roof(rng: np.random.Generator, w: float, d: float, h: float) -> Mesh:
-    """Parapet and rooftop plant on walls of height ``h``."""
+    """Draw parapet and rooftop plant on walls of height ``h``."""
     parts = [placed(box(w, 0.3, 0.6), 0, s * (d / 2 - 0.15), h) for s in (-1, 1)]
     parts += [placed(box(0.3, d, 0.6), s * (w / 2 - 0.15), 0, h) for s in (-1, 1)]
     for _ in range(int(rng.integers(0, 2 + int(w * d / 150)))):
@@ -91,7 +91,7 @@ def _wing(rng: np.random.Generator, w: float, d: float, h: float) -> Mesh:
 
 
 def institute(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Large flat-roofed building: a slab, an L, a U or a court, with a stair tower, canopy or arcade."""
+    """Draw a large flat-roofed building: a slab, an L, a U or a court; a stair tower, canopy or arcade."""
     h = float(rng.integers(2, 7)) * 3.6
     wing = min(12.0, 0.4 * d)
     shape = rng.choice(["slab", "L", "U", "court"])
@@ -113,7 +113,7 @@ def institute(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def hall(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Industrial hall: saw-tooth, flat or low-pitched roof, loading docks, an office block in front."""
+    """Draw an industrial hall: saw-tooth, flat or low-pitched roof, loading docks, an office block in front."""
     h = rng.uniform(6.0, 12.0)
     parts = [_walls(w, d, h)]
     kind = rng.choice(["saw", "flat", "pitch"])
@@ -131,7 +131,7 @@ def hall(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def tanks(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Row of tanks or silos with a pipe bridge."""
+    """Draw a row of tanks or silos with a pipe bridge."""
     radius = min(w, d) / rng.uniform(3.0, 5.0)
     count = max(1, int(w / (2.3 * radius)))
     rows = (np.arange(count) + 0.5) / count * w - w / 2
@@ -147,7 +147,7 @@ def tanks(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def containers(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Stacks of shipping containers."""
+    """Draw stacks of shipping containers."""
     parts = []
     for x in np.arange(-w / 2 + 3.1, w / 2 - 3.0, 6.6).tolist():
         for y in np.arange(-d / 2 + 1.3, d / 2 - 1.2, 2.7).tolist():
@@ -158,7 +158,7 @@ def containers(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def cabin(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Forest hut with a wood pile."""
+    """Draw a forest hut with a wood pile."""
     h = rng.uniform(2.4, 3.2)
     pile = placed(frustum(w * 0.8, 1.2, 1.6 + _FOOTING, w * 0.7, 0.8), 0, d / 2 + 1.4, -_FOOTING)
     return join([_walls(w, d, h), placed(gable(w + 1, d + 1, 0.4 * d), 0, 0, h), pile])

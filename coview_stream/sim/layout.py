@@ -40,12 +40,12 @@ def resample(points: Floats, step: float) -> Floats:
 
 
 def arc_lengths(points: Floats) -> Floats:
-    """(N,) metres along a polyline (N, 2)."""
+    """Return (N,) metres along a polyline (N, 2)."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
 def directions(points: Floats) -> Floats:
-    """(N,) headings of a polyline (N, 2), radians."""
+    """Return (N,) headings of a polyline (N, 2), radians."""
     tangent = np.gradient(points, axis=0)
     return np.asarray(np.arctan2(tangent[:, 1], tangent[:, 0]))
 

@@ -32,7 +32,7 @@ _BOX = np.array(
 
 
 def join(meshes: Iterable[Mesh]) -> Mesh:
-    """One mesh from many."""
+    """Return one mesh of many."""
     parts = list(meshes)
     if not parts:
         return EMPTY
@@ -50,27 +50,27 @@ def placed(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> 
 
 
 def prism(bottom: Floats, top: Floats) -> Mesh:
-    """Solid between two quadrilaterals (4, 3) with corners in the same, counter-clockwise, order."""
+    """Return the solid between two quadrilaterals (4, 3) with corners in the same, counter-clockwise, order."""
     return Mesh(np.concatenate([bottom, top]), _BOX)
 
 
 def rectangle(w: float, d: float, z: float) -> Floats:
-    """(4, 3) corners of a w x d rectangle at height ``z``, counter-clockwise."""
+    """Return (4, 3) corners of a w x d rectangle at height ``z``, counter-clockwise."""
     return np.array([[-w, -d, 2 * z], [w, -d, 2 * z], [w, d, 2 * z], [-w, d, 2 * z]]) / 2.0
 
 
 def box(w: float, d: float, h: float) -> Mesh:
-    """Box of width (x), depth (y) and height."""
+    """Return a box of width (x), depth (y) and height."""
     return prism(rectangle(w, d, 0.0), rectangle(w, d, h))
 
 
 def frustum(w: float, d: float, h: float, top_w: float, top_d: float) -> Mesh:
-    """Box whose top is smaller than its base: hipped roofs, bonnets, woodpiles."""
+    """Return a box whose top is smaller than its base: hipped roofs, bonnets, woodpiles."""
     return prism(rectangle(w, d, 0.0), rectangle(top_w, top_d, h))
 
 
 def gable(w: float, d: float, rise: float) -> Mesh:
-    """Saddle roof with its ridge along x."""
+    """Return a saddle roof with its ridge along x."""
     ridge = np.array([[-w / 2, 0.0, rise], [w / 2, 0.0, rise]])
     vertices = np.concatenate([rectangle(w, d, 0.0), ridge])
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
@@ -78,14 +78,14 @@ def gable(w: float, d: float, rise: float) -> Mesh:
 
 
 def shed(w: float, d: float, rise: float) -> Mesh:
-    """Single-pitch roof that rises towards +y: one tooth of a saw-tooth roof."""
+    """Return a single-pitch roof that rises towards +y: one tooth of a saw-tooth roof."""
     top = rectangle(w, d, 0.02)
     top[2:, 2] = rise
     return prism(rectangle(w, d, 0.0), top)
 
 
 def cylinder(radius: float, h: float, sides: int = 10, top: float | None = None) -> Mesh:
-    """Upright cylinder, or cone frustum where ``top`` is another radius; closed above, open below."""
+    """Return an upright cylinder, or cone frustum where ``top`` is another radius; closed above, open below."""
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     low = np.column_stack([ring * radius, np.zeros(sides)])
@@ -99,7 +99,7 @@ def cylinder(radius: float, h: float, sides: int = 10, top: float | None = None)
 
 
 def ellipsoid(rings: int = 5, sides: int = 8) -> Mesh:
-    """Coarse unit sphere about the origin: the template of crowns and bushes."""
+    """Return a coarse unit sphere about the origin: the template of crowns and bushes."""
     polar = np.pi * np.arange(1, rings) / rings
     angle = np.arange(sides) * 2 * np.pi / sides
     P, A = np.meshgrid(polar, angle, indexing="ij")
@@ -120,14 +120,14 @@ def ellipsoid(rings: int = 5, sides: int = 8) -> Mesh:
 
 
 def copies(template: Mesh, vertices: Floats) -> Mesh:
-    """One mesh of many deformed templates; ``vertices`` is (copies, V, 3)."""
+    """Return one mesh of many deformed templates; ``vertices`` is (copies, V, 3)."""
     count, size = vertices.shape[0], vertices.shape[1]
     offsets = (np.arange(count) * size)[:, None, None]
     return Mesh(vertices.reshape(-1, 3), (template.triangles[None] + offsets).reshape(-1, 3))
 
 
 def height_field(axis: Floats, heights: Floats) -> Mesh:
-    """Ground over the square grid ``axis`` x ``axis``; ``heights`` is indexed [x, y]."""
+    """Return the ground over the square grid ``axis`` x ``axis``; ``heights`` is indexed [x, y]."""
     n = len(axis)
     X, Y = np.meshgrid(axis, axis, indexing="ij")
     i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)[None]).ravel()

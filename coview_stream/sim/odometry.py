@@ -77,7 +77,7 @@ def drive(scene: Scene, length: float, speed: float, height: float, rng: np.rand
 
 
 def _slopes(scene: Scene, x: Floats, y: Floats, heading: Floats) -> Floats:
-    """(N, 2) roll and pitch of the ground under the wheels, radians."""
+    """Return (N, 2) roll and pitch of the ground under the wheels, radians."""
     cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
     site = scene.site
     rise_ahead = site.z(x + cx, y + cy) - site.z(x - cx, y - cy)

@@ -75,7 +75,7 @@ def _spherical(azimuth: Floats, elevation: Floats) -> Floats:
 
 
 def _spinning(elevations: npt.ArrayLike, offsets: Floats, columns: int) -> Callable[[int], Floats]:
-    """Every beam at every column, clockwise as seen from above; beams lead or lag by ``offsets`` radians."""
+    """Return the beams of all columns, clockwise as seen from above; each leads or lags by its ``offsets``, radians."""
     azimuth = -np.arange(columns)[:, None] * 2 * np.pi / columns + offsets[None]
     elevation = np.broadcast_to(np.asarray(elevations, dtype=np.float64), azimuth.shape)
     rays = _spherical(azimuth.ravel(), elevation.ravel())
@@ -97,7 +97,7 @@ def _os64(name: str = "os64", columns: int = 512) -> Sensor:
 
 
 def _mid360() -> Sensor:
-    """Non-repetitive: 200,000 points a second, -7 to 52 degrees, the pattern wanders from frame to frame."""
+    """Return a non-repetitive lidar: 200,000 points a second, -7 to 52 degrees, another pattern in each frame."""
     count = 20_000
     low, high = np.radians(-7.0), np.radians(52.0)
 

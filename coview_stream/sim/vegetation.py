@@ -33,7 +33,7 @@ class Species(NamedTuple):
 
 
 def draw_tree(rng: np.random.Generator, x: float, y: float, species: Species) -> Floats:
-    """One tree as a row of ``TREE_COLUMNS``."""
+    """Draw one tree as a row of ``TREE_COLUMNS``."""
     height = rng.uniform(*species.height)
     conifer = float(rng.random() < species.conifers)
     spread = rng.uniform(*species.spread) * (0.6 if conifer else 1.0)
@@ -42,7 +42,7 @@ def draw_tree(rng: np.random.Generator, x: float, y: float, species: Species) ->
 
 
 def trunks(trees: Floats, ground: Floats) -> Mesh:
-    """Tapering, slightly leaning trunks of (N, 8) trees on (N,) ground heights."""
+    """Return tapering, slightly leaning trunks of (N, 8) trees on (N,) ground heights."""
     if not len(trees):
         return EMPTY
     x, y, height, _, _, lean_x, lean_y, seed = trees.T
@@ -57,7 +57,7 @@ def trunks(trees: Floats, ground: Floats) -> Mesh:
 
 
 def crowns(trees: Floats, ground: Floats) -> Mesh:
-    """Foliage of (N, 8) trees: lumpy crowns, and three-storey cones for conifers."""
+    """Return the foliage of (N, 8) trees: lumpy crowns, and three-storey cones for conifers."""
     conifer = trees[:, 4] > 0.5
     return join([_broadleaf(trees[~conifer], ground[~conifer]), _conifers(trees[conifer], ground[conifer])])
 
@@ -100,7 +100,7 @@ def _conifers(trees: Floats, ground: Floats) -> Mesh:
 
 
 def undergrowth(rng: np.random.Generator, site: Site, count: int, extent: float) -> Mesh:
-    """Bushes anywhere off the road within +-``extent`` metres."""
+    """Draw bushes off the road within +-``extent`` metres."""
     xy = rng.uniform(-extent, extent, (count, 2))
     radius = rng.uniform(0.3, 1.1, count)
     off_road = site.road_distance(*xy.T) > site.layout.half_width + radius
@@ -113,7 +113,7 @@ def undergrowth(rng: np.random.Generator, site: Site, count: int, extent: float)
 
 
 def strip(site: Site, line: Floats, thickness: float, height: float) -> Mesh:
-    """Hedge, wall or fence along a polyline (K, 2), following the ground."""
+    """Return a hedge, wall or fence along a polyline (K, 2), following the ground."""
     z = site.z(*line.T)
     parts = []
     for k in range(len(line) - 1):
@@ -127,7 +127,7 @@ def strip(site: Site, line: Floats, thickness: float, height: float) -> Mesh:
 
 
 def logs(rng: np.random.Generator, site: Site, count: int, extent: float) -> Mesh:
-    """Fallen trunks off the road."""
+    """Draw fallen trunks off the road."""
     parts = []
     for _ in range(count):
         x, y = rng.uniform(-extent, extent, 2)
@@ -140,7 +140,7 @@ def logs(rng: np.random.Generator, site: Site, count: int, extent: float) -> Mes
 
 
 def rocks(rng: np.random.Generator, site: Site, count: int, extent: float) -> Mesh:
-    """Boulders off the road."""
+    """Draw boulders off the road."""
     parts = []
     for _ in range(count):
         x, y = rng.uniform(-extent, extent, 2)
@@ -152,6 +152,6 @@ def rocks(rng: np.random.Generator, site: Site, count: int, extent: float) -> Me
 
 
 def _noise(seed: Floats, k: int | Ints) -> Floats:
-    """Repeatable numbers in [0, 1) from each tree's own seed, so that a tree keeps its shape."""
+    """Return repeatable numbers in [0, 1) from each tree's own seed: a tree keeps its shape."""
     value = np.sin(seed * 12.9898 + np.asarray(k) * 78.233) * 43758.5453
     return np.asarray(value - np.floor(value))

@@ -1,4 +1,4 @@
-"""Who else is there: keys and tokens of the four conventions, and the options that lead to them."""
+"""Discovery: keys and tokens of the four conventions, and the options that lead to them."""
 
 from __future__ import annotations
 
