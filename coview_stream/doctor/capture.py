@@ -14,7 +14,7 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry
 from coview_stream.messages.choose import Channel, codec_for
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
-from coview_stream.stream.node.decoding import decode_sample
+from coview_stream.stream.node.counters import counter_of
 from coview_stream.stream.transport.keys import RobotKeys
 
 _MAX_COORDINATE = (
@@ -114,26 +114,24 @@ def capture_odometry(
 def _capture(
     channel: Channel,
     codecs: Mapping[str, Any],
-    decode: Callable[[Sample, str | None, str | None], Any],
+    decode: Callable[..., Any],
     sample: Sample,
     arrived: float,
     option: str | None,
     hint: str | None,
 ) -> tuple[CapturedMessage, Any]:
-    message, counter, reason = decode_sample(sample, decode, option, hint, NodeConfig().max_payload)
-    captured = CapturedMessage(
-        arrived, sample.key, sample.encoding, len(sample.payload), counter=counter, reason=reason
-    )
-    if message is not None:
-        return replace(captured, codec=codec_for(channel, codecs, sample, option, hint)), message
-    if counter == "oversized":
-        return captured, None
-    return replace(captured, readable_as=_readable_as(codecs, decode, sample)), None
+    captured = CapturedMessage(arrived, sample.key, sample.encoding, len(sample.payload))
+    try:
+        message = decode(sample, option, hint, NodeConfig().max_payload)
+    except MessageError as error:
+        captured = replace(captured, counter=counter_of(error), reason=str(error))
+        if captured.counter == "oversized":
+            return captured, None
+        return replace(captured, readable_as=_readable_as(codecs, decode, sample)), None
+    return replace(captured, codec=codec_for(channel, codecs, sample, option, hint)), message
 
 
-def _readable_as(
-    codecs: Mapping[str, Any], decode: Callable[[Sample, str | None, str | None], Any], sample: Sample
-) -> str:
+def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: Sample) -> str:
     """Return the name of a codec that reads plausible values; formats that check most come first, raw rows last."""
     raw = ("xyzi", "xyz")
     for name in [name for name in codecs if name not in raw] + [name for name in raw if name in codecs]:

@@ -89,16 +89,20 @@ _PREPARE: Mapping[str, Callable[[], object]] = {
 }
 
 
-def decode_cloud(sample: Sample, option: str | None = None, hint: str | None = None) -> CloudMessage:
+def decode_cloud(
+    sample: Sample, option: str | None = None, hint: str | None = None, max_payload: int = MAX_PAYLOAD
+) -> CloudMessage:
     """Read a lidar frame; ``sequence`` is set where the attachment is rmw_zenoh's."""
-    message = _decode("cloud", CLOUD_CODECS, sample, option, hint)
+    message = _decode("cloud", CLOUD_CODECS, sample, option, hint, max_payload)
     _, sequence = read_attachment(sample.attachment)
     return message if sequence is None else replace(message, sequence=sequence)
 
 
-def decode_odometry(sample: Sample, option: str | None = None, hint: str | None = None) -> OdometryMessage:
+def decode_odometry(
+    sample: Sample, option: str | None = None, hint: str | None = None, max_payload: int = MAX_PAYLOAD
+) -> OdometryMessage:
     """Read an odometry sample."""
-    return _decode("odometry", ODOMETRY_CODECS, sample, option, hint)
+    return _decode("odometry", ODOMETRY_CODECS, sample, option, hint, max_payload)
 
 
 def decode_pose(sample: Sample, option: str | None = None, hint: str | None = None) -> PoseMessage:
@@ -134,11 +138,19 @@ def _named(channel: Channel, codecs: Mapping[str, Codec[M]], name: str) -> Codec
 
 
 def _decode(
-    channel: Channel, codecs: Mapping[str, Codec[M]], sample: Sample, option: str | None, hint: str | None
+    channel: Channel,
+    codecs: Mapping[str, Codec[M]],
+    sample: Sample,
+    option: str | None,
+    hint: str | None,
+    max_payload: int = MAX_PAYLOAD,
 ) -> M:
+    try:
+        check_size(sample.payload, max_payload, sample.size)
+    except OversizedError as error:
+        raise OversizedError(f"{sample.key}: {error}") from error
     name = codec_for(channel, codecs, sample, option, hint)
     try:
-        check_size(sample.payload)
         return codecs[name].decode(sample)
     except MessageError as error:
         raise type(error)(f"{sample.key}: {error}") from error

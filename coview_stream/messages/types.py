@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +63,15 @@ class CloudMessage:
     times: Floats | None = None
     rings: npt.NDArray[np.uint16] | None = None
     sequence: int | None = None
+
+    def limited(self, max_points: int) -> CloudMessage:
+        """Return the frame with every n-th point only, if it has more than ``max_points``."""
+        step = -(-len(self.points) // max_points)
+        if step <= 1:
+            return self
+        times = None if self.times is None else self.times[::step]
+        rings = None if self.rings is None else self.rings[::step]
+        return replace(self, points=np.ascontiguousarray(self.points[::step]), times=times, rings=rings)
 
 
 @dataclass(frozen=True)

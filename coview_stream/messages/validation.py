@@ -27,10 +27,11 @@ class OversizedError(MessageError):
     """A message is larger than the node takes; it is counted apart from malformed ones."""
 
 
-def check_size(payload: bytes, limit: int = MAX_PAYLOAD) -> None:
-    """Refuse a payload of more than ``limit`` bytes (OversizedError)."""
-    if len(payload) > limit:
-        raise OversizedError(f"{len(payload)} bytes; at most {limit} are taken: send fewer points or fields")
+def check_size(payload: bytes, limit: int = MAX_PAYLOAD, size: int | None = None) -> None:
+    """Refuse a payload of more than ``limit`` bytes, or of ``size`` bytes that a transport left (OversizedError)."""
+    if size is not None or len(payload) > limit:
+        size = len(payload) if size is None else size
+        raise OversizedError(f"{size} bytes; at most {limit} are taken: send fewer points or fields")
 
 
 def check_points(count: int) -> None:

@@ -8,6 +8,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from coview_stream.errors import EncodingError, MessageError
+from coview_stream.messages.validation import OversizedError
+
 _RESTART_NS = 5_000_000_000  # a stamp that lies farther back than this is a restarted clock; set by hand
 _MAX_DURATIONS = 600  # a minute of frames at 10 Hz
 _MAX_ERRORS = 10  # different ones that are kept
@@ -129,6 +132,13 @@ class MissingFrames:
         if len(self._gaps) < 5 or not 1.5 < gap / usual < 100:
             return 0
         return round(gap / usual) - 1
+
+
+def counter_of(error: MessageError) -> str:
+    """Return the name of the counter of a message that cannot be decoded."""
+    if isinstance(error, EncodingError):
+        return "unknown_encoding"
+    return "oversized" if isinstance(error, OversizedError) else "malformed"
 
 
 def last_line(text: str) -> str:

@@ -9,14 +9,14 @@ from __future__ import annotations
 import threading
 
 from coview_stream.config.node import NodeConfig
+from coview_stream.errors import MessageError
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
-from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames
-from coview_stream.stream.node.decoding import count_undecodable, decode_sample, limit_points
+from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames, counter_of
 from coview_stream.stream.node.engine_queue import EngineQueue
 from coview_stream.stream.node.frame_sync import FrameSync
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, Job, OdometryJob, Result, SearchJob
@@ -75,15 +75,15 @@ class Session:
 
     def on_cloud(self, sample: Sample, now: float) -> None:
         """Take in a cloud: decode, check, pair with odometry, queue. Never raises for what the sample holds."""
-        limit, hint = self.config.max_payload, self.keys.cloud_hint
-        message, failure, reason = decode_sample(sample, decode_cloud, self.codecs[0], hint, limit)
+        try:
+            message = decode_cloud(sample, self.codecs[0], self.keys.cloud_hint, self.config.max_payload)
+        except MessageError as error:
+            self._count_undecodable(error, sample.key)
+            return
         with self._lock:
             self.counters.received += 1
-            if message is None:
-                count_undecodable(self.counters, self.errors, "", failure, sample.key, reason)
-                return
             self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
-            self._add_cloud(limit_points(message, self.config.max_points), now)
+            self._add_cloud(message.limited(self.config.max_points), now)
 
     def _add_cloud(self, message: CloudMessage, now: float) -> None:
         """Pair a cloud with the odometry that there is, or let it wait."""
@@ -92,13 +92,15 @@ class Session:
 
     def on_odometry(self, sample: Sample, now: float) -> None:
         """Take in an odometry sample. Never raises for what the sample holds."""
-        limit, hint = self.config.max_payload, self.keys.odometry_hint
-        message, failure, reason = decode_sample(sample, decode_odometry, self.codecs[1], hint, limit)
+        try:
+            message = decode_odometry(
+                sample, self.codecs[1], self.keys.odometry_hint, self.config.max_payload
+            )
+        except MessageError as error:
+            self._count_undecodable(error, sample.key, "odometry_")
+            return
         with self._lock:
             self.counters.odometry_received += 1
-            if message is None:
-                count_undecodable(self.counters, self.errors, "odometry_", failure, sample.key, reason)
-                return
             unreachable = self._disconnected_at > self.odometry.arrived
             self._add_odometry(message, now, unreachable)
 
@@ -113,6 +115,17 @@ class Session:
             self.restart_search(RESTART_REASONS[kind])
         self._queue_paired(now)
         self._record_state()
+
+    def _count_undecodable(self, error: MessageError, key: str, prefix: str = "") -> None:
+        """Count a message that could not be decoded; name it, unless every such message would have its own reason."""
+        name = counter_of(error)
+        with self._lock:
+            self.counters.count(f"{prefix}received")
+            self.counters.count(prefix + name)
+            if name == "unknown_encoding":
+                self.errors.add(str(error))
+            else:
+                self.errors.add_first(f"{key}: {name} messages", str(error).removeprefix(f"{key}: "))
 
     def _queue_paired(self, now: float) -> None:
         """Queue the frames whose odometry is there; the newest one stays."""
