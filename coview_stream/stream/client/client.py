@@ -1,6 +1,4 @@
-"""A robot's side of the node, for Python: NumPy clouds and odometry out, poses in."""
-
-# FOLDED coview_stream/stream/client/client.py: """A bounded queue between a network thread and a reader who may be slow: the newest win."""
+"""Client of a node for one robot: NumPy clouds and odometry out, poses in."""
 
 from __future__ import annotations
 
@@ -32,22 +30,21 @@ _log = logging.getLogger(__name__)
 
 _Item = TypeVar("_Item")
 
-POSES_KEPT = 100  # ten seconds of unread poses
-
-STATUSES_KEPT = 100
+MAX_UNREAD_POSES = 100  # ten seconds of them
+_MAX_UNREAD_STATUSES = 100
 
 
 class RobotClient:
     """Streams one robot to a node and receives its poses; a context manager.
 
     >>> with RobotClient("rover1", "tcp/127.0.0.1:7447") as robot:     # doctest: +SKIP
-    ...     robot.wait_for_node(10)                                    # what is sent before it is there is lost
+    ...     robot.wait_for_node(10)                                    # samples sent before it runs are lost
     ...     robot.send_odometry(T_odom_body, stamp)                    # before the cloud that it belongs to
     ...     robot.send_cloud(points, stamp)
     ...     for pose in robot.poses():
     ...         print(pose.T_map_body)
 
-    Sending and reading may happen on different threads. Unread poses are kept up to a limit; then the newest win.
+    Sending and reading may happen on different threads. Of unread poses the newest 100 are kept.
 
     Args:
         robot: its name, as given to ``coview-stream serve --robot``.
@@ -59,12 +56,12 @@ class RobotClient:
         preset: key convention, see :mod:`coview_stream.stream.transport.keys`.
         cloud_encoding: ``xyz``, ``xyzi``, ``foxglove``, ``cdr`` or ``keelson``; None takes the preset's.
         odometry_encoding: ``json``, ``cdr``, ``foxglove`` or ``keelson``; None takes the preset's.
-        transport: one that is open already; it stays the caller's to close.
+        transport: one that is open already; the caller closes it.
 
     Raises:
         ConfigError: a name, preset or encoding is not valid.
-        TransportError: the session cannot be opened. A router that is not there yet is no error: it is waited for in
-            the background.
+        TransportError: the session cannot be opened. A missing router is no error: the client waits for it in the
+            background.
     """
 
     def __init__(
@@ -83,8 +80,8 @@ class RobotClient:
         self.keys: RobotKeys = robot_keys(preset, base, robot)
         self._owned = transport is None
         self._transport = transport if transport is not None else open_client(endpoint, listen, config)
-        self._poses: LatestQueue[PoseMessage] = LatestQueue(POSES_KEPT)
-        self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(STATUSES_KEPT)
+        self._poses: LatestQueue[PoseMessage] = LatestQueue(MAX_UNREAD_POSES)
+        self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(_MAX_UNREAD_STATUSES)
         self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
         self._latest_status: dict[str, Any] | None = None
         self._malformed = 0
@@ -105,10 +102,10 @@ class RobotClient:
 
     @property
     def latest_pose(self) -> PoseMessage | None:
-        """The newest pose received, while it holds.
+        """The newest pose received, while it is valid.
 
-        None before the first, as soon as a status says another state than TRACKING, and when none has come for 2 s of
-        local time: a robot that is lost, or has lost its node, must not drive by where it once was.
+        None before the first, as soon as a status has another state than TRACKING, and when none has come for 2 s of
+        local time: a robot that is lost, or has lost its node, must not drive by an old pose.
         """
         newest = self._latest_pose
         if newest is None or monotonic() - newest[0] >= STALE or not self._tracking():
@@ -122,14 +119,14 @@ class RobotClient:
 
     @property
     def malformed(self) -> int:
-        """How many poses and statuses could not be decoded."""
+        """Number of poses and statuses that could not be decoded."""
         return self._malformed
 
     def send_cloud(self, points: npt.ArrayLike, stamp: float, times: Floats | None = None) -> None:
-        """Publish one lidar frame; it is dropped if the link is busy with the one before, or nobody listens.
+        """Publish one lidar frame; it is dropped if the link is busy with the one before, or without subscriber.
 
         Args:
-            points: (N, 3), or (N, 4) with an intensity that is not used: body frame (x forward, z up), metres.
+            points: (N, 3), or (N, 4) with an unused intensity: body frame (x forward, z up), metres.
             stamp: sensor time, seconds; the same clock as the odometry's.
             times: (N,) seconds after ``stamp`` at which each point was measured; None if the frame is deskewed. Raw
                 rows cannot carry them: a client without an explicit encoding sends such a frame as foxglove.PointCloud.
@@ -164,9 +161,9 @@ class RobotClient:
         return _drain(self._statuses, timeout)
 
     def wait_for_node(self, seconds: float) -> bool:
-        """Wait until somebody subscribes to this robot's clouds; False if nobody did for ``seconds``.
+        """Wait for a subscriber to this robot's clouds; False if there is none after ``seconds``.
 
-        What is sent before is lost.
+        Samples sent before are lost.
 
         Raises:
             TransportError: the client is closed.
@@ -178,18 +175,18 @@ class RobotClient:
         """Make the node forget the pose and search again; returns its reply.
 
         Raises:
-            TransportError: nobody answered within ``timeout`` seconds, the node refused, or the client is closed.
+            TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.
         """
         self._check_open()
         return self._transport.query(self.keys.relocalize, timeout=timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:
-        """Make the node forget everything about this robot; returns its reply. Errors as :meth:`relocalize`."""
+        """Make the node forget all that it knows of this robot; returns its reply. Errors as :meth:`relocalize`."""
         self._check_open()
         return self._transport.query(self.keys.reset, timeout=timeout)
 
     def close(self) -> None:
-        """Undeclare, end all iterators and close the session unless it was handed in; idempotent."""
+        """Undeclare, end all iterators and close the session unless it is the caller's; idempotent."""
         self._poses.close()
         self._statuses.close()
         if self._owned and not self._closed:
@@ -212,7 +209,7 @@ class RobotClient:
             raise TransportError(f"the client of robot {self.robot!r} is closed: open another one")
 
     def _tracking(self) -> bool:
-        """Whether poses may be believed; True without a status, which access rules may keep from us."""
+        """Whether poses are valid; True without a status, which access rules may withhold."""
         status = self._latest_status
         return status is None or status.get("state", "TRACKING") == "TRACKING"
 
@@ -237,27 +234,27 @@ class RobotClient:
             return
         self._latest_status = status
         if not self._tracking():
-            self._latest_pose = None  # also for the time after: only a new pose brings it back
+            self._latest_pose = None  # a later TRACKING does not make the old pose valid again
         self._statuses.put(status)
 
     def _reject(self, sample: Sample, error: MessageError) -> None:
         self._malformed += 1
-        if self._malformed == 1:  # once: a sender that is wrong is wrong ten times a second
+        if self._malformed == 1:  # once: a wrong sender is wrong ten times a second
             _log.warning("%s: %s", sample.key, error)
 
 
-def _drain(box: LatestQueue[_Item], timeout: float | None) -> Iterator[_Item]:
-    while (item := box.get(timeout)) is not None:
+def _drain(unread: LatestQueue[_Item], timeout: float | None) -> Iterator[_Item]:
+    while (item := unread.get(timeout)) is not None:
         yield item
 
 
 class LatestQueue(Generic[_Item]):
-    """Holds up to ``size`` items in order of arrival; when it is full, the oldest goes.
+    """Bounded queue in order of arrival; a new item replaces the oldest when it is full.
 
-    ``put`` never blocks, so that a subscription is never held up by its reader.
+    ``put`` never blocks, so that a slow reader does not block a subscription.
 
     Args:
-        size: most items kept, at least 1.
+        size: maximal number of items, at least 1.
 
     Raises:
         ConfigError: ``size`` is below 1.
@@ -265,7 +262,7 @@ class LatestQueue(Generic[_Item]):
 
     def __init__(self, size: int) -> None:
         if size < 1:
-            raise ConfigError(f"mailbox size: {size} is out of range; use at least 1")
+            raise ConfigError(f"queue size: {size} is out of range; use at least 1")
         self._items: deque[_Item] = deque(maxlen=size)
         self._arrived = threading.Condition()
         self._closed = False
@@ -273,7 +270,7 @@ class LatestQueue(Generic[_Item]):
 
     @property
     def dropped(self) -> int:
-        """How many items went unread because newer ones needed the place."""
+        """Number of items that were replaced unread."""
         return self._dropped
 
     def put(self, item: _Item) -> None:
@@ -286,7 +283,7 @@ class LatestQueue(Generic[_Item]):
             self._arrived.notify()
 
     def get(self, timeout: float | None = None) -> _Item | None:
-        """Take the oldest item; None when none came for ``timeout`` seconds (None: for ever) or it is closed."""
+        """Take the oldest item; None if there is none for ``timeout`` seconds (None: for ever) or it is closed."""
         deadline = None if timeout is None else time.monotonic() + timeout
         with self._arrived:
             while not self._items and not self._closed:
@@ -297,7 +294,7 @@ class LatestQueue(Generic[_Item]):
             return self._items.popleft() if self._items else None
 
     def close(self) -> None:
-        """Wake every reader; what is still inside can be taken."""
+        """Wake every reader; the items inside can still be taken."""
         with self._arrived:
             self._closed = True
             self._arrived.notify_all()

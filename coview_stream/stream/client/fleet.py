@@ -1,4 +1,4 @@
-"""What is known of the robots on the network, and a table of it. Pure: time is handed in."""
+"""Table of the robots on the network: newest poses, statuses and rates. Without a clock: callers pass the time."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 from coview_stream.geometry.transforms import yaw_of
 from coview_stream.messages.types import PoseMessage
 
+# set by hand
 WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last one is no longer shown
-SILENT = 5.0  # seconds without any message: a node says something every second
+SILENT = 5.0  # seconds without any message: a node sends one every second
 
 _COLUMNS = (
     ("robot", -12),
@@ -32,7 +33,16 @@ _COLUMNS = (
 
 @dataclass
 class RobotView:
-    """The newest of one robot, with the times (steady, seconds) at which it arrived."""
+    """Newest messages of one robot. Times are of a monotonic clock, seconds.
+
+    Attributes:
+        robot: its name.
+        heard: time of the newest message.
+        pose: the newest.
+        status: the newest.
+        status_heard: time of the newest status.
+        arrivals: times of the last poses.
+    """
 
     robot: str
     heard: float
@@ -42,14 +52,14 @@ class RobotView:
     arrivals: deque[float] = field(default_factory=deque)
 
     def pose_rate(self, now: float) -> float:
-        """Poses per second over the last seconds."""
+        """Return poses per second over the last :data:`WINDOW` seconds."""
         while self.arrivals and self.arrivals[0] < now - WINDOW:
             self.arrivals.popleft()
         span = now - self.arrivals[0] if self.arrivals else 0.0
         return (len(self.arrivals) - 1) / span if span > 0 else 0.0
 
     def fresh_pose(self, now: float) -> PoseMessage | None:
-        """Return the pose, unless it is stale or the state since is another: who is lost must not look localised."""
+        """Return the pose; None if it is stale, or a later status has another state than TRACKING."""
         if not self.arrivals or now - self.arrivals[-1] >= STALE:
             return None
         lost = self.status.get("state", "TRACKING") != "TRACKING" and self.status_heard > self.arrivals[-1]
@@ -57,7 +67,7 @@ class RobotView:
 
 
 class FleetTable:
-    """All robots heard of so far."""
+    """Table of all robots that sent a message so far."""
 
     def __init__(self) -> None:
         self.views: dict[str, RobotView] = {}
@@ -74,7 +84,7 @@ class FleetTable:
         view.status, view.status_heard = status, now
 
     def table(self, now: float, header: bool = True) -> list[str]:
-        """Lines of text, one per robot, sorted by name."""
+        """Return lines of text, one per robot, sorted by name."""
         rows = [_row(self.views[name], now) for name in sorted(self.views)]
         if header:
             rows.insert(0, [title for title, _ in _COLUMNS])
@@ -87,7 +97,7 @@ class FleetTable:
 
 
 def printable(text: object) -> str:
-    """Text from the network, fit for a terminal: no control characters, one line."""
+    """Return text from the network in a form safe for a terminal: no control characters, one line."""
     return "".join(c if c.isprintable() else " " for c in str(text))
 
 
@@ -136,5 +146,5 @@ def _number(value: object, digits: int) -> str:
     try:
         known = isinstance(value, (int, float)) and math.isfinite(value)
         return f"{value:.{digits}f}" if known else "-"
-    except OverflowError:  # the integers of JSON know no limit
+    except OverflowError:  # integers of JSON have no limit
         return "-"

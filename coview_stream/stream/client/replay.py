@@ -1,4 +1,4 @@
-"""Feeds a recorded run as a live robot: frames on absolute deadlines, odometry just before its frame."""
+"""Replay of a recorded run as a live robot: frames on absolute deadlines, odometry just before its frame."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,40 +14,41 @@ import numpy as np
 from coview_stream.errors import CloudError
 from coview_stream.messages.types import Encoded
 from coview_stream.recordings.run import Run
-from coview_stream.stream.client.replay_schedule import Beat, ReplayConfig, beats
+from coview_stream.stream.client.replay_schedule import ReplayConfig, schedule
 from coview_stream.stream.client.sender import Sender, nanoseconds
 
-_KEPT = 100_000  # of each kind of measurement: a replay in a loop may run for days
+# set by hand
+_MAX_MEASUREMENTS = 100_000  # of each kind: a replay in a loop may run for days
 _LATE = 0.02  # seconds; a live lidar's own jitter stays below
 
 
 class Clock(Protocol):
-    """Time as the replay sees it; the tests have one of their own."""
+    """Time of a replay."""
 
     def now(self) -> float:
-        """Seconds, steady."""
+        """Return seconds of a monotonic clock."""
         ...
 
     def wait(self, seconds: float) -> bool:
-        """Let ``seconds`` pass (none if not positive); True as soon as the replay is to end."""
+        """Wait for ``seconds`` (not at all if not positive); True as soon as the replay is to end."""
         ...
 
 
 @dataclass
 class ReplayReport:
-    """What a replay did.
+    """Result of a replay.
 
     Attributes:
         frames: clouds sent.
         odometry: odometry samples sent.
         points: in all clouds sent.
-        damaged: frames that could not be read, or have no finite point, and so were not sent.
-        first_error: of these, or None.
+        damaged: frames not sent: they cannot be read, or have no finite point.
+        first_error: of the damaged frames, None without any.
         seconds: from the first message to the last.
-        put_ms: how long publishing each cloud took, milliseconds.
-        late_ms: how long after its deadline each frame was sent, milliseconds.
-        finished: False if it was told to end before its end.
-        heard: False if nobody is known to have listened; whoever has looked says so.
+        put_ms: duration of publishing each cloud, milliseconds.
+        late_ms: delay of each sample after its deadline, milliseconds.
+        finished: False if it was ended before its last frame.
+        heard: False if there was no subscriber; set by the caller, who has looked.
     """
 
     frames: int = 0
@@ -56,18 +57,18 @@ class ReplayReport:
     damaged: int = 0
     first_error: CloudError | None = None
     seconds: float = 0.0
-    put_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
-    late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    put_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
+    late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
     finished: bool = False
     heard: bool = True
 
     def text(self) -> str:
-        """Summary in a few lines."""
+        """Summarize in a few lines."""
         rate = f" ({(self.frames - 1) / self.seconds:.2f} Hz)" if self.frames > 1 and self.seconds else ""
         lines = [
             f"{self.frames} frames{rate} and {self.odometry} odometry samples sent in {self.seconds:.1f} s"
             + ("" if self.finished else ", ended early"),
-            f"put {_spread(self.put_ms)}; behind schedule {_spread(self.late_ms)}",
+            f"put {_percentiles(self.put_ms)}; behind schedule {_percentiles(self.late_ms)}",
         ]
         late = sum(ms > 1e3 * _LATE for ms in self.late_ms)
         if late:
@@ -78,14 +79,14 @@ class ReplayReport:
             lines.append(f"{self.damaged} damaged frames left out, the first: {self.first_error}")
         if not self.heard:
             lines.append(
-                "nobody listened: is a node running, connected, and for this --robot, --base and --preset?"
+                "nothing subscribed: is a node running, connected, and for this --robot, --base and --preset?"
             )
         return "\n".join(lines)
 
 
 @dataclass(frozen=True)
-class _Parcel:
-    """A beat with its messages encoded."""
+class _EncodedSample:
+    """A scheduled sample with its messages encoded; ``error`` in place of a damaged cloud."""
 
     due: float
     odometry: Encoded | None
@@ -103,23 +104,23 @@ def replay(
 ) -> ReplayReport:
     """Send the whole run, or until the clock says to end.
 
-    A frame that is behind its deadline is sent at once; deadlines do not move. ``on_frame`` gets the number of frames
-    sent so far.
+    A frame behind its deadline is sent at once; deadlines do not move. ``on_frame`` gets the number of frames sent so
+    far.
 
     Raises:
-        CloudError: not one frame could be read.
+        CloudError: no frame can be read.
         InputError: a stamp of the run is not in seconds, or a pose no rigid transform.
     """
     report = ReplayReport()
-    with _ReadAhead(_parcels(run, sender, config), config.read_ahead) as parcels:
+    with _ReadAhead(_encoded(run, sender, config), config.read_ahead) as samples:
         start: float | None = None
-        for parcel in parcels:
+        for sample in samples:
             if start is None:
                 start = clock.now()  # after the first read, which may be slow
-            if clock.wait(start + parcel.due - clock.now()):
+            if clock.wait(start + sample.due - clock.now()):
                 break
-            report.late_ms.append(1e3 * (clock.now() - start - parcel.due))
-            _send(parcel, sender, clock, report)
+            report.late_ms.append(1e3 * (clock.now() - start - sample.due))
+            _send(sample, sender, clock, report)
             report.seconds = clock.now() - start
             on_frame(report.frames)
         else:
@@ -129,45 +130,41 @@ def replay(
     return report
 
 
-def _send(parcel: _Parcel, sender: Sender, clock: Clock, report: ReplayReport) -> None:
-    if parcel.odometry is not None:
-        sender.put_odometry(parcel.odometry)
+def _send(sample: _EncodedSample, sender: Sender, clock: Clock, report: ReplayReport) -> None:
+    if sample.odometry is not None:
+        sender.put_odometry(sample.odometry)
         report.odometry += 1
-    if parcel.error is not None:
+    if sample.error is not None:
         report.damaged += 1
-        report.first_error = report.first_error or parcel.error
-    if parcel.cloud is not None:
+        report.first_error = report.first_error or sample.error
+    if sample.cloud is not None:
         before = clock.now()
-        sender.put_cloud(parcel.cloud)
+        sender.put_cloud(sample.cloud)
         report.put_ms.append(1e3 * (clock.now() - before))
         report.frames += 1
-        report.points += parcel.points
+        report.points += sample.points
 
 
-def _parcels(run: Run, sender: Sender, config: ReplayConfig) -> Iterator[_Parcel]:
-    for beat in beats(run, config):
-        stamp = nanoseconds(beat.stamp)
-        odometry = None if config.clouds_only else sender.odometry(beat.T_odom_body, stamp)
-        yield _parcel(run, beat, sender, odometry)
-
-
-def _parcel(run: Run, beat: Beat, sender: Sender, odometry: Encoded | None) -> _Parcel:
-    if beat.frame is None:
-        return _Parcel(beat.due, odometry)
-    try:
-        points = run.read(beat.frame).points
-        cloud = sender.cloud(points, nanoseconds(beat.stamp))
-    except CloudError as error:
-        return _Parcel(beat.due, odometry, error=error)
-    return _Parcel(beat.due, odometry, cloud, len(points))
+def _encoded(run: Run, sender: Sender, config: ReplayConfig) -> Iterator[_EncodedSample]:
+    for sample in schedule(run, config):
+        stamp = nanoseconds(sample.stamp)
+        odometry = None if config.clouds_only else sender.odometry(sample.T_odom_body, stamp)
+        encoded = _EncodedSample(sample.due, odometry)
+        if sample.frame is not None:
+            try:
+                points = run.read(sample.frame).points
+                encoded = replace(encoded, cloud=sender.cloud(points, stamp), points=len(points))
+            except CloudError as error:
+                encoded = replace(encoded, error=error)
+        yield encoded
 
 
 class _ReadAhead:
-    """Runs an iterator on a thread of its own, ``size`` items ahead, so that a slow disk does not disturb the clock."""
+    """Iterator run on a thread of its own, ``size`` items ahead, so that a slow disk does not delay the replay."""
 
-    def __init__(self, source: Iterator[_Parcel], size: int) -> None:
+    def __init__(self, source: Iterator[_EncodedSample], size: int) -> None:
         self._source = source
-        self._ready: queue.Queue[_Parcel | BaseException | None] = queue.Queue(size)
+        self._ready: queue.Queue[_EncodedSample | BaseException | None] = queue.Queue(size)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._fill, name="replay-reader", daemon=True)
 
@@ -179,7 +176,7 @@ class _ReadAhead:
         self._ended.set()
         self._thread.join(timeout=5.0)
 
-    def __iter__(self) -> Iterator[_Parcel]:
+    def __iter__(self) -> Iterator[_EncodedSample]:
         while (item := self._ready.get()) is not None:
             if isinstance(item, BaseException):
                 raise item
@@ -187,14 +184,14 @@ class _ReadAhead:
 
     def _fill(self) -> None:
         try:
-            for parcel in self._source:
-                if not self._offer(parcel):
+            for sample in self._source:
+                if not self._offer(sample):
                     return
             self._offer(None)
-        except Exception as error:  # whatever it is, it belongs to the thread that reads
+        except Exception as error:  # of any kind: it is raised on the thread that reads
             self._offer(error)
 
-    def _offer(self, item: _Parcel | BaseException | None) -> bool:
+    def _offer(self, item: _EncodedSample | BaseException | None) -> bool:
         while not self._ended.is_set():
             try:
                 self._ready.put(item, timeout=0.1)
@@ -204,7 +201,7 @@ class _ReadAhead:
         return False
 
 
-def _spread(values: deque[float]) -> str:
+def _percentiles(values: deque[float]) -> str:
     if not values:
         return "-"
     p50, p99 = np.percentile(values, [50, 99])

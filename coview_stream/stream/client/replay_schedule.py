@@ -1,10 +1,10 @@
-"""When a replay sends what: pure, from a run's stamps to deadlines."""
+"""Schedule of a replay: from a run's stamps to deadlines, without a clock."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,19 +13,19 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, interpolate
 from coview_stream.recordings.run import Run
 
-_LONE_PERIOD = 0.1  # seconds between repetitions of a run of one frame, which has no rate of its own
+_SINGLE_FRAME_PERIOD = 0.1  # seconds, set by hand: between repetitions of a run of one frame
 
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """How a run is fed.
+    """Settings of a replay.
 
     Attributes:
         rate: frames sent per second; None keeps the spacing of the run's stamps.
         speed: factor on that spacing; 2 sends a run in half its time. Not together with ``rate``.
         odometry_rate: odometry samples sent per second, interpolated between frames; None sends one per frame.
         clouds_only: send no odometry: the node makes its own.
-        loop: start over for ever; stamps go on increasing, and the robot is back where it started.
+        loop: repeat without end; stamps go on increasing, and the robot is back where it started.
         read_ahead: frames read and encoded before their time.
     """
 
@@ -51,8 +51,8 @@ class ReplayConfig:
 
 
 @dataclass(frozen=True)
-class Beat:
-    """One moment of a replay: an odometry sample, and with it a frame or none.
+class ScheduledSample:
+    """An odometry sample of a replay, with a frame or without.
 
     Attributes:
         due: seconds after the start of the replay.
@@ -67,23 +67,23 @@ class Beat:
     frame: int | None
 
 
-def beats(run: Run, config: ReplayConfig) -> Iterator[Beat]:
-    """Yield every moment in order, for ever if the configuration says so."""
+def schedule(run: Run, config: ReplayConfig) -> Iterator[ScheduledSample]:
+    """Yield every sample in order; without end if ``config.loop`` is set."""
     dues = frame_times(run, config)
-    # one more period closes the lap: from the last frame to the first one of the next
-    lap_due = float(dues[-1]) + _period(dues, 1.0 / config.rate if config.rate else _LONE_PERIOD)
-    lap_stamp = float(run.stamps[-1] - run.stamps[0]) + _period(run.stamps, _LONE_PERIOD)
+    # a lap lasts one period longer than its frames: from the last one to the first of the next lap
+    lap_due = float(dues[-1]) + _period(dues, 1.0 / config.rate if config.rate else _SINGLE_FRAME_PERIOD)
+    lap_stamp = float(run.stamps[-1] - run.stamps[0]) + _period(run.stamps, _SINGLE_FRAME_PERIOD)
     lap = 0
     while True:
-        for beat in _lap(run, dues, config.odometry_rate):
-            yield Beat(lap * lap_due + beat.due, lap * lap_stamp + beat.stamp, beat.T_odom_body, beat.frame)
+        for sample in _lap(run, dues, config.odometry_rate):
+            yield replace(sample, due=lap * lap_due + sample.due, stamp=lap * lap_stamp + sample.stamp)
         if not config.loop:
             return
         lap += 1
 
 
 def frame_times(run: Run, config: ReplayConfig) -> Floats:
-    """(N,) seconds after the start at which each frame is due."""
+    """Return (N,) seconds after the start at which each frame is due."""
     if config.rate is not None:
         return np.arange(len(run)) / config.rate
     times: Floats = (run.stamps - run.stamps[0]) / config.speed
@@ -91,29 +91,31 @@ def frame_times(run: Run, config: ReplayConfig) -> Floats:
 
 
 def odometry_spacing(run: Run, config: ReplayConfig) -> float:
-    """Seconds from one odometry sample to the next, as a rule: of sensor time or of real time, whichever is longer."""
+    """Return the usual seconds between odometry samples, of sensor time or of real time, the longer of both."""
     dues = frame_times(run, config)
     real = _period(dues, 0.0)
     parts = max(1, round(real * (config.odometry_rate or 0.0)))
     return max(real, _period(run.stamps, 0.0)) / parts
 
 
-def _period(times: Floats, lone: float) -> float:
-    return float(np.median(np.diff(times))) if len(times) > 1 else lone
+def _period(times: Floats, single: float) -> float:
+    return float(np.median(np.diff(times))) if len(times) > 1 else single
 
 
-def _lap(run: Run, dues: Floats, odometry_rate: float | None) -> Iterator[Beat]:
+def _lap(run: Run, dues: Floats, odometry_rate: float | None) -> Iterator[ScheduledSample]:
     for k in range(len(run)):
-        yield Beat(float(dues[k]), float(run.stamps[k]), run.poses[k], k)
-        # nothing after the last frame: the way back to the start was never driven
+        yield ScheduledSample(float(dues[k]), float(run.stamps[k]), run.poses[k], k)
+        # no sample after the last frame: the robot did not drive back to the start
         if odometry_rate is not None and k + 1 < len(run):
             yield from _between(run, dues, k, odometry_rate)
 
 
-def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[Beat]:
+def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[ScheduledSample]:
     count = round((dues[k + 1] - dues[k]) * rate)
     if count < 2:
         return
     for share in np.arange(1, count) / count:
         due, stamp = (a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps))
-        yield Beat(float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None)
+        yield ScheduledSample(
+            float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None
+        )

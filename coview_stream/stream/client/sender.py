@@ -1,11 +1,10 @@
-"""Publishes one robot's clouds and odometry, in the formats and on the keys of a preset."""
+"""Publisher of one robot's clouds and odometry, in the formats and on the keys of a preset."""
 
 from __future__ import annotations
 
 import math
 import time
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,27 +12,26 @@ import numpy.typing as npt
 from coview_stream.errors import CloudError, ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, is_pose
+from coview_stream.geometry.validation import cloud_rows, to_array
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage
 from coview_stream.stream.transport.key_expressions import check_expression
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.rmw import RmwPublisher, publisher_token, type_hash
 from coview_stream.stream.transport.transport import Publisher, Transport, Urgency
 
-_Float = TypeVar("_Float", np.float32, np.float64)
-
 CLOUD_ENCODINGS = ("xyz", "xyzi", "foxglove", "cdr", "keelson")
 ODOMETRY_ENCODINGS = ("json", "cdr", "foxglove", "keelson")
 
 _TIMED = {"xyz": "foxglove", "xyzi": "foxglove"}  # raw rows have no place for times
-_SETTLE = 0.3  # seconds; see Sender.settle
-_LAST_STAMP = 2**63 / 1e9  # seconds; int64 nanoseconds end there
+_SETTLE = 0.3  # seconds, set by hand; see Sender.settle
+_MAX_STAMP = 2**63 / 1e9  # seconds; int64 nanoseconds end there
 
 
 class Sender:
-    """One robot's outgoing side: encodes on whichever thread asks, publishes on whichever thread puts.
+    """Encoder and publishers of one robot's clouds and odometry; encoding and publishing may be on different threads.
 
     Args:
-        transport: stays the caller's to close.
+        transport: the caller closes it.
         keys: of the robot; a key expression that ends in a wildcard is completed to a key.
         cloud_encoding: codec name; None takes the preset's, ``xyz`` if it has none.
         odometry_encoding: codec name; None takes the preset's, ``json`` if it has none.
@@ -50,14 +48,16 @@ class Sender:
         odometry_encoding: str | None = None,
     ) -> None:
         self._chosen = cloud_encoding is not None
-        self.cloud_encoding = _known(
+        self.cloud_encoding = _checked_encoding(
             cloud_encoding or keys.cloud_hint or "xyz", CLOUD_ENCODINGS, "cloud encoding"
         )
-        self.odometry_encoding = _known(
+        self.odometry_encoding = _checked_encoding(
             odometry_encoding or keys.odometry_hint or "json", ODOMETRY_ENCODINGS, "odometry encoding"
         )
-        self.cloud_key = _plain(keys.cloud, keys.rmw, "sensor_msgs/msg/PointCloud2", "--cloud-key")
-        self.odometry_key = _plain(keys.odometry, keys.rmw, "nav_msgs/msg/Odometry", "--odometry-key")
+        self.cloud_key = _publishing_key(keys.cloud, keys.rmw, "sensor_msgs/msg/PointCloud2", "--cloud-key")
+        self.odometry_key = _publishing_key(
+            keys.odometry, keys.rmw, "nav_msgs/msg/Odometry", "--odometry-key"
+        )
         self._bare = keys.bare
         self._last_cloud = -math.inf
         self._cloud = _publisher(transport, self.cloud_key, "bulk", keys.rmw)
@@ -67,14 +67,12 @@ class Sender:
         """Encode (N, 3) body-frame points, metres; further columns are not sent. ``times`` as in CloudMessage.
 
         Raises:
-            InputError: the array has another shape or no numbers, or ``times`` another length.
-            CloudError: there is not one finite point.
+            CloudError: the array has another shape or no numbers, or there is no finite point.
+            InputError: ``times`` has no numbers, or another length.
         """
         from coview_stream.messages import encode_cloud
 
-        rows = _numbers(points, np.float32, "points")
-        if rows.ndim != 2 or rows.shape[1] not in (3, 4):
-            raise InputError(f"points of shape {rows.shape}: give (N, 3), or (N, 4) with the intensity last")
+        rows = cloud_rows(points, columns=(3, 4))
         if times is not None and np.shape(times) != (len(rows),):
             raise InputError(f"times of shape {np.shape(times)} do not fit {len(rows)} points")
         encoding = self.cloud_encoding
@@ -83,8 +81,8 @@ class Sender:
         xyz = np.ascontiguousarray(rows[:, :3])
         if not np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2]).any():  # many times faster than all(axis=1)
             raise CloudError(f"a cloud of {len(xyz)} points, none of them finite: leave such frames out")
-        seconds = None if times is None else _numbers(times, np.float64, "times")
-        return self._dressed(encode_cloud(CloudMessage(stamp_ns, xyz, seconds), encoding))
+        seconds = None if times is None else to_array(times, np.float64, "times", InputError)
+        return self._with_convention(encode_cloud(CloudMessage(stamp_ns, xyz, seconds), encoding))
 
     def odometry(self, T_odom_body: Pose, stamp_ns: int) -> Encoded:
         """Encode a (4, 4) pose, odometry <- body, metres.
@@ -94,18 +92,18 @@ class Sender:
         """
         from coview_stream.messages import encode_odometry
 
-        T = _numbers(T_odom_body, np.float64, "T_odom_body")
+        T = to_array(T_odom_body, np.float64, "T_odom_body", InputError)
         if not is_pose(T):
             raise InputError("T_odom_body is no rigid transform: give a finite 4x4 matrix, odometry <- body")
-        return self._dressed(encode_odometry(OdometryMessage(stamp_ns, T), self.odometry_encoding))
+        return self._with_convention(encode_odometry(OdometryMessage(stamp_ns, T), self.odometry_encoding))
 
     def put_cloud(self, message: Encoded) -> None:
-        """Publish; a frame that does not fit the link is dropped."""
+        """Publish a cloud; one that does not fit the link is dropped."""
         self._cloud.put(message)
         self._last_cloud = time.monotonic()
 
     def put_odometry(self, message: Encoded) -> None:
-        """Publish; waits for the link rather than drop it."""
+        """Publish an odometry sample; waits for the link rather than drop it."""
         self._odometry.put(message)
 
     def settle(self) -> None:
@@ -120,19 +118,19 @@ class Sender:
         self._cloud.close()
         self._odometry.close()
 
-    def _dressed(self, message: Encoded) -> Encoded:
-        # a convention that sets no Encoding is imitated to the byte, so that what reads it here reads it there
+    def _with_convention(self, message: Encoded) -> Encoded:
+        # a convention without Encoding is followed to the byte: readers tested against us must work with it
         return replace(message, encoding="") if self._bare else message
 
 
 def nanoseconds(stamp: float) -> int:
-    """Seconds as whole nanoseconds.
+    """Turn seconds into whole nanoseconds.
 
     Raises:
         InputError: no number, not finite, or beyond int64 (nanoseconds given for seconds, as a rule).
     """
     try:
-        plausible = bool(abs(stamp) < _LAST_STAMP)  # False of NaN
+        plausible = bool(abs(stamp) < _MAX_STAMP)  # False of NaN
     except (TypeError, ValueError):  # no number at all
         plausible = False
     if not plausible:
@@ -141,22 +139,13 @@ def nanoseconds(stamp: float) -> int:
     return whole * 1_000_000_000 + round((float(stamp) - whole) * 1e9)
 
 
-def _numbers(values: npt.ArrayLike, dtype: type[_Float], what: str) -> npt.NDArray[_Float]:
-    try:
-        return np.asarray(values, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{what} of type {type(values).__name__} are no array of numbers: {error}"
-        ) from error
-
-
-def _known(name: str, names: tuple[str, ...], what: str) -> str:
+def _checked_encoding(name: str, names: tuple[str, ...], what: str) -> str:
     if name not in names:
         raise ConfigError(f"{what} {name!r} is unknown: choose one of {', '.join(names)}")
     return name
 
 
-def _plain(expression: str, rmw: bool, type_name: str, option: str) -> str:
+def _publishing_key(expression: str, rmw: bool, type_name: str, option: str) -> str:
     """Complete a key to publish on from an expression to subscribe to: a final wildcard gets a name."""
     head, _, last = expression.rpartition("/")
     if head and last in ("*", "**"):
@@ -168,5 +157,5 @@ def _publisher(transport: Transport, key: str, urgency: Urgency, rmw: bool) -> P
     inner = transport.publisher(key, urgency)
     if not rmw:
         return inner
-    # nobody looks our clouds up by token, but readers require the attachment, and its identity comes from one
+    # no reader looks our clouds up by token, but all require the attachment, whose identity derives from one
     return RmwPublisher(inner, publisher_token(key, "0", "coview_robot", 0), time.time_ns)

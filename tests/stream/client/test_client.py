@@ -15,7 +15,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import decode_cloud, decode_odometry, encode_pose
 from coview_stream.messages.types import Encoded, PoseMessage, Sample
 from coview_stream.stream.client import client as client_module
-from coview_stream.stream.client.client import POSES_KEPT
+from coview_stream.stream.client.client import MAX_UNREAD_POSES
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.stream.transport.zenoh_transport import open_transport
@@ -92,13 +92,13 @@ def test_point_times_are_sent(client, net):
         (lambda c: c.send_cloud(np.zeros((4, 2)), 1.0), "shape"),
         (lambda c: c.send_cloud(np.zeros(3), 1.0), "shape"),
         (lambda c: c.send_cloud(None, 1.0), "shape"),
-        (lambda c: c.send_cloud([["a", "b", "c"]], 1.0), "points .*no array of numbers"),
-        (lambda c: c.send_cloud([[1, 2, 3], [4]], 1.0), "points .*no array of numbers"),
+        (lambda c: c.send_cloud([["a", "b", "c"]], 1.0), "cloud is not an array of numbers"),
+        (lambda c: c.send_cloud([[1, 2, 3], [4]], 1.0), "cloud is not an array of numbers"),
         (lambda c: c.send_cloud(np.zeros((0, 3)), 1.0), "0 points"),
         (lambda c: c.send_cloud(np.full((4, 3), np.nan), 1.0), "4 points, none of them finite"),
         (lambda c: c.send_cloud(np.where(np.eye(3), np.inf, 1.0), 1.0), "none of them finite"),
         (lambda c: c.send_cloud(CLOUD, 1.0, np.zeros(3)), "times"),
-        (lambda c: c.send_cloud(CLOUD, 1.0, ["x"] * 4), "times .*no array of numbers"),
+        (lambda c: c.send_cloud(CLOUD, 1.0, ["x"] * 4), "times is not an array of numbers"),
         (lambda c: c.send_cloud(CLOUD, None), "stamp None: give seconds"),
         (lambda c: c.send_cloud(CLOUD, "now"), "stamp 'now': give seconds"),
         (lambda c: c.send_cloud(CLOUD, np.zeros(2)), "seconds"),
@@ -167,10 +167,10 @@ def test_poses_and_statuses_come_in_order(client, net):
 
 
 def test_unread_poses_are_bounded(client, net):
-    for k in range(POSES_KEPT + 5):
+    for k in range(MAX_UNREAD_POSES + 5):
         published(net, encode_pose(pose_message(k), "json"))
     stamps = [pose.stamp_ns for pose in client.poses(timeout=0)]
-    assert stamps == list(range(5, POSES_KEPT + 5))
+    assert stamps == list(range(5, MAX_UNREAD_POSES + 5))
 
 
 def test_other_robots_and_undecodable_messages_are_ignored(client, net, caplog):

@@ -11,19 +11,19 @@ from coview_stream.stream.client.client import LatestQueue
 
 
 def test_latest_queue_keeps_order_and_drops_oldest():
-    box = LatestQueue[int](3)
+    queue = LatestQueue[int](3)
     for k in range(5):
-        box.put(k)
-    assert [box.get(0), box.get(0), box.get(0), box.get(0)] == [2, 3, 4, None]
-    assert box.dropped == 2
+        queue.put(k)
+    assert [queue.get(0), queue.get(0), queue.get(0), queue.get(0)] == [2, 3, 4, None]
+    assert queue.dropped == 2
 
 
 def test_close_wakes_reader_and_keeps_items():
-    box = LatestQueue[int](3)
+    queue = LatestQueue[int](3)
     found: list[int | None] = [7]
-    reader = threading.Thread(target=lambda: found.append(box.get()))
+    reader = threading.Thread(target=lambda: found.append(queue.get()))
     reader.start()
-    box.close()
+    queue.close()
     reader.join(5)
     assert found == [7, None]
 
@@ -35,15 +35,15 @@ def test_close_wakes_reader_and_keeps_items():
 
 
 def test_put_wakes_waiting_reader():
-    box = LatestQueue[int](3)
+    queue = LatestQueue[int](3)
     found: list[int | None] = []
-    reader = threading.Thread(target=lambda: found.append(box.get(timeout=10)))
+    reader = threading.Thread(target=lambda: found.append(queue.get(timeout=10)))
     reader.start()
-    box.put(4)
+    queue.put(4)
     reader.join(5)
     assert found == [4]
 
 
 def test_latest_queue_size_is_validated():
-    with pytest.raises(ConfigError, match="mailbox size"):
+    with pytest.raises(ConfigError, match="queue size"):
         LatestQueue[int](0)

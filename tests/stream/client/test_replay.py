@@ -17,7 +17,7 @@ from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
 from coview_stream.stream.client.replay import replay
-from coview_stream.stream.client.replay_schedule import ReplayConfig, beats, frame_times, odometry_spacing
+from coview_stream.stream.client.replay_schedule import ReplayConfig, frame_times, odometry_spacing, schedule
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -224,7 +224,7 @@ def test_bad_replay_config_is_refused(options, text):
 
 
 def test_schedule_without_loop_ends(run):
-    assert [beat.frame for beat in beats(run, ReplayConfig())] == [0, 1, 2, 3]
+    assert [sample.frame for sample in schedule(run, ReplayConfig())] == [0, 1, 2, 3]
     assert frame_times(run, ReplayConfig(rate=10.0)) == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
