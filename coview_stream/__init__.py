@@ -1,4 +1,4 @@
-"""Where is the robot on the map? Lidar localization on a base map without GPU, GNSS, ROS or an initial guess.
+"""Lidar localization of robots on a base map, without GPU, GNSS, ROS or an initial guess.
 
 >>> from coview_stream import BaseMap, Localizer
 >>> localizer = Localizer(BaseMap.load("site.coview"))      # doctest: +SKIP

@@ -1,4 +1,4 @@
-"""The one error tree.
+"""Errors of the package, as one tree, and the import of libraries that only some installations have.
 
 CoViewError
 ├── ConfigError      an option or a configuration field is out of its range
@@ -7,14 +7,12 @@ CoViewError
 │   ├── RunError     a run's frames and odometry do not fit together
 │   ├── MapError     a ``.coview`` file is damaged, of another version or not a map
 │   └── MessageError a message from the network cannot be decoded
-│       └── EncodingError   nobody here knows its encoding
+│       └── EncodingError   no codec knows its encoding
 ├── TransportError   the network session cannot be opened or configured
 └── DependencyError  an optional or native library is missing; the message names the remedy
 
-Every message names the file, field or key and what to do. The CLI prints it as one line and exits with 2.
+Every message names the file, field or key and the remedy. The command prints it as one line and exits with 2.
 """
-
-# FOLDED coview_stream/errors.py: """Libraries that only some installations have: imported when asked for, and named with their remedy when missing."""
 
 from __future__ import annotations
 
@@ -66,19 +64,19 @@ def require_library(module: str, requirement: str, purpose: str) -> Any:
     """Import a module that comes with one of the package's extras.
 
     Args:
-        module: its full name.
-        requirement: the distribution that has it, with the least version, as the package's extra says.
-        purpose: what needs it, for the message.
+        module: full name of the module.
+        requirement: its distribution with the minimum version, as the package's extra has it.
+        purpose: feature that needs it, for the message.
 
     Raises:
         DependencyError: it is not installed, or cannot be loaded.
     """
     try:
         return import_module(module)
-    except Exception as error:  # what is installed and does not fit raises what it likes
+    except Exception as error:  # an incompatible version may raise anything
         library = module.partition(".")[0]
         absent = isinstance(error, ImportError) and error.name == library
         missing = "is not installed" if absent else f"cannot be loaded ({error})"
-        # not by our extra: pip would look for us in a registry, where a copy from elsewhere is not
+        # not by our extra: pip would look for this package in a registry, and it may come from elsewhere
         remedy = f"pip install '{requirement}'"
         raise DependencyError(f"{purpose}: {library.replace('_', '-')} {missing}; {remedy}") from error

@@ -14,9 +14,8 @@ from coview_stream.errors import MapError
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
 
-_NETWORK_MEMORY = (
-    0.2 * GB
-)  # onnxruntime and the network in two processes, and what else is imported; set by hand
+# set by hand; of onnxruntime, the network and what else is imported, in two processes
+_NETWORK_MEMORY = 0.2 * GB
 _SPECTRA_MEMORY = 80.0  # bytes per square metre, set by hand
 
 
