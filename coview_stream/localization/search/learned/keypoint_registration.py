@@ -18,24 +18,41 @@ Start = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class KeypointMatch:
-    """Pose ``p_map = R(yaw) p_query + (x, y)`` and the pairs of keypoints behind it.
+class RigidFit2D:
+    """Pose ``p_map = R(yaw) p_query + (x, y)`` of a least-squares fit.
 
     Attributes:
         x: metres.
         y: metres.
         yaw: radians in (-pi, pi].
-        inliers: pairs that agree with the pose.
-        exact: whether it is proved that no more pairs agree with each other.
-        rms: root mean square of their residuals in the plane, metres.
+        residuals: (N,) metres, in the plane.
     """
 
     x: float
     y: float
     yaw: float
-    inliers: int
+    residuals: Floats
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals, metres."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+
+@dataclass(frozen=True)
+class KeypointMatch(RigidFit2D):
+    """Pose that pairs of keypoints agree on.
+
+    Attributes:
+        exact: whether it is proved that no more pairs agree with each other.
+    """
+
     exact: bool
-    rms: float
+
+    @property
+    def inliers(self) -> int:
+        """Number of pairs that agree with the pose."""
+        return len(self.residuals)
 
 
 def refine_by_keypoints(
@@ -65,7 +82,9 @@ def refine_by_keypoints(
         found = _fit(query, near, members)
         fits = found.residuals < config.tolerance
         if fits.all():
-            return _match(found, len(members), clique.exact) if _close(found, start, config) else None
+            if not _close(found, start, config):
+                return None
+            return KeypointMatch(found.x, found.y, found.yaw, found.residuals, clique.exact)
         # distances alone do not tell a place from its mirror image, and a long clique may bend
         members = members[found.residuals < max(config.tolerance, float(np.median(found.residuals)))]
     return None
@@ -90,32 +109,6 @@ def _fit(query: Keypoints, known: Keypoints, members: Ints) -> RigidFit2D:
 def _close(found: RigidFit2D, start: Start, config: LearnedMatchConfig) -> bool:
     shift = math.hypot(found.x - start[0], found.y - start[1])
     return shift <= config.max_shift and abs(wrap_angle(found.yaw - start[2])) <= config.max_turn
-
-
-def _match(found: RigidFit2D, inliers: int, exact: bool) -> KeypointMatch:
-    return KeypointMatch(found.x, found.y, found.yaw, inliers, exact, found.rms)
-
-
-@dataclass(frozen=True)
-class RigidFit2D:
-    """Pose ``p_map = R(yaw) p_query + (x, y)`` of a least-squares fit.
-
-    Attributes:
-        x: metres.
-        y: metres.
-        yaw: radians in (-pi, pi].
-        residuals: (N,) metres, in the plane.
-    """
-
-    x: float
-    y: float
-    yaw: float
-    residuals: Floats
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the residuals, metres."""
-        return float(np.sqrt(np.mean(self.residuals**2)))
 
 
 def fit_rigid_2d(query: Floats, known: Floats, weights: Floats | None = None) -> RigidFit2D:

@@ -122,7 +122,8 @@ def test_rough_place_is_refined_to_a_pose(seed):
     assert found.inliers >= 20
     assert found.exact
     assert found.rms < 0.7
-    assert found == refine_by_keypoints(query, known, start)
+    again = refine_by_keypoints(query, known, start)
+    assert (again.x, again.y, again.yaw, again.rms) == (found.x, found.y, found.yaw, found.rms)
 
 
 @pytest.mark.parametrize("off", [(9.0, 0.0, 0.0), (0.0, 0.0, 0.6), (0.0, 0.0, np.pi)])
