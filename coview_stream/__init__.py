@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BaseMap",
-    "RejectionReason",
     "CoViewError",
     "Fix",
     "KeyframeEvidence",
     "Localizer",
     "LocalizerConfig",
     "MapConfig",
+    "RejectionReason",
     "RobotClient",
     "State",
     "__version__",
@@ -40,13 +40,13 @@ __all__ = [
 
 _HOMES = {
     "BaseMap": "basemap.basemap",
-    "RejectionReason": "localization.tracking.monitor",
     "CoViewError": "errors",
     "Fix": "localization.result",
     "KeyframeEvidence": "localization.result",
     "Localizer": "localization.localizer",
     "LocalizerConfig": "config",
     "MapConfig": "config",
+    "RejectionReason": "localization.tracking.monitor",
     "RobotClient": "stream.client.client",
     "State": "localization.state",
 }

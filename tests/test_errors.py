@@ -39,7 +39,7 @@ def test_library_raising_any_exception_is_reported(tmp_path, monkeypatch):
 def test_install_commands_match_pyproject_extras():
     root = Path(__file__).parents[1]
     sources = "".join(path.read_text() for path in (root / "coview_stream").rglob("*.py"))
-    named = set(re.findall(r'extra\(f?"[^"]+", "([^"]+)"', sources))
+    named = set(re.findall(r'require_library\(f?"[^"]+", "([^"]+)"', sources))
     libraries = {"kiss-icp", "small-gicp", "rerun-sdk", "onnxruntime", "onnx", "torch"}
     assert {re.split("[><=]", name)[0] for name in named} == libraries
     project = (root / "pyproject.toml").read_text()
