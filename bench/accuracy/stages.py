@@ -19,7 +19,7 @@ from coview_stream.basemap.stations import describe_storeys
 from coview_stream.clouds import read_tum
 from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ground_below
-from coview_stream.geometry.arrays import Floats32
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import Points, Pose, inverse, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.keyframes import KeyframeBuffer
@@ -53,7 +53,7 @@ class Seen:
     """
 
     scan: Points
-    position: npt.NDArray[np.float64]
+    position: Floats
     ground: float
     T_map_odom: Pose
 
@@ -91,9 +91,7 @@ class Bank:
         return self._known[name]
 
 
-def keyframes_of(
-    world: Path, origin: npt.NDArray[np.float64], descriptor: DescriptorConfig
-) -> Iterator[Seen]:
+def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> Iterator[Seen]:
     """Keyframes of a world's run in order; ``origin`` (3,) is the map's."""
     run, (_, truth) = open_run(world / "run"), read_tum(world / "truth.tum")
     settings = KeyframeConfig()
@@ -122,7 +120,7 @@ class _Search:
         self._window = Consensus(stations, block, replace(variant.consensus, window=WINDOW))
         self.places = Places()
 
-    def vote(self, seen: Seen, centre: npt.NDArray[np.float64], volumes: dict[Channel, Floats32]) -> None:
+    def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
         self._alone.vote(centre, volumes)
         self._window.vote(centre, volumes)
         self.places.keyframes += 1

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import fft
 
 from bench.forest.query import APART, Chain, distinct, errors, local, of_places, of_volume, query_of
@@ -18,13 +17,12 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.birds_eye_view import CELL, SLABS, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, robust_zscore
 from coview_stream.localization.search.learned.matcher import QueryFeatures
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
-
-Floats = npt.NDArray[np.float64]
 
 METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "keypoints", "verified")
 """In the tables' order."""
@@ -154,8 +152,6 @@ class _Clock:
         self.seconds[name] = time.perf_counter() - begin
 
 
-Floats = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 COARSE = 2.0  # edge of a cell, metres
 HEADINGS = 72
 REACH = 30.0  # metres around the robot
@@ -166,7 +162,7 @@ _WINDOW, _MARGIN = 128.0, 48.0  # metres: large maps are drawn piece by piece
 _TOP, _FLAT = -3, 1e-3
 
 
-def heights(points: Points, corner: Floats, shape: tuple[int, int]) -> tuple[Floats, Mask]:
+def heights(points: Points, corner: Floats, shape: tuple[int, int]) -> tuple[Floats, Bools]:
     """Greatest heights (H, W) above the ground, metres, and which cells of 0.5 m were seen at all."""
     image = birds_eye_view(points, corner, shape)
     return image[_TOP] * (SLABS[-1] / 255.0), np.asarray(image[:-1].any(axis=0))
@@ -191,13 +187,13 @@ class Canopy:
         self._prepare(top, seen, low)
 
     @classmethod
-    def of(cls, top: Floats, seen: Mask, corner: Floats) -> Canopy:
+    def of(cls, top: Floats, seen: Bools, corner: Floats) -> Canopy:
         """Take heights (H, W) on cells of 2 m as they are; ``corner`` (2,) is that of cell (0, 0), metres."""
         made = cls.__new__(cls)
         made._prepare(top, seen, corner)
         return made
 
-    def _prepare(self, top: Floats, seen: Mask, corner: Floats) -> None:
+    def _prepare(self, top: Floats, seen: Bools, corner: Floats) -> None:
         self.shape, self.corner = top.shape, corner
         self._half = round(REACH / COARSE)
         self._size = tuple(fft.next_fast_len(n + 2 * self._half, real=True) for n in self.shape)
@@ -266,7 +262,7 @@ def seen_from(points: Points, centre: Floats) -> tuple[Floats, Floats]:
     return xy[near], top[row[near], column[near]]
 
 
-def _window(points: Points, corner: Floats, cells: int) -> tuple[Floats, Mask]:
+def _window(points: Points, corner: Floats, cells: int) -> tuple[Floats, Bools]:
     """Draw cells (n, n) of 2 m from ``corner`` on, the ground found with a margin of points around them."""
     low, high = corner - _MARGIN, corner + cells * COARSE + _MARGIN
     part = points[((points[:, :2] >= low) & (points[:, :2] < high)).all(axis=1)]

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.forest.methods import METHODS, Methods
 from bench.forest.tables import EXACT_DEGREES, EXACT_METRES, recall, success
@@ -23,9 +22,8 @@ from bench.forest.worlds import Drive, noted
 from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, inverse, pose_from, rot_z, transform
-
-Floats = npt.NDArray[np.float64]
 
 TILES = ("bcts_2.laz", "bcts_3.laz")
 HEADINGS = 4

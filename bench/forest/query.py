@@ -10,12 +10,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 import coview_kernels as kernels
 from bench.forest.worlds import Drive, in_odometry
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.arrays import Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
@@ -25,7 +25,6 @@ from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.refinement import Candidate, Refinement
 from coview_stream.localization.search.request import SearchRequest
 
-Floats = npt.NDArray[np.float64]
 _SUBMAP = 8.0  # metres driven that are registered: four keyframes, as in the search
 
 
@@ -57,7 +56,7 @@ def query_of(drive: Drive, config: LocalizerConfig) -> tuple[SearchRequest, Pose
     return query, truth
 
 
-def local(truth: Pose, origin: npt.NDArray[np.float64]) -> Pose:
+def local(truth: Pose, origin: Floats) -> Pose:
     """Return a pose (4, 4) of the map's source relative to the map's ``origin`` (3,)."""
     moved: Pose = truth.copy()
     moved[:3, 3] -= origin
@@ -85,7 +84,7 @@ BEST = 5  # places that each method names
 APART = 10.0  # metres between two of them
 
 
-def chosen(xy: npt.NDArray[np.floating], score: npt.NDArray[np.floating], count: int = BEST) -> list[int]:
+def chosen(xy: Reals, score: Reals, count: int = BEST) -> list[int]:
     """Which of the places (N, 2) are best, higher scores (N,) being better, 10 m or more apart, best first."""
     at, left = np.asarray(xy, dtype=np.float64), np.array(score, dtype=np.float64)
     found: list[int] = []
@@ -96,14 +95,12 @@ def chosen(xy: npt.NDArray[np.floating], score: npt.NDArray[np.floating], count:
     return found
 
 
-def distinct(xy: npt.NDArray[np.floating], score: npt.NDArray[np.floating], count: int = BEST) -> Floats:
+def distinct(xy: Reals, score: Reals, count: int = BEST) -> Floats:
     """Return the best places (K, 2) themselves, see :func:`chosen`."""
     return np.asarray(xy, dtype=np.float64)[chosen(xy, score, count)].reshape(-1, 2)
 
 
-def of_volume(
-    volume: npt.NDArray[np.float32], stations: npt.NDArray[np.float32], centre: Floats
-) -> list[Hypothesis]:
+def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypothesis]:
     """Best stations (M, 3) of distances (M, S), each at its best shift; ``centre`` (3,) in the odometry frame."""
     found = []
     for k in chosen(stations[:, :2], -volume.min(axis=1)):
@@ -114,7 +111,7 @@ def of_volume(
 
 
 def of_places(
-    xy: Floats, score: Floats, heading: Floats, stations: npt.NDArray[np.float32], centre: Floats
+    xy: Floats, score: Floats, heading: Floats, stations: Floats32, centre: Floats
 ) -> list[Hypothesis]:
     """Hypotheses of the best places (N, 2) at their headings (N,), as high as the station next to each."""
     found = []
@@ -125,7 +122,7 @@ def of_places(
     return found
 
 
-def _pose(at: npt.NDArray[np.floating], yaw: float, centre: Floats) -> Pose:
+def _pose(at: Reals, yaw: float, centre: Floats) -> Pose:
     return pose_from(rot_z(yaw), at.astype(np.float64)) @ pose_from(np.eye(3), -centre)
 
 

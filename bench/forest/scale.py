@@ -28,12 +28,11 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import ground_below
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
+from coview_stream.geometry.arrays import Bools, Floats32, Ints
 from coview_stream.geometry.transforms import pose_from, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
-
-Ints = npt.NDArray[np.int64]
 
 SIDES = (10, 32)  # tiles of 32 m along the edge: 0.10 and 1.05 km2
 LIMITS = {10: 0.4, 32: 3.0}  # seconds a query that issue 6 allows
@@ -60,7 +59,7 @@ def repeated(tiles: Ints, low: Ints, side: int, cut: int = CUT) -> tuple[Ints, I
     return np.array([number[tuple(tile)] for tile in originals]), places + low
 
 
-def enlarged(base_map: BaseMap, side: int) -> tuple[FeatureMap, npt.NDArray[np.float32], Ints]:
+def enlarged(base_map: BaseMap, side: int) -> tuple[FeatureMap, Floats32, Ints]:
     """Features and stations (M, 3) of the repeated middle of a map, and its lowest tile (2,)."""
     features = base_map.learned
     assert features is not None
@@ -88,7 +87,7 @@ def enlarged(base_map: BaseMap, side: int) -> tuple[FeatureMap, npt.NDArray[np.f
     return large, stations.astype(np.float32), low
 
 
-def _within(at: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+def _within(at: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any]) -> Bools:
     return np.asarray(((at[:, :2] >= low) & (at[:, :2] < high)).all(axis=1))
 
 
@@ -152,7 +151,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 class _LargeMap(BaseMap):
     """A map with other features and stations than the original's."""
 
-    def __init__(self, original: BaseMap, features: FeatureMap, stations: npt.NDArray[np.float32]) -> None:
+    def __init__(self, original: BaseMap, features: FeatureMap, stations: Floats32) -> None:
         self.__dict__.update(original.__dict__)
         self.__dict__ |= {"learned": features, "stations": stations}
 

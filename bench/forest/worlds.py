@@ -1,9 +1,7 @@
 """Where learned re-localization is judged: worlds of the training simulator that it never saw, and worlds on disk.
 
 Of a drawn world the frames of each submap are kept, not the submap: what the product makes of them is measured too.
-Whole runs are written as ``coview-stream simulate`` writes them: the simulator's own forests have a track that the
-robot follows; in the stands of the training simulator it finds its way between the trees, and the inclined rotating
-lidar can be driven as well. Their seeds were never trained on.
+Beside them, what all forest benchmarks share: progress, the weights, and what their results depend on.
 """
 
 from __future__ import annotations
@@ -12,28 +10,86 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.harness.files import fingerprint, folder, remembered
 from coview_stream.errors import InputError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rotations import exp_so3
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
-from coview_stream.sim import SimulationConfig
+from coview_stream.report.evaluation import driven
 from coview_stream.training.recipe import Recipe
 
-Floats = npt.NDArray[np.float64]
 BEHIND = 12.0  # metres of a recorded run that a query is made of, and ...
 EVERY = 10.0
 """... and between two queries of it."""
 
 _SPACING = 0.25  # metres between the frames of a recorded run that are read
 _LEANING = 3  # random stream
+
+
+WORLDS = (
+    *(f"coview_stream/{part}" for part in ("geometry", "clouds", "sim", "training")),
+    "bench/forest/worlds.py",
+)
+"""What makes worlds, and the runs and queries in them."""
+
+ANSWERS = (
+    *WORLDS,
+    *(f"coview_stream/{part}" for part in ("config", "descriptors", "odometry", "basemap", "localization")),
+    "coview_kernels",
+    *(f"bench/forest/{part}.py" for part in ("methods", "query")),
+)
+"""What answers to single queries depend on as well, but for the weights. Whole runs depend on all of the product."""
+
+_PARTS = ("base.laz", "base.las", "truth.tum", "world.json", "run/odometry.tum")
+
+
+def place() -> Path:
+    """Where worlds and answers are kept."""
+    return folder() / "forest"
+
+
+def say(text: str) -> None:
+    """Report progress."""
+    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
+
+
+def weights() -> str:
+    """Say which weights the package has, by both networks' hashes."""
+    from coview_stream.descriptors.network import weights_directory, weights_name
+
+    total = hashlib.sha256()
+    for view in ("aerial", "ground"):
+        file = weights_directory() / weights_name(view)
+        total.update(file.read_bytes() if file.is_file() else b"")
+    return total.hexdigest()[:10]
+
+
+def code() -> str:
+    """Hash of all that answers depend on but the weights."""
+    return fingerprint(*ANSWERS)
+
+
+def noted(text: str, command: str) -> str:
+    """Return a table with the command that made it, which knows no paths of a machine."""
+    return f"{text}\n\n`python -m bench {command}`. Weights {weights()}, code {code()}, {time.strftime('%Y-%m-%d')}."
+
+
+def on_disk(world: Path) -> dict[str, Any]:
+    """Say what lies in a world's folder: a hash of its files' names, sizes and times."""
+    files = [world / part for part in _PARTS] + sorted((world / "run" / "frames").glob("*"))
+    total = hashlib.sha256()
+    for file in files:
+        if file.is_file():
+            stat = file.stat()
+            total.update(f"{file.relative_to(world)} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return {"world": str(world.resolve()), "files": total.hexdigest()[:16]}
 
 
 @dataclass(frozen=True)
@@ -157,7 +213,7 @@ def recorded(directory: Path, most: int | None = None) -> Place:
     run = open_run(directory / "run")
     stamps, poses = read_tum(directory / "truth.tum")
     told = run.poses
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(told[:, :3, 3], axis=0), axis=1))])
+    way = driven(told)
     drives = []
     for end in ends_of(way, most):
         nearest = int(np.abs(stamps - run.stamps[end]).argmin())
@@ -201,176 +257,3 @@ def in_odometry(drive: Drive) -> tuple[Floats, Pose]:
     told = drive.odometry.copy()
     told[:, :3, 3] -= drive.odometry[-1, :3, 3]
     return told, drive.truth @ inverse(told[-1])
-
-
-_STAND = Recipe(built=0.0, size=(200.0, 200.0), slope=(0.0, 15.0), stems=(200.0, 600.0))
-_SPEED, _EVERY = 1.2, 2  # metres per second; of the sensor's frames
-_PATH = 7  # random stream
-
-
-@dataclass(frozen=True)
-class Through:
-    """A run of ``length`` metres with a sensor: through the simulator's forest, or a drawn stand (``drawn``)."""
-
-    sensor: str
-    seed: int
-    length: float
-    drawn: bool = False
-    recipe: Recipe = field(default=_STAND)
-
-    @property
-    def name(self) -> str:
-        """Directory of the world."""
-        return f"{'stand' if self.drawn else 'track'}-{self.sensor}-{self.seed}"
-
-
-RUNS = (
-    Through("vlp16", 21_001, 300.0),
-    Through("os64", 21_002, 100.0),
-    Through("mid360", 21_003, 100.0),
-    Through("vlp16", 21_101, 60.0, drawn=True),
-    Through("os64", 21_102, 60.0, drawn=True),
-    Through("mid360", 21_103, 60.0, drawn=True),
-    Through("vlp16-inclined", 21_104, 60.0, drawn=True),
-)
-"""The usual ones."""
-
-
-def world_of(folder: Path, run: Through) -> Path:
-    """Return the directory of a run's world, simulated now unless it is there.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
-    out = folder / run.name
-    spec = {"run": asdict(run), "code": fingerprint(*WORLDS)}
-
-    def make() -> dict[str, Any]:
-        from coview_stream.sim import simulate
-
-        if run.drawn:
-            return drawn_run(out, run)
-        size = 240.0 if run.length <= 150.0 else 320.0
-        config = SimulationConfig("forest", run.sensor, run.seed, size, run.length, changed=0.1, speed=2.0)
-        return {"driven": simulate(out, config, overwrite=True).distance}
-
-    remembered(folder / f"{run.name}.json", spec, make)
-    return out
-
-
-def drawn_run(out: Path, run: Through) -> dict[str, Any]:
-    """Write a drive through a drawn stand; the way is shorter than asked where the trees leave none."""
-    import json
-
-    from coview_stream.clouds import write_cloud, write_tum
-    from coview_stream.sim.caster import Caster
-    from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
-    from coview_stream.sim.sensors import FRAME_PERIOD
-    from coview_stream.training.sensors import trained_sensor
-    from coview_stream.training.worlds import base_scan, draw_world
-
-    world, rng = draw_world(run.seed, run.recipe), np.random.default_rng([run.seed, _PATH])
-    (out / "run" / "frames").mkdir(parents=True, exist_ok=True)
-    for old in (out / "run" / "frames").iterdir():
-        old.unlink()
-    write_cloud(out / "base.laz", base_scan(world, run.seed, run.recipe)[0].astype(np.float64))
-    path = longest(world, rng, run.length)
-    step = _SPEED * FRAME_PERIOD * _EVERY
-    truth = poses(path, step, world.ground, rng)
-    caster, sensor = Caster(world.now, threads=1, leaf_depth=0.3), trained_sensor(run.sensor)
-    for k, T in enumerate(truth):
-        write_cloud(out / "run" / "frames" / f"{k:06d}.pcd", sensor.scan(caster, T, _EVERY * k, rng))
-    stamps: Floats = 1000.0 + FRAME_PERIOD * _EVERY * np.arange(len(truth), dtype=np.float64)
-    write_tum(out / "run" / "odometry.tum", stamps, drifting_odometry(truth, OdometryConfig(), rng))
-    write_tum(out / "truth.tum", stamps, truth)
-    (out / "world.json").write_text(json.dumps({"scene": world.kind, "sensor": run.sensor, "seed": run.seed}))
-    return {"driven": step * (len(truth) - 1), "kind": world.kind}
-
-
-def longest(world: Any, rng: np.random.Generator, length: float) -> Floats:
-    """Return the longest of a few ways (N, 2) up to ``length`` metres."""
-    ways: Sequence[Floats] = [world.path(rng, world.size / 2 - 30.0, length) for _ in range(8)]
-    return max(ways, key=len)
-
-
-def poses(path: Floats, step: float, ground: Any, rng: np.random.Generator, height: float = 1.5) -> Floats:
-    """Poses (K, 4, 4) along a path (N, 2), ``step`` metres apart, ``height`` above the ground, swaying a little."""
-    from coview_stream.geometry.rotations import exp_so3
-    from coview_stream.geometry.transforms import pose_from, rot_z
-
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    at = np.arange(0.0, way[-1], step)
-    x, y = (np.interp(at, way, path[:, k]) for k in range(2))
-    heading = np.arctan2(np.gradient(y), np.gradient(x))
-    z = ground(x, y) + height
-    sway = rng.normal(0.0, np.radians(0.5), (len(at), 2))
-    slope = np.gradient(z) / step
-    made = []
-    for k in range(len(at)):
-        lean = exp_so3(np.array([sway[k, 0], sway[k, 1] - np.arctan(slope[k]), 0.0]))
-        made.append(pose_from(rot_z(float(heading[k])) @ lean, np.array([x[k], y[k], z[k]])))
-    return np.array(made)
-
-
-def shortened(run: Through, length: float) -> Through:
-    """Return the same run, no longer than ``length`` metres."""
-    return replace(run, length=min(run.length, length))
-
-
-WORLDS = (
-    *(f"coview_stream/{part}" for part in ("geometry", "clouds", "sim", "training")),
-    "bench/forest/worlds.py",
-)
-"""What makes worlds, and the runs and queries in them."""
-
-ANSWERS = (
-    *WORLDS,
-    *(f"coview_stream/{part}" for part in ("config", "descriptors", "odometry", "basemap", "localization")),
-    "coview_kernels",
-    *(f"bench/forest/{part}.py" for part in ("methods", "query")),
-)
-"""What answers to single queries depend on as well, but for the weights. Whole runs depend on all of the product."""
-
-_PARTS = ("base.laz", "base.las", "truth.tum", "world.json", "run/odometry.tum")
-
-
-def place() -> Path:
-    """Where worlds and answers are kept."""
-    return folder() / "forest"
-
-
-def say(text: str) -> None:
-    """Report progress."""
-    print(f"{time.strftime('%H:%M:%S')} {text}", file=sys.stderr, flush=True)
-
-
-def weights() -> str:
-    """Say which weights the package has, by both networks' hashes."""
-    from coview_stream.descriptors.network import weights_directory, weights_name
-
-    total = hashlib.sha256()
-    for view in ("aerial", "ground"):
-        file = weights_directory() / weights_name(view)
-        total.update(file.read_bytes() if file.is_file() else b"")
-    return total.hexdigest()[:10]
-
-
-def code() -> str:
-    """Hash of all that answers depend on but the weights."""
-    return fingerprint(*ANSWERS)
-
-
-def noted(text: str, command: str) -> str:
-    """Return a table with the command that made it, which knows no paths of a machine."""
-    return f"{text}\n\n`python -m bench {command}`. Weights {weights()}, code {code()}, {time.strftime('%Y-%m-%d')}."
-
-
-def on_disk(world: Path) -> dict[str, Any]:
-    """Say what lies in a world's folder: a hash of its files' names, sizes and times."""
-    files = [world / part for part in _PARTS] + sorted((world / "run" / "frames").glob("*"))
-    total = hashlib.sha256()
-    for file in files:
-        if file.is_file():
-            stat = file.stat()
-            total.update(f"{file.relative_to(world)} {stat.st_size} {stat.st_mtime_ns}\n".encode())
-    return {"world": str(world.resolve()), "files": total.hexdigest()[:16]}

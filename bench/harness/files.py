@@ -8,15 +8,15 @@ import os
 import resource
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 import coview_kernels
 import coview_stream
+from coview_stream.clouds.atomic_file import atomic_path
 
 _ROOTS = {
     "coview_stream": Path(coview_stream.__file__).parent,
@@ -32,17 +32,6 @@ def folder() -> Path:
     return Path(os.environ.get("COVIEW_BENCH") or Path(tempfile.gettempdir()) / "coview-bench")
 
 
-@contextmanager
-def whole(file: Path) -> Iterator[Path]:
-    """Yield a name to write under that becomes ``file`` at the end: the file is whole, or not there."""
-    part = file.with_name(f"{file.name}.{os.getpid()}.part")
-    try:
-        yield part
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def remembered(file: Path, spec: dict[str, Any], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return the result in ``file`` if it was made for an equal ``spec``; else make it and keep it there.
 
@@ -56,7 +45,7 @@ def remembered(file: Path, spec: dict[str, Any], make: Callable[[], dict[str, An
             return dict(known["result"])
     result = make()
     file.parent.mkdir(parents=True, exist_ok=True)
-    with whole(file) as part:
+    with atomic_path(file) as part:
         part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
     return dict(json.loads(json.dumps(result)))
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Floats = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from coview_stream.geometry.arrays import Bools, Floats
+
 FALSE_METRES, FALSE_DEGREES = 1.0, 5.0  # a pose further from the truth than either is false
 DOUBTFUL_METRES = 0.5
 """One further than this is counted beside them."""
@@ -40,7 +39,7 @@ class Told:
     seconds: Floats
 
     @property
-    def tracking(self) -> Mask:
+    def tracking(self) -> Bools:
         """(N,) whether the frame has a pose."""
         posed = ~np.isnan(self.poses[:, 0, 0])
         return np.asarray(posed & (np.asarray(self.states) == "TRACKING"))
@@ -61,7 +60,7 @@ class Errors:
     degrees: Floats
 
     @property
-    def right(self) -> Mask:
+    def right(self) -> Bools:
         """(N,) whether the frame has a pose that is not false."""
         return np.asarray((self.metres <= FALSE_METRES) & (self.degrees <= FALSE_DEGREES))
 
@@ -87,7 +86,7 @@ def held(stamps: Floats) -> Floats:
     return np.asarray(np.minimum(np.r_[gaps, np.median(gaps)], MOST_HELD))
 
 
-def recovery(right: Mask, stamps: Floats, driven: Floats, end: int) -> tuple[float, float] | None:
+def recovery(right: Bools, stamps: Floats, driven: Floats, end: int) -> tuple[float, float] | None:
     """Seconds and metres driven from the frame ``end`` to the first right pose; None if there is none."""
     again = np.flatnonzero(right[end:])
     if not len(again):
@@ -152,7 +151,7 @@ def score(
 
 
 def _event(
-    what: str, begin: int, end: int, right: Mask, false: Mask, stamps: Floats, driven: Floats, hold: Floats
+    what: str, begin: int, end: int, right: Bools, false: Bools, stamps: Floats, driven: Floats, hold: Floats
 ) -> dict[str, Any]:
     back = recovery(right, stamps, driven, end)
     until = len(right) if back is None else end + int(np.argmax(right[end:])) + 1

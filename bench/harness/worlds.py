@@ -11,17 +11,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.harness.files import fingerprint, remembered_seconds
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import DescriptorConfig, KeyframeConfig, MapConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
+from coview_stream.report.evaluation import driven
 from coview_stream.sim import SimulationConfig
 
 TUNED_SEEDS = frozenset(range(1, 21))
@@ -127,18 +128,17 @@ def places(folder: Path, scene: str, count: int) -> list[Place]:
     there, site = folder / world_name(WORLDS[scene]), base_map(folder, scene)
     run, (_, truth) = open_run(there / "run"), read_tum(there / "truth.tum")
     settings = KeyframeConfig()
-    position = np.array([T[:3, 3] for T in run.poses])
-    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
-    last = driven[-1] - KEYFRAMES * settings.distance
-    starts = np.searchsorted(driven, np.linspace(0.0, last, count))
+    way = driven(run.poses)
+    last = way[-1] - KEYFRAMES * settings.distance
+    starts = np.searchsorted(way, np.linspace(0.0, last, count))
     return [_place(run, truth, int(start), site.origin, settings, site.descriptor_config) for start in starts]
 
 
 def _place(
     run: Run,
-    truth: npt.NDArray[np.float64],
+    truth: Floats,
     start: int,
-    origin: npt.NDArray[np.float64],
+    origin: Floats,
     settings: KeyframeConfig,
     descriptor: DescriptorConfig,
 ) -> Place:

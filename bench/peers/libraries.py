@@ -6,12 +6,12 @@ import os
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.harness.worlds import Place
 from bench.peers.methods import Answer, started
 from coview_stream import BaseMap
 from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, inverse, norms, pose_from
 
 
@@ -89,7 +89,7 @@ class MapClosures:
         T = pose_from(np.eye(3), self._tiles[best.source_id]) @ inverse(np.asarray(best.pose))
         return Answer(T, best.number_of_inliers > self._least, best.number_of_inliers)
 
-    def _thinned(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def _thinned(self, points: Floats) -> Floats:
         """Thin as its pipeline does before it asks."""
         from map_closures.voxel_map import VoxelMap
 
@@ -176,7 +176,7 @@ class SmallGicp:
             self._voxels = small_gicp.GaussianVoxelMap(self.VOXEL)
             self._voxels.insert(self._map)
 
-    def _prepared(self, points: npt.NDArray[np.float64], voxel: float) -> Any:
+    def _prepared(self, points: Floats, voxel: float) -> Any:
         return self._library.preprocess_points(
             points, downsampling_resolution=voxel, num_neighbors=10, num_threads=self._threads
         )

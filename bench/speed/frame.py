@@ -16,15 +16,15 @@ from argparse import Namespace
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.harness.rows import REPEAT, Row, against, bounded, medians
+from coview_stream.geometry.arrays import Floats, Floats32
 
 _LEAST = 4.0
 LIMITS = 0.3, 0.5, 80.0
 
 
-def frame(seed: int = 0) -> npt.NDArray[np.float32]:
+def frame(seed: int = 0) -> Floats32:
     """One turn (65536, 3) of a 64-beam lidar in a street, row by row, metres."""
     rng = np.random.default_rng(seed)
     elevation = np.deg2rad(np.linspace(-25, 15, 64))[:, None]
@@ -42,7 +42,7 @@ def frame(seed: int = 0) -> npt.NDArray[np.float32]:
     return np.asarray(beams * noisy[:, None], dtype=np.float32)
 
 
-def pose() -> npt.NDArray[np.float64]:
+def pose() -> Floats:
     """Return where the robot stands, (4, 4)."""
     T = np.eye(4)
     T[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
@@ -50,7 +50,7 @@ def pose() -> npt.NDArray[np.float64]:
     return T
 
 
-def best_numpy(points: npt.NDArray[np.float32], T: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+def best_numpy(points: Floats32, T: Floats) -> Floats32:
     """Return the same points; presumes finite ones near the sensor."""
     voxel, r_min, r_max = LIMITS
     x, y, z = points.T.astype(np.float64)
@@ -81,7 +81,7 @@ def _taken(repeat: int) -> list[float]:
     points, T = frame(), pose()
     ours = VoxelFilter(*LIMITS)
 
-    def plain() -> npt.NDArray[np.float32]:
+    def plain() -> Floats32:
         return reference.transform_unique(points, T, *LIMITS)[0]
 
     found, _ = ours(points, T)
@@ -122,7 +122,7 @@ _SCAN = 131_072
 _DESCRIBE = 10.0
 
 
-def virtual_scan() -> npt.NDArray[np.float32]:
+def virtual_scan() -> Floats32:
     """Points (131072, 3) of 20 keyframes 2 m apart; heights are spread, since one street has too few voxels."""
     from coview_kernels import reference
 
@@ -148,7 +148,7 @@ def _described(repeat: int) -> list[float]:
     points, centre, config = virtual_scan(), np.array([0.1, -0.2, -1.8]), DescriptorConfig()
     size = config.rings, config.sectors, config.radius
 
-    def plain() -> list[npt.NDArray[np.float32]]:
+    def plain() -> list[Floats32]:
         grid, _ = reference.polar_bin(points, centre, *size)
         highest = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
         return [highest, reference.coview(*grid)]

@@ -19,28 +19,26 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.harness.rows import Row, against, bounded, informs, medians
+from coview_stream.geometry.arrays import Bools, Floats, Floats32
 
 CHANNELS, HEADINGS, QUERY = 32, 36, 32
 SIDES = {"0.1 km2": (158, 250.0), "1 km2": (500, 1500.0)}  # cells on a side and the milliseconds allowed
 PAIRS = 300
 
-F32 = npt.NDArray[np.float32]
-
 
 class OneFft:
     """Baseline: per channel over the whole map, its spectra kept."""
 
-    def __init__(self, features: F32) -> None:
+    def __init__(self, features: Floats32) -> None:
         from scipy import fft
 
         self._shape = features.shape[1:]
         self._size = tuple(fft.next_fast_len(side + QUERY, real=True) for side in self._shape)
         self._spectra = fft.rfft2(features, self._size)
 
-    def __call__(self, query: F32, weight: F32, yaws: npt.NDArray[np.float64]) -> F32:
+    def __call__(self, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
         """Return sums (K, H, W) over all weights."""
         from scipy import fft
 
@@ -53,7 +51,7 @@ class OneFft:
         return out
 
 
-def convolved(features: F32, query: F32, weight: F32, yaws: npt.NDArray[np.float64]) -> F32:
+def convolved(features: Floats32, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
     """Baseline: ``scipy.signal.fftconvolve`` along the map's axes, then the sum over dimensions (K, H, W)."""
     from scipy.signal import fftconvolve
 
@@ -61,7 +59,7 @@ def convolved(features: F32, query: F32, weight: F32, yaws: npt.NDArray[np.float
     return np.stack([fftconvolve(features, grid, mode="same", axes=(1, 2)).sum(axis=0) for grid in grids])
 
 
-def _turned(query: F32, weight: F32, yaws: npt.NDArray[np.float64]) -> F32:
+def _turned(query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
     """Turn a query (K, C, h + 1, h + 1), over the sum of its weights."""
     from coview_stream.localization.search.learned.correlation import rotate_images
 
@@ -143,7 +141,7 @@ def _cliques(repeat: int) -> Iterator[Row]:
         yield against(f"learned_match/search from nothing, {name}", search, listing, "ms", None)
 
 
-def enumerated(adjacent: npt.NDArray[np.bool_]) -> int:
+def enumerated(adjacent: Bools) -> int:
     """Baseline: size of the largest of all maximal cliques, listed by Bron and Kerbosch with Tomita's pivots."""
     near = [set(np.flatnonzero(row).tolist()) - {i} for i, row in enumerate(adjacent)]
     most = 0
@@ -163,13 +161,13 @@ def enumerated(adjacent: npt.NDArray[np.bool_]) -> int:
     return most
 
 
-def _unit(rng: np.random.Generator, height: int, width: int) -> F32:
+def _unit(rng: np.random.Generator, height: int, width: int) -> Floats32:
     values = rng.standard_normal((CHANNELS, height, width), dtype=np.float32)
     values /= np.linalg.norm(values, axis=0)
     return values
 
 
-def _pairs(rng: np.random.Generator, share: float) -> tuple[npt.NDArray[np.float64], ...]:
+def _pairs(rng: np.random.Generator, share: float) -> tuple[Floats, ...]:
     """Points of pairs in a disk's square, ``share`` of them the same from either side but for the heading."""
     here, there = rng.uniform(-30.0, 30.0, (2, PAIRS, 2))
     right = round(share * PAIRS)

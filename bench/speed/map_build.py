@@ -33,16 +33,16 @@ import numpy.typing as npt
 
 from bench.harness.files import isolated, peak_megabytes
 from bench.harness.rows import Row, against, bounded, informs
+from coview_stream.geometry.arrays import Floats, Floats32, Indices
 
 _BLOCK = 2.0
 _LEAST = 10.0
 _SAMPLE = 40
 _MOST_OFF = {"scan_context": 3.5, "coview": 5.1}  # % of the bins
 _MOST_MEAN = {"scan_context": 0.2, "coview": 0.26}  # metres
-Floats = npt.NDArray[np.float32]
 
 
-def site(points: int, count: int) -> tuple[Floats, Floats]:
+def site(points: int, count: int) -> tuple[Floats32, Floats32]:
     """Points (N, 3) and stations (count, 3) at the centres of blocks, on the ground; metres."""
     cloud = synthetic(points, count, _BLOCK).astype(np.float32)
     side = int(np.ceil(np.sqrt(count)))
@@ -52,7 +52,7 @@ def site(points: int, count: int) -> tuple[Floats, Floats]:
     return cloud, np.column_stack([xy, terrain(xy)]).astype(np.float32)
 
 
-def ours(cloud: Floats, stations: Floats) -> tuple[float, dict[str, npt.NDArray[np.float16]]]:
+def ours(cloud: Floats32, stations: Floats32) -> tuple[float, dict[str, npt.NDArray[np.float16]]]:
     """Seconds, and the channels."""
     from coview_stream.basemap.stations import RASTER_CELL, aligned_corner, describe_stations, rasterise
     from coview_stream.config import DescriptorConfig
@@ -65,7 +65,7 @@ def ours(cloud: Floats, stations: Floats) -> tuple[float, dict[str, npt.NDArray[
     return time.perf_counter() - begin, {str(name): values for name, values in described.items()}
 
 
-def highest_of_voxels(cloud: Floats, voxel: float) -> Floats:
+def highest_of_voxels(cloud: Floats32, voxel: float) -> Floats32:
     """Return the highest point of each voxel."""
     cells = np.floor(cloud / np.float32(voxel)).astype(np.int64)
     cells -= cells.min(axis=0)
@@ -77,8 +77,8 @@ def highest_of_voxels(cloud: Floats, voxel: float) -> Floats:
 
 
 def baseline(
-    cloud: Floats, stations: Floats, chosen: npt.NDArray[np.intp]
-) -> tuple[float, float, dict[str, Floats]]:
+    cloud: Floats32, stations: Floats32, chosen: Indices
+) -> tuple[float, float, dict[str, Floats32]]:
     """Seconds once, seconds per station, and the channels of the chosen ones."""
     from scipy.spatial import cKDTree
 
@@ -90,7 +90,7 @@ def baseline(
     thin = highest_of_voxels(cloud, config.voxel)
     tree = cKDTree(thin[:, :2])
     once = time.perf_counter() - begin
-    found: dict[str, list[Floats]] = {"scan_context": [], "coview": []}
+    found: dict[str, list[Floats32]] = {"scan_context": [], "coview": []}
     begin = time.perf_counter()
     for station in stations[chosen].astype(np.float64):
         near = thin[tree.query_ball_point(station[:2], config.radius)]
@@ -130,10 +130,9 @@ MOST_SECONDS, MOST_MEGABYTES = 180.0, 4096.0  # the target for 10 M points and 1
 _COVERED = 0.2  # share of the ground below boxes: more than there is, so that no station is missing
 _BOX, _BOX_EVERY = (8.0, 20.0), 45.0  # metres
 _CROWNS_PER_M2 = 0.004
-Cloud = npt.NDArray[np.float64]
 
 
-def synthetic(points: int, stations: int, block: float, seed: int = 1) -> Cloud:
+def synthetic(points: int, stations: int, block: float, seed: int = 1) -> Floats:
     """Return a cloud (N, 3), metres, with ground for ``stations`` blocks; an eighth of it are walls."""
     rng = np.random.default_rng(seed)
     side = float(np.sqrt(stations / (1 - _COVERED))) * block
@@ -152,12 +151,12 @@ def synthetic(points: int, stations: int, block: float, seed: int = 1) -> Cloud:
     return np.concatenate([seen, *wall_parts])
 
 
-def terrain(xy: Cloud) -> Cloud:
+def terrain(xy: Floats) -> Floats:
     """Height of the ground at (N, 2), metres."""
     return np.asarray(2.0 * np.sin(xy[:, 0] / 37.0) + 1.5 * np.cos(xy[:, 1] / 51.0))
 
 
-def _boxes(rng: np.random.Generator, side: float) -> Cloud:
+def _boxes(rng: np.random.Generator, side: float) -> Floats:
     """Boxes (B, 5): centre, width, depth, height; one somewhere in each square of a grid, so none overlap."""
     centres = np.arange(_BOX_EVERY / 2, side, _BOX_EVERY)
     grid = np.stack(np.meshgrid(centres, centres), axis=-1).reshape(-1, 2)
@@ -166,7 +165,7 @@ def _boxes(rng: np.random.Generator, side: float) -> Cloud:
     return np.column_stack([grid, size, rng.uniform(4, 14, len(grid))])
 
 
-def _wall(rng: np.random.Generator, count: int, box: Any, base: float) -> Cloud:
+def _wall(rng: np.random.Generator, count: int, box: Any, base: float) -> Floats:
     x, y, width, depth, height = box
     along, side = rng.uniform(-0.5, 0.5, count), rng.choice([-0.5, 0.5], count)
     faces_x = rng.random(count) < 0.5
@@ -175,7 +174,7 @@ def _wall(rng: np.random.Generator, count: int, box: Any, base: float) -> Cloud:
     return np.column_stack([px, py, base + rng.uniform(0, height, count)])
 
 
-def _grow(rng: np.random.Generator, xy: Cloud, z: Cloud, side: float) -> None:
+def _grow(rng: np.random.Generator, xy: Floats, z: Floats, side: float) -> None:
     """Lift half of the points below each crown into it."""
     count = int(_CROWNS_PER_M2 * side**2)
     centres, radii = rng.uniform(0, side, (count, 2)), rng.uniform(1.0, 3.0, count)

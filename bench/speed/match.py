@@ -33,6 +33,7 @@ import numpy.typing as npt
 from bench.harness.files import folder
 from bench.harness.rows import REPEAT, Row, against, bounded, informs, medians
 from bench.harness.worlds import base_map, places, world
+from coview_stream.geometry.arrays import Floats32
 
 STATIONS, MANY = 9_527, 100_000
 BEST = 10
@@ -40,7 +41,7 @@ KILOBYTES = 3.0
 LOOP = 150.0  # times as fast as the plain C++ loop, one thread each
 BUILD_MS = 300.0
 
-F16, F32 = npt.NDArray[np.float16], npt.NDArray[np.float32]
+F16 = npt.NDArray[np.float16]
 
 
 class Spectral:
@@ -57,7 +58,7 @@ class Spectral:
         angle = 2.0 * np.pi / sectors * np.outer(n, f)
         self._turn = np.hstack([np.cos(angle) * weight, -np.sin(angle) * weight]).astype(np.float32)
 
-    def __call__(self, query: F32, k: int) -> tuple[npt.NDArray[Any], ...]:
+    def __call__(self, query: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
         """Return stations, shifts and distances of the ``k`` nearest."""
         from scipy import fft
 
@@ -77,7 +78,7 @@ class Turned:
         unit = kernels.unit_columns(stations).reshape(len(stations), -1)
         self._columns = np.ascontiguousarray(unit.T)
 
-    def __call__(self, query: F32, k: int) -> tuple[npt.NDArray[Any], ...]:
+    def __call__(self, query: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
         """Return stations, shifts and distances of the ``k`` nearest."""
         import coview_kernels as kernels
 
@@ -88,7 +89,7 @@ class Turned:
         return _best(turned @ self._columns, k)
 
 
-def _best(correlation: F32, k: int) -> tuple[npt.NDArray[Any], ...]:
+def _best(correlation: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
     top = correlation.max(axis=0)
     chosen = np.argpartition(top, -k)[-k:]
     chosen = chosen[np.argsort(-top[chosen], kind="stable")]
@@ -127,7 +128,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     yield _against_loop(index, some, query, repeat)
 
 
-def _limits(index: Any, query: F32, bandwidth: float, repeat: int) -> Iterator[Row]:
+def _limits(index: Any, query: Floats32, bandwidth: float, repeat: int) -> Iterator[Row]:
     kilobytes = index.nbytes / len(index) / 1e3
     yield bounded("match/memory of the index per station", kilobytes, "kB", KILOBYTES)
     whole = kilobytes + index.descriptors.nbytes / len(index) / 1e3
@@ -137,7 +138,7 @@ def _limits(index: Any, query: F32, bandwidth: float, repeat: int) -> Iterator[R
     yield against("match/top 10 beside one reading of the index from memory", ours, floor, "ms", None)
 
 
-def _hard(query: F32, repeat: int) -> Iterator[Row]:
+def _hard(query: Floats32, repeat: int) -> Iterator[Row]:
     """Stations that bounds cannot tell apart, with the spectra at hand for the exhaustive way out."""
     import coview_kernels as kernels
 
@@ -158,7 +159,7 @@ def _hard(query: F32, repeat: int) -> Iterator[Row]:
         yield against(f"match/top 10, {name}, without", alone, base, "ms", None)
 
 
-def _growth(stations: F16, query: F32, repeat: int) -> Iterator[Row]:
+def _growth(stations: F16, query: Floats32, repeat: int) -> Iterator[Row]:
     """Time per station with many against that with few, interleaved."""
     import coview_kernels as kernels
 
@@ -168,7 +169,7 @@ def _growth(stations: F16, query: F32, repeat: int) -> Iterator[Row]:
     yield bounded("match/time per station, many over few", (long / MANY) / (short / STATIONS), "x", 1.0)
 
 
-def _against_loop(index: Any, stations: F16, query: F32, repeat: int) -> Row:
+def _against_loop(index: Any, stations: F16, query: Floats32, repeat: int) -> Row:
     from coview_kernels.runtime import workers
 
     name = "match/top 10 against a plain C++ loop, all shifts"
@@ -182,7 +183,7 @@ def _against_loop(index: Any, stations: F16, query: F32, repeat: int) -> Row:
     return against(name, ours, milliseconds, "ms", LOOP if workers() == 1 else None)
 
 
-def plain_loop(stations: F16, query: F32) -> tuple[float, int, int, float] | None:
+def plain_loop(stations: F16, query: Floats32) -> tuple[float, int, int, float] | None:
     """Milliseconds of ``peers/plain_loop.cpp``, its station, shift and distance; None without a compiler."""
     compiler = shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
     if compiler is None:
@@ -201,7 +202,7 @@ def plain_loop(stations: F16, query: F32) -> tuple[float, int, int, float] | Non
     return float(milliseconds), int(station), int(shift), float(distance)
 
 
-def town() -> tuple[dict[str, F16], dict[str, F32]]:
+def town() -> tuple[dict[str, F16], dict[str, Floats32]]:
     """Descriptors (M, R, S) and a keyframe's (R, S), by channel, of a simulated town."""
     from coview_stream.descriptors.coview import describe, ground_below
 

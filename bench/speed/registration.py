@@ -32,7 +32,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.harness.files import folder
 from bench.harness.rows import Row, against, informs
@@ -42,6 +41,7 @@ from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import RegistrationConfig
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import (
     Pose,
     inverse,
@@ -71,7 +71,7 @@ class Place(NamedTuple):
     """A scan (N, 3) in the odometry frame, where the robot is in it, the truth and the map around it."""
 
     source: RegistrationCloud
-    position: npt.NDArray[np.float64]
+    position: Floats
     truth: Pose
     target: LocalMap
 
@@ -79,11 +79,11 @@ class Place(NamedTuple):
 class Trials(NamedTuple):
     """Milliseconds, metres and degrees (n,) of one way from all starts."""
 
-    ms: npt.NDArray[np.float64]
-    metres: npt.NDArray[np.float64]
-    degrees: npt.NDArray[np.float64]
+    ms: Floats
+    metres: Floats
+    degrees: Floats
 
-    def rms(self) -> npt.NDArray[np.float64]:
+    def rms(self) -> Floats:
         """Root mean squares (2,) of both errors, metres and degrees."""
         return np.asarray(np.sqrt(np.mean(np.square(self[1:]), axis=1)))
 
@@ -126,7 +126,7 @@ def places(site: Path, run: Path, truth: Path, count: int) -> Iterator[Place]:
     stamps, poses = read_tum(truth)
     frames = list(open_run(run))
     wanted = set(np.linspace(0, len(frames) - 1, count + 1).astype(int)[1:].tolist())
-    recent: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float32]]] = []
+    recent: list[tuple[Floats, Floats32]] = []
     anchor = frames[0].T_odom_body[:3, 3]  # odometry may begin anywhere; float32 should not
     for index, frame in enumerate(frames):
         T = pose_from(frame.T_odom_body[:3, :3], frame.T_odom_body[:3, 3] - anchor)
@@ -142,7 +142,7 @@ def places(site: Path, run: Path, truth: Path, count: int) -> Iterator[Place]:
             yield Place(source, T[:3, 3], T_map_body @ inverse(T), target)
 
 
-def _source(points: npt.NDArray[np.float32], position: npt.NDArray[np.float64]) -> RegistrationCloud:
+def _source(points: Floats32, position: Floats) -> RegistrationCloud:
     near = points.compress(norms(points, position.astype(np.float32)) < REACH, axis=0)
     thin, _ = transform_unique(near, np.eye(4), VOXEL)
     height = height_above_lowest(thin)
@@ -257,9 +257,7 @@ class SmallGicp:
         self._voxels = small_gicp.GaussianVoxelMap(1.0)
         self._voxels.insert(self._map)
 
-    def align(
-        self, way: str, points: npt.NDArray[np.float32], begin: Pose, whole: bool
-    ) -> tuple[float, Pose | None]:
+    def align(self, way: str, points: Floats32, begin: Pose, whole: bool) -> tuple[float, Pose | None]:
         """Seconds, with the source's covariances or without, and the pose."""
         cloud = points.astype(np.float64)
         clock = time.perf_counter()

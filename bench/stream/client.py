@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from bench.stream.drive import Drive, RobotPlan, schedule, stamp_of
-from bench.stream.scores import Floats, Posed, Told
+from bench.stream.scores import Posed, Told
 from bench.stream.wire import CLOUDS, ODOMETRY, read_pose, rubbish
+from coview_stream.geometry.arrays import Floats
 
 METRONOME = "bench/metronome"
 TICK = 0.1

@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.stream.scores import Floats
 from bench.stream.wire import EPOCH_NS, Points
 from coview_stream.clouds import read_tum
+from coview_stream.geometry.arrays import Floats
 from coview_stream.recordings.open_run import open_run
 
 RESTARTED = 1000.0  # seconds by which a robot's clock jumps back in phase ``restart``

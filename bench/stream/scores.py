@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from coview_stream.geometry.arrays import Floats
+
 FALSE_METRES, FALSE_DEGREES = 2.0, 5.0  # a pose further from the truth than either is a false one
 MOST_MISMATCH_NS = 2_000_000
 """A frame is recognised by its stamp; ages come as decimal seconds, so that stamps made of them are rounded."""

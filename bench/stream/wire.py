@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bench.stream.scores import Floats, Posed
+from bench.stream.scores import Posed
+from coview_stream.geometry.arrays import Floats, Floats32
 
-Points = npt.NDArray[np.float32]
+Points = Floats32
 Message = tuple[bytes, str, bytes | None]  # payload, encoding, attachment
 
 CDR_CLOUD, CDR_ODOMETRY = (

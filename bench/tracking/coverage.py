@@ -10,7 +10,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import Errors, Floats, Mask, Told
+from bench.harness.trajectory_scores import Errors, Told
+from coview_stream.geometry.arrays import Bools, Floats
 
 FIRST_MINUTE = 60.0  # seconds after a fix in which its covariance is judged apart
 
@@ -50,7 +51,7 @@ def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
     error = twist[:, pick]
     cov = covariances[:, pick[:, None], pick]
     out = np.full(len(twist), np.inf)
-    sane: Mask = np.asarray(np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1))
+    sane: Bools = np.asarray(np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1))
     cov = np.where(sane[:, None, None], cov, np.eye(len(pick)))
     # metres stand beside radians: compare each by its own size
     scale = np.sqrt(np.abs(np.einsum("nii->ni", cov)))
@@ -65,7 +66,7 @@ def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
 def spread(told: Told, error: Errors) -> dict[str, dict[str, Floats]]:
     """Squared distances of all poses by name of the axes, in the ``first minute`` after a fix and ``later``."""
     age = since_fix(told)
-    parts: dict[str, Mask] = {
+    parts: dict[str, Bools] = {
         "first minute": np.asarray(age < FIRST_MINUTE),
         "later": np.asarray(age >= FIRST_MINUTE),
     }

@@ -9,14 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.tracking.worlds import in_gap
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
 from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 
-Floats = npt.NDArray[np.float64]
 PERIOD = 0.1
 SEGMENT = 100.0  # metres over which drift is measured
 CLEAR, CLOTH, DUST = 0, 1, 2
@@ -50,12 +49,12 @@ class Drive:
         events: what to recover from.
     """
 
-    frames: npt.NDArray[np.int64]
+    frames: Ints
     stamps: Floats
     truth: Floats
     odometry: Floats
     driven: Floats
-    cover: npt.NDArray[np.int64]
+    cover: Ints
     events: tuple[Event, ...] = field(default=())
 
     def __len__(self) -> int:

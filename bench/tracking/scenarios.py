@@ -14,7 +14,6 @@ from bench.tracking.drives import (
     DUST,
     PERIOD,
     Drive,
-    Floats,
     carried,
     covered,
     jumped,
@@ -25,6 +24,7 @@ from bench.tracking.drives import (
     start,
 )
 from bench.tracking.worlds import World
+from coview_stream.geometry.arrays import Floats
 
 SEEDS = 5000  # what reported seeds follow; this one itself, of ``--quick``, is in nobody's table
 _EVENT_AT = 90.0  # metres

@@ -19,12 +19,12 @@ import numpy.typing as npt
 from bench.harness.files import fingerprint, remembered_seconds, whole
 from bench.harness.worlds import MAPPER, SIMULATOR
 from coview_stream.config import MapConfig
+from coview_stream.geometry.arrays import Bools, Floats, Indices, Ints
 from coview_stream.geometry.transforms import Points
 from coview_stream.report.evaluation import driven
 from coview_stream.sim import KINDS, SimulationConfig
 from coview_stream.sim.scenes import Scene, build_scene
 
-Floats = npt.NDArray[np.float64]
 STEP = 0.004  # metres; what frames are rounded to
 
 GAP = (120.0, 220.0)  # metres of the drive between which the map of a gap holds nothing near the robot
@@ -81,7 +81,7 @@ class Recorded:
     """
 
     truth: Floats
-    _counts: npt.NDArray[np.int64]
+    _counts: Ints
     _rows: npt.NDArray[np.int16]
 
     def __len__(self) -> int:
@@ -120,7 +120,7 @@ def map_of(folder: Path, world: World, variant: str = "plain") -> Path:
     return file
 
 
-def in_gap(truth: Floats, positions: Floats) -> npt.NDArray[np.bool_]:
+def in_gap(truth: Floats, positions: Floats) -> Bools:
     """Whether each of (N, 2 or 3) positions lies where the map of a gap holds nothing."""
     from scipy.spatial import cKDTree
 
@@ -164,7 +164,7 @@ def earlier(scene: Scene, seed: int, share: float) -> Scene:
     return replace(scene, mapped=epoch, now=scene.mapped)
 
 
-def _owners(scene: Scene, margin: float = 2.0) -> npt.NDArray[np.intp]:
+def _owners(scene: Scene, margin: float = 2.0) -> Indices:
     """(V,) the building that each vertex of ``scene.now.solid`` belongs to, -1 for none.
 
     A mesh is of unconnected pieces (walls, roofs, porches, and the ground); a piece belongs to the building whose
