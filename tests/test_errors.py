@@ -40,7 +40,7 @@ def test_install_commands_match_pyproject_extras():
     root = Path(__file__).parents[1]
     sources = "".join(path.read_text() for path in (root / "coview_stream").rglob("*.py"))
     named = set(re.findall(r'require_library\(f?"[^"]+", "([^"]+)"', sources))
-    libraries = {"kiss-icp", "small-gicp", "rerun-sdk", "onnxruntime", "onnx", "torch"}
+    libraries = {"kiss-icp", "small-gicp", "rerun-sdk", "onnxruntime", "onnx", "torch", "gtsam"}
     assert {re.split("[><=]", name)[0] for name in named} == libraries
     project = (root / "pyproject.toml").read_text()
     assert all(f'"{name}"' in project for name in named)

@@ -40,7 +40,9 @@ def test_dunder_all_is_sorted_and_resolvable():
     for name in names:
         assert getattr(coview_stream, name) is not None
     assert set(names) <= set(dir(coview_stream))
-    assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "Cause", "KeyframeEvidence"} <= set(names)
+    assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "RejectionReason", "KeyframeEvidence"} <= set(
+        names
+    )
 
 
 def test_unknown_name_is_an_attribute_error():
