@@ -47,7 +47,7 @@ class BaseMap:
             raise MapError(f"the map lacks {', '.join(missing)}; build it again")
         try:
             fields = dict(parameters["config"])
-            fields.setdefault("learned", False)  # maps from before it
+            fields.setdefault("learned", False)  # maps older than this field
             descriptor = dict(fields.pop("descriptor"))
             descriptor["channels"] = tuple(descriptor["channels"])
             for name, only in _FIXED.items():
@@ -95,7 +95,7 @@ class BaseMap:
         settings = config or map_preset(preset, **options)
         arrays, parameters = build_arrays([Path(p) for p in paths], settings, progress)
         parameters["config"] = asdict(settings)
-        # as it will be read back: a tuple becomes a list
+        # as :meth:`load` will read it: a tuple becomes a list
         return cls(arrays, json.loads(json.dumps(parameters)))
 
     @classmethod

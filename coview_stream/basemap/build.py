@@ -106,7 +106,7 @@ def build_arrays(
         "crs": crs,
         "sources": {_label(path, paths): _sha256(path) for path in paths},
         "source_points": source_points,
-        "ground_filter": ground_filter(points),  # it differs between platforms
+        "ground_filter": ground_filter(points),  # depends on the platform
         "stations_below_another": int(below_another(stations, config.block).sum()),
         "learned": learned[1],
     }

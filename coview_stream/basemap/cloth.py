@@ -85,7 +85,7 @@ def _one_cloth(
     cloth.params.bSloopSmooth = slope_smooth
     cloth.params.cloth_resolution = resolution
     cloth.params.rigidness = rigidness
-    cloth.params.interations = iterations  # its own spelling
+    cloth.params.interations = iterations  # the wheel's spelling
     cloth.params.class_threshold = threshold
     kept, rest = csf.VecInt(), csf.VecInt()
     with _silence():
@@ -123,7 +123,7 @@ def _silence() -> Iterator[None]:
         yield
     finally:
         if libc is not None:
-            libc.fflush(None)  # before the descriptor comes back, or the buffer lands there
+            libc.fflush(None)  # before the descriptor comes back, or its buffer is written to the real output
         os.dup2(saved, 1)
         os.close(null)
         os.close(saved)

@@ -13,6 +13,7 @@ from coview_stream.geometry.arrays import Bools, Ints
 from coview_stream.geometry.rasters import cells, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
+# set by hand
 _SUBCELL = 0.5  # metres: airborne scans of 8 points/m2 still fill two
 _STEP = 0.1  # metres: height resolution of the columns
 _SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level

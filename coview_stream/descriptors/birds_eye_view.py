@@ -28,9 +28,7 @@ BIRDS_EYE_VIEW_VERSION = 1
 """To be raised when the same cloud gives another image: features are comparable only between equal versions."""
 
 # set by hand, and trained with: other values need other weights
-_LEVEL = (
-    0.25  # metres: a layer counts its occupied levels, not points, whose number depends on the scan's density
-)
+_LEVEL = 0.25  # metres: a layer counts its occupied levels, not its points, of which a denser scan has more
 _GROUND_CELL = 2.0  # metres
 _MAX_GROUND_HEIGHT = 0.4  # metres above the ground, below which a point is of the ground
 _GROUND_BAND = 0.8  # metres about the first estimate of the ground in which it is refined

@@ -20,9 +20,7 @@ _REACH = 36.0  # metres from a piece's middle within which queries stand: their 
 _ROTATED = 0.5  # share of the pieces that are rotated by any angle, not only by quarters
 _NARROWED = 0.4  # share of the queries that are cut at a random radius
 _SECTOR_LOST = 0.25  # share that lose a sector
-_FROM_MAP = (
-    0.1  # share that are cut from the map: a robot that drove all around a tree sees whole crowns as well
-)
+_FROM_MAP = 0.1  # share that are cut from the map: driving all around a tree shows its whole crown, too
 _RADIUS = 30.0  # metres, of a query
 _TRIES = 50
 

@@ -38,7 +38,7 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
     paths = end[:, None] + np.cumsum(step, axis=1) - step[:, :1]
     free = _clear(paths[:, ::_COARSE], obstacles) & (np.abs(paths[:, ::_COARSE]) < extent + 15).all(axis=2)
     reach = np.cumprod(free, axis=1).sum(axis=1)
-    best = int(np.argmax(reach))  # the first of those that go all the way
+    best = int(np.argmax(reach))  # the first of the longest
     kept = min(count, max(1, (int(reach[best]) - 1) * _COARSE + 1))
     return np.asarray(paths[best, :kept][::-1])
 

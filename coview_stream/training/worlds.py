@@ -21,7 +21,7 @@ from coview_stream.training.stands import draw_stand, tags
 from coview_stream.training.submaps import RADIUS, VOXEL, Frames, Submap, gathered, scanned
 
 _PLACE, _FLIGHT, _DRIVES = range(3)  # random streams
-_BEYOND = 8.0  # metres of forest beyond the map
+_BEYOND = 8.0  # metres of forest beyond the map; set by hand
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ _PENDING_POINTS = (
     200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
 )
 
-# OdometryCheck
+# of OdometryCheck
 _VOXEL = 1.0  # metres; set by hand
 _STRIDE = 2.0  # metres between the frames that others are compared with; set by hand
 _POINTS = 2000  # of a frame, compared; set by hand
@@ -67,7 +67,9 @@ class KeyframeBuffer:
 
     def voxelize(self, cloud: Points, T_odom_body: Pose) -> Points:
         """Reduce one frame (N, 3), body frame, to :attr:`newest`, without adding it to a keyframe."""
-        self.newest = self._filter(cloud, T_odom_body)[0].copy()  # which the next frame overwrites
+        self.newest = self._filter(cloud, T_odom_body)[
+            0
+        ].copy()  # the next frame overwrites the filter's array
         return self.newest
 
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:

@@ -13,7 +13,7 @@ from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval
 
-if TYPE_CHECKING:  # it imports SciPy, which takes a while
+if TYPE_CHECKING:  # imports SciPy, which takes a while
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
