@@ -1,4 +1,4 @@
-"""The node: threads and clocks around the pure sessions, between a transport and the engines.
+"""The node: endpoints of the robots on the network, and threads and clocks between their sessions and the engines.
 
 Who waits for whom: the transport's threads decode and queue; one thread feeds each engine and waits for it; the pose
 clock and the status clock wait for neither.
@@ -11,20 +11,24 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from coview_stream.config.node import NodeConfig
+from coview_stream.messages import encode_pose
+from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.node.counters import last_line
-from coview_stream.stream.node.endpoints import RobotEndpoints
 from coview_stream.stream.node.engine_process import DiedError, EngineRunner, FailedError, RejectedError
 from coview_stream.stream.node.jobs import Job
 from coview_stream.stream.node.scheduling import Rate, RoundRobin
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
+from coview_stream.stream.transport import rmw
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.transport import Transport
+from coview_stream.stream.transport.transport import Publisher, Transport
 
 log = logging.getLogger("coview_stream.node")
 
+_ROS_NODE = "coview_stream"
 _MAX_POSE_TICKS = 200.0  # of the pose clock, per second
 _MAX_RESTART_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
 _ERROR_PAUSE = 0.2  # seconds after an unexpected error
@@ -219,3 +223,89 @@ def _take_job(session: Session, engine: str) -> Job | None:
     if engine == "search":
         return session.take_search_request()
     return session.take_lidar_frame()
+
+
+class RobotEndpoints:
+    """One robot's subscriptions, queryables, publishers and liveliness tokens, around its session.
+
+    Args:
+        session: of the robot.
+        transport: where everything is declared.
+        reporter: publishes the robot's status.
+        wake_engines: called when there may be a job.
+        pose_format: codec of the poses; None leaves it to the robot's keys.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        transport: Transport,
+        reporter: Reporter,
+        wake_engines: Callable[[], None],
+        pose_format: str | None = None,
+    ) -> None:
+        self.session = session
+        self._transport = transport
+        self._reporter = reporter
+        self._wake_engines = wake_engines
+        self._pose_format = pose_format or session.keys.pose_format
+        self._bare = session.keys.bare and pose_format is None
+        self._publisher: Publisher | None = None
+
+    def declare(self, node_id: str, number: int) -> None:
+        """Declare everything; ``node_id`` is of our ROS node, and ``number`` of this robot there, from 1."""
+        keys, transport = self.session.keys, self._transport
+        self._publisher = self._pose_publisher(node_id, number)
+        self._reporter.declare(self.session)
+        if self.session.odometry_source == "robot":
+            transport.subscribe(keys.odometry, self.on_odometry, "all")
+        transport.subscribe(keys.cloud, self.on_cloud, "newest")
+        transport.answer(keys.relocalize, self.relocalize)
+        transport.answer(keys.reset, self.reset)
+        transport.announce(keys.alive)
+
+    def _pose_publisher(self, node_id: str, number: int) -> Publisher:
+        keys = self.session.keys
+        publisher = self._transport.publisher(keys.pose, "realtime")
+        if not keys.rmw:
+            return publisher
+        token = rmw.publisher_token(keys.pose, node_id, _ROS_NODE, number)
+        if number == 1:
+            self._transport.announce(rmw.node_token(int(keys.pose.split("/")[0]), node_id, _ROS_NODE))
+        self._transport.announce(token)
+        return rmw.RmwPublisher(publisher, token, time.time_ns)
+
+    def on_cloud(self, sample: Sample) -> None:
+        """Take in a cloud."""
+        self.session.on_cloud(sample, time.monotonic())
+        self._wake_engines()
+
+    def on_odometry(self, sample: Sample) -> None:
+        """Take in an odometry sample."""
+        self.session.on_odometry(sample, time.monotonic())
+        self._wake_engines()
+
+    def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
+        """Answer ``rpc/relocalize``."""
+        self.session.relocalize()
+        return self._answer()
+
+    def reset(self, parameters: dict[str, str]) -> dict[str, Any]:
+        """Answer ``rpc/reset``."""
+        self.session.reset()
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        self._reporter.changed.set()
+        state, reason = self.session.state()
+        return {"ok": True, "robot": self.session.keys.robot, "state": state.reported, "reason": reason}
+
+    def publish_pose(self, now: float) -> None:
+        """Let time pass in the session, and publish the pose if it is known."""
+        self.session.tick(now)
+        pose = self.session.pose()
+        if pose is not None and self._publisher is not None:
+            encoded = encode_pose(pose, self._pose_format)
+            self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
+            self._reporter.rates[self.session.keys.robot].add(now)
+        self._reporter.report_change(self.session)
