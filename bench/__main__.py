@@ -19,10 +19,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.harness.files import whole
 from bench.harness.rows import Row
 from bench.harness.suite import BENCHMARKS, Benchmark, counted, run
 from bench.harness.tables import HEAD, WIDTHS, cells, filled, line, machine, rule, suite_tables
+from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import CoViewError, InputError
 
 _BUSY = 0.7  # load average: someone else computes
@@ -161,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         own = _tables(name, rows, asked)
         print(*(f"\n{place}\n\n{text}" for place, text in own.items()), sep="\n")
         if asked.json:
-            with whole(asked.json) as part:
+            with atomic_path(asked.json) as part:
                 text = json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False)
                 part.write_text(f"{text}\n")
         if asked.write:

@@ -16,8 +16,9 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 
-from bench.harness.files import fingerprint, remembered_seconds, whole
+from bench.harness.files import fingerprint, remembered_seconds
 from bench.harness.worlds import MAPPER, SIMULATOR
+from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.config import MapConfig
 from coview_stream.geometry.arrays import Bools, Floats, Indices, Ints
 from coview_stream.geometry.transforms import Points
@@ -198,7 +199,7 @@ def _simulate(out: Path, world: World) -> None:
     out.mkdir(parents=True, exist_ok=True)
     np.save(out / "base.npy", _scanned(scene, world).astype(np.float32))
     np.save(out / "truth.npy", truth)
-    with whole(out / "frames.i16") as part, part.open("wb") as stream:
+    with atomic_path(out / "frames.i16") as part, part.open("wb") as stream:
         counts = [_write(stream, points) for points in frames(scene, world.config, truth)]
     np.save(out / "counts.npy", np.array(counts, dtype=np.int64))
 
