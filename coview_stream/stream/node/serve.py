@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("coview_stream.node")
 
+# the engines stand back: the pose clock and the receiving threads are in this process; set by hand
 _ODOMETRY_NICE = 2  # every pose waits for it
-_TRACK_NICE = 4  # the engines stand back: the pose clock and the receiving threads are in this process
+_TRACK_NICE = 4
 _SEARCH_NICE = 10
 
 
@@ -82,21 +83,11 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     missing = base_map.require_features(options.reloc)
     if missing is not None:
         log.warning("%s: %s", options.map_path, missing)
-    path, method = str(options.map_path), options.registration
     reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
-    engines = [
-        track := EngineProcess("track", path, base_map.sha256, _TRACK_NICE, registration=method, reloc=reloc),
-        search := EngineProcess(
-            "search", path, base_map.sha256, _SEARCH_NICE, registration=method, reloc=reloc
-        ),
-    ]
-    odometry = None
-    if options.lidar is not None:
-        odometry = EngineProcess("odometry", path, base_map.sha256, _ODOMETRY_NICE)
-        engines.append(odometry)
+    engines = _engine_processes(options, base_map.sha256, reloc)
     transport = None
     try:
-        for engine in engines:
+        for engine in engines.values():
             engine.start()
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
@@ -110,18 +101,19 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         warn_if_served_already(transport, options.keys)
         sessions = make_sessions(options, base_map.sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
-        if odometry is not None:
-            odometry.wait_ready(cancelled)
-        track.wait_ready(cancelled)  # the other one has until the first keyframe
+        for name, engine in engines.items():
+            if name != "search":  # which has until the first keyframe
+                engine.wait_ready(cancelled)
         if cancelled():
             raise CancelledError("the node is no longer wanted")
         background = {} if options.state is None else {"memory": LastPoseKeeper(options.state, sessions).run}
         node = Node(
-            sessions, transport, track, search, options.node, options.pose_codec, odometry, background
-        )
+            sessions, transport, engines["track"], engines["search"], options.node, options.pose_codec,
+            engines.get("odometry"), background,
+        )  # fmt: skip
         node.start()
     except BaseException as error:
-        for engine in engines:
+        for engine in engines.values():
             engine.close()
         if transport is not None:
             transport.close()
@@ -132,6 +124,17 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
     )
     return node
+
+
+def _engine_processes(options: ServeOptions, sha256: str, reloc: Reloc) -> dict[str, EngineProcess]:
+    """Return the engines by name; that of odometry, whose library may be missing, comes first."""
+    path, method = str(options.map_path), options.registration
+    engines = {}
+    if options.lidar is not None:
+        engines["odometry"] = EngineProcess("odometry", path, sha256, _ODOMETRY_NICE)
+    for name, nice in (("track", _TRACK_NICE), ("search", _SEARCH_NICE)):
+        engines[name] = EngineProcess(name, path, sha256, nice, registration=method, reloc=reloc)
+    return engines
 
 
 def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
