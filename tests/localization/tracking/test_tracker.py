@@ -157,6 +157,7 @@ def test_off_map_frame_is_not_compared(world_map, world_drive):
     verdict = refused(ride, world_drive.clouds[4], far)
     assert verdict.cause is RejectionReason.OFF_MAP
     assert "empty" in verdict.reason
+    assert ride.tracker._scans.newest is None
 
 
 @pytest.mark.parametrize("limit", [2.0, 0.5])
