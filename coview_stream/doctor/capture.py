@@ -1,9 +1,12 @@
-"""Messages received of a robot, described without their bytes; the modules ``*_checks`` judge them."""
+"""Messages received of robots, described without their bytes; the modules ``*_checks`` judge them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,15 +14,23 @@ import numpy as np
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import EncodingError, MessageError
 from coview_stream.geometry.transforms import Pose
-from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry
+from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry, prepare
 from coview_stream.messages.choose import Channel, codec_for
+from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.stream.node.counters import counter_of
 from coview_stream.stream.transport.keys import RobotKeys
+from coview_stream.stream.transport.transport import Transport
 
-_MAX_COORDINATE = (
-    1000.0  # metres, set by hand: no lidar reaches farther; bytes read in a wrong format are any size
-)
+Wait = Callable[[float], object]
+"""Passes some seconds."""
+
+Codecs = tuple[str | None, str | None]
+"""Codec of all clouds and of all odometry; None: as the messages name it."""
+
+# set by hand
+_MAX_MESSAGES = 20_000  # kept of a channel: enough for 30 s of the fastest IMU odometry
+_MAX_COORDINATE = 1000.0  # metres: no lidar reaches farther; bytes read in a wrong format are any size
 
 
 @dataclass(frozen=True)
@@ -78,6 +89,60 @@ class RobotCapture:
     alive: bool = False
     began: float = 0.0
     ended: float = 0.0
+
+
+def capture_robots(
+    transport: Transport,
+    keys: Sequence[RobotKeys],
+    seconds: float,
+    codecs: Codecs = (None, None),
+    wait: Wait = time.sleep,
+    clock: Callable[[], float] = time.monotonic,
+) -> list[RobotCapture]:
+    """Receive what robots send for ``seconds``.
+
+    Args:
+        transport: open transport.
+        keys: keys of each robot.
+        seconds: duration.
+        codecs: instead of those that the messages name.
+        wait: passes the time.
+        clock: local time, seconds.
+    """
+    prepare(*CLOUD_CODECS, *ODOMETRY_CODECS)
+    captures = [RobotCapture(k) for k in keys]
+    over = False
+
+    def keep(
+        messages: list[CapturedMessage], describe: Callable[[Sample, float], CapturedMessage]
+    ) -> Callable[[Sample], None]:
+        def handler(sample: Sample) -> None:
+            if not over and len(messages) < _MAX_MESSAGES:
+                messages.append(describe(sample, clock()))
+
+        return handler
+
+    def keep_status(capture: RobotCapture) -> Callable[[Sample], None]:
+        def handler(sample: Sample) -> None:
+            with contextlib.suppress(MessageError):
+                capture.status = read_status(sample)
+
+        return handler
+
+    for capture in captures:
+        k = capture.keys
+        capture.began = clock()
+        odometry = keep(capture.odometry, partial(capture_odometry, option=codecs[1], hint=k.odometry_hint))
+        transport.subscribe(k.odometry, odometry, "all")
+        clouds = keep(capture.clouds, partial(capture_cloud, option=codecs[0], hint=k.cloud_hint))
+        transport.subscribe(k.cloud, clouds, "all")
+        transport.subscribe(k.status, keep_status(capture), "all")
+    wait(seconds)
+    over = True
+    for capture in captures:
+        capture.ended = clock()
+        capture.alive = bool(transport.tokens(capture.keys.alive))
+    return captures
 
 
 def capture_cloud(

@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 
-from coview_stream.doctor.capture import CapturedMessage, RobotCapture, capture_cloud, capture_odometry
+from coview_stream.doctor.capture import Codecs, RobotCapture, Wait, capture_robots
 from coview_stream.doctor.channel_checks import cloud_findings, odometry_findings
 from coview_stream.doctor.cross_checks import cross_findings, node_finding
 from coview_stream.doctor.discovery import Candidate, discover, suggestion
 from coview_stream.doctor.finding import Finding
-from coview_stream.errors import MessageError
-from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, prepare
-from coview_stream.messages.json_messages import read_status
-from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import Connection, Transport
-
-Wait = Callable[[float], object]
-Codecs = tuple[str | None, str | None]
 
 # all set by hand, seconds
 _CONNECT_TIMEOUT = 2.0  # for a first connection to the given endpoints
 _LISTEN_TIMEOUT = 6.0  # for a first connection from outside: a client tries again every 1 to 4 s
 _POLL_PERIOD = 0.05
 _TCP_TIMEOUT = 1.0
-_MAX_MESSAGES = 20_000  # kept of a channel, set by hand: enough for 30 s of the fastest IMU odometry
 _OPEN = "is open, but no zenoh session came about"
 _TCP = re.compile(r"(?:tcp|tls|ws)/(\[[^\]]+\]|[^:/]+):(\d+)")
 
@@ -83,60 +73,6 @@ def _counts(connection: Connection) -> str:
     clients = len(connection.clients)
     counts = {"router": len(connection.routers), "peer": len(connection.peers) - clients, "client": clients}
     return ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
-
-
-def capture_robots(
-    transport: Transport,
-    keys: Sequence[RobotKeys],
-    seconds: float,
-    codecs: Codecs = (None, None),
-    wait: Wait = time.sleep,
-    clock: Callable[[], float] = time.monotonic,
-) -> list[RobotCapture]:
-    """Receive what robots send for ``seconds``.
-
-    Args:
-        transport: open transport.
-        keys: keys of each robot.
-        seconds: duration.
-        codecs: codec of all clouds and of all odometry, over what they name themselves; None goes by that.
-        wait: passes the time.
-        clock: local time, seconds.
-    """
-    prepare(*CLOUD_CODECS, *ODOMETRY_CODECS)
-    captures = [RobotCapture(k) for k in keys]
-    over = False
-
-    def keep(
-        messages: list[CapturedMessage], describe: Callable[[Sample, float], CapturedMessage]
-    ) -> Callable[[Sample], None]:
-        def handler(sample: Sample) -> None:
-            if not over and len(messages) < _MAX_MESSAGES:
-                messages.append(describe(sample, clock()))
-
-        return handler
-
-    def keep_status(capture: RobotCapture) -> Callable[[Sample], None]:
-        def handler(sample: Sample) -> None:
-            with contextlib.suppress(MessageError):
-                capture.status = read_status(sample)
-
-        return handler
-
-    for capture in captures:
-        k = capture.keys
-        capture.began = clock()
-        odometry = keep(capture.odometry, partial(capture_odometry, option=codecs[1], hint=k.odometry_hint))
-        transport.subscribe(k.odometry, odometry, "all")
-        clouds = keep(capture.clouds, partial(capture_cloud, option=codecs[0], hint=k.cloud_hint))
-        transport.subscribe(k.cloud, clouds, "all")
-        transport.subscribe(k.status, keep_status(capture), "all")
-    wait(seconds)
-    over = True
-    for capture in captures:
-        capture.ended = clock()
-        capture.alive = bool(transport.tokens(capture.keys.alive))
-    return captures
 
 
 def robot_findings(
