@@ -159,7 +159,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows.append(row)
             print(line(cells(row), WIDTHS), flush=True)
         own = _tables(name, rows, asked)
-        print(*(f"\n{place}\n\n{text}" for place, text in own.items()), sep="\n")
+        for place, text in own.items():
+            print(f"\n{place}\n\n{text}")
         if asked.json:
             with atomic_path(asked.json) as part:
                 text = json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False)

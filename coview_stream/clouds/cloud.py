@@ -26,7 +26,7 @@ COARSE_FLOAT32 = 1e6
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points and the float64 origin they are relative to.
+    """Points, and the float64 origin that they are relative to.
 
     Attributes:
         points: (N, 3) float32 metres, ``raw - origin``, subtracted in float64.
@@ -53,7 +53,7 @@ class Cloud:
 
 @dataclass
 class CloudBuilder:
-    """A cloud in the making, from chunks of raw coordinates; the first usable chunk decides the origin.
+    """Builder of a cloud from chunks of raw coordinates; the first usable chunk decides the origin.
 
     Attributes:
         crs: as of :class:`Cloud`.

@@ -44,7 +44,7 @@ def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0
 
 
 def voxel_grid(points: Points, voxel: float) -> Points:
-    """Centroids of the occupied voxels, in the order of their keys (x slowest, z fastest).
+    """Return the centroids of the occupied voxels, in the order of their keys (x slowest, z fastest).
 
     In NumPy because it is several times quicker than Open3D's filter on clouds of 10 M points, and its order
     does not depend on threads.
@@ -70,7 +70,7 @@ def voxel_grid(points: Points, voxel: float) -> Points:
 
 
 def _voxel_groups(points: Points, voxel: float) -> tuple[Indices, Indices]:
-    """Order of the points by voxel key, and where in that order each voxel begins."""
+    """Return the order of the points by voxel key, and where in that order each voxel begins."""
     low = np.floor(points.min(axis=0).astype(np.float64) / voxel)
     extent = np.floor(points.max(axis=0).astype(np.float64) / voxel) - low + 1
     if float(np.prod(extent)) > _MAX_CELLS:

@@ -95,7 +95,7 @@ def _truncated(path: Path, expected: int, found: int) -> str:
 
 
 def _crs(header: Any) -> str | None:
-    """WKT of the header where there is any (by pyproj if it is installed), else ``EPSG:code``, else None."""
+    """Return the header's WKT if it has one (by pyproj if installed), else ``EPSG:code``, else None."""
     if importlib.util.find_spec("pyproj") is not None:
         try:
             crs = header.parse_crs()

@@ -22,7 +22,7 @@ _DEBIAN_PACKAGES = {
 
 @functools.cache
 def open3d() -> ModuleType:
-    """Open3D, imported on first use (about a second) with its console output silenced.
+    """Import Open3D, on first use (about a second), with its console output silenced.
 
     Raises:
         DependencyError: Open3D or a system library that it links against is missing; the message names both

@@ -110,7 +110,7 @@ def _truncated(path: Path, header: _Header, found: int) -> CloudError:
 
 
 def _stack(columns: list[npt.NDArray[np.generic]]) -> Reals:
-    """(N, 3) in float32 if that is what the file holds, in float64 otherwise."""
+    """Stack to (N, 3), in float32 if that is what the file holds, in float64 otherwise."""
     dtype = np.float32 if all(column.dtype == np.float32 for column in columns) else np.float64
     return np.stack([column.astype(dtype, copy=False) for column in columns], axis=1)
 

@@ -152,7 +152,7 @@ def _binary(
 
 
 def _skip(content: bytes, start: int, order: str, element: _Element) -> int:
-    """Offset behind an element; rows with lists have no fixed size and are walked one by one."""
+    """Return the offset behind an element; rows with lists have no fixed size and are walked one by one."""
     if not element.has_list:
         return start + element.count * element.row(order).itemsize
     for _row in range(element.count):

@@ -15,20 +15,20 @@ _SMALL = 1e-8  # radians: below, the sine is the angle
 
 
 def nearest_rotation(R: Reals) -> Floats:
-    """Rotations (..., 3, 3) nearest to matrices (..., 3, 3) that are nearly rotations."""
+    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3) that are nearly rotations."""
     U, _, Vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
     return np.asarray(U @ Vt)
 
 
 def skew(v: Floats) -> Floats:
-    """Matrices (..., 3, 3) of the cross product with (..., 3)."""
+    """Return the matrices (..., 3, 3) of the cross product with (..., 3)."""
     K = np.zeros((*v.shape, 3))
     K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     return np.asarray(K - np.swapaxes(K, -1, -2))
 
 
 def exp_so3(rotvec: npt.ArrayLike) -> Floats:
-    """Rotations (..., 3, 3) about axes (..., 3) by their length, radians (Rodrigues' formula)."""
+    """Return the rotations (..., 3, 3) about axes (..., 3) by their length, radians (Rodrigues' formula)."""
     v = np.asarray(rotvec, dtype=np.float64)
     angle = np.sqrt((v * v).sum(axis=-1))[..., None, None]
     small = angle < _SMALL
@@ -40,7 +40,7 @@ def exp_so3(rotvec: npt.ArrayLike) -> Floats:
 
 
 def log_so3(R: Reals) -> Floats:
-    """Rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    """Return rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
     turn = matrix_to_quat(R)
     turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
     sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)
@@ -51,15 +51,13 @@ def log_so3(R: Reals) -> Floats:
 
 
 def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
     q = np.asarray(quaternions, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     R = np.empty((*q.shape[:-1], 3, 3))
-    R[..., 0, 0], R[..., 1, 1], R[..., 2, 2] = (
-        1 - 2 * (y * y + z * z),
-        1 - 2 * (x * x + z * z),
-        1 - 2 * (x * x + y * y),
-    )
+    R[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    R[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    R[..., 2, 2] = 1 - 2 * (x * x + y * y)
     R[..., 0, 1], R[..., 1, 0] = 2 * (x * y - z * w), 2 * (x * y + z * w)
     R[..., 0, 2], R[..., 2, 0] = 2 * (x * z + y * w), 2 * (x * z - y * w)
     R[..., 1, 2], R[..., 2, 1] = 2 * (y * z - x * w), 2 * (y * z + x * w)
@@ -88,6 +86,6 @@ def matrix_to_quat(R: Reals) -> Floats:
 
 
 def slerp(start: Reals, end: Reals, share: npt.ArrayLike) -> Floats:
-    """Rotations (..., 3, 3) a ``share`` (...) of the way from ``start`` to ``end`` (..., 3, 3), the short way round."""
+    """Return rotations (..., 3, 3), the ``share`` (...) of the way from ``start`` to ``end``, the short way round."""
     rotvec = log_so3(np.swapaxes(start, -1, -2) @ end)
     return np.asarray(start @ exp_so3(np.asarray(share, dtype=np.float64)[..., None] * rotvec))

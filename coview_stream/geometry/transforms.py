@@ -27,7 +27,7 @@ Points = npt.NDArray[np.float32]
 
 
 def pose_from(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Pose:
-    """Pose (4, 4) from a rotation matrix (3, 3) and a translation (3,) in metres."""
+    """Return the pose (4, 4) of a rotation matrix (3, 3) and a translation (3,) in metres."""
     T = np.eye(4)
     T[:3, :3] = np.asarray(rotation, dtype=np.float64)
     T[:3, 3] = np.asarray(translation, dtype=np.float64)
@@ -35,7 +35,7 @@ def pose_from(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Pose:
 
 
 def inverse(T: Pose) -> Pose:
-    """Inverse of a rigid transform, without a general matrix inversion."""
+    """Invert a rigid transform, without a general matrix inversion."""
     R_t = T[:3, :3].T
     return pose_from(R_t, -R_t @ T[:3, 3])
 
@@ -49,7 +49,7 @@ def transform(T: Pose, points: npt.NDArray[_Real]) -> npt.NDArray[_Real]:
 
 
 def norms(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) -> npt.NDArray[_Real]:
-    """Distance (N,) of each of (N, 3) points from ``origin`` (3,), by default the frame's, in the points' precision."""
+    """Return the distances (N,) of points (N, 3) from ``origin`` (3,), by default zero, in the points' precision."""
     # by columns: np.linalg.norm along the short axis takes ten times as long, for the same numbers
     x, y, z = (points[:, d].copy() if origin is None else points[:, d] - origin[d] for d in range(3))
     x *= x
@@ -61,13 +61,13 @@ def norms(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) 
 
 
 def rot_z(yaw: float) -> Floats:
-    """Rotation matrix (3, 3) about z by ``yaw`` radians."""
+    """Return the rotation matrix (3, 3) about z by ``yaw`` radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def yaw_of(T: Pose) -> float:
-    """Heading of a pose about z, radians in (-pi, pi]."""
+    """Return the heading of a pose about z, radians in (-pi, pi]."""
     return float(np.arctan2(T[1, 0], T[0, 0]))
 
 
@@ -77,7 +77,7 @@ def wrap_angle(angle: float) -> float:
 
 
 def rotation_angle(T: Pose) -> float:
-    """Angle of the rotation part, radians in [0, pi]."""
+    """Return the angle of the rotation part, radians in [0, pi]."""
     # the sine keeps its precision near zero, where the cosine of eq. 15 has none left
     R = T[:3, :3]
     sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
@@ -85,12 +85,12 @@ def rotation_angle(T: Pose) -> float:
 
 
 def tilt_of(T: Pose) -> float:
-    """Angle between the vertical axes of two frames, radians."""
+    """Return the angle between the vertical axes of two frames, radians."""
     return float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
 
 
 def orthonormal(T: Pose) -> Pose:
-    """``T`` with its rotation projected back onto SO(3) (drift from repeated products)."""
+    """Return ``T`` with its rotation projected back onto SO(3) (drift from repeated products)."""
     return pose_from(nearest_rotation(T[:3, :3]), T[:3, 3])
 
 
@@ -103,7 +103,7 @@ def is_pose(T: Reals) -> bool:
 
 
 def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:
-    """Poses (..., 4, 4) a ``share`` (...) of the way from one to another, both (..., 4, 4).
+    """Return poses (..., 4, 4), the ``share`` (...) of the way from ``T_start`` to ``T_end`` (..., 4, 4).
 
     The rotation turns at a constant rate the short way round, the position moves along a straight line. Shares outside
     [0, 1] extrapolate.
@@ -116,12 +116,12 @@ def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:
 
 
 def pose_to_tum(T: Pose) -> Floats:
-    """(7,) x y z qx qy qz qw of a pose."""
+    """Return (7,) x y z qx qy qz qw of a pose."""
     return np.concatenate([T[:3, 3], matrix_to_quat(T[:3, :3])])
 
 
 def pose_from_tum(row: npt.ArrayLike) -> Pose:
-    """Pose from (7,) x y z qx qy qz qw; the quaternion need not be normalised."""
+    """Return the pose of (7,) x y z qx qy qz qw; the quaternion need not be normalised."""
     values = np.asarray(row, dtype=np.float64)
     return pose_from(quat_to_matrix(values[3:]), values[:3])
 

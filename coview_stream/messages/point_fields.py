@@ -47,7 +47,7 @@ Field = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Table:
-    """``height`` rows of ``width`` points in a buffer; ``step`` and ``row_step`` bytes from one to the next."""
+    """Points in a buffer: ``height`` rows of ``width`` points, ``row_step`` and ``step`` bytes from one to the next."""
 
     data: memoryview | bytes | npt.NDArray[np.uint8]
     fields: tuple[Field, ...]

@@ -66,7 +66,7 @@ class Segment:
 
 
 class OdometryBuffer:
-    """The newest samples in order of their stamps (sensor time).
+    """Buffer of the newest samples in order of their stamps (sensor time).
 
     Attributes:
         newest: the newest sample, None before the first.

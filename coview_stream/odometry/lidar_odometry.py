@@ -53,7 +53,7 @@ class LidarOdometry:
     def __init__(
         self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None
     ) -> None:
-        """Begin with nothing; ``registration`` replaces kiss-icp.
+        """Start without a frame; ``registration`` replaces kiss-icp.
 
         Raises:
             DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
@@ -118,7 +118,7 @@ class LidarOdometry:
         return np.array(self._pose)
 
     def _begin(self, points: Points, stamp: float) -> Pose:
-        """Take gravity, and place the first frame."""
+        """Determine gravity, and place the first frame."""
         if self.config.gravity == "ground":
             found = find_ground(points)
             if isinstance(found, str):

@@ -38,7 +38,7 @@ def readable(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
 
 
 class BagReader:
-    """A recording, open until it is collected; messages are read while they are asked for.
+    """An open recording, closed when it is garbage-collected; messages are read one by one.
 
     rosbag2 directories (sqlite3 and mcap, several files, compressed or not), single ``.mcap`` and ``.db3`` files, and
     ROS 1 ``.bag`` files, whose messages are turned into CDR.

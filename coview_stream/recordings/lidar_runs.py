@@ -151,9 +151,11 @@ def open_bare_run(path: Path, cloud_topic: str | None = None) -> Run:
     if (bag := find_bag(path)) is not None:
         return open_bag(bag, None, cloud_topic, None, _identity_track)
     layout = find_layout(path)
-    told = read_stamps(layout)
-    notes = () if told is not None else (f"{path}: no times.txt; frames are taken for {_PERIOD:g} s apart",)
-    stamps = _PERIOD * np.arange(len(layout.frames), dtype=np.float64) if told is None else told
+    stamps = read_stamps(layout)
+    notes: tuple[str, ...] = ()
+    if stamps is None:
+        stamps = _PERIOD * np.arange(len(layout.frames), dtype=np.float64)
+        notes = (f"{path}: no times.txt; frames are taken for {_PERIOD:g} s apart",)
     return Run(path, layout.frames, stamps, _identities(len(stamps)), notes=notes)
 
 

@@ -100,3 +100,13 @@ def test_norms_equal_numpy_and_keep_the_input(dtype):
     np.testing.assert_allclose(found[1], np.linalg.norm(points - origin, axis=1), rtol=1e-6)
     np.testing.assert_array_equal(points, before)
     assert g.norms(points[:0]).shape == (0,)
+
+
+def test_interpolation_turns_at_a_constant_rate_and_extrapolates():
+    start, end = g.pose_from(g.rot_z(0.2), [1, 2, 3]), g.pose_from(g.rot_z(0.6), [3, 2, 1])
+    shares = np.array([-0.5, 0.0, 0.25, 1.0])
+    several = g.interpolate(np.tile(start, (4, 1, 1)), np.tile(end, (4, 1, 1)), shares)
+    for share, T in zip(shares, several, strict=True):
+        expected = g.pose_from(g.rot_z(0.2 + 0.4 * share), [1 + 2 * share, 2, 3 - 2 * share])
+        np.testing.assert_allclose(T, expected, atol=1e-12)
+        np.testing.assert_allclose(g.interpolate(start, end, share), expected, atol=1e-12)

@@ -35,7 +35,7 @@ _MAX_UNREAD_STATUSES = 100
 
 
 class RobotClient:
-    """Streams one robot to a node and receives its poses; a context manager.
+    """Streamer of one robot's frames to a node, and receiver of its poses; a context manager.
 
     >>> with RobotClient("rover1", "tcp/127.0.0.1:7447") as robot:     # doctest: +SKIP
     ...     robot.wait_for_node(10)                                    # samples sent before it runs are lost

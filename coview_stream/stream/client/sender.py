@@ -107,7 +107,7 @@ class Sender:
         self._odometry.put(message)
 
     def settle(self) -> None:
-        """Give the last frame time to leave: zenoh sends big ones in the background and forgets them at closing.
+        """Wait for the last frame to leave: zenoh sends large ones in the background and drops them at closing.
 
         Measured: of 1 MB frames put just before closing the session none arrived, and there is no call to flush.
         """

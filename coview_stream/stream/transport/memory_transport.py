@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class MemoryPublisher:
-    """Publishes on one key of a :class:`MemoryTransport`."""
+    """Publisher on one key of a :class:`MemoryTransport`."""
 
     def __init__(self, transport: MemoryTransport, key: str, urgency: Urgency) -> None:
         self.key = key

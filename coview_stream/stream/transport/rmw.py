@@ -60,7 +60,7 @@ def publisher_token(key: str, zid: str, node: str, entity_id: int, node_id: int 
 
 
 class RmwPublisher:
-    """Publisher in the way of a ROS 2 node: with the attachment, and without Encoding, as rmw_zenoh sets none.
+    """Publisher as a ROS 2 node has it: with the attachment, and without Encoding, as rmw_zenoh sets none.
 
     Args:
         inner: publishes the messages.

@@ -1,0 +1,42 @@
+"""Files that are complete or not there."""
+
+from __future__ import annotations
+
+import pytest
+
+from coview_stream.clouds.atomic_file import atomic_file, atomic_path
+
+
+@pytest.mark.parametrize("sync", [False, True])
+def test_atomic_file_replaces_the_old_one(tmp_path, sync):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with atomic_file(path, sync=sync) as stream:
+        stream.write(b"new")
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_atomic_file_keeps_the_old_one_after_an_error(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with pytest.raises(ValueError, match="half"), atomic_file(path) as stream:
+        stream.write(b"ne")
+        raise ValueError("half")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_atomic_path_uses_the_given_temporary_name(tmp_path):
+    path, temporary = tmp_path / "a.json", tmp_path / "a.part"
+    with atomic_path(path, temporary) as part:
+        assert part == temporary
+        part.write_text("{}")
+    assert path.read_text() == "{}"
+    assert not temporary.exists()
+
+
+def test_missing_directory_is_an_os_error(tmp_path):
+    with pytest.raises(OSError, match="no"), atomic_file(tmp_path / "no" / "a.bin"):
+        pass
