@@ -138,11 +138,6 @@ class HeightRaster:
     corner: Floats
     cell: float
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.top.shape[0], self.top.shape[1]
-
     def cells_of(self, xy: Reals) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         """Return row and column (M,) of the cells that hold (M, 2) positions."""
         index = np.floor((np.asarray(xy, dtype=np.float64) - self.corner) / self.cell).astype(np.int32)

@@ -14,7 +14,7 @@ def test_raster_cells_hold_max_height_and_voxel_count():
         [[0.1, 0.1, 1.0], [0.2, 0.2, 1.1], [0.3, 0.1, 4.0], [0.9, 0.1, -2.0], [0.1, 1.6, 0.3]], np.float32
     )
     raster = rasterise(points, np.array([0.0, 0.0]), cell=0.5, voxel=0.5, margin=1)
-    assert raster.shape == (5, 3)
+    assert raster.top.shape == (5, 3)
     # row along y, column along x; 1.0 and 1.1 share a voxel
     assert raster.count.tolist() == [[2, 1, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0]]
     assert raster.top[0, 0] == 4.0
@@ -46,8 +46,8 @@ def test_station_centres_are_cell_centres_of_an_aligned_raster(low, block, cell)
     rows, columns = raster.cells_of(centres)
     assert (rows >= 0).all()
     assert (columns >= 0).all()
-    assert rows.max() < raster.shape[0]
-    assert columns.max() < raster.shape[1]
+    assert rows.max() < raster.top.shape[0]
+    assert columns.max() < raster.top.shape[1]
     np.testing.assert_allclose(corner + cell * (np.column_stack([columns, rows]) + 0.5), centres, atol=1e-4)
 
 

@@ -85,7 +85,7 @@ def _query_spectra(
     if not (total > _EPSILON).all():
         raise ValueError("no cell of the query has a weight")
     images *= (1.0 / total)[:, None]
-    spectra = half_spectra(images, index.block, index.workers)
+    spectra = half_spectra(images, index.block)
     before = _QuerySpectra(np.conjugate(spectra), index.margin - half)
     return (before, _QuerySpectra(spectra, index.margin + half)) if in_pairs else (before,)
 
@@ -125,8 +125,8 @@ def _inverse(product: Complexes, index: FeatureIndex, query: _QuerySpectra) -> F
     """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
     size, last = index.block, query.first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
-    rows = fft.ifft(grid, axis=0, overwrite_x=True, workers=index.workers)[query.first : last]
-    return np.asarray(fft.irfft(rows, size, axis=1, workers=index.workers)[:, query.first : last])
+    rows = fft.ifft(grid, axis=0, overwrite_x=True)[query.first : last]
+    return np.asarray(fft.irfft(rows, size, axis=1)[:, query.first : last])
 
 
 def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:

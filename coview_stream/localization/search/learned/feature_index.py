@@ -38,7 +38,6 @@ class FeatureIndex:
         block: int = BLOCK,
         margin: int = MARGIN,
         max_bytes: int = MAX_BYTES,
-        workers: int = 1,
     ) -> None:
         """Cut the map and transform its blocks.
 
@@ -50,7 +49,6 @@ class FeatureIndex:
             block: cells of a block's edge, margins included.
             margin: cells that a query may reach from its middle.
             max_bytes: above it the spectra are not kept.
-            workers: threads of the transforms.
 
         Raises:
             ValueError: the map has no cells, the mask another shape, or the margins leave nothing of a block.
@@ -66,7 +64,7 @@ class FeatureIndex:
                 f"blocks of {block} cells with margins of {margin}: nothing is left between them"
             )
         self.corner = np.asarray(corner, dtype=np.float64)
-        self.cell, self.block, self.margin, self.workers = cell, block, margin, workers
+        self.cell, self.block, self.margin = cell, block, margin
         self.valid = block - 2 * margin
         """Edge of the valid part of a block, cells."""
         self.blocks_down = math.ceil(self.height / self.valid)
@@ -98,7 +96,7 @@ class FeatureIndex:
     def surveyed_spectra(self, blocks: Ints) -> Complexes:
         """Return half spectra (bins, len(blocks), 1) of the mask of surveyed cells."""
         cut = np.stack([self._cut(self.surveyed, k) for k in blocks], axis=-1).astype(np.float32)
-        return half_spectra(cut, self.block, self.workers)[..., None]
+        return half_spectra(cut, self.block)[..., None]
 
     def gapless(self, blocks: Ints) -> Bools:
         """Mask the blocks whose cells have all been surveyed, margin included."""
@@ -126,7 +124,7 @@ class FeatureIndex:
         out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.dimensions), dtype=np.complex64)
         for k, block in enumerate(blocks):  # one by one: intermediate arrays stay small
             cut = np.ascontiguousarray(self._cut(self._features, block).transpose(1, 2, 0))
-            out[:, k] = half_spectra(cut, self.block, self.workers)
+            out[:, k] = half_spectra(cut, self.block)
         return out
 
     def _cut(self, image: npt.NDArray[np.generic], block: int | np.integer) -> Floats32:
@@ -142,8 +140,8 @@ class FeatureIndex:
         return out
 
 
-def half_spectra(images: Floats32, size: int, workers: int) -> Complexes:
+def half_spectra(images: Floats32, size: int) -> Complexes:
     """Transform images (h, w, ...), zero-padded to ``size``, to half spectra (size * (size // 2 + 1), ...)."""
-    half = fft.rfft(images, size, axis=1, workers=workers)
-    whole = fft.fft(half, size, axis=0, overwrite_x=True, workers=workers)
+    half = fft.rfft(images, size, axis=1)
+    whole = fft.fft(half, size, axis=0, overwrite_x=True)
     return np.asarray(whole.reshape(-1, *images.shape[2:]))

@@ -33,31 +33,10 @@ class RigidFit2D:
     yaw: float
     residuals: Floats
 
-    @property
-    def rms(self) -> float:
-        """Root mean square of the residuals, metres."""
-        return float(np.sqrt(np.mean(self.residuals**2)))
-
-
-@dataclass(frozen=True)
-class KeypointMatch(RigidFit2D):
-    """Pose that pairs of keypoints agree on.
-
-    Attributes:
-        exact: whether it is proved that no more pairs agree with each other.
-    """
-
-    exact: bool
-
-    @property
-    def inliers(self) -> int:
-        """Number of pairs that agree with the pose."""
-        return len(self.residuals)
-
 
 def refine_by_keypoints(
     query: Keypoints, known: Keypoints, start: Start, config: LearnedMatchConfig | None = None
-) -> KeypointMatch | None:
+) -> RigidFit2D | None:
     """Match the keypoints of a query with those of the map around ``start``.
 
     Args:
@@ -67,7 +46,7 @@ def refine_by_keypoints(
         config: tolerances and what a match has to be.
 
     Returns:
-        None where too few pairs agree, or agree on something too far from ``start``.
+        The fit of the pairs that agree; None where they are too few, or too far from ``start``.
     """
     config = config or LearnedMatchConfig()
     near = known.around(start[:2], config.reach + config.max_shift)
@@ -76,15 +55,12 @@ def refine_by_keypoints(
     if len(pairs) < config.min_inliers:
         return None
     left, right = query.select(pairs[:, 0]), near.select(pairs[:, 1])
-    clique = maximum_clique(consistency_graph(left.xy, right.xy, config), config.nodes)
-    members = pairs[clique.members]
+    members = pairs[maximum_clique(consistency_graph(left.xy, right.xy, config), config.nodes).members]
     while len(members) >= config.min_inliers:
         found = _fit(query, near, members)
         fits = found.residuals < config.tolerance
         if fits.all():
-            if not _close(found, start, config):
-                return None
-            return KeypointMatch(found.x, found.y, found.yaw, found.residuals, clique.exact)
+            return found if _close(found, start, config) else None
         # distances alone do not tell a place from its mirror image, and a long clique may bend
         members = members[found.residuals < max(config.tolerance, float(np.median(found.residuals)))]
     return None
