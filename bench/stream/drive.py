@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bench.stream.wire import EPOCH_NS, Points
 from coview_stream.clouds import read_tum
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import interpolate
 from coview_stream.recordings.open_run import open_run
 
 RESTARTED = 1000.0  # seconds by which a robot's clock jumps back in phase ``restart``
@@ -165,10 +165,4 @@ class Drive:
 
 def _between(poses: Floats, at: float) -> Floats:
     low = min(int(at), len(poses) - 2)
-    share = at - low
-    a, b = poses[low], poses[low + 1]
-    T = np.eye(4)
-    turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
-    T[:3, :3] = a[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-    T[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
-    return T
+    return interpolate(poses[low], poses[low + 1], at - low)

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.stream.client.replay_schedule import ReplayConfig, odometry_spacing
     from coview_stream.stream.client.sender import Sender
     from coview_stream.stream.transport.keys import robot_keys
-    from coview_stream.stream.transport.rpc import open_client
+    from coview_stream.stream.transport.open_client import open_client
 
     if not args.wait >= 0:
         raise ConfigError(f"--wait {args.wait!r}: give seconds, 0 or more")

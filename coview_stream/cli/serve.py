@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import ServeOptions
     from coview_stream.stream.transport.keys import robot_keys
-    from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
+    from coview_stream.stream.transport.open_client import DEFAULT_ENDPOINT
 
     logging.basicConfig(
         level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.stream.client.fleet import FleetTable
-    from coview_stream.stream.transport.rpc import open_client
+    from coview_stream.stream.transport.open_client import open_client
 
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
@@ -190,7 +190,7 @@ class _Watch:
 
     def _print_silence(self) -> None:
         """Print the keys, the connections and the endpoints to which nothing has come."""
-        from coview_stream.stream.transport.rpc import DEFAULT_ENDPOINT
+        from coview_stream.stream.transport.open_client import DEFAULT_ENDPOINT
 
         connection = self._transport.connection()
         count = len(connection.routers) + len(connection.peers)

@@ -23,7 +23,7 @@ from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.fleet import STALE
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import RobotKeys, robot_keys
-from coview_stream.stream.transport.rpc import open_client
+from coview_stream.stream.transport.open_client import open_client
 from coview_stream.stream.transport.transport import Transport
 
 _log = logging.getLogger(__name__)
