@@ -10,14 +10,28 @@ import numpy as np
 
 from coview_stream.cli import build_parser
 from coview_stream.config import AcceptanceConfig
+from coview_stream.localization import localizer
 from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.search import global_search
 from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry, decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record
 from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.odometry import buffer
 from coview_stream.stream.client import client
+from coview_stream.stream.node import (
+    engine_process,
+    engine_queue,
+    engines,
+    frame_sync,
+    node,
+    robot_state,
+    session,
+    worker,
+)
 from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.robot_state import Transition
+from coview_stream.stream.transport import zenoh_io, zenoh_transport
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
@@ -38,6 +52,20 @@ def test_docs_list_every_preset_and_its_keys():
     native = robot_keys("native", "{base}", "{robot}")
     for key in (native.status, native.alive, native.relocalize, native.reset):
         assert f"`{key}`" in keys
+
+
+def test_figure_of_the_way_names_existing_functions():
+    figure = re.search(r"```text\n(.*?)```", section("The way of one cloud"), re.DOTALL)[1]
+    owners = (
+        zenoh_transport, zenoh_io, node, session, frame_sync, buffer, engine_queue, engine_process, engines, worker,
+        localizer, global_search, robot_state,
+    )  # fmt: skip
+    named = re.findall(r"\b(\w+)\.(\w+)\b", figure)
+    assert len(named) > 20
+    for owner, name in named:
+        homes = [getattr(m, owner) for m in owners if hasattr(m, owner)]
+        homes += [m for m in owners if m.__name__.endswith(f".{owner}")]
+        assert any(hasattr(home, name) for home in homes), f"{owner}.{name}"
 
 
 def test_docs_list_every_counter():
