@@ -1,4 +1,4 @@
-"""A robot that sends what a test says, as received by a checkup on a fake clock."""
+"""A robot that sends what a test says, as received by the doctor on a fake clock."""
 
 from __future__ import annotations
 
