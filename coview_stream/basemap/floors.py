@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from coview_stream.basemap.ground import GroundConfig, ground_mask
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Bools, Ints
 from coview_stream.geometry.rasters import cells, lowest_per_cell
@@ -44,40 +43,19 @@ class LevelConfig:
             raise ConfigError(f"area={self.area}, flatness={self.flatness}: need 0.25-10000 m2 and 0.01-1 m")
 
 
-def ground_levels(
-    points: Points,
-    cell: float = 2.0,
-    mask: Bools | None = None,
-    config: LevelConfig | None = None,
-    ground_config: GroundConfig | None = None,
-    floors: Points | None = None,
-) -> Points:
+def ground_levels(ground: Points, floors: Points, cell: float) -> Points:
     """Find the centres (K, 3) of all walkable ``cell``-sized squares, one for each level, metres.
 
-    The lowest level is the ground itself (``ground_mask``). A higher one counts only where it is a floor
-    *indoors*: flat, extended, with headroom, and covered by something flat within ``config.cover``. So an
-    upper storey counts, while a roof (nothing above), a bridge deck in the open, and a canopy (not flat) do
-    not. The price: an open parking deck or roof terrace is no level. Heights of upper levels are good to
-    0.1 m.
+    The lowest level is the ground itself. A higher one counts only where it is a floor *indoors*: flat, extended, with
+    headroom, and covered by something flat. So an upper storey counts, while a roof (nothing above), a bridge deck in
+    the open, and a canopy (not flat) do not. The price: an open parking deck or roof terrace is no level. Heights of
+    upper levels are good to 0.1 m.
 
     Args:
-        points: (N, 3) float32 metres, finite, z up.
-        cell: edge of the squares, whose centres are (k + 1/2) * cell.
-        mask: (N,) ground points if they are known already.
-        config: criteria of a floor.
-        ground_config: for ``ground_mask`` where ``mask`` is None.
-        floors: (F, 3) of :func:`indoor_floors` if they are known already; empty for the ground alone.
-
-    Raises:
-        ConfigError: ``cell`` is not positive, or the extent is absurd.
+        ground: (N, 3) float32 points on the ground, metres.
+        floors: (F, 3) of :func:`indoor_floors`; empty for the ground alone.
+        cell: edge of the squares, whose centres are (k + 1/2) * cell, metres.
     """
-    if not cell > 0:
-        raise ConfigError(f"cell={cell}: must be positive")
-    if not len(points):
-        return points.reshape(0, 3)
-    config = config or LevelConfig()
-    ground = points[ground_mask(points, ground_config) if mask is None else mask]
-    floors = indoor_floors(points, config) if floors is None else floors
     base = _squares(ground, cell)
     return np.concatenate([base, _upper_squares(floors, base, cell)])
 

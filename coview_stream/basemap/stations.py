@@ -43,7 +43,7 @@ def find_stations(points: Points, block: float, levels: bool = True) -> Floats32
     if not mask.any():
         return nothing
     floors = indoor_floors(points, _FLOORS) if levels else nothing
-    return ground_levels(points, block, mask, floors=floors)
+    return ground_levels(points[mask], floors, block)
 
 
 def describe_storeys(

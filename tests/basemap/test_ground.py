@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from coview_stream.basemap.cloth import cloth_available
-from coview_stream.basemap.floors import LevelConfig, ground_levels
+from coview_stream.basemap.floors import LevelConfig, ground_levels, indoor_floors
 from coview_stream.basemap.ground import GroundConfig, GroundRaster, ground_filter, ground_mask
 from coview_stream.errors import ConfigError, DependencyError
 from coview_stream.geometry.rasters import filled
@@ -165,8 +165,12 @@ def storeys() -> npt.NDArray[np.float32]:
     return np.concatenate(parts).astype(np.float32)
 
 
+def levels_of(points: npt.NDArray[np.float32], config: LevelConfig) -> npt.NDArray[np.float32]:
+    return ground_levels(points[ground_mask(points)], indoor_floors(points, config), 2.0)
+
+
 def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
-    levels = ground_levels(storeys, cell=2.0)
+    levels = levels_of(storeys, LevelConfig())
     ground, upper = levels[levels[:, 2] < 1], levels[levels[:, 2] >= 1]
     # the whole field, below the house, the bridge and the canopy too, once per square
     assert len(ground) == len(np.unique(ground[:, :2], axis=0)) == 30 * 30
@@ -180,14 +184,11 @@ def test_floors_of_a_house(storeys: npt.NDArray[np.float32]) -> None:
 
 def test_floors_need_extent_and_headroom(storeys: npt.NDArray[np.float32]) -> None:
     wide = LevelConfig(area=400.0)
-    assert (ground_levels(storeys, config=wide)[:, 2] < 1).all()
+    assert (levels_of(storeys, wide)[:, 2] < 1).all()
     high = LevelConfig(headroom=3.5)
-    assert (ground_levels(storeys, config=high)[:, 2] < 1).all()
-    assert ground_levels(np.zeros((0, 3), np.float32)).shape == (0, 3)
+    assert (levels_of(storeys, high)[:, 2] < 1).all()
     with pytest.raises(ConfigError, match="headroom"):
         LevelConfig(headroom=7.0)
-    with pytest.raises(ConfigError, match="cell"):
-        ground_levels(storeys, cell=0.0)
 
 
 @pytest.mark.slow
