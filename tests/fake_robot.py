@@ -66,11 +66,11 @@ def cloud(seconds, points=POINTS, codec="xyz", keys=KEYS, attachment=None, **fie
     return Sample(keys.cloud, encoded.payload, encoded.encoding, attachment or encoded.attachment)
 
 
-def query(seconds=0.0):
+def search_request(seconds=0.0):
     return SearchRequest(seconds, np.eye(4), POINTS, POINTS, POINTS)
 
 
-def verdict(seconds=0.0, reason="two places fit", accepted=None):
+def search_result(seconds=0.0, reason="two places fit", accepted=None):
     return SearchResult(accepted, KeyframeEvidence(seconds, State.AMBIGUOUS, reason))
 
 

@@ -58,9 +58,7 @@ class RobotState:
         self._hint.begin_epoch()
         self._fix: Fix | None = None
         self._correction: OdomCorrection | None = None
-        self._verify_from_ns: int | None = (
-            None  # a frame of this stamp or a later one has to verify the place
-        )
+        self._verify_from_ns: int | None = None  # frames from this stamp on may verify the place
         self._published: PoseMessage | None = None
 
     @property
@@ -96,6 +94,7 @@ class RobotState:
             if self._verify_from_ns is None:
                 self._correct(OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned))
             return
+        # an engine that holds no place any more has given it up, even if it says so with another state
         given_up = fix.state is State.LOST or (self.state.has_place and not fix.state.has_place)
         if (given_up or fix.state.has_place) and self.state is not State.LOST:
             self._apply(Event.PLACE_ACCEPTED)  # with this frame, and doubted or given up at once

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 
-from fake_robot import SHA, cloud, odometry, tracking, verdict
+from fake_robot import SHA, cloud, odometry, search_result, tracking
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.messages import decode_pose
@@ -35,7 +35,7 @@ class Engine:
         self.served.append(job.robot)
         if job.robot in self.failing:
             raise self.failing[job.robot]
-        return self.answer(job) if isinstance(job, FrameJob) else verdict()
+        return self.answer(job) if isinstance(job, FrameJob) else search_result()
 
     def forget(self, robot):
         pass

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from fake_node import STEP, Site, publish_statuses
-from fake_robot import ns, query, unknown
+from fake_robot import ns, search_request, unknown
 from sockets import until
 
 from coview_stream.config.node import NodeConfig
@@ -102,7 +102,7 @@ def test_repeated_engine_restart_reason_is_reported(pair, engine, caplog):
     if engine == "track":
         for name in ("r1", "r2"):
             pair.frame(name, 0.0)
-    pair.engine.answer = lambda job: unknown(job, ask=query())
+    pair.engine.answer = lambda job: unknown(job, ask=search_request())
     pair.node._stopping.wait = lambda seconds: True  # no pauses
     for k, text in enumerate(["it died", REPLACED, REPLACED, REPLACED], 1):
         getattr(pair, engine).run = die(text)
@@ -126,7 +126,7 @@ def test_engine_death_is_reported_before_first_frame(site):
 
 def test_dead_search_engine_loses_no_place(pair):
     def ask(job):
-        return unknown(job, ask=query())
+        return unknown(job, ask=search_request())
 
     pair.frame("r1", 0.0)
     pair.engine.answer = ask
@@ -165,7 +165,7 @@ def test_search_engine_failure_is_reported(site):
         def forget(self, robot):
             pass
 
-    site.engine.answer = lambda job: unknown(job, ask=query())
+    site.engine.answer = lambda job: unknown(job, ask=search_request())
     site.search.engine = Broken()
     for k in range(5):
         site.frame("r1", STEP * k)

@@ -13,11 +13,11 @@ from fake_robot import (
     ns,
     numbered,
     odometry,
-    query,
+    search_request,
+    search_result,
     state,
     tracking,
     unknown,
-    verdict,
 )
 
 from coview_stream.config.node import NodeConfig
@@ -179,15 +179,15 @@ def test_missing_frames_by_sequence_number_are_counted(robot):
 
 
 def test_searches_and_skipped_searches_are_counted(robot):
-    robot.frame(0.0, unknown, ask=query(0.0))
+    robot.frame(0.0, unknown, ask=search_request(0.0))
     job = robot.session.take_search_request()
     assert job.request.stamp == 0.0
-    robot.frame(0.1, unknown, ask=query(0.1))
+    robot.frame(0.1, unknown, ask=search_request(0.1))
     assert robot.session.take_search_request() is None  # one at a time
     assert robot.counters.searches_skipped == 0
-    robot.frame(0.2, unknown, ask=query(0.2))
+    robot.frame(0.2, unknown, ask=search_request(0.2))
     assert (robot.counters.searches_skipped, robot.counters.searches) == (1, 0)
-    robot.session.handle_result(job, verdict(), robot.now)
+    robot.session.handle_result(job, search_result(), robot.now)
     assert robot.counters.searches == 1
     assert robot.session.take_search_request().request.stamp == 0.2
     assert robot.session.take_search_request() is None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from fake_robot import KEYS, Robot, counted, query, state, tracking, unknown, verdict
+from fake_robot import KEYS, Robot, counted, search_request, search_result, state, tracking, unknown
 
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
@@ -49,7 +49,7 @@ def test_reset_clears_the_session(robot):
 
 @pytest.mark.parametrize("how", ["begin_anew", "reset", "jump"])
 def test_results_of_old_epoch_are_ignored(robot, how):
-    robot.frame(0.0, unknown, ask=query(0.0))
+    robot.frame(0.0, unknown, ask=search_request(0.0))
     searching = robot.session.take_search_request()
     robot.drive(0.05, 0.2)
     robot.saw(0.15)
@@ -62,7 +62,7 @@ def test_results_of_old_epoch_are_ignored(robot, how):
         robot.moved(0.25, x=500.0)
     robot.session.handle_result(busy, tracking(busy), robot.now)
     assert robot.session.pose() is None
-    robot.session.handle_result(searching, verdict(accepted="a place"), robot.now)
+    robot.session.handle_result(searching, search_result(accepted="a place"), robot.now)
     far = 500.0 if how == "jump" else 0.6
     robot.moved(0.3, x=far)
     robot.moved(0.35, x=far)
@@ -71,7 +71,7 @@ def test_results_of_old_epoch_are_ignored(robot, how):
     assert job.search_result is None
     assert job.epoch > busy.epoch
     # the old frame's end does not end the new one
-    robot.session.handle_result(job, unknown(job, ask=query(1.0)), robot.now)
+    robot.session.handle_result(job, unknown(job, ask=search_request(1.0)), robot.now)
     assert robot.session.take_search_request().epoch == job.epoch
 
 
@@ -91,16 +91,16 @@ def test_failure_of_old_epoch_does_not_end_running_frame(robot):
 
 
 def test_search_result_goes_with_the_next_frame_once(robot):
-    robot.frame(0.0, unknown, ask=query(0.0))
-    said = verdict()
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    said = search_result()
     robot.session.handle_result(robot.session.take_search_request(), said, robot.now)
     assert robot.frame(0.1, unknown).search_result is said
     assert robot.frame(0.2, unknown).search_result is None
 
 
 def test_search_result_is_kept_when_frame_is_rejected(robot):
-    robot.frame(0.0, unknown, ask=query(0.0))
-    said = verdict()
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    said = search_result()
     robot.session.handle_result(robot.session.take_search_request(), said, robot.now)
     robot.drive(0.05, 0.2)
     robot.saw(0.1)
@@ -110,9 +110,9 @@ def test_search_result_is_kept_when_frame_is_rejected(robot):
 
 
 def test_failed_search_skips_only_its_keyframe(robot):
-    robot.frame(0.0, unknown, ask=query(0.0))
+    robot.frame(0.0, unknown, ask=search_request(0.0))
     robot.session.handle_failure(robot.session.take_search_request(), "boom")
-    assert robot.frame(0.1, unknown, ask=query(0.1)).search_result is None
+    assert robot.frame(0.1, unknown, ask=search_request(0.1)).search_result is None
     assert robot.session.take_search_request() is not None
 
 

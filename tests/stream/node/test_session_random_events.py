@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fake_robot import KEYS, Robot, cloud, ends, query, tracking, unknown, verdict
+from fake_robot import KEYS, Robot, cloud, ends, search_request, search_result, tracking, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -75,7 +75,7 @@ class Chaos:
                 self.searches.append(search)
         elif event == "searched" and self.searches:
             if value:
-                session.handle_result(self.searches.pop(0), verdict(), self.now)
+                session.handle_result(self.searches.pop(0), search_result(), self.now)
             else:
                 session.handle_failure(self.searches.pop(0), "boom")
         elif event == "done" and self.jobs:
@@ -93,7 +93,7 @@ class Chaos:
     def answer(self, job, state):
         known = state is State.TRACKING
         self.session.handle_result(
-            job, tracking(job) if known else unknown(job, state, ask=query()), self.now
+            job, tracking(job) if known else unknown(job, state, ask=search_request()), self.now
         )
 
     def hold(self):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fake_node import Site
-from fake_robot import DRIFT, Robot, ns, numbered, pose, query, tracking, unknown, verdict
+from fake_robot import DRIFT, Robot, ns, numbered, pose, search_request, search_result, tracking, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_world import pose_error
@@ -35,10 +35,10 @@ def test_frame_result_of_before_reset_is_ignored():
 
 def test_search_result_of_before_reset_is_ignored():
     robot = Robot()
-    robot.frame(0.0, unknown, ask=query(0.0))
+    robot.frame(0.0, unknown, ask=search_request(0.0))
     job = robot.session.take_search_request()
     robot.session.reset()
-    robot.session.handle_result(job, verdict(), robot.now)
+    robot.session.handle_result(job, search_result(), robot.now)
     assert robot.counters.searches == 0
 
 
@@ -136,15 +136,19 @@ def test_late_cloud_covariance_includes_odometry_since():
     np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)
 
 
-@pytest.mark.parametrize("second", [None, verdict(1.0)])
+@pytest.mark.parametrize("second", [None, search_result(1.0)])
 def test_accepted_search_result_is_not_replaced(second):
     robot = Robot()
-    robot.frame(0.0, unknown, ask=query(0.0))
+    robot.frame(0.0, unknown, ask=search_request(0.0))
     first = robot.session.take_search_request()
-    robot.frame(0.1, unknown, ask=query(0.1))
-    accepted = verdict(0.0, accepted="a place")
+    robot.frame(0.1, unknown, ask=search_request(0.1))
+    accepted = search_result(0.0, accepted="a place")
     robot.session.handle_result(first, accepted, robot.now)
-    robot.session.handle_result(robot.session.take_search_request(), second, robot.now)
+    job = robot.session.take_search_request()
+    if second is None:
+        robot.session.handle_failure(job, "boom")
+    else:
+        robot.session.handle_result(job, second, robot.now)
     assert robot.frame(0.2, unknown).search_result is accepted
 
 
