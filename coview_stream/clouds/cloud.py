@@ -15,7 +15,7 @@ from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
 
 LOCAL_LIMIT = 10_000.0
-"""Coordinates below this (metres) keep a zero origin: float32 still resolves 1 mm there."""
+"""Coordinates below this (metres), set by hand, keep a zero origin: float32 still resolves 1 mm there."""
 
 ORIGIN_STEP = 100.0
 """An origin is a multiple of this (metres), so that neighbouring tiles have readable, exact offsets."""

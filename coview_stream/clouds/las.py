@@ -18,7 +18,7 @@ from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.errors import CloudError
 
 CHUNK = 1_000_000
-"""Points per chunk: about 100 MB of float64 and record buffers at a time."""
+"""Points per chunk, set by hand: about 100 MB of float64 and record buffers at a time."""
 
 NOISE_CLASSES = (7, 18)
 """ASPRS classes low and high noise."""

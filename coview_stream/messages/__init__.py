@@ -57,7 +57,7 @@ M = TypeVar("M")
 
 @dataclass(frozen=True)
 class Codec(Generic[M]):
-    """The two directions of one encoding on one channel."""
+    """One encoding on one channel, in both directions."""
 
     decode: Callable[[Sample], M]
     encode: Callable[[M], Encoded]

@@ -36,7 +36,7 @@ from coview_stream.messages.validation import check_points
 TIME_NAMES = ("time", "t", "time_offset", "offset_time", "timestamp")
 RING_NAMES = ("ring", "line", "channel")
 MAX_FIELDS = 256
-"""Fields of a point beyond which a message is taken for an attack; real ones have four to ten."""
+"""Fields of a point beyond which a message is refused as an attack, set by hand; real ones have four to ten."""
 
 _KNOWN = frozenset(("x", "y", "z", *TIME_NAMES, *RING_NAMES))
 _MAX_SWEEP = 1.0  # seconds, set by hand: no lidar frame lasts longer
@@ -47,7 +47,16 @@ Field = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Table:
-    """Points in a buffer: ``height`` rows of ``width`` points, ``row_step`` and ``step`` bytes from one to the next."""
+    """Points in a buffer, in rows.
+
+    Attributes:
+        data: the buffer.
+        fields: of each point.
+        step: bytes from one point to the next.
+        width: points in a row.
+        height: rows.
+        row_step: bytes from one row to the next; of no account with one row.
+    """
 
     data: memoryview | bytes | npt.NDArray[np.uint8]
     fields: tuple[Field, ...]

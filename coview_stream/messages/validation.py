@@ -15,10 +15,10 @@ from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages.types import PoseMessage
 
 MAX_PAYLOAD = 64 * 2**20
-"""Bytes of the largest payload that is decoded."""
+"""Bytes of the largest payload that is decoded; set by hand."""
 
 MAX_POINTS = 4_000_000
-"""Points of the largest cloud that is decoded."""
+"""Points of the largest cloud that is decoded; set by hand."""
 
 _NANO = 1_000_000_000
 
