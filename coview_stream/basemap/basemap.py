@@ -178,7 +178,7 @@ class BaseMap:
                 if load:
                     from coview_stream.descriptors.network import network
 
-                    network("ground", None, 1)
+                    network("ground", 1)
             elif reloc == "learned":
                 raise MapError(
                     "the map has no learned features; build it again without --no-learned, or go without "

@@ -6,7 +6,6 @@ Windows overlap by more than the network's reach, so the result does not depend 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,7 +35,6 @@ Windows = dict[tuple[int, int], Image]
 def feature_arrays(
     points: Points,
     progress: Callable[[int, int], None] | None = None,
-    directory: Path | None = None,
     window: int = WINDOW,
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the arrays ``learned.*`` of a map, and the parameters that name the weights and the cell.
@@ -44,13 +42,12 @@ def feature_arrays(
     Args:
         points: (N, 3) the map's cloud, metres, z up, relative to the map's origin.
         progress: called with windows done and all windows.
-        directory: of the weights; None for those of the package.
         window: metres at a time, a multiple of 32.
 
     Raises:
         DependencyError: no onnxruntime. InputError: no weights.
     """
-    encoder = network("aerial", directory)
+    encoder = network("aerial")
     low = np.floor(points[:, :2].min(axis=0) / TILE).astype(np.int64) * TILE
     high = (np.floor(points[:, :2].max(axis=0) / TILE).astype(np.int64) + 1) * TILE
     drawn = _drawn(points, low, high, window)
@@ -63,7 +60,7 @@ def feature_arrays(
         if progress:
             progress(done + 1, len(drawn))
     arrays = {f"learned.{name}": np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return arrays, {"weights": weights_sha256(directory), "cell": LOCAL_CELL}
+    return arrays, {"weights": weights_sha256(), "cell": LOCAL_CELL}
 
 
 def _drawn(points: Points, low: Ints, high: Ints, window: int) -> Windows:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -123,16 +122,16 @@ class FeatureMap:
             whole[:, rows, columns] = means(np.asarray(tile), ratio)
         return whole, np.asarray(self.index.low * (TILE * LOCAL_CELL), dtype=np.float64)
 
-    def check(self, directory: Path | None = None) -> None:
+    def check(self) -> None:
         """Refuse to compare these features with those of another network.
 
         Raises:
-            MapError: they were made by other weights than those in ``directory`` (the package's), or of
-                images of another version. InputError: there are no weights.
+            MapError: they were made by other weights than the installed ones, or of images of another version.
+            InputError: there are no weights.
         """
         for view in VIEW_NAMES:
-            weights_file(view, directory)
-        here = weights_sha256(directory)
+            weights_file(view)
+        here = weights_sha256()
         if here != self.weights:
             raise MapError(
                 f"the map's learned features are of other weights ({self.weights[:12]}) than the installed ones "
@@ -147,11 +146,11 @@ def means(tile: Int8s, ratio: int) -> Floats32:
     return np.ascontiguousarray(blocks.mean(axis=(1, 3)).transpose(2, 0, 1) * np.float32(1.0 / 127.0))
 
 
-@lru_cache(maxsize=4)
-def weights_sha256(directory: Path | None = None) -> str:
+@lru_cache(maxsize=1)
+def weights_sha256() -> str:
     """Return the sha256 of both networks' weights and the images' version; empty if a network has no weights."""
     try:
-        parts = [file_sha256(weights_file(view, directory)) for view in VIEW_NAMES]
+        parts = [file_sha256(weights_file(view)) for view in VIEW_NAMES]
     except InputError:
         return ""
     return hashlib.sha256("\n".join([*parts, str(BIRDS_EYE_VIEW_VERSION)]).encode()).hexdigest()

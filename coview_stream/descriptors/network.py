@@ -101,7 +101,7 @@ class Network:
 
 
 @lru_cache(maxsize=4)
-def network(view: ViewName, directory: Path | None = None, threads: int | None = None) -> Network:
+def network(view: ViewName, threads: int | None = None) -> Network:
     """Return the encoder of a view, loaded once; without ``threads`` it has as many as the kernels have.
 
     Raises:
@@ -112,7 +112,7 @@ def network(view: ViewName, directory: Path | None = None, threads: int | None =
             threads = workers()
         except ValueError as error:
             raise ConfigError(str(error)) from error
-    return Network(view, directory, threads)
+    return Network(view, threads=threads)
 
 
 def weights_directory() -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -68,32 +67,25 @@ class FeatureMatcher:
     """
 
     def __init__(
-        self,
-        features: FeatureMap,
-        stations: Floats32,
-        config: LearnedConfig,
-        directory: Path | None = None,
-        *,
-        block: float = 2.0,
+        self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0
     ) -> None:
         """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
 
         Raises:
-            MapError: they were made by other weights than those in ``directory`` (the package's).
+            MapError: the features were made by other weights than the installed ones.
             InputError: there are no weights.
         """
-        features.check(directory)
+        features.check()
         self.features = features
         self.stations = stations
         self.config = config
         self.match_config = LearnedMatchConfig(reach=config.reach)
         self._block = block
-        self._directory = directory
 
     @cached_property
     def network(self) -> Network:
         """The ground encoder; one thread is enough for 64 m."""
-        return network("ground", self._directory, 1)
+        return network("ground", 1)
 
     @cached_property
     def index(self) -> FeatureIndex:
