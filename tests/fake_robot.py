@@ -14,7 +14,7 @@ from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
-from coview_stream.localization.tracking.odometry_noise import Drift
+from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages import encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.stream.node.jobs import FrameResult

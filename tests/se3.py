@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.transforms import Pose, pose_from
+from coview_stream.geometry.transforms import Pose, exp_so3, pose_from
 
 
 def exp_se3(xi: npt.NDArray[np.float64]) -> Pose:

@@ -19,7 +19,7 @@ from coview_stream.geometry.arrays import Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.scan_matcher import ScanInput
+from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.refinement import Candidate, Refinement

@@ -26,8 +26,7 @@ from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Told, errors
 from coview_stream.config import LocalizerConfig, Reloc
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 from coview_stream.report.evaluation import driven
 from coview_stream.sim import SimulationConfig
 from coview_stream.training.recipe import Recipe

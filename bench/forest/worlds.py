@@ -20,8 +20,7 @@ import numpy as np
 from bench.harness.files import fingerprint, folder, remembered
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, pose_from
 from coview_stream.report.evaluation import driven
 from coview_stream.training.recipe import Recipe
 

@@ -30,7 +30,8 @@ Times = dict[str, float]
 def stages() -> list[tuple[str, Any, str]]:
     """Return what is timed: name in the table, and where the function is looked up."""
     from coview_stream.localization import localizer
-    from coview_stream.localization.registration import local_map, scan_matcher, verification
+    from coview_stream.localization.registration import local_map, verification
+    from coview_stream.localization.registration import register as registration
     from coview_stream.localization.tracking import tracker
 
     return [
@@ -39,9 +40,9 @@ def stages() -> list[tuple[str, Any, str]]:
         ("match to map", localizer.Tracker, "match_to_map"),
         ("  crop of the map", local_map.LocalMaps, "around"),
         ("  points to register", tracker, "prepare_scan"),
-        ("  registration", scan_matcher, "register"),
-        ("  rays of the newest frame", scan_matcher.RangeImage, "of"),
-        ("  verification", scan_matcher, "verify"),
+        ("  registration", registration, "register"),
+        ("  rays of the newest frame", registration.RangeImage, "of"),
+        ("  verification", registration, "verify"),
         ("    nearest map points", verification.kernels, "nearest"),
         ("    rays against the map", verification, "free_space"),
     ]

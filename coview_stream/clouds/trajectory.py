@@ -11,8 +11,7 @@ import numpy as np
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import InputError, RunError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import nearest_rotation, quat_to_matrix
-from coview_stream.geometry.transforms import Pose, Poses, pose_to_tum
+from coview_stream.geometry.transforms import Pose, Poses, nearest_rotation, pose_to_tum, quat_to_matrix
 from coview_stream.geometry.validation import MAX_COORDINATE
 
 _TUM_COLUMNS = 8

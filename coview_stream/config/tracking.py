@@ -21,7 +21,7 @@ class TrackingConfig:
     the last two metres (seen once on worlds 5103 and 5106, no command prints it).
 
     Drifts are sigmas of a random walk per square root of a metre driven, with which
-    :class:`coview_stream.localization.tracking.odometry_noise.DriftEstimator` begins before it measures them. All are
+    :class:`coview_stream.localization.tracking.motion.DriftEstimator` begins before it measures them. All are
     set by hand.
 
     Attributes:

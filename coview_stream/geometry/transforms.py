@@ -1,7 +1,15 @@
-"""Rigid transforms in 3-D, as 4x4 float64 matrices.
+"""Rigid transforms in 3-D: rotations, poses as 4x4 float64 matrices, and small motions with their covariances.
 
 ``T_target_source`` maps coordinates of the *source* frame into the *target* frame:
-``p_target = T_target_source @ p_source``. Metres and radians throughout.
+``p_target = T_target_source @ p_source``. Metres and radians throughout; quaternions are x, y, z, w. Rotations come
+single or in stacks; SciPy has them too, but importing it takes half a second of the two in which a node should be ready.
+
+A small motion of a pose has six numbers (rx, ry, rz, x, y, z) *along the map's axes*: the body turns about its own
+origin, then it is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the right,
+``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes; gtsam's Pose3 has the same. To first order,
+which is all that a covariance says, both name the same motions: r = R xi_r and s = R xi_t. So a covariance goes from one
+to the other by the rotation alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its lever arm [t]x R, would belong
+to turning about the map's origin.)
 """
 
 from __future__ import annotations
@@ -12,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.arrays import Floats, Reals
-from coview_stream.geometry.rotations import matrix_to_quat, nearest_rotation, quat_to_matrix, slerp
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -24,6 +31,85 @@ Poses = npt.NDArray[np.float64]
 
 Points = npt.NDArray[np.float32]
 """(N, 3) float32 coordinates near the origin of their frame, metres."""
+
+_SMALL = 1e-8  # radians: below, the sine is the angle
+
+
+def nearest_rotation(R: Reals) -> Floats:
+    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3) that are nearly rotations."""
+    U, _, Vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
+    return np.asarray(U @ Vt)
+
+
+def skew(v: Floats) -> Floats:
+    """Return the matrices (..., 3, 3) of the cross product with (..., 3)."""
+    K = np.zeros((*v.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return np.asarray(K - np.swapaxes(K, -1, -2))
+
+
+def exp_so3(rotvec: npt.ArrayLike) -> Floats:
+    """Return the rotations (..., 3, 3) about axes (..., 3) by their length, radians (Rodrigues' formula)."""
+    v = np.asarray(rotvec, dtype=np.float64)
+    angle = np.sqrt((v * v).sum(axis=-1))[..., None, None]
+    small = angle < _SMALL
+    safe = np.where(small, 1.0, angle)
+    sine = np.where(small, 1.0, np.sin(safe) / safe)
+    cosine = np.where(small, 0.5, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)
+    K = skew(v)
+    return np.asarray(np.eye(3) + sine * K + cosine * (K @ K))
+
+
+def log_so3(R: Reals) -> Floats:
+    """Return rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    turn = matrix_to_quat(R)
+    turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, turn[..., 3:])
+    return np.asarray(
+        turn[..., :3] * np.where(sine < _SMALL, 2.0, angle / np.where(sine < _SMALL, 1.0, sine))
+    )
+
+
+def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
+    q = np.asarray(quaternions, dtype=np.float64)
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    R = np.empty((*q.shape[:-1], 3, 3))
+    R[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    R[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    R[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    R[..., 0, 1], R[..., 1, 0] = 2 * (x * y - z * w), 2 * (x * y + z * w)
+    R[..., 0, 2], R[..., 2, 0] = 2 * (x * z + y * w), 2 * (x * z - y * w)
+    R[..., 1, 2], R[..., 2, 1] = 2 * (y * z - x * w), 2 * (y * z + x * w)
+    return R
+
+
+def matrix_to_quat(R: Reals) -> Floats:
+    """Return unit quaternions (..., 4) of rotation matrices (..., 3, 3); the largest component is positive."""
+    M = np.asarray(R, dtype=np.float64)
+    xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
+    x, y, z = M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]
+    xy, xz, yz = M[..., 0, 1] + M[..., 1, 0], M[..., 0, 2] + M[..., 2, 0], M[..., 1, 2] + M[..., 2, 1]
+    # row k is 4 q_k q: each is right, the one of the largest component is right to the last digit
+    rows = np.stack(
+        [
+            np.stack([1 + xx - yy - zz, xy, xz, x], axis=-1),
+            np.stack([xy, 1 - xx + yy - zz, yz, y], axis=-1),
+            np.stack([xz, yz, 1 - xx - yy + zz, z], axis=-1),
+            np.stack([x, y, z, 1 + xx + yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    chosen = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
+
+
+def slerp(start: Reals, end: Reals, share: npt.ArrayLike) -> Floats:
+    """Return rotations (..., 3, 3), the ``share`` (...) of the way from ``start`` to ``end``, the short way round."""
+    rotvec = log_so3(np.swapaxes(start, -1, -2) @ end)
+    return np.asarray(start @ exp_so3(np.asarray(share, dtype=np.float64)[..., None] * rotvec))
 
 
 def pose_from(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Pose:
@@ -135,3 +221,42 @@ def to_map_origin(T_map_local: Pose, anchor: Floats, origin: Floats) -> Pose:
     """Return ``T_map_odom`` in the source's frame from the localizer's: undo both shifts, in float64."""
     shifted = T_map_local @ inverse(pose_from(np.eye(3), anchor))
     return pose_from(shifted[:3, :3], shifted[:3, 3] + origin)
+
+
+def along_body(covariance: Floats, T_map_body: Pose) -> Floats:
+    """Turn a covariance (6, 6) along the map's axes into one in the body's tangent."""
+    return rotate_covariance(covariance, T_map_body[:3, :3].T)
+
+
+def along_map(covariance: Floats, T_map_body: Pose) -> Floats:
+    """Turn a covariance (6, 6) in the body's tangent into one along the map's axes."""
+    return rotate_covariance(covariance, T_map_body[:3, :3])
+
+
+def rotate_covariance(covariance: Floats, R: Floats) -> Floats:
+    """Rotate both halves of a covariance (6, 6) by ``R`` (3, 3): diag(R, R) C diag(R, R)^T."""
+    blocks = covariance.reshape(2, 3, 2, 3).transpose(0, 2, 1, 3)
+    moved = (R @ blocks @ R.T).transpose(0, 2, 1, 3).reshape(6, 6)
+    return np.asarray(0.5 * (moved + moved.T))
+
+
+def boxminus(T_map_body: Pose, T_map_reference: Pose) -> Floats:
+    """Return the step (6,) by which a pose differs from a reference, along the map's axes."""
+    turn = log_so3(T_map_body[:3, :3] @ T_map_reference[:3, :3].T)
+    return np.asarray(np.concatenate([turn, T_map_body[:3, 3] - T_map_reference[:3, 3]]))
+
+
+def boxplus(T_map_body: Pose, step: Floats) -> Pose:
+    """Return the pose that differs by ``step`` (6,) along the map's axes; undoes :func:`boxminus`."""
+    moved: Pose = T_map_body.copy()
+    moved[:3, :3] = exp_so3(step[:3]) @ T_map_body[:3, :3]
+    moved[:3, 3] += step[3:]
+    return moved
+
+
+def adjoint(T: Pose) -> Floats:
+    """Return the matrix (6, 6) with T exp(xi) = exp(Ad xi) T."""
+    Ad = np.zeros((6, 6))
+    Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
+    Ad[3:, :3] = skew(T[:3, 3]) @ T[:3, :3]
+    return Ad

@@ -10,7 +10,7 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
-from coview_stream.localization.tracking.odometry_noise import Drift
+from coview_stream.localization.tracking.motion import Drift
 
 _SHARES = tuple(f.name for f in fields(Evidence))
 

@@ -7,10 +7,10 @@ import numpy as np
 from coview_stream.config.odometry import LidarOdometryConfig, down
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import exp_so3
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
+    exp_so3,
     interpolate,
     inverse,
     is_pose,

@@ -56,9 +56,7 @@ def open_run(
 
         return open_lidar_run(path, lidar, cloud_topic, odometry_topic, progress)
     if (bag := find_bag(path)) is not None:
-        from coview_stream.recordings.bags import (
-            open_bag,  # with the decoders of messages: only once a bag is met
-        )
+        from coview_stream.recordings.bags import open_bag
 
         return open_bag(bag, explicit, cloud_topic, odometry_topic)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):

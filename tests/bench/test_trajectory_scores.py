@@ -10,8 +10,7 @@ from bench.harness.trajectory_scores import errors, losses, recovery, score
 from bench.tracking import coverage as tracking_coverage
 from bench.tracking import tracking
 from bench.tracking.coverage import AXES, NOMINAL, coverage, pooled, shares, spread
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 
 
 def gaussian(covariance, scale=1.0, count=4000, seed=3):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bench.harness.trajectory_scores import Told
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 
 
 def way(count=1500, step=0.2):

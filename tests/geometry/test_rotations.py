@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from coview_stream.geometry.rotations import (
+from coview_stream.geometry.transforms import (
     exp_so3,
     log_so3,
     matrix_to_quat,

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from se3 import exp_se3
 
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.se3 import (
+from coview_stream.geometry.transforms import (
     adjoint,
     along_body,
     along_map,
     boxminus,
     boxplus,
+    exp_so3,
+    pose_from,
 )
-from coview_stream.geometry.transforms import pose_from
 
 T = pose_from(exp_so3([0.4, -0.7, 1.9]), [300.0, -200.0, 12.0])
 

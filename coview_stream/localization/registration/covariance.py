@@ -13,9 +13,7 @@ import numpy as np
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import skew
-from coview_stream.geometry.se3 import boxminus, boxplus
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.transforms import Pose, boxminus, boxplus, skew
 
 _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _MIN_SHARE = 0.01

@@ -32,9 +32,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.rotations import skew
-from coview_stream.geometry.se3 import boxminus, boxplus
-from coview_stream.geometry.transforms import Points, Pose, orthonormal
+from coview_stream.geometry.transforms import Points, Pose, boxminus, boxplus, orthonormal, skew
 from coview_stream.localization.registration.result import MIN_PAIRS, Registration
 
 # set by hand

@@ -9,7 +9,7 @@ from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.scan_matcher import ScanInput
+from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.acceptance import AcceptanceTest, SearchResult
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position

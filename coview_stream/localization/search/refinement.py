@@ -12,8 +12,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+from coview_stream.localization.registration.register import ScanInput, register_and_verify
 from coview_stream.localization.registration.result import Prior, Registration
-from coview_stream.localization.registration.scan_matcher import ScanInput, register_and_verify
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
 

@@ -13,8 +13,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse, tilt_of
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior
 from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.register import ScanInput, register_and_verify
 from coview_stream.localization.registration.result import Prior
-from coview_stream.localization.registration.scan_matcher import ScanInput, register_and_verify
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph

@@ -28,13 +28,15 @@ import numpy as np
 from coview_stream.config import GraphConfig
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.se3 import (
+from coview_stream.geometry.transforms import (
+    Pose,
     adjoint,
     along_body,
     along_map,
     boxminus,
+    inverse,
+    orthonormal,
 )
-from coview_stream.geometry.transforms import Pose, inverse, orthonormal
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
 # set by hand
@@ -130,7 +132,7 @@ class PoseGraph:
         Args:
             T_between: (4, 4) the new body in the frame of the newest keyframe's, ``inverse(T_odom_last) @ T_odom_new``.
             covariance: of the new pose if the last one were known, along the map's axes as the estimate has them now
-                (see :func:`coview_stream.localization.tracking.odometry_noise.Drift.covariance`).
+                (see :func:`coview_stream.localization.tracking.motion.Drift.covariance`).
         """
         step = check_rigid(T_between, "T_between")
         spread = check_covariance(covariance, "covariance")

@@ -9,8 +9,7 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.se3 import boxminus
-from coview_stream.geometry.transforms import Points, Pose, inverse, transform
+from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, transform
 from coview_stream.localization.registration.covariance import (
     propagate,
     registration_covariance,
@@ -18,13 +17,12 @@ from coview_stream.localization.registration.covariance import (
 )
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.registration.result import Registration
-from coview_stream.localization.registration.scan_matcher import ScanInput
 from coview_stream.localization.tracking.displacement_check import DisplacementCheck
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
-from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer
-from coview_stream.localization.tracking.odometry_noise import Drift
+from coview_stream.localization.tracking.motion import MAX_FRAMES, Drift, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
@@ -136,7 +134,9 @@ class Tracker:
             newest_only: use the newest frame alone: something is wrong with it, or with what came before.
         """
         belief = self._predict(T_odom_body, standing_still)
-        self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
+        self._scans.keep_newest(
+            1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES
+        )
         self._unregistered = 0
         target = self._target(T_odom_body)
         if target is None:

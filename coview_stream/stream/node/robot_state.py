@@ -11,7 +11,7 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import Event, State, next_state
-from coview_stream.localization.tracking.odometry_noise import Drift
+from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages.types import PoseMessage
 from coview_stream.odometry.buffer import OdometryBuffer
 from coview_stream.stream.node.counters import Counters

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from coview_stream.geometry.rotations import skew
+from coview_stream.geometry.transforms import skew
 
 _FLAT = 2e-3  # variance along the normal of two clouds' covariances
 

@@ -8,8 +8,7 @@ from courtyard import courtyard, local_map, source_of
 
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.geometry.se3 import boxminus, boxplus
-from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.geometry.transforms import boxminus, boxplus, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.registration.covariance import (
     propagate,

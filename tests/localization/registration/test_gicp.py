@@ -16,9 +16,7 @@ from small_world import pose_error
 from coview_kernels import Belief
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.errors import ConfigError, DependencyError
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.se3 import boxminus, boxplus
-from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.geometry.transforms import boxminus, boxplus, exp_so3, pose_from, rot_z, transform
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration import gicp
 from coview_stream.localization.registration.covariance import registration_covariance, remove_prior

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from se3 import exp_se3
 
-from coview_stream.geometry.rotations import exp_so3
-from coview_stream.geometry.se3 import boxplus
-from coview_stream.geometry.transforms import inverse, pose_from
+from coview_stream.geometry.transforms import boxplus, exp_so3, inverse, pose_from
 
 START = pose_from(exp_so3([0.1, -0.2, 2.2]), [120.0, -40.0, 7.0])
 START_COVARIANCE = np.diag([0.01, 0.01, 0.03, 0.3, 0.3, 0.2]) ** 2

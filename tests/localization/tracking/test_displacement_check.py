@@ -7,8 +7,7 @@ import pytest
 from courtyard import courtyard, local_map
 from small_world import boxes, scan
 
-from coview_stream.geometry.se3 import boxplus
-from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.geometry.transforms import boxplus, pose_from, rot_z, transform
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.tracking import displacement_check as module
 from coview_stream.localization.tracking.displacement_check import DisplacementCheck, share_on_map

@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.se3 import boxminus, boxplus
-from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.registration import scan_matcher
+from coview_stream.localization.registration import register as registration
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import register
+from coview_stream.localization.registration.register import ScanInput, register
 from coview_stream.localization.registration.result import Prior
-from coview_stream.localization.registration.scan_matcher import ScanInput
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
@@ -115,7 +113,7 @@ def test_singular_prior_covariance_is_rejected(world_map, world_drive, scan, bad
 @pytest.mark.parametrize("bad", [np.zeros((6, 6)), np.full((6, 6), np.nan)], ids=["singular", "nan"])
 def test_singular_registration_information_is_rejected(world_map, world_drive, scan, bad, monkeypatch):
     truth, whole = world_drive.T_map_body[4], register
-    monkeypatch.setattr(scan_matcher, "register", lambda *given: replace(whole(*given), information=bad))
+    monkeypatch.setattr(registration, "register", lambda *given: replace(whole(*given), information=bad))
     found = matched(world_map, scan, Estimate(truth, TIGHT))
     assert_no_hold(found, truth)
     assert found.verdict.evidence is not None  # it is as good as ever, and does not help

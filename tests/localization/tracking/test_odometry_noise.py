@@ -7,7 +7,7 @@ import pytest
 
 from coview_stream.config import TrackingConfig
 from coview_stream.geometry.validation import check_covariance
-from coview_stream.localization.tracking.odometry_noise import Drift, DriftEstimator
+from coview_stream.localization.tracking.motion import Drift, DriftEstimator
 
 CONFIG = TrackingConfig(
     position_drift=0.015,

@@ -11,8 +11,7 @@ from se3 import exp_se3
 
 from coview_stream.config import GraphConfig
 from coview_stream.errors import ConfigError, DependencyError, InputError
-from coview_stream.geometry.se3 import boxminus, boxplus
-from coview_stream.geometry.transforms import pose_from
+from coview_stream.geometry.transforms import boxminus, boxplus, pose_from
 from coview_stream.localization.tracking.pose_graph import PoseGraph
 
 HUBER = GraphConfig().huber

@@ -16,7 +16,7 @@ from graph_drives import (
 )
 
 from coview_stream.config import GraphConfig
-from coview_stream.geometry.se3 import along_body, along_map, boxminus, boxplus
+from coview_stream.geometry.transforms import along_body, along_map, boxminus, boxplus
 from coview_stream.localization.tracking.pose_graph import _RELINEARIZE, PoseGraph
 
 HUBER = GraphConfig().huber
