@@ -1,15 +1,15 @@
 """Rigid transforms in 3-D: rotations, poses as 4x4 float64 matrices, and small motions with their covariances.
 
-``T_target_source`` maps coordinates of the *source* frame into the *target* frame:
-``p_target = T_target_source @ p_source``. Metres and radians throughout; quaternions are x, y, z, w. Rotations come
-single or in stacks; SciPy has them too, but importing it takes half a second of the two in which a node should be ready.
+``T_target_source`` maps coordinates of the *source* frame into the *target* frame: ``p_target = T_target_source @
+p_source``. Metres and radians throughout; quaternions are x, y, z, w. Rotations come single or in stacks; SciPy has
+them too, but importing it takes half a second, of the two in which a node should start.
 
 A small motion of a pose has six numbers (rx, ry, rz, x, y, z) *along the map's axes*: the body turns about its own
-origin, then it is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the right,
-``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes; gtsam's Pose3 has the same. To first order,
-which is all that a covariance says, both name the same motions: r = R xi_r and s = R xi_t. So a covariance goes from one
-to the other by the rotation alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its lever arm [t]x R, would belong
-to turning about the map's origin.)
+origin, then it is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the
+right, ``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes; gtsam's Pose3 has the same. To
+first order, which is all that a covariance says, both name the same motions: r = R xi_r and s = R xi_t. So a
+covariance goes from one to the other by the rotation alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its
+lever arm [t]x R, would belong to turning about the map's origin.)
 """
 
 from __future__ import annotations

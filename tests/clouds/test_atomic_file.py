@@ -21,9 +21,14 @@ def test_atomic_file_replaces_the_old_one(tmp_path, sync):
 def test_atomic_file_keeps_the_old_one_after_an_error(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(b"old")
-    with pytest.raises(ValueError, match="half"), atomic_file(path) as stream:
-        stream.write(b"ne")
-        raise ValueError("half")
+
+    def fail_half_way():
+        with atomic_file(path) as stream:
+            stream.write(b"ne")
+            raise ValueError("half")
+
+    with pytest.raises(ValueError, match="half"):
+        fail_half_way()
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

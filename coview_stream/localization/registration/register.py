@@ -1,4 +1,4 @@
-"""Registration of a scan to the map, coarse to fine (trimmed point-to-plane ICP, eq. 13, or GICP), and its verification.
+"""Registration of a scan to the map, coarse to fine (trimmed point-to-plane ICP, eq. 13, or GICP), and verification.
 
 :func:`register_and_verify` is what search and tracking call.
 """

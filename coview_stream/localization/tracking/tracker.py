@@ -214,7 +214,8 @@ class Tracker:
     def _learn(self, match: MapMatch, position: Floats) -> None:
         """Learn from a verified registration: odometry's drift, what is usual here, what errors repeat."""
         evidence, scan, target, newest = match.verdict.evidence, match.scan, match.target, self._scans.newest
-        assert evidence is not None and scan is not None and target is not None and newest is not None
+        if evidence is None or scan is None or target is None or newest is None:
+            raise ValueError("nothing can be learned from a match without a registration")
         self._baseline.learn(evidence)
         self._odometry.learn(match.T_map_body, match.covariance)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
