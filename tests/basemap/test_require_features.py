@@ -146,7 +146,7 @@ def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_pat
     BaseMap(learned_map._arrays, parameters).save(tmp_path / "old.coview")
     relocs = []
 
-    class Lane(serve.EngineProcess):
+    class Recorded(serve.EngineProcess):
         def __init__(self, *given, **named):
             super().__init__(*given, **named)
             relocs.append(self.reloc)
@@ -154,7 +154,7 @@ def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_pat
         def start(self):
             raise TransportError("that is enough")
 
-    monkeypatch.setattr(serve, "EngineProcess", Lane)
+    monkeypatch.setattr(serve, "EngineProcess", Recorded)
     options = serve.ServeOptions(tmp_path / "old.coview", [robot_keys("native", "coview", "r1")])
     with caplog.at_level(logging.WARNING), pytest.raises(TransportError, match="that is enough"):
         serve.open_node(options)
