@@ -23,11 +23,38 @@ log = logging.getLogger("coview_stream.node")
 class Counters:
     """Counts of all that can happen to a message; each message is counted once, where it ends.
 
-    ``received`` clouds end as ``processed``, ``rejected`` (the engine could not use it), ``dropped`` (a newer one came
-    before its turn), ``late`` (older than the odometry that is remembered), ``out_of_order``, ``duplicate``,
-    ``no_odometry`` (none came for its stamp), ``malformed``, ``oversized``, ``unknown_encoding`` or ``engine_errors``;
-    up to ten more are under way. ``missing`` is an estimate of what never arrived, from gaps between stamps or in the
-    sender's numbering.
+    ``received`` clouds end as one of the next eleven; up to ten more are under way.
+
+    Attributes:
+        received: clouds that came.
+        processed: went through the localizer.
+        rejected: readable, but of no use to the localizer or to lidar odometry.
+        dropped: made room for a newer one.
+        late: older than the odometry that is remembered.
+        out_of_order: stamp before that of the cloud before.
+        duplicate: stamp of the cloud before.
+        no_odometry: none came for the stamp.
+        malformed: not what the encoding says.
+        oversized: beyond the limits on bytes or points.
+        unknown_encoding: no codec reads it.
+        engine_errors: an engine failed at it.
+        missing: clouds that seem never to have arrived, by the sender's numbers or gaps between stamps: an estimate.
+        odometry_received: odometry samples that came, or were made here.
+        odometry_malformed: likewise.
+        odometry_oversized: likewise.
+        odometry_unknown_encoding: likewise.
+        odometry_duplicate: likewise.
+        odometry_out_of_order: likewise.
+        odometry_gaps: pauses in the odometry too long to interpolate across.
+        odometry_jumps: samples farther from the one before than a robot can drive.
+        clock_restarts: times the sender's clock restarted.
+        searches: searches of the whole map.
+        searches_skipped: requests that made room for a newer one.
+        search_errors: searches that failed.
+        fixes: times the robot was found.
+        losses: times it was lost.
+        poses: poses published.
+        engine_restarts: times an engine was started again.
     """
 
     received: int = 0

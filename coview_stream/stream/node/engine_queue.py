@@ -47,7 +47,7 @@ class EngineQueue:
     """
 
     def __init__(self, robot: str, epoch: int, counters: Counters, errors: ErrorLog) -> None:
-        """Begin with nothing to do in odometry epoch ``epoch``, which no robot's job has had before."""
+        """Begin with nothing to do in odometry epoch ``epoch``, which no job of this robot has had before."""
         self.robot = robot
         self.epoch = epoch
         self._first_epoch = epoch

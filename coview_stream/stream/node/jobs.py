@@ -47,7 +47,13 @@ class FrameJob:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Fix after a frame, what has to be searched for (if anything), and the seconds that the engine took."""
+    """The tracking engine's answer to a frame.
+
+    Attributes:
+        fix: after the frame.
+        request: what has to be searched for, None for nothing.
+        seconds: that the engine took.
+    """
 
     fix: Fix
     request: SearchRequest | None
@@ -56,7 +62,12 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class SearchJob:
-    """One keyframe for the search engine; its request has the epoch of the frame's job."""
+    """One keyframe for the search engine.
+
+    Attributes:
+        robot: name.
+        request: what to search for; it has the epoch of the frame's job.
+    """
 
     robot: str
     request: SearchRequest

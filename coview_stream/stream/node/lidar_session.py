@@ -121,7 +121,12 @@ def _deskewed(message: CloudMessage, result: OdometryResult) -> CloudMessage:
 
 @dataclass(frozen=True)
 class LidarFrame:
-    """A frame and the local time at which it came, seconds."""
+    """A frame for the odometry engine.
+
+    Attributes:
+        message: the frame.
+        received: local time at which it came, seconds.
+    """
 
     message: CloudMessage
     received: float
