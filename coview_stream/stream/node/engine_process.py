@@ -144,7 +144,10 @@ class EngineProcess:
         except CoViewError as error:
             self._end()
             raise DiedError(str(error)) from error
-        return unwrap(*self._exchange(lambda pipe: pipe.send(job), self.job_timeout))
+        with self._exchange(self.job_timeout) as pipe:
+            pipe.send(job)
+            kind, value = pipe.recv()
+        return unwrap(kind, value)
 
     def close(self) -> None:
         """Kill the child at once; it keeps nothing that would have to be saved."""
@@ -154,30 +157,28 @@ class EngineProcess:
         self._watchdog.close()
 
     def _await(self, message: str, cancelled: Callable[[], bool] = lambda: False) -> None:
-        def wait(pipe: Connection) -> None:
+        with self._exchange(self.open_timeout) as pipe:
             while not pipe.poll(_POLL_INTERVAL):
                 if cancelled():
                     raise CancelledError(f"the {self.kind} engine is no longer wanted")
-
-        kind, value = self._exchange(wait, self.open_timeout)
+            kind, value = pipe.recv()
         if kind == "error":
             raise CoViewError(value)
         self._awaited.remove(message)
 
-    def _exchange(self, begin: Callable[[Connection], object], seconds: float) -> tuple[str, Any]:
-        """Do ``begin`` and receive; sending, waiting and receiving may all hang, and together have ``seconds``."""
+    @contextmanager
+    def _exchange(self, seconds: float) -> Iterator[Connection]:
+        """Yield the pipe; sending, waiting and receiving may all hang, and together have ``seconds``."""
         pipe = self._pipe
         try:
             if pipe is None:
                 raise EOFError
             with self._watchdog.limit(seconds):
-                begin(pipe)
-                kind, value = pipe.recv()
+                yield pipe
         except (EOFError, OSError, TypeError) as error:  # the last one: closed by another thread meanwhile
             self._end()
             hung = f" had no answer for {seconds:g} s and was ended"
             raise DiedError(f"the {self.kind} engine{hung if self._watchdog.acted else ' died'}") from error
-        return str(kind), value
 
     def _kill(self) -> None:
         child = self._child
