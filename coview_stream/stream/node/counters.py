@@ -11,9 +11,14 @@ import numpy as np
 from coview_stream.errors import EncodingError, MessageError
 from coview_stream.messages.validation import OversizedError
 
+_RATE_WINDOW = 30  # poses over which their rate is taken
+
 _RESTART_NS = 5_000_000_000  # a stamp that lies farther back than this is a restarted clock; set by hand
+
 _MAX_DURATIONS = 600  # a minute of frames at 10 Hz
+
 _MAX_ERRORS = 10  # different ones that are kept
+
 _MAX_LOGGED = 20  # errors of one robot's input that are logged, ever: its sender may invent new ones
 
 log = logging.getLogger("coview_stream.node")
@@ -171,3 +176,21 @@ def counter_of(error: MessageError) -> str:
 def last_line(text: str) -> str:
     """Return the last line of a traceback."""
     return (text.strip() or "unknown failure").splitlines()[-1]
+
+
+class PoseRate:
+    """Rate at which poses go out."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
+
+    def add(self, now: float) -> None:
+        """Count a pose at local time ``now``."""
+        self._times.append(now)
+
+    def rate(self, now: float) -> float:
+        """Return poses per second; 0 if the newest is older than two seconds."""
+        span = self._times[-1] - self._times[0] if self._times else 0.0
+        if span <= 0.0 or now - self._times[-1] > 2.0:
+            return 0.0
+        return round((len(self._times) - 1) / span, 2)

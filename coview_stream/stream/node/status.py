@@ -6,12 +6,12 @@ import json
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
+from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.scheduling import Rate
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
@@ -21,8 +21,8 @@ from coview_stream.version import __version__
 log = logging.getLogger("coview_stream.node")
 
 _JSON = "application/json"
+
 _MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
-_RATE_WINDOW = 30  # poses over which their rate is taken
 
 
 class Reporter:
@@ -184,21 +184,3 @@ class ConnectionMonitor:
             log.info("connected to router %s", ", ".join(sorted(come)))
         elif gone:
             log.warning("router %s is gone%s", ", ".join(sorted(gone)), "" if now else ": nobody can hear us")
-
-
-class PoseRate:
-    """Rate at which poses go out."""
-
-    def __init__(self) -> None:
-        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
-
-    def add(self, now: float) -> None:
-        """Count a pose at local time ``now``."""
-        self._times.append(now)
-
-    def rate(self, now: float) -> float:
-        """Return poses per second; 0 if the newest is older than two seconds."""
-        span = self._times[-1] - self._times[0] if self._times else 0.0
-        if span <= 0.0 or now - self._times[-1] > 2.0:
-            return 0.0
-        return round((len(self._times) - 1) / span, 2)

@@ -20,7 +20,7 @@ from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
-from coview_stream.stream.node.status import PoseRate
+from coview_stream.stream.node.counters import PoseRate
 
 
 def test_frame_result_of_before_reset_is_ignored():
