@@ -37,15 +37,9 @@ def _parser(name: str) -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="smaller sizes; says little about the targets")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows: a list of objects")
-    parser.add_argument(
-        "--write", type=Path, metavar="PAGE", help="put the tables into their places in a page"
-    )
-    parser.add_argument(
-        "--read", type=Path, metavar="FILE", help="take the rows from --json, measure nothing"
-    )
-    parser.add_argument(
-        "--threads", type=int, choices=(1, 2), help="one count instead of each benchmark's own"
-    )
+    parser.add_argument("--write", type=Path, metavar="PAGE", help="put the tables into their places in a page")
+    parser.add_argument("--read", type=Path, metavar="FILE", help="take the rows from --json, measure nothing")
+    parser.add_argument("--threads", type=int, choices=(1, 2), help="one count instead of each benchmark's own")
     parser.add_argument(
         "--work", type=Path, metavar="DIR", help="keeps worlds and answers (COVIEW_BENCH, or temporary)"
     )

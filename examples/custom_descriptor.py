@@ -42,9 +42,7 @@ def main(world: Path) -> dict[str, float]:
         centre = keyframe.position.copy()
         centre[2] = ground_below(scan, keyframe.position)  # both sides measure heights from the ground
         for name, distance in retrieval.distances(describe(scan, centre, settings)).items():
-            station = stations[
-                distance.min(axis=1).argmin()
-            ]  # (stations, shifts): the smallest over all shifts
+            station = stations[distance.min(axis=1).argmin()]  # (stations, shifts): the smallest over all shifts
             miss = np.linalg.norm(station[:2] - truth[frame.index, :2, 3])
             found[name].append(bool(miss < NEAR))
     shares = {name: float(np.mean(right)) for name, right in found.items()}

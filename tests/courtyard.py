@@ -12,9 +12,7 @@ from coview_stream.localization.registration.prepare_scan import RegistrationClo
 def plane(corner, a, b, spacing=0.25):
     """Points (N, 3) on the rectangle of edges ``a`` and ``b`` from ``corner``, and their normals."""
     a, b = np.asarray(a, float), np.asarray(b, float)
-    u, v = np.meshgrid(
-        np.arange(0, 1, spacing / np.linalg.norm(a)), np.arange(0, 1, spacing / np.linalg.norm(b))
-    )
+    u, v = np.meshgrid(np.arange(0, 1, spacing / np.linalg.norm(a)), np.arange(0, 1, spacing / np.linalg.norm(b)))
     points = np.asarray(corner, float) + u.reshape(-1, 1) * a + v.reshape(-1, 1) * b
     normal = np.cross(a, b)
     return points, np.tile(normal / np.linalg.norm(normal), (len(points), 1))

@@ -141,9 +141,7 @@ def picture() -> str:
 
     lines = ["```mermaid", "flowchart BT"]
     for name in FOLDERS:
-        text = (
-            ast.get_docstring(ast.parse((PACKAGE / name / "__init__.py").read_text(encoding="utf-8"))) or ""
-        )
+        text = ast.get_docstring(ast.parse((PACKAGE / name / "__init__.py").read_text(encoding="utf-8"))) or ""
         sentence = text.partition("\n")[0].rstrip(".").replace("`", "").replace('"', "")
         lines.append(f'    {name}["<b>{name}</b><br/>{"<br/>".join(textwrap.wrap(sentence, 60))}"]')
     for name in FOLDERS:

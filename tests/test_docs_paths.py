@@ -19,9 +19,7 @@ SOURCES = sorted(
 )
 
 DOTTED = re.compile(r"(?<![\w./-])(?:coview_stream|coview_kernels|bench)(?:\.[a-zA-Z_]\w*)+(?![\w/])")
-FILE = re.compile(
-    r"(?<![\w./-])(?:coview_stream|coview_kernels|kernels|tests|bench|examples|docs|\.ci)/[\w./-]*\w/?"
-)
+FILE = re.compile(r"(?<![\w./-])(?:coview_stream|coview_kernels|kernels|tests|bench|examples|docs|\.ci)/[\w./-]*\w/?")
 BARE_FILE = re.compile(r"`(\w+\.py)`")
 MEMBER = re.compile(r"`([A-Z]\w+)\.([a-z]\w*)[`(]")
 IMPORT = re.compile(r"^\s*(?:>>> )?from (coview_\w[\w.]*|bench[\w.]*) import ([\w, ]+)", re.MULTILINE)
@@ -102,9 +100,7 @@ def docstrings(path):
     strings = [
         node.value.value
         for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
     ]
     comments = re.findall(r"(?:^|\s)# (.*)$", text, re.MULTILINE)
     return "\n".join([*strings, *comments])
@@ -132,9 +128,7 @@ def test_links_in_page_lead_somewhere(page):
 
 
 def test_names_in_docstrings_exist():
-    missing = {
-        str(path.relative_to(ROOT)): names for path in SOURCES if (names := unknown_names(docstrings(path)))
-    }
+    missing = {str(path.relative_to(ROOT)): names for path in SOURCES if (names := unknown_names(docstrings(path)))}
     assert missing == {}
 
 
@@ -168,10 +162,5 @@ def test_unknown_names_are_found(text):
 
 
 def test_known_names_pass():
-    names = (
-        "`coview_stream.recordings.open_run`",
-        "coview_stream/errors.py",
-        "`errors.py`",
-        "`Localizer.step`",
-    )
+    names = ("`coview_stream.recordings.open_run`", "coview_stream/errors.py", "`errors.py`", "`Localizer.step`")
     assert unknown_names(", ".join([*names, "bench.json", "docs/method.md"])) == []

@@ -16,17 +16,14 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)
 
 
 def run_python(script: str) -> list[str]:
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, env=ENVIRONMENT, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=ENVIRONMENT, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "statement",
-    ["import coview_stream", "from coview_stream import *", "from coview_stream import BaseMap, Localizer"],
+    "statement", ["import coview_stream", "from coview_stream import *", "from coview_stream import BaseMap, Localizer"]
 )
 def test_import_loads_no_heavy_library(statement):
     script = f"{statement}\nimport sys; print('loaded:', *sorted({set(HEAVY)!r} & set(sys.modules)))"
@@ -40,9 +37,7 @@ def test_dunder_all_is_sorted_and_resolvable():
     for name in names:
         assert getattr(coview_stream, name) is not None
     assert set(names) <= set(dir(coview_stream))
-    assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "RejectionReason", "KeyframeEvidence"} <= set(
-        names
-    )
+    assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "RejectionReason", "KeyframeEvidence"} <= set(names)
 
 
 def test_unknown_name_is_an_attribute_error():

@@ -62,14 +62,7 @@ def test_real_run_on_wrong_map_gets_no_pose(located, tmp_path):
     """The handheld run is no part of the street."""
     _, _, _, out = located
     code = main(
-        [
-            "locate",
-            str(out / "site.coview"),
-            str(data("handheld_livox", "run")),
-            "-o",
-            str(tmp_path),
-            "--no-pictures",
-        ]
+        ["locate", str(out / "site.coview"), str(data("handheld_livox", "run")), "-o", str(tmp_path), "--no-pictures"]
     )
     assert code == 1
     assert (tmp_path / "trajectory.tum").read_text() == ""

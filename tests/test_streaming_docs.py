@@ -95,11 +95,7 @@ def test_docs_list_every_transition_field():
 def test_docs_list_every_evidence_field():
     text = (DOCS / "method.md").read_text(encoding="utf-8")
     table = text.split("## Fields of the evidence")[1].split("\n## ")[0]
-    named = [
-        name
-        for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
-        for name in re.findall(r"`(\w+)`", row)
-    ]
+    named = [name for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)]
     assert sorted(named) == sorted(KeyframeEvidence(0.0, State.LOST, "").to_json())
     assert f"above {AcceptanceConfig().max_innovation:.0f} it is rejected" in table
     assert "(method.md#fields-of-the-evidence)" in TEXT
@@ -127,9 +123,7 @@ def test_documented_fields_missing_in_smaller_pose_formats():
     missing = {}
     for name in ("cdr", "foxglove"):
         encoded = encode_pose(full, name)
-        record = pose_record(
-            decode_pose(Sample("k", encoded.payload, encoded.encoding)), Sample("k", encoded.payload)
-        )
+        record = pose_record(decode_pose(Sample("k", encoded.payload, encoded.encoding)), Sample("k", encoded.payload))
         missing[name] = {field for field, value in record.items() if not value} | {"state"}
     assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s"}
     assert missing["foxglove"] == missing["cdr"] | {"covariance"}
@@ -142,9 +136,7 @@ def test_documented_client_example_runs(monkeypatch, capsys):
     monkeypatch.setattr(client, "open_client", lambda *endpoints: net)
 
     def answer(sample):
-        pose = PoseMessage(
-            decode_cloud(sample).stamp_ns, "rover1", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab"
-        )
+        pose = PoseMessage(decode_cloud(sample).stamp_ns, "rover1", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab")
         net.publish(Sample("coview/rover1/out/pose", encode_pose(pose, "json").payload))
 
     net.subscribe("coview/rover1/in/cloud", answer, "newest")

@@ -94,9 +94,7 @@ def measure(folder: Path, run: SimulationConfig, site: SimulationConfig) -> Run:
     return found | json.loads(evaluate(estimate, read_tum(folder / world_name(run) / "truth.tum")).to_json())
 
 
-def run_one(
-    folder: Path, run: SimulationConfig, site: SimulationConfig, call: Callable[..., Any] = isolated
-) -> Run:
+def run_one(folder: Path, run: SimulationConfig, site: SimulationConfig, call: Callable[..., Any] = isolated) -> Run:
     """Prepare the worlds and measure, each in its own process; a crash makes a run that has failed."""
     code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/accuracy.py")}
     name = world_name(run) if run == site else f"{world_name(run)}-on-{site.seed}"

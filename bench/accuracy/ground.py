@@ -35,9 +35,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     from coview_stream.clouds import read_cloud
 
     usual, fields = GroundConfig(), dict(item.split("=") for item in asked.set)
-    config = GroundConfig(
-        method=asked.method, **{k: type(getattr(usual, k))(float(v)) for k, v in fields.items()}
-    )
+    config = GroundConfig(method=asked.method, **{k: type(getattr(usual, k))(float(v)) for k, v in fields.items()})
     for file in asked.files:
         cloud = read_cloud(file)
         start = time.perf_counter()

@@ -33,14 +33,10 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, default=FIRST_SEED, metavar="FIRST", help=f"({FIRST_SEED})")
     parser.add_argument("--worlds", type=int, default=8, metavar="N", help="worlds of these seeds (8)")
     parser.add_argument("--queries", type=int, default=16, metavar="N", help="of each world (16)")
-    parser.add_argument(
-        "--world", type=Path, nargs="+", default=[], metavar="DIR", help="worlds on disk as well"
-    )
+    parser.add_argument("--world", type=Path, nargs="+", default=[], metavar="DIR", help="worlds on disk as well")
 
 
-def answers(
-    folder: Path, name: str, opened: Callable[[], Any], about: dict[str, Any]
-) -> list[dict[str, Any]]:
+def answers(folder: Path, name: str, opened: Callable[[], Any], about: dict[str, Any]) -> list[dict[str, Any]]:
     """Answers to all queries of a place (a function that opens it), now or when the same was asked before.
 
     ``about`` says what else they depend on: what lies in a folder, say.
@@ -93,8 +89,4 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     found = [answer for row in rows for answer in row.details.get("answers", ())]
     about = f"--seeds {asked.seeds} --worlds {asked.worlds} --queries {asked.queries}"
     disk = " --world" * bool(asked.world) + " DIR" * len(asked.world)
-    return (
-        {name: noted(text, f"forest {about}{disk}") for name, text in tables_of(found).items()}
-        if found
-        else {}
-    )
+    return {name: noted(text, f"forest {about}{disk}") for name, text in tables_of(found).items()} if found else {}

@@ -110,9 +110,7 @@ def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypo
     return found
 
 
-def of_places(
-    xy: Floats, score: Floats, heading: Floats, stations: Floats32, centre: Floats
-) -> list[Hypothesis]:
+def of_places(xy: Floats, score: Floats, heading: Floats, stations: Floats32, centre: Floats) -> list[Hypothesis]:
     """Hypotheses of the best places (N, 2) at their headings (N,), as high as the station next to each."""
     found = []
     for k in chosen(xy, score):
@@ -160,9 +158,7 @@ class Chain:
             "accepted": self._acceptance.decide(candidates, query, 1).accepted is not None,
         }
 
-    def ask(
-        self, named: list[Hypothesis], scan: ScanInput, truth: Pose, query: SearchRequest
-    ) -> dict[str, Any]:
+    def ask(self, named: list[Hypothesis], scan: ScanInput, truth: Pose, query: SearchRequest) -> dict[str, Any]:
         """Register what a method names: what :meth:`metric` says, and the milliseconds."""
         begin = time.perf_counter()
         candidates = self.register(named, scan)

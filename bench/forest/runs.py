@@ -205,9 +205,7 @@ def _rms(values: Floats) -> float | None:
 
 def options(parser: ArgumentParser) -> None:
     """Add worlds on disk."""
-    parser.add_argument(
-        "--world", type=Path, nargs="+", default=[], metavar="DIR", help="instead of the usual runs"
-    )
+    parser.add_argument("--world", type=Path, nargs="+", default=[], metavar="DIR", help="instead of the usual runs")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -215,9 +213,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     folder = place()
     folder.mkdir(parents=True, exist_ok=True)
     few = [replace(run, length=min(run.length, 40.0)) for run in RUNS[1:4:2]] if asked.quick else list(RUNS)
-    jobs: list[tuple[str, Any, Any]] = [
-        (path.name, lambda path=path: path, on_disk(path)) for path in asked.world
-    ]
+    jobs: list[tuple[str, Any, Any]] = [(path.name, lambda path=path: path, on_disk(path)) for path in asked.world]
     jobs = jobs or [(run.name, lambda run=run: world_of(folder, run), asdict(run)) for run in few]
     for k, (name, _, _) in enumerate(jobs):
         for site in dict.fromkeys((k, (k + 1) % len(jobs))):
@@ -233,9 +229,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 yield informs(f"forest_runs/{label}, {reloc}: false", run["false"], "", run)
 
 
-def _run(
-    folder: Path, label: str, reloc: Reloc, world: tuple[str, Any, Any], site: tuple[str, Any, Any]
-) -> Run:
+def _run(folder: Path, label: str, reloc: Reloc, world: tuple[str, Any, Any], site: tuple[str, Any, Any]) -> Run:
     outside = world is not site
 
     def make() -> Run:

@@ -96,9 +96,7 @@ def home(hypothesis: Hypothesis, query: SearchRequest, low: Ints) -> Hypothesis:
     at = transform(hypothesis.T_map_odom, query.position[None])[0, :2]
     edge = CUT * float(TILE)
     shift = np.floor((at - low * float(TILE)) / edge) * -edge
-    return replace(
-        hypothesis, T_map_odom=pose_from(np.eye(3), np.array([*shift, 0.0])) @ hypothesis.T_map_odom
-    )
+    return replace(hypothesis, T_map_odom=pose_from(np.eye(3), np.array([*shift, 0.0])) @ hypothesis.T_map_odom)
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -137,15 +135,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
             spent.append(np.diff(ticks).tolist())
         medians = np.median(np.array(spent[1:]), axis=0).tolist()  # the first one waits for memory and crops
         total = float(np.median(np.array(spent[1:]).sum(axis=1)))
-        parts = dict(zip(_PARTS, medians, strict=True)) | {
-            "prepare": prepared,
-            "total": total,
-            "limit": LIMITS[side],
-        }
+        parts = dict(zip(_PARTS, medians, strict=True)) | {"prepare": prepared, "total": total, "limit": LIMITS[side]}
         about = {"km2": features.tile_area / 1e6, "stations": len(stations), "threads": _threads(), **parts}
-        yield replace(
-            bounded(f"forest_scale/{about['km2']:.2f} km2", total, "s", LIMITS[side]), details=about
-        )
+        yield replace(bounded(f"forest_scale/{about['km2']:.2f} km2", total, "s", LIMITS[side]), details=about)
 
 
 class _LargeMap(BaseMap):
@@ -163,14 +155,7 @@ def _threads() -> str:
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per size of the map, seconds."""
-    head = (
-        "map, km2",
-        "stations",
-        "prepared once, s",
-        *(f"{part}, s" for part in _PARTS),
-        "query, s",
-        "limit, s",
-    )
+    head = ("map, km2", "stations", "prepared once, s", *(f"{part}, s" for part in _PARTS), "query, s", "limit, s")
     sizes = [row.details for row in rows]
     shown = [
         [

@@ -32,10 +32,7 @@ _SPACING = 0.25  # metres between the frames of a recorded run that are read
 _LEANING = 3  # random stream
 
 
-WORLDS = (
-    *(f"coview_stream/{part}" for part in ("geometry", "clouds", "sim", "training")),
-    "bench/forest/worlds.py",
-)
+WORLDS = (*(f"coview_stream/{part}" for part in ("geometry", "clouds", "sim", "training")), "bench/forest/worlds.py")
 """What makes worlds, and the runs and queries in them."""
 
 ANSWERS = (
@@ -195,9 +192,7 @@ def base_of(directory: Path) -> Path:
     for name in ("base.laz", "base.las"):
         if (directory / name).is_file():
             return directory / name
-    raise InputError(
-        f"{directory}: no base.laz or base.las; name a folder as 'coview-stream simulate' makes it"
-    )
+    raise InputError(f"{directory}: no base.laz or base.las; name a folder as 'coview-stream simulate' makes it")
 
 
 def recorded(directory: Path, most: int | None = None) -> Place:
@@ -220,9 +215,7 @@ def recorded(directory: Path, most: int | None = None) -> Place:
             continue
         chosen = frames_behind(way, end)
         clouds = tuple(run.read(k).points for k in chosen)
-        drives.append(
-            Drive(_sensor(directory), float(way[end] - way[chosen[0]]), told[chosen], clouds, poses[nearest])
-        )
+        drives.append(Drive(_sensor(directory), float(way[end] - way[chosen[0]]), told[chosen], clouds, poses[nearest]))
     return Place(directory.name, "on disk", base_of(directory), drives)
 
 

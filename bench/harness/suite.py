@@ -53,9 +53,7 @@ BENCHMARKS = {
     "learned_match": Benchmark(
         "speed.learned_match", "dense correlation and cliques of learned re-localization", _BOTH, ()
     ),
-    "frame": Benchmark(
-        "speed.frame", "a frame: transform, filter, voxels; the descriptor of a keyframe", _BOTH, ()
-    ),
+    "frame": Benchmark("speed.frame", "a frame: transform, filter, voxels; the descriptor of a keyframe", _BOTH, ()),
     "map_build": Benchmark("speed.map_build", "descriptors of 10,000 stations", _ANY, ()),
     "registration": Benchmark("speed.registration", "trimmed ICP beside small_gicp", _BOTH, ()),
     "engine": Benchmark("speed.engine", "Localizer.step on a large map: times, CPU share, memory", _ANY, ()),

@@ -110,9 +110,7 @@ def transitions(told: Told) -> list[tuple[float, str, str]]:
     return out
 
 
-def score(
-    told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]
-) -> dict[str, Any]:
+def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
     """All figures of one drive but coverage; metres, degrees, seconds, milliseconds.
 
     Args:
@@ -141,9 +139,7 @@ def score(
         "losses": len(lost),
         "reasons": lost,
         "transitions": transitions(told),
-        "events": [
-            _event(what, begin, end, right, false, told.stamps, driven, hold) for what, begin, end in events
-        ],
+        "events": [_event(what, begin, end, right, false, told.stamps, driven, hold) for what, begin, end in events],
         "step_ms": _percentiles(told.seconds * 1e3),
         "tracking_step_ms": _percentiles(told.seconds[before] * 1e3),
         "skipped": sum(state == "SKIPPED" for state in told.states),

@@ -60,9 +60,7 @@ def prepare(folder: Path, config: SimulationConfig) -> dict[str, float]:
     world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
     made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
     return {
-        "simulate_s": remembered_seconds(
-            out / "simulated.json", world, lambda: simulate(out, config, overwrite=True)
-        ),
+        "simulate_s": remembered_seconds(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True)),
         "build_s": remembered_seconds(out / "built.json", made, lambda: _build(out)),
     }
 
@@ -135,12 +133,7 @@ def places(folder: Path, scene: str, count: int) -> list[Place]:
 
 
 def _place(
-    run: Run,
-    truth: Floats,
-    start: int,
-    origin: Floats,
-    settings: KeyframeConfig,
-    descriptor: DescriptorConfig,
+    run: Run, truth: Floats, start: int, origin: Floats, settings: KeyframeConfig, descriptor: DescriptorConfig
 ) -> Place:
     buffer, queries = KeyframeBuffer(settings), []
     for index in range(start, len(run)):

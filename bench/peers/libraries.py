@@ -73,9 +73,7 @@ class MapClosures:
         # closures are looked for with earlier numbers only: backwards, no tile is compared with another one
         for number in reversed(range(len(self._tiles))):
             points, _ = site.crop(self._tiles[number], self.REACH)
-            self._closures.get_closures(
-                number, self._thinned(points.astype(np.float64) - self._tiles[number])
-            )
+            self._closures.get_closures(number, self._thinned(points.astype(np.float64) - self._tiles[number]))
         self._asked = len(self._tiles) + self._APART
 
     def answer(self, place: Place) -> Answer:

@@ -186,9 +186,7 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
     parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world and peer (180 s)")
-    parser.add_argument(
-        "--only", nargs="+", metavar="PEER", help="those whose name has this in it, beside ours: kiss"
-    )
+    parser.add_argument("--only", nargs="+", metavar="PEER", help="those whose name has this in it, beside ours: kiss")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:

@@ -70,9 +70,7 @@ def opened(length: float) -> tuple[Any, Any, Any]:
 def frames_of(run: Any, count: int) -> Iterator[tuple[int, int]]:
     """(index of the frame in the run, tick) for ``count`` frames, forwards and backwards."""
     there_and_back = [*range(len(run)), *range(len(run) - 2, 0, -1)]
-    return (
-        (index, tick) for tick, index in enumerate(itertools.islice(itertools.cycle(there_and_back), count))
-    )
+    return ((index, tick) for tick, index in enumerate(itertools.islice(itertools.cycle(there_and_back), count)))
 
 
 def drive(base_map: Any, run: Any, truth: np.ndarray, count: int) -> Drive:
@@ -83,10 +81,7 @@ def drive(base_map: Any, run: Any, truth: np.ndarray, count: int) -> Drive:
 
     rng = np.random.default_rng(0)
     frames = [run.read(k) for k in range(len(run))]
-    clouds = [
-        f.points[np.sort(rng.choice(len(f.points), min(POINTS, len(f.points)), replace=False))]
-        for f in frames
-    ]
+    clouds = [f.points[np.sort(rng.choice(len(f.points), min(POINTS, len(f.points)), replace=False))] for f in frames]
     localizer, out, process = Localizer(base_map), Drive(), psutil.Process()
     for index, tick in frames_of(run, count):
         before = localizer.state.has_place
@@ -114,16 +109,12 @@ def rows(asked: Namespace) -> Iterator[Row]:
     yield bounded(f"{name}: step p99", p99, "ms", STEP_P99)
     yield informs(f"{name}: longest step while tracking", wall[tracking].max(), "ms")
     searched = wall[~tracking & (wall > 5 * np.median(wall))]
-    yield informs(
-        f"{name}: step while searching", float(np.median(searched)) if len(searched) else np.nan, "ms"
-    )
+    yield informs(f"{name}: step while searching", float(np.median(searched)) if len(searched) else np.nan, "ms")
     share = 100.0 * _RATE * float(np.array(done.cpu)[tracking].mean()) if tracking.any() else np.nan
     yield bounded(f"{name}: processor share while tracking", share, "%", SHARE)
     error = np.array(done.error)
     known = error[np.isfinite(error)]
-    yield bounded(
-        f"{name}: error, rms", float(np.sqrt((known**2).mean())) if len(known) else np.nan, "m", ERROR
-    )
+    yield bounded(f"{name}: error, rms", float(np.sqrt((known**2).mean())) if len(known) else np.nan, "m", ERROR)
     yield reached(f"{name}: frames with a pose", 100.0 * len(known) / count, "%", POSED)
     if not asked.quick:
         settled = min((tick for tick in done.memory if tick >= _SETTLED), default=0)

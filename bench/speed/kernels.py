@@ -60,9 +60,7 @@ def _neighbours(rng: np.random.Generator) -> Iterator[Case]:
     """Walk a street: ground, two walls, a point every quarter metre; the twin is SciPy's k-d tree, queries alone."""
     along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))
     flat = np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])
-    walls = [
-        np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)
-    ]
+    walls = [np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)]
     street = np.concatenate([flat, *walls]).astype(np.float32)
     street += rng.normal(0, 0.02, street.shape).astype(np.float32)
     grid = ck.PointGrid(street)
@@ -70,11 +68,7 @@ def _neighbours(rng: np.random.Generator) -> Iterator[Case]:
     scan += rng.normal(0, 0.1, scan.shape).astype(np.float32)
     for radius in (0.4, 3.0):
         name = f"nearest 5000, {radius} m"
-        yield (
-            name,
-            partial(ck.nearest, grid, scan, radius),
-            partial(reference.nearest, grid.tree, scan, radius),
-        )
+        yield (name, partial(ck.nearest, grid, scan, radius), partial(reference.nearest, grid.tree, scan, radius))
 
 
 def _einsum_distance(query: np.ndarray, spectra: np.ndarray, sectors: int) -> np.ndarray:

@@ -101,9 +101,7 @@ def _dense(quick: bool) -> Iterator[Row]:
         )
         yield bounded(f"learned_match/dense correlation, {label}, 36 headings", mean, "ms", most)
         yield against(f"learned_match/sums only, beside one FFT per channel, {label}", ours, whole, "ms", 2.0)
-        yield against(
-            f"learned_match/the same beside fftconvolve, {label}", ours, single * HEADINGS, "ms", 5.0
-        )
+        yield against(f"learned_match/the same beside fftconvolve, {label}", ours, single * HEADINGS, "ms", 5.0)
         yield informs(f"learned_match/within 50 m of a place, {label}", restricted, "ms")
         yield informs(f"learned_match/spectra kept, {label}", known.nbytes / 1e6, "MB")
 

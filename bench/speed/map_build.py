@@ -76,9 +76,7 @@ def highest_of_voxels(cloud: Floats32, voxel: float) -> Floats32:
     return np.ascontiguousarray(cloud[order[last]])
 
 
-def baseline(
-    cloud: Floats32, stations: Floats32, chosen: Indices
-) -> tuple[float, float, dict[str, Floats32]]:
+def baseline(cloud: Floats32, stations: Floats32, chosen: Indices) -> tuple[float, float, dict[str, Floats32]]:
     """Seconds once, seconds per station, and the channels of the chosen ones."""
     from scipy.spatial import cKDTree
 
@@ -241,12 +239,8 @@ def _timed(name: str, work: Callable[..., Any], stages: dict[str, float]) -> Cal
 
 def options(parser: ArgumentParser) -> None:
     """Add the clouds, or how large a synthetic one is."""
-    parser.add_argument(
-        "--whole", action="store_true", help="build a whole map instead: its seconds and memory"
-    )
-    parser.add_argument(
-        "files", nargs="*", type=Path, help="clouds to build the whole from, not a synthetic one"
-    )
+    parser.add_argument("--whole", action="store_true", help="build a whole map instead: its seconds and memory")
+    parser.add_argument("files", nargs="*", type=Path, help="clouds to build the whole from, not a synthetic one")
     parser.add_argument("--points", type=float, default=10e6, help="points of the synthetic cloud (10e6)")
     parser.add_argument("--stations", type=int, default=10_000, help="at least so many stations (10000)")
     parser.add_argument("--block", type=float, default=2.0, help="metres between stations (2)")

@@ -114,10 +114,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         for k in (BEST, 1, 100):
             _agree(index.top_k(query, k), spectral(query, k), turned(query, k))
             ours, *others = medians(
-                partial(index.top_k, query, k),
-                partial(spectral, query, k),
-                partial(turned, query, k),
-                repeat=repeat,
+                partial(index.top_k, query, k), partial(spectral, query, k), partial(turned, query, k), repeat=repeat
             )
             label = f"match/top {k} of {len(some)} stations, {name}"
             yield against(label, ours, min(others), "ms", 3.0 if k == BEST else None)

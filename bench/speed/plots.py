@@ -162,9 +162,7 @@ def draw(shown: Curves, command: str, path: Path) -> None:
 
 def options(parser: ArgumentParser) -> None:
     """Add which plots, and where they go."""
-    parser.add_argument(
-        "names", nargs="*", choices=[[], *PLOTS], metavar="PLOT", help=f"of {', '.join(PLOTS)}"
-    )
+    parser.add_argument("names", nargs="*", choices=[[], *PLOTS], metavar="PLOT", help=f"of {', '.join(PLOTS)}")
     parser.add_argument("--out", type=Path, default=OUT, help=f"directory for the pictures ({OUT})")
 
 

@@ -42,15 +42,7 @@ from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import (
-    Pose,
-    inverse,
-    norms,
-    pose_from,
-    rot_z,
-    rotation_angle,
-    transform,
-)
+from coview_stream.geometry.transforms import Pose, inverse, norms, pose_from, rot_z, rotation_angle, transform
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
@@ -95,9 +87,7 @@ class Trials(NamedTuple):
         """Root mean square, median and 95th percentile of each, and the share that is right, %."""
         right = 100 * float(((self.metres < 0.1) & (self.degrees < 0.5)).mean())
         metres, degrees = self.rms().tolist()
-        cm, deg, ms = (
-            np.percentile(v, [50, 95]).tolist() for v in (self.metres * 100, self.degrees, self.ms)
-        )
+        cm, deg, ms = (np.percentile(v, [50, 95]).tolist() for v in (self.metres * 100, self.degrees, self.ms))
         return {"cm": [100 * metres, *cm], "deg": [degrees, *deg], "right": [right], "ms": ms}
 
 
@@ -190,9 +180,7 @@ def compare(found: list[Place]) -> Iterator[Row]:
         for name in ("ours", *WAYS):
             metres, degrees = results[name].rms()
             about = {"way": f"{kind}, {name}", "trials": results[name].details()}
-            yield informs(
-                f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm", about
-            )
+            yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm", about)
             yield informs(f"registration/{kind}: {name}, rms of the rotation's error", degrees, "deg")
 
 
@@ -261,9 +249,7 @@ class SmallGicp:
         """Seconds, with the source's covariances or without, and the pose."""
         cloud = points.astype(np.float64)
         clock = time.perf_counter()
-        source, _ = self._library.preprocess_points(
-            cloud, downsampling_resolution=0.5, num_threads=self._threads
-        )
+        source, _ = self._library.preprocess_points(cloud, downsampling_resolution=0.5, num_threads=self._threads)
         if not whole:
             clock = time.perf_counter()
         within = 2.0 if way == "VGICP" else 1.0

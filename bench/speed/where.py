@@ -98,9 +98,7 @@ def measured(frames: int) -> list[Times]:
 
 def options(parser: ArgumentParser) -> None:
     """Add how many frames."""
-    parser.add_argument(
-        "--frames", type=int, default=FRAMES, help=f"({FRAMES}; the first {_SETTLED} do not count)"
-    )
+    parser.add_argument("--frames", type=int, default=FRAMES, help=f"({FRAMES}; the first {_SETTLED} do not count)")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:

@@ -22,13 +22,7 @@ SETTLED = 20.0
 
 
 def judge_return(
-    outcome: Outcome,
-    stage: Stage,
-    what: str,
-    moment: float,
-    limit: float,
-    first: int,
-    last: int | None = None,
+    outcome: Outcome, stage: Stage, what: str, moment: float, limit: float, first: int, last: int | None = None
 ) -> None:
     """Judge how soon after ``moment`` poses came again whose stamps are ``first`` or later (to ``last``), ns."""
     newer = [pose for pose in stage.recorder.poses("r1", moment) if pose.stamp_ns >= first]
@@ -36,9 +30,7 @@ def judge_return(
     outcome.most(what, poses[0].arrival - moment if poses else None, limit)
 
 
-def judge_common(
-    outcome: Outcome, stage: Stage, plan: RobotPlan, sent: Any, start: float, **options: Any
-) -> Any:
+def judge_common(outcome: Outcome, stage: Stage, plan: RobotPlan, sent: Any, start: float, **options: Any) -> Any:
     """Measure, and judge what any ill treatment must leave intact."""
     numbers = stage.measure(plan, sent, start, **options)
     outcome.numbers.update(numbers)
@@ -90,11 +82,7 @@ def flood(setting: Setting) -> Outcome:
         outcome.tell("jitter during the flood p50 / p99, ms", scores.jitter_ms(steps))
         ticks = scores.tracking_intervals(stage.recorder.ticks(start + begin, start + end), [])
         outcome.tell("... of the machine itself, ms", scores.jitter_ms(ticks))
-        outcome.numbers["flood"] = {
-            "rate_hz": rate,
-            "jitter_ms": scores.jitter_ms(steps),
-            "memory_mb": memory,
-        }
+        outcome.numbers["flood"] = {"rate_hz": rate, "jitter_ms": scores.jitter_ms(steps), "memory_mb": memory}
         share = scores.share_posed(within, start + begin, start + end)
         outcome.tell("time posed during the flood", share)
         judge_return(outcome, stage, "poses after the flood, s", start + end, BACK_SOON, stamp_of(end))
@@ -141,13 +129,7 @@ def random(setting: Setting) -> Outcome:
 def backwards(setting: Setting) -> Outcome:
     """Old stamps among new ones, twins, time running backwards, a stamp of tomorrow, a clock that restarts."""
     outcome = Outcome("backwards")
-    late, twice, reverse, future, restart = (
-        (15.0, 20.0),
-        (23.0, 28.0),
-        (31.0, 34.0),
-        (41.0, 42.0),
-        (50.0, 75.0),
-    )
+    late, twice, reverse, future, restart = ((15.0, 20.0), (23.0, 28.0), (31.0, 34.0), (41.0, 42.0), (50.0, 75.0))
     phases = (
         Phase(*late, "late"), Phase(*twice, "twice"), Phase(*reverse, "reversed"), Phase(*future, "future"),
         Phase(*restart, "restart"),

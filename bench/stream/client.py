@@ -115,9 +115,7 @@ class Sent:
     longest_put: float
 
 
-def send(
-    conn: Connection, endpoint: str, world: str, plans: Sequence[RobotPlan], base: str = "coview"
-) -> None:
+def send(conn: Connection, endpoint: str, world: str, plans: Sequence[RobotPlan], base: str = "coview") -> None:
     """Stream the plans' robots through one session, on time; every cloud is loaded before."""
     import zenoh
 
@@ -142,27 +140,19 @@ def send(
             if kind == "cloud":
                 payload, encoding, attachment = CLOUDS[plan.cloud](drive.cloud(content, plan.points), stamp)
                 begin = time.monotonic()
-                session.put(
-                    f"{base}/{plan.robot}/in/cloud", payload, encoding=encoding, attachment=attachment
-                )
+                session.put(f"{base}/{plan.robot}/in/cloud", payload, encoding=encoding, attachment=attachment)
                 puts[plan.robot].append((stamp, begin))
             else:
                 payload, encoding, _ = ODOMETRY[plan.odometry](drive.T_odom_body(content), stamp)
                 begin = time.monotonic()
-                session.put(
-                    f"{base}/{plan.robot}/in/odom", payload, encoding=encoding, congestion_control=block
-                )
+                session.put(f"{base}/{plan.robot}/in/odom", payload, encoding=encoding, congestion_control=block)
             lag, longest = max(lag, -wait), max(longest, time.monotonic() - begin)
             done += 1
     tables = {robot: np.array(rows, dtype=np.float64).reshape(-1, 2) for robot, rows in puts.items()}
-    conn.send(
-        Sent({robot: rows[np.argsort(rows[:, 0])] for robot, rows in tables.items()}, done, lag, longest)
-    )
+    conn.send(Sent({robot: rows[np.argsort(rows[:, 0])] for robot, rows in tables.items()}, done, lag, longest))
 
 
-def vandalise(
-    conn: Connection, endpoint: str, robots: Sequence[str], rate: float, base: str = "coview"
-) -> None:
+def vandalise(conn: Connection, endpoint: str, robots: Sequence[str], rate: float, base: str = "coview") -> None:
     """Send rubbish to the robots' inputs, ``rate`` messages a second, until told to stop; sends back how many."""
     source = rubbish(7)
     keys = [f"{base}/{robot}/in/{name}" for robot in robots for name in ("cloud", "odom")]
@@ -192,9 +182,7 @@ class Recorder:
 
         self.session = open_session("client", connect=[self.endpoint])
         direct = zenoh.handlers.Callback(self._record, indirect=False)
-        self._held = [
-            self.session.declare_subscriber(key, direct) for key in (f"{self.base}/*/out/*", METRONOME)
-        ]
+        self._held = [self.session.declare_subscriber(key, direct) for key in (f"{self.base}/*/out/*", METRONOME)]
         alive = f"{self.base}/*/alive"
         self._held.append(self.session.liveliness().declare_subscriber(alive, self._token, history=True))
         return self

@@ -61,9 +61,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     from coview_stream.sim import SimulationConfig
 
     repeat, serves = (5, 1) if asked.quick else (_REPEAT, _SERVES)
-    yield bounded(
-        "start/import coview_stream", float(np.median([imported() for _ in range(repeat)])), "s", IMPORT
-    )
+    yield bounded("start/import coview_stream", float(np.median([imported() for _ in range(repeat)])), "s", IMPORT)
     config = SimulationConfig("town", "vlp16", seed=4005, size=120.0, length=0.0, density=10.0)
     prepare(folder(), config)
     site = map_of(folder(), config)

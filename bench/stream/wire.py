@@ -21,10 +21,7 @@ from coview_stream.geometry.arrays import Floats, Floats32
 Points = Floats32
 Message = tuple[bytes, str, bytes | None]  # payload, encoding, attachment
 
-CDR_CLOUD, CDR_ODOMETRY = (
-    "application/cdr;sensor_msgs/msg/PointCloud2",
-    "application/cdr;nav_msgs/msg/Odometry",
-)
+CDR_CLOUD, CDR_ODOMETRY = ("application/cdr;sensor_msgs/msg/PointCloud2", "application/cdr;nav_msgs/msg/Odometry")
 FOXGLOVE_CLOUD = "application/protobuf;foxglove.PointCloud"
 ENCODINGS = (
     "application/octet-stream;layout=xyz", "application/octet-stream;layout=xyzi", CDR_CLOUD, FOXGLOVE_CLOUD,
@@ -161,14 +158,7 @@ _RUBBISH = (
     b'{"stamp_ns": ' + b"9" * 5000 + b', "position": [0,0,0], "orientation": [0,0,0,1]}',
     b"\0\1\0\0" + b"\xff" * 400, b"\0\0\0\0" + b"\0" * 60,
 )  # fmt: skip
-_STRANGE = (
-    "",
-    "text/plain",
-    "application/x-unheard-of",
-    "application/cdr;some_msgs/msg/Other",
-    "a;b;c;d",
-    "image/png",
-)
+_STRANGE = ("", "text/plain", "application/x-unheard-of", "application/cdr;some_msgs/msg/Other", "a;b;c;d", "image/png")
 
 
 def rubbish(seed: int) -> Iterator[Message]:

@@ -66,10 +66,7 @@ def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
 def spread(told: Told, error: Errors) -> dict[str, dict[str, Floats]]:
     """Squared distances of all poses by name of the axes, in the ``first minute`` after a fix and ``later``."""
     age = since_fix(told)
-    parts: dict[str, Bools] = {
-        "first minute": np.asarray(age < FIRST_MINUTE),
-        "later": np.asarray(age >= FIRST_MINUTE),
-    }
+    parts: dict[str, Bools] = {"first minute": np.asarray(age < FIRST_MINUTE), "later": np.asarray(age >= FIRST_MINUTE)}
     return {
         part: {n: squares(error.twist[mask], told.covariances[mask], axes) for n, axes in AXES.items()}
         for part, mask in parts.items()
@@ -169,9 +166,7 @@ def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> 
             if count < _LEAST:
                 draw_notice(axes, "too few poses")
             axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="promised share", aspect="equal")
-            axes.set_title(
-                f"{part} after a fix, {count} poses" if part != "later" else f"{part}, {count} poses"
-            )
+            axes.set_title(f"{part} after a fix, {count} poses" if part != "later" else f"{part}, {count} poses")
             axes.set_xticks([0, 0.25, 0.5, *NOMINAL[:2]], ["0", ".25", ".5", "1$\\sigma$", "2$\\sigma$"])
             axes.grid(True, color="#eeeeee", linewidth=0.6)
         both[0].set_ylabel("observed share")

@@ -103,10 +103,7 @@ def drifting(truth: Floats, share: float, seed: int) -> Floats:
     usual, factor = OdometryConfig(), share / 0.015
     for _ in range(5):
         config = replace(
-            usual,
-            yaw_walk=usual.yaw_walk * factor,
-            scale_error=0.0,
-            position_walk=usual.position_walk * factor,
+            usual, yaw_walk=usual.yaw_walk * factor, scale_error=0.0, position_walk=usual.position_walk * factor
         )
         walked = drifting_odometry(truth, config, np.random.default_rng([seed, 41]))
         odometry = rescaled(walked, 1.0 + (-1) ** seed * usual.scale_error * factor)

@@ -57,9 +57,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     every = QUICK if asked.quick else scenarios(asked.seeds)
     chosen = [each for each in every if not asked.names or any(name in each.name for name in asked.names)]
     if not chosen:
-        raise InputError(
-            f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in every)}"
-        )
+        raise InputError(f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in every)}")
     drives, parts = [], []
     for scenario in chosen:
         figures, squared = measure(folder(), scenario)
@@ -168,9 +166,7 @@ def cells(figures: Figures) -> list[str]:
     ]  # fmt: skip
 
 
-def verdicts(
-    drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick: bool = False
-) -> Iterator[Row]:
+def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick: bool = False) -> Iterator[Row]:
     """Judge all drives together; ``found`` is their coverage.
 
     ``quick`` drives are too short to be found again on, and too few for a coverage.

@@ -29,9 +29,7 @@ _MIN_POINTS = 1000  # set by hand
 _SURVEY_MARGIN = 1  # cells; set by hand
 
 
-def build_arrays(
-    paths: list[Path], config: MapConfig, progress: bool = False
-) -> tuple[Arrays, dict[str, Any]]:
+def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
     """Read ``paths`` and return a map's arrays and the parameters that say where it came from.
 
     Raises:
@@ -67,18 +65,14 @@ def build_arrays(
         if config.outlier_neighbours:
             points, _ = remove_outliers(points, config.outlier_neighbours, config.outlier_std_ratio)
         if len(points) < _MIN_POINTS:
-            raise MapError(
-                f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more"
-            )
+            raise MapError(f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more")
         step(2, 3)
         normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
     with _progress_bar(progress, "ground") as step:
         stations = find_stations(points, config.block, config.levels)
         if not len(stations):
-            raise MapError(
-                "no ground found in the base map; it needs points on the ground to put stations on"
-            )
+            raise MapError("no ground found in the base map; it needs points on the ground to put stations on")
         step(1, 1)
     with _progress_bar(progress, "describing stations") as step:
         described = describe_storeys(points, stations, config.block, config.descriptor, step)
@@ -127,9 +121,7 @@ def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8],
     cells = np.floor(points[:, :2].astype(np.float64) / block).astype(np.int64)
     low = cells.min(axis=0) - _SURVEY_MARGIN
     columns, rows = (cells - low).T
-    grid = np.zeros(
-        (int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool
-    )
+    grid = np.zeros((int(rows.max()) + 1 + _SURVEY_MARGIN, int(columns.max()) + 1 + _SURVEY_MARGIN), dtype=bool)
     grid[rows, columns] = True
     square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
     return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block

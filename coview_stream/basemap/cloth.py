@@ -39,13 +39,7 @@ def require_cloth() -> None:
 
 
 def cloth_ground(
-    points: Points,
-    *,
-    resolution: float,
-    rigidness: int,
-    slope_smooth: bool,
-    iterations: int,
-    threshold: float,
+    points: Points, *, resolution: float, rigidness: int, slope_smooth: bool, iterations: int, threshold: float
 ) -> Bools:
     """Mask the points (N, 3), metres, on which the cloth comes to lie, dropped on the upturned cloud.
 

@@ -78,11 +78,7 @@ def _write(file: BinaryIO, arrays: Arrays, metadata: dict[str, str]) -> None:
     for name in names:
         array = arrays[name]
         begin, end = end, end + array.nbytes
-        header[name] = {
-            "dtype": _NAMES[array.dtype.str],
-            "shape": list(array.shape),
-            "data_offsets": [begin, end],
-        }
+        header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     file.write(len(text).to_bytes(8, "little") + text)
@@ -113,9 +109,7 @@ def load(path: Path) -> tuple[Arrays, dict[str, Any], str]:
         digest = _digest(metadata["parameters"], arrays)
         parameters = json.loads(metadata["parameters"])
     except (KeyError, TypeError, ValueError, OSError) as error:
-        raise MapError(
-            f"{path}: the map is damaged or truncated ({error}); copy or build it again"
-        ) from error
+        raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
     if digest != metadata.get("sha256"):
         raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
     return arrays, parameters, digest

@@ -36,9 +36,7 @@ class LevelConfig:
 
     def __post_init__(self) -> None:
         if not 0.3 <= self.headroom < self.cover <= 50.0:
-            raise ConfigError(
-                f"headroom={self.headroom}, cover={self.cover}: need 0.3 <= headroom < cover <= 50"
-            )
+            raise ConfigError(f"headroom={self.headroom}, cover={self.cover}: need 0.3 <= headroom < cover <= 50")
         if not (0.25 <= self.area <= 10_000 and 0.01 <= self.flatness <= 1.0):
             raise ConfigError(f"area={self.area}, flatness={self.flatness}: need 0.25-10000 m2 and 0.01-1 m")
 
@@ -90,13 +88,7 @@ def indoor_floors(points: Points, config: LevelConfig) -> Points:
     return np.column_stack([x, y, (floor[kept] + base + 0.5) * _STEP]).astype(np.float32)
 
 
-def _flat_and_wide(
-    column: Ints,
-    floor: Ints,
-    ceiling: Ints,
-    shape: tuple[int, int],
-    config: LevelConfig,
-) -> Bools:
+def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], config: LevelConfig) -> Bools:
     """Mask the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
     kept = np.zeros(len(column), dtype=bool)
     steps = max(1, round(config.flatness / _STEP))
@@ -114,14 +106,7 @@ def _flat_and_wide(
     return kept
 
 
-def _one_slab(
-    column: Ints,
-    floor: Ints,
-    ceiling: Ints,
-    shape: tuple[int, int],
-    steps: int,
-    area: float,
-) -> Bools:
+def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int], steps: int, area: float) -> Bools:
     row, col = np.divmod(column, shape[1])
     # crop to where this slab has candidates; one cell of border keeps neighbours inside
     row, col = row - row.min() + 1, col - col.min() + 1
@@ -152,9 +137,7 @@ def _squares(ground: Points, cell: float) -> Points:
     unique, first, count = np.unique(flat[order], return_index=True, return_counts=True)
     row, column = np.divmod(unique, shape[1])
     z = ground[order[first + count // 2], 2]
-    return np.column_stack([corner[0] + (column + 0.5) * cell, corner[1] + (row + 0.5) * cell, z]).astype(
-        np.float32
-    )
+    return np.column_stack([corner[0] + (column + 0.5) * cell, corner[1] + (row + 0.5) * cell, z]).astype(np.float32)
 
 
 def _upper_squares(floors: Points, base: Points, cell: float) -> Points:

@@ -230,13 +230,7 @@ def _filtered(
     return ground if bool(ground.any()) else np.ones(len(lowest), dtype=bool)
 
 
-def _refined(
-    z: Floats32,
-    occupied: Ints,
-    ground: Bools,
-    config: GroundConfig,
-    cell: float,
-) -> Floats32:
+def _refined(z: Floats32, occupied: Ints, ground: Bools, config: GroundConfig, cell: float) -> Floats32:
     """Raster the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
     heights = z.flat[occupied]
     for _ in range(config.refinements + 1):

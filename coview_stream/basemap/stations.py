@@ -24,9 +24,7 @@ Progress = Callable[[int, int], None]
 
 RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
 _PORTION = 512  # stations at a time: 7 MB of bins
-_FLOORS = LevelConfig(
-    area=25.0
-)  # square metres: smaller floors are overhangs more often than not; set by hand
+_FLOORS = LevelConfig(area=25.0)  # square metres: smaller floors are overhangs more often than not; set by hand
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together; set by hand
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey; set by hand
 _CEILING = 6.0  # metres: as LevelConfig.cover
@@ -47,11 +45,7 @@ def find_stations(points: Points, block: float, levels: bool = True) -> Floats32
 
 
 def describe_storeys(
-    points: Points,
-    stations: Floats32,
-    block: float,
-    config: DescriptorConfig,
-    progress: Progress | None = None,
+    points: Points, stations: Floats32, block: float, config: DescriptorConfig, progress: Progress | None = None
 ) -> Described:
     """Describe all stations by channels (M, R, S), those with a storey above them storey by storey.
 
@@ -86,10 +80,7 @@ def describe_storeys(
 
 
 def describe_stations(
-    raster: HeightRaster,
-    stations: Floats32,
-    config: DescriptorConfig,
-    progress: Progress | None = None,
+    raster: HeightRaster, stations: Floats32, config: DescriptorConfig, progress: Progress | None = None
 ) -> Described:
     """Describe the virtual reference scans at ``stations`` (M, 3) by channels (M, R, S), float16.
 
@@ -155,12 +146,7 @@ def aligned_corner(points: Points, block: float, cell: float) -> Floats:
 
 
 def rasterise(
-    points: Points,
-    corner: Floats,
-    cell: float,
-    voxel: float,
-    margin: int = 0,
-    extent: Points | None = None,
+    points: Points, corner: Floats, cell: float, voxel: float, margin: int = 0, extent: Points | None = None
 ) -> HeightRaster:
     """Raster (N, 3) map-frame points.
 
@@ -180,9 +166,4 @@ def rasterise(
     top = np.full(size, -np.inf, dtype=np.float32)
     np.maximum.at(top, flat, points[:, 2])
     top[count == 0] = 0.0
-    return HeightRaster(
-        top.reshape(height, width),
-        count.astype(np.int32).reshape(height, width),
-        corner,
-        cell,
-    )
+    return HeightRaster(top.reshape(height, width), count.astype(np.int32).reshape(height, width), corner, cell)

@@ -30,12 +30,7 @@ def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, 
 
 
 def crop(
-    points: npt.NDArray[Any],
-    normals: npt.NDArray[Any],
-    index: Ints,
-    tile: float,
-    centre: Floats,
-    radius: float,
+    points: npt.NDArray[Any], normals: npt.NDArray[Any], index: Ints, tile: float, centre: Floats, radius: float
 ) -> tuple[Points, Points]:
     """Return points and unit normals (K, 3) float32 within ``radius`` metres (horizontal) of ``centre``."""
     low = np.floor((centre[:2] - radius) / tile)

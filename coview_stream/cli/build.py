@@ -23,14 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("maps", nargs="+", type=Path, metavar="MAP", help="las, laz, ply, pcd, npy or bin")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="SITE.coview")
-    parser.add_argument(
-        "--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans"
-    )
+    parser.add_argument("--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans")
     for name, (kind, text) in _OPTIONS.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N", help=text)
-    parser.add_argument(
-        "--channels", metavar="A,B", help="descriptor channels that vote (scan_context,coview)"
-    )
+    parser.add_argument("--channels", metavar="A,B", help="descriptor channels that vote (scan_context,coview)")
     parser.add_argument(
         "--learned",
         action=argparse.BooleanOptionalAction,

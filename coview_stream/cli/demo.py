@@ -31,9 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
     parser.add_argument("--size", type=float, default=180.0, help="side of the map, metres (180)")
     parser.add_argument("--length", type=float, default=40.0, help="distance driven, metres (40)")
-    parser.add_argument(
-        "--offline", action="store_true", help="frames straight from file to localizer, no zenoh"
-    )
+    parser.add_argument("--offline", action="store_true", help="frames straight from file to localizer, no zenoh")
     parser.epilog = (
         "Runs `serve`, `replay` and `watch` as processes of their own, which talk over zenoh on the loopback "
         "interface; at the robot's own pace. Exit code 0 if the robot was localised rightly, 1 if not."
@@ -47,9 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.recordings.open_run import open_run
     from coview_stream.sim import SimulationConfig, simulate
 
-    config = SimulationConfig(
-        scene=args.scene, sensor=args.sensor, seed=args.seed, size=args.size, length=args.length
-    )
+    config = SimulationConfig(scene=args.scene, sensor=args.sensor, seed=args.seed, size=args.size, length=args.length)
     out = _prepare_folder(args.out)
     world, shown = out / "world", sys.stderr.isatty()
     seconds: dict[str, float] = {}
@@ -159,9 +155,7 @@ def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out
     return evaluate(estimate, truth)
 
 
-def _write_report(
-    evaluation: Evaluation, config: SimulationConfig, seconds: dict[str, float], out: Path
-) -> None:
+def _write_report(evaluation: Evaluation, config: SimulationConfig, seconds: dict[str, float], out: Path) -> None:
     import json
 
     from coview_stream.clouds.atomic_file import atomic_file

@@ -45,10 +45,7 @@ class Recording:
 
 
 def record_live(
-    map_path: Path,
-    run_path: Path,
-    logs: Path,
-    on_record: Callable[[dict[str, Any]], None] = lambda record: None,
+    map_path: Path, run_path: Path, logs: Path, on_record: Callable[[dict[str, Any]], None] = lambda record: None
 ) -> Recording:
     """Serve a map, replay a run to it at its own pace, and record what is published.
 

@@ -72,8 +72,7 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     names = dict.fromkeys(args.robot or ["any"])  # one robot at least, to check the keys
     keys = [
-        robot_keys(args.preset, args.base, name, args.cloud_key, args.odometry_key, None, args.domain)
-        for name in names
+        robot_keys(args.preset, args.base, name, args.cloud_key, args.odometry_key, None, args.domain) for name in names
     ]
     return keys if args.robot else []
 

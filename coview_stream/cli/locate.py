@@ -7,14 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.options import (
-    add_gravity,
-    add_registration,
-    add_reloc,
-    add_run_path,
-    add_topics,
-    lidar_config,
-)
+from coview_stream.cli.options import add_gravity, add_registration, add_reloc, add_run_path, add_topics, lidar_config
 
 if TYPE_CHECKING:
     from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -70,9 +63,7 @@ def run(args: argparse.Namespace) -> int:
             bar.total = total
             bar.update(done - bar.n)
 
-        recorded = open_run(
-            args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow
-        )
+        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow)
     for note in recorded.notes:
         print(note, file=sys.stderr)
     config = LocalizerConfig(

@@ -16,24 +16,18 @@ ROBOT, KISS_ICP = "robot", "kiss-icp"
 
 def add_run_path(parser: argparse.ArgumentParser) -> None:
     """Declare ``RUN``, a recorded run."""
-    parser.add_argument(
-        "run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag"
-    )
+    parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag")
 
 
 def add_topics(parser: argparse.ArgumentParser) -> None:
     """Declare ``--cloud-topic`` and ``--odometry-topic`` of a ROS recording."""
-    parser.add_argument(
-        "--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics"
-    )
+    parser.add_argument("--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics")
     parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")
 
 
 def add_client_network(parser: argparse.ArgumentParser) -> None:
     """Declare ``--connect``, ``--listen``, ``--config`` and ``--base`` of a command that joins a running node."""
-    parser.add_argument(
-        "--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)"
-    )
+    parser.add_argument("--connect", action="append", metavar="EP", help="endpoint to connect to (tcp/127.0.0.1:7447)")
     parser.add_argument("--listen", action="append", metavar="EP", help="endpoint to be connected to on")
     parser.add_argument("--config", type=Path, metavar="FILE", help="zenoh configuration, JSON5")
     parser.add_argument("--base", default="coview", help="first part of the keys (coview)")
@@ -161,9 +155,7 @@ def writable_state_folder(args: argparse.Namespace) -> Path | None:
     except OSError as error:
         text = f"{folder}: the last poses cannot be kept here ({error.strerror or error})"
         if args.state is not None:
-            raise InputError(
-                f"--state {text}; name a directory that can be written, or use --no-state"
-            ) from error
+            raise InputError(f"--state {text}; name a directory that can be written, or use --no-state") from error
         log.warning("%s; use --state DIR or --no-state", text)
     else:
         log.info("the last poses are kept in %s", folder)

@@ -20,12 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", required=True, metavar="NAME", help="whose frames these are")
     add_client_network(parser)
     parser.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
-    parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)"
-    )
-    parser.add_argument(
-        "--speed", type=float, default=1.0, metavar="X", help="times faster than recorded (1)"
-    )
+    parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (as the run's stamps say)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times faster than recorded (1)")
     parser.add_argument("--loop", action="store_true", help="start over until interrupted; stamps go on")
     parser.add_argument("--encoding", metavar="NAME", help="xyz, xyzi, foxglove or cdr (the preset's)")
     parser.add_argument("--odometry-encoding", metavar="NAME", help="json or cdr (the preset's)")
@@ -39,13 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
     add_topics(parser)
-    parser.add_argument(
-        "--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)"
-    )
+    parser.add_argument("--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
-    parser.epilog = (
-        "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
-    )
+    parser.epilog = "Exit code 1 if nothing subscribed to the clouds, neither at the beginning nor at the end."
 
 
 def run(args: argparse.Namespace) -> int:

@@ -35,13 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=Path, metavar="SITE.coview")
     parser.add_argument("--robot", nargs="+", required=True, metavar="NAME", help="one or several robots")
     network = parser.add_argument_group("network (with none of these: --listen tcp/127.0.0.1:7447)")
-    network.add_argument(
-        "--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT of a router"
-    )
+    network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT of a router")
     network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for peers here")
-    network.add_argument(
-        "--config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ..."
-    )
+    network.add_argument("--config", type=Path, metavar="FILE", help="zenoh JSON5: TLS, users, ACL, namespace ...")
     keys = parser.add_argument_group("keys and encodings")
     keys.add_argument("--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson (native)")
     keys.add_argument("--base", default="coview", metavar="KEY", help="first part of our keys (coview)")
@@ -49,18 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument(
         "--humble", action="store_true", help="for rmw_zenoh: name types as ROS 2 Humble does, without a hash"
     )
-    keys.add_argument(
-        "--cloud-key", metavar="KEY", help="instead of the preset's; {base} and {robot} are filled in"
-    )
+    keys.add_argument("--cloud-key", metavar="KEY", help="instead of the preset's; {base} and {robot} are filled in")
     keys.add_argument("--odometry-key", metavar="KEY", help="likewise")
     keys.add_argument("--pose-key", metavar="KEY", help="likewise")
-    keys.add_argument(
-        "--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, for all frames"
-    )
+    keys.add_argument("--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, for all frames")
     keys.add_argument("--odometry-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson, likewise")
-    keys.add_argument(
-        "--pose-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson (the preset's)"
-    )
+    keys.add_argument("--pose-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson (the preset's)")
     source = parser.add_argument_group("odometry")
     source.add_argument(
         "--odometry",
@@ -71,9 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_gravity(source)
     limits = parser.add_argument_group("rates and limits")
     limits.add_argument("--pose-rate", type=float, default=10.0, metavar="HZ", help="(10)")
-    limits.add_argument(
-        "--odometry-timeout", type=float, default=0.5, metavar="S", help="older: no pose (0.5)"
-    )
+    limits.add_argument("--odometry-timeout", type=float, default=0.5, metavar="S", help="older: no pose (0.5)")
     limits.add_argument(
         "--max-outage", type=float, default=2.0, metavar="S", help="after longer without: search anew (2)"
     )

@@ -32,9 +32,7 @@ _MAX_QUEUED = 10_000  # samples waiting for a slow reader of our output
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument(
-        "--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)"
-    )
+    parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="(all robots of the base)")
     add_client_network(parser)
     parser.add_argument(
         "--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson; needs --robot (native)"
@@ -195,8 +193,6 @@ class _Watch:
         connection = self._transport.connection()
         count = len(connection.routers) + len(connection.peers)
         connected = f"connected to {count} other(s)" if count else "not connected"
-        at = ", ".join(
-            self._args.connect or self._args.listen or [str(self._args.config or DEFAULT_ENDPOINT)]
-        )
+        at = ", ".join(self._args.connect or self._args.listen or [str(self._args.config or DEFAULT_ENDPOINT)])
         keys = ", ".join(topic.key for topic in self._topics)
         print(f"nothing yet on {keys}; {connected} ({at})", file=sys.stderr, flush=True)

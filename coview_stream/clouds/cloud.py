@@ -67,12 +67,7 @@ class CloudBuilder:
     _points: list[Points] = field(default_factory=list)
     _classes: list[npt.NDArray[np.uint8]] = field(default_factory=list)
 
-    def add(
-        self,
-        raw: Reals,
-        classification: npt.NDArray[np.uint8] | None = None,
-        dropped: int = 0,
-    ) -> None:
+    def add(self, raw: Reals, classification: npt.NDArray[np.uint8] | None = None, dropped: int = 0) -> None:
         """Append (N, 3) raw coordinates in metres; ``dropped`` counts rows the reader left out before."""
         with np.errstate(invalid="ignore"):
             # false for NaN as well

@@ -72,9 +72,7 @@ def _read(reader: Any, path: Path) -> Cloud:
         keep = ~np.isin(classes, NOISE_CLASSES) & ~np.asarray(chunk.withheld, dtype=bool)
         columns = [
             np.asarray(axis)[keep] * scale + offset
-            for axis, scale, offset in zip(
-                (chunk.X, chunk.Y, chunk.Z), header.scales, header.offsets, strict=True
-            )
+            for axis, scale, offset in zip((chunk.X, chunk.Y, chunk.Z), header.scales, header.offsets, strict=True)
         ]
         builder.add(np.stack(columns, axis=1), classes[keep], dropped=int(len(keep) - keep.sum()))
     if read < expected:

@@ -30,9 +30,7 @@ def read_npy(path: Path) -> Cloud:
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise CloudError(f"{path}: NPY does not hold an array of numbers; save (N, 3) floats")
     if array.ndim != 2 or array.shape[1] < 3:
-        raise CloudError(
-            f"{path}: NPY array has shape {array.shape}; save (N, 3) floats with columns x, y, z"
-        )
+        raise CloudError(f"{path}: NPY array has shape {array.shape}; save (N, 3) floats with columns x, y, z")
     builder = CloudBuilder()
     wide = np.float32 if array.dtype == np.float32 else np.float64
     for start in range(0, len(array), _CHUNK):

@@ -126,12 +126,7 @@ def _ascii(content: bytes, header: _Header, path: Path) -> Reals:
         raise _truncated(path, header, body.count(b"\n"))
     try:
         rows = np.loadtxt(
-            io.BytesIO(body),
-            dtype=np.float64,
-            usecols=columns,
-            ndmin=2,
-            max_rows=header.points,
-            encoding="ascii",
+            io.BytesIO(body), dtype=np.float64, usecols=columns, ndmin=2, max_rows=header.points, encoding="ascii"
         )
     except (ValueError, UnicodeDecodeError, IndexError) as error:
         reason = str(error).split(";")[0]
@@ -158,8 +153,7 @@ def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
     packed, unpacked = struct.unpack_from("<II", content, header.data_start)
     if len(content) < start + packed:
         raise CloudError(
-            f"{path}: truncated PCD, {len(content) - start} of {packed} compressed bytes; "
-            "copy or export it again"
+            f"{path}: truncated PCD, {len(content) - start} of {packed} compressed bytes; copy or export it again"
         )
     if unpacked < header.points * header.row.itemsize:
         raise _truncated(path, header, unpacked // max(1, header.row.itemsize))

@@ -137,9 +137,7 @@ def _ascii(content: bytes, start: int, _: str, before: list[_Element], vertex: _
     return rows[:, [names.index(axis) for axis in _AXES]]
 
 
-def _binary(
-    content: bytes, start: int, order: str, before: list[_Element], vertex: _Element, path: Path
-) -> Reals:
+def _binary(content: bytes, start: int, order: str, before: list[_Element], vertex: _Element, path: Path) -> Reals:
     for element in before:
         start = _skip(content, start, order, element)
     row = vertex.row(order)

@@ -54,9 +54,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
     wrong = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
     wrong |= np.linalg.det(R) <= 0
     if wrong.any():
-        raise RunError(
-            f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is no rotation; check the columns"
-        )
+        raise RunError(f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is no rotation; check the columns")
     return _poses(parts[:, :, 3], nearest_rotation(R))
 
 
@@ -72,9 +70,7 @@ def read_times(path: str | os.PathLike[str]) -> Floats:
     return rows[:, 0]
 
 
-def write_tum(
-    path: str | os.PathLike[str], stamps: Sequence[float] | Floats, poses: Sequence[Pose] | Poses
-) -> None:
+def write_tum(path: str | os.PathLike[str], stamps: Sequence[float] | Floats, poses: Sequence[Pose] | Poses) -> None:
     """Write stamps (N,) in seconds and poses (N, 4, 4) in metres; the file is complete or not there.
 
     N = 0 writes an empty file.
@@ -134,18 +130,13 @@ def _read_rows(path: Path, columns: int, meaning: str) -> tuple[Floats, list[int
     rows, lines = [], []
     for number, words in _words(path):
         if len(words) != columns:
-            raise RunError(
-                f"{path}:{number}: {len(words)} columns instead of {columns}; each line is {meaning}"
-            )
+            raise RunError(f"{path}:{number}: {len(words)} columns instead of {columns}; each line is {meaning}")
         try:
             row = [float(word) for word in words]
         except ValueError as error:
             raise RunError(f"{path}:{number}: not a number ({error}); each line is {meaning}") from error
         # false for NaN as well; stamps may be any finite number
-        if (
-            not all(abs(value) < np.inf for value in row)
-            or max(map(abs, row[1:]), default=0.0) > MAX_COORDINATE
-        ):
+        if not all(abs(value) < np.inf for value in row) or max(map(abs, row[1:]), default=0.0) > MAX_COORDINATE:
             raise RunError(f"{path}:{number}: NaN, infinite or absurd number; repair or drop the line")
         rows.append(row)
         lines.append(number)

@@ -10,13 +10,7 @@ from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.localizer import LocalizerConfig
 from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, map_preset
 from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
-from coview_stream.config.search import (
-    ConsensusConfig,
-    KeyframeConfig,
-    LearnedConfig,
-    Reloc,
-    RetrievalConfig,
-)
+from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
 from coview_stream.config.tracking import GraphConfig, TrackingConfig
 
 __all__ = [

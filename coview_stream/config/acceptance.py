@@ -84,9 +84,7 @@ class AcceptanceConfig:
     max_blind_s: float = 60.0
 
     def __post_init__(self) -> None:
-        fraction(
-            self, "score", "lead", "ground", "single_score", "single_lead", "learned_score", "learned_ground"
-        )
+        fraction(self, "score", "lead", "ground", "single_score", "single_lead", "learned_score", "learned_ground")
         fraction(self, "full_overlap", "min_overlap")
         fraction(self, "tracking_min_score", "tracking_min_share", "tracking_min_ground")
         counts(self, "confirmations", "max_rejections")

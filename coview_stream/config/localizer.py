@@ -8,13 +8,7 @@ from typing import get_args
 from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.checks import require
 from coview_stream.config.registration import RegistrationConfig
-from coview_stream.config.search import (
-    ConsensusConfig,
-    KeyframeConfig,
-    LearnedConfig,
-    Reloc,
-    RetrievalConfig,
-)
+from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
 from coview_stream.config.tracking import GraphConfig, TrackingConfig
 
 

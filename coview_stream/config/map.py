@@ -44,9 +44,7 @@ class DescriptorConfig:
         require(self.radius <= 1000, self, "radius", "at most 1000 m")
         counts(self, "rings", "sectors", minimum=4)
         known = get_args(Channel)
-        require(
-            bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}"
-        )
+        require(bool(self.channels) and set(self.channels) <= set(known), self, "channels", f"some of {known}")
         require(len(set(self.channels)) == len(self.channels), self, "channels", "without repetition")
 
 
@@ -85,12 +83,7 @@ class MapConfig:
         halves = self.block / 0.5  # stations must stand at the centres of the raster's cells
         require(abs(halves - round(halves)) < 1e-6, self, "block", "a multiple of 0.5 m")
         require(self.voxel <= self.block, self, "voxel", f"no larger than block ({self.block} m)")
-        require(
-            self.block < self.descriptor.radius,
-            self,
-            "block",
-            f"below the radius ({self.descriptor.radius} m)",
-        )
+        require(self.block < self.descriptor.radius, self, "block", f"below the radius ({self.descriptor.radius} m)")
 
 
 def map_preset(name: Preset, **changes: Any) -> MapConfig:
@@ -111,7 +104,5 @@ def map_preset(name: Preset, **changes: Any) -> MapConfig:
         elif key in map_names:
             rest[key] = value
         else:
-            raise ConfigError(
-                f"unknown map option {key!r}; choose from {sorted(descriptor_names | map_names)}"
-            )
+            raise ConfigError(f"unknown map option {key!r}; choose from {sorted(descriptor_names | map_names)}")
     return MapConfig(descriptor=DescriptorConfig(**descriptor), **rest)

@@ -80,7 +80,5 @@ class RegistrationConfig:
         all_positive(self, "method", "search", "track")
         for name in ("search", "track"):
             scales = getattr(self, name)
-            falling = bool(scales) and all(
-                a >= b > 0 for a, b in zip(scales, (*scales[1:], scales[-1]), strict=True)
-            )
+            falling = bool(scales) and all(a >= b > 0 for a, b in zip(scales, (*scales[1:], scales[-1]), strict=True))
             require(falling, self, name, "one or more positive distances, coarse to fine")

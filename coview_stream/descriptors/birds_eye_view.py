@@ -64,9 +64,7 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
     above = points[:, 2] - _interpolate(ground, (points[:, :2] - corner) / _GROUND_CELL - 0.5)
     cell = index[:, 1] * width + index[:, 0]
     _layers(image, cell, above)
-    fine = np.meshgrid(
-        (np.arange(width) + 0.5) / ratio - 0.5, (np.arange(height) + 0.5) / ratio - 0.5, indexing="xy"
-    )
+    fine = np.meshgrid((np.arange(width) + 0.5) / ratio - 0.5, (np.arange(height) + 0.5) / ratio - 0.5, indexing="xy")
     curved = _interpolate(relief, np.stack([each.ravel() for each in fine], axis=1))
     image[-1] = np.clip(128.0 + curved * (127.0 / _MAX_RELIEF), 1.0, 255.0)
     return image.astype(np.uint8).reshape(LAYERS, height, width)

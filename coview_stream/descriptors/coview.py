@@ -41,12 +41,7 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
     """
     first: Channel = "coview" if "coview" in config.channels else "coview_strict"
     grid, context, _ = kernels.describe_points(
-        points,
-        centre,
-        config.rings,
-        config.sectors,
-        config.radius,
-        vertical=_VERTICAL[first],
+        points, centre, config.rings, config.sectors, config.radius, vertical=_VERTICAL[first]
     )
     return {name: context if name == first else channel(name, grid) for name in config.channels}
 

@@ -23,9 +23,7 @@ WINDOW = 256
 
 _DRAW_MARGIN = 48  # metres around a window whose points determine its ground; set by hand
 _NET_MARGIN = 64  # metres around a window that the network sees: 30 m for its layers, 28 for GeM's disk
-_KNOWN_RADIUS = (
-    4  # metres from the nearest point within which the map is known, to bridge shadows; set by hand
-)
+_KNOWN_RADIUS = 4  # metres from the nearest point within which the map is known, to bridge shadows; set by hand
 _CELLS = round(1 / CELL)  # image cells a metre
 _PER_PLACE = 2  # cells of the network's global descriptors along the edge of a stored one's
 
@@ -33,9 +31,7 @@ Windows = dict[tuple[int, int], Image]
 
 
 def feature_arrays(
-    points: Points,
-    progress: Callable[[int, int], None] | None = None,
-    window: int = WINDOW,
+    points: Points, progress: Callable[[int, int], None] | None = None, window: int = WINDOW
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the arrays ``learned.*`` of a map, and the parameters that name the weights and the cell.
 
@@ -89,9 +85,7 @@ def _within(values: Floats32, begin: np.int64, size: int, margin: int = 0) -> Bo
 
 def _with_margin(views: Windows, column: int, row: int, width: int, height: int, window: int) -> Image:
     """Return a window's view with :data:`_NET_MARGIN` metres of its neighbours' on every side."""
-    image = np.zeros(
-        (LAYERS, (height + 2 * _NET_MARGIN) * _CELLS, (width + 2 * _NET_MARGIN) * _CELLS), dtype=np.uint8
-    )
+    image = np.zeros((LAYERS, (height + 2 * _NET_MARGIN) * _CELLS, (width + 2 * _NET_MARGIN) * _CELLS), dtype=np.uint8)
     image[-1] = 128  # nothing is known of the ground there
     reach = -(-_NET_MARGIN // window)
     for i in range(-reach, reach + 1):
@@ -110,9 +104,7 @@ def _clipped(begin: int, length: int, size: int) -> tuple[slice, slice]:
     return slice(low, max(low, high)), slice(low - begin, max(low, high) - begin)
 
 
-def _stored(
-    features: Features, image: Image, corner: Ints, shape: tuple[int, int]
-) -> dict[str, npt.NDArray[Any]]:
+def _stored(features: Features, image: Image, corner: Ints, shape: tuple[int, int]) -> dict[str, npt.NDArray[Any]]:
     """Quantize the features without their margin, of the tiles that have points."""
     height, width = shape
     known = _known(image)

@@ -69,9 +69,7 @@ class Network:
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
         try:
-            self._session: Any = runtime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
-            )
+            self._session: Any = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
             (image,) = self._session.get_inputs()
             layers = image.shape[1]
             outputs = tuple(output.name for output in self._session.get_outputs())
@@ -86,15 +84,8 @@ class Network:
         Raises:
             ValueError: the image has another shape.
         """
-        if (
-            image.ndim != 3
-            or image.shape[0] != LAYERS
-            or image.shape[1] % _MULTIPLE
-            or image.shape[2] % _MULTIPLE
-        ):
-            raise ValueError(
-                f"image {image.shape}: ({LAYERS}, H, W) with H and W multiples of {_MULTIPLE} needed"
-            )
+        if image.ndim != 3 or image.shape[0] != LAYERS or image.shape[1] % _MULTIPLE or image.shape[2] % _MULTIPLE:
+            raise ValueError(f"image {image.shape}: ({LAYERS}, H, W) with H and W multiples of {_MULTIPLE} needed")
         scaled = image[None].astype(np.float32) / np.float32(255.0)
         local, sigma, place = self._session.run(list(OUTPUTS), {_INPUT: scaled})
         return Features(local[0], sigma[0, 0], place[0])
@@ -143,8 +134,7 @@ def _runtime() -> Any:
     runtime = require_library("onnxruntime", "onnxruntime>=1.18", "learned re-localization")
     if not hasattr(runtime, "InferenceSession"):  # an uninstallation may leave an empty folder behind
         raise DependencyError(
-            "learned re-localization: onnxruntime is not complete; "
-            "pip install --force-reinstall 'onnxruntime>=1.18'"
+            "learned re-localization: onnxruntime is not complete; pip install --force-reinstall 'onnxruntime>=1.18'"
         )
     return runtime
 

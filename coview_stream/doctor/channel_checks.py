@@ -51,9 +51,7 @@ def odometry_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding
     if not messages:
         yield _missing("odometry", capture, capture.keys.odometry, elsewhere)
     if unreadable := [m for m in messages if m.stamp_ns is None]:
-        yield _unreadable(
-            "odometry", "--odometry-encoding", list(ODOMETRY_CODECS), unreadable, len(messages), robot
-        )
+        yield _unreadable("odometry", "--odometry-encoding", list(ODOMETRY_CODECS), unreadable, len(messages), robot)
     if readable:
         yield _odometry(readable, capture)
         yield stamps_finding("odometry stamps", readable, robot)
@@ -145,9 +143,7 @@ def _odometry(messages: list[CapturedMessage], capture: RobotCapture) -> Finding
     found = f"{_described(messages)}, moved {moved:.1f} m"
     if pause > _NODE.odometry_timeout:
         found += f", a pause of {pause:.1f} s"
-        remedy = (
-            f"without odometry for {_NODE.odometry_timeout:g} s the robot is LOST: send 20 to 100 a second"
-        )
+        remedy = f"without odometry for {_NODE.odometry_timeout:g} s the robot is LOST: send 20 to 100 a second"
         return Finding("FAIL", "odometry", found, remedy, robot)
     if hertz is None or hertz < _MIN_ODOMETRY_RATE:
         return Finding("warn", "odometry", found, "poses repeat stamps: send 20 to 100 a second", robot)
@@ -169,17 +165,13 @@ def stamps_finding(what: str, messages: Sequence[CapturedMessage], robot: str) -
     if back or same:
         verdict: Verdict = "FAIL" if back + same > len(steps) / 2 else "warn"
         found = f"of {len(steps)} steps {back} go backwards, {same} stand still"
-        return Finding(
-            verdict, what, found, "two senders on one key, or a sender that repeats itself?", robot
-        )
+        return Finding(verdict, what, found, "two senders on one key, or a sender that repeats itself?", robot)
     span, elapsed = (stamps[-1] - stamps[0]) * 1e-9, messages[-1].arrived - messages[0].arrived
     if elapsed >= 1.0 and not 1 / _MAX_CLOCK_RATIO < span / elapsed < _MAX_CLOCK_RATIO:
         found = f"run {span / elapsed:.3g} times as fast as the clock here"
         wrong = not 0.05 < span / elapsed < 20
         remedy = (
-            "write nanoseconds"
-            if wrong
-            else "fine for a recording at another speed, else look at the sender's clock"
+            "write nanoseconds" if wrong else "fine for a recording at another speed, else look at the sender's clock"
         )
         return Finding("FAIL" if wrong else "warn", what, found, remedy, robot)
     return Finding("ok", what, f"increasing, newest {stamps[-1] * 1e-9:.3f} s", robot=robot)
@@ -191,9 +183,7 @@ def gravity_finding(messages: Sequence[CapturedMessage], robot: str) -> Finding:
     median, largest = statistics.median(tilts), max(tilts)
     found = f"tilt {math.degrees(median):.1f} degrees, at most {math.degrees(largest):.1f}"
     if median > _MAX_TILT:
-        remedy = (
-            "z must point up in odometry and body: a camera's optical frame, or a sensor mounted on its side?"
-        )
+        remedy = "z must point up in odometry and body: a camera's optical frame, or a sensor mounted on its side?"
         return Finding("FAIL", "gravity", found, remedy, robot)
     if median > _MAX_SLOPE:
         return Finding("warn", "gravity", found, "on a steep slope? else align odometry to gravity", robot)

@@ -84,9 +84,7 @@ def pairing_finding(
     paired = 0
     for message in heapq.merge(odometry, clouds, key=lambda m: m.arrived):
         if message.T_odom_body is not None:
-            kinds[
-                buffer.add(OdometryMessage(message.stamp_ns or 0, message.T_odom_body), message.arrived)
-            ] += 1
+            kinds[buffer.add(OdometryMessage(message.stamp_ns or 0, message.T_odom_body), message.arrived)] += 1
         else:
             pairing.add(_without_points(message), message.arrived)
         paired += sum(1 for _ in pairing.take_paired(message.arrived))
@@ -115,31 +113,21 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
     """Judge whether a node serves the robot, and its status; ``sha256`` of the map it should have, None for any."""
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
-        return Finding(
-            "warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot
-        )
+        return Finding("warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot)
     if status is None:
         remedy = "is its out/status allowed through, and is --base the same?"
         return Finding("warn", "node", "alive, but says nothing", remedy, robot)
     found = f"{_text(status, 'state')}: {_text(status, 'reason') or 'no reason given'}"
     found += f", version {_text(status, 'version')}, map {_text(status, 'map_sha256')[:12]}"
     if not capture.alive:
-        return Finding(
-            "warn", "node", f"{found}; no liveliness token", "do access rules let it hold one?", robot
-        )
+        return Finding("warn", "node", f"{found}; no liveliness token", "do access rules let it hold one?", robot)
     if sha256 and status.get("map_sha256") != sha256:
-        return Finding(
-            "FAIL", "node", f"{found}, not {sha256[:12]}", "it serves another map: restart it", robot
-        )
+        return Finding("FAIL", "node", f"{found}, not {sha256[:12]}", "it serves another map: restart it", robot)
     if status.get("version") != __version__:
-        return Finding(
-            "warn", "node", f"{found}, here {__version__}", "run the same version on both sides", robot
-        )
+        return Finding("warn", "node", f"{found}, here {__version__}", "run the same version on both sides", robot)
     behind = ((time.time_ns() if now_ns is None else now_ns) - _number(status, "stamp_ns")) * 1e-9
     if behind > _MAX_STATUS_AGE:
-        return Finding(
-            "warn", "node", f"{found}; {_seconds(behind)} old", "its clock, or this one, is wrong", robot
-        )
+        return Finding("warn", "node", f"{found}; {_seconds(behind)} old", "its clock, or this one, is wrong", robot)
     errors = status.get("errors")
     if isinstance(errors, list) and errors:
         return Finding("warn", "node", f"{found}; reports: {str(errors[-1])[:200]}", robot=robot)

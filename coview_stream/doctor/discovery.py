@@ -70,9 +70,7 @@ def suggestion(candidates: Iterable[Candidate], channel: str) -> str:
     if not fitting:
         return ""
     what = "clouds come" if channel == "cloud" else "odometry comes"
-    listed = "; ".join(
-        f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_SUGGESTED]
-    )
+    listed = "; ".join(f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_SUGGESTED])
     more = f"; and {len(fitting) - _MAX_SUGGESTED} more" if len(fitting) > _MAX_SUGGESTED else ""
     return f"{what} {listed}{more}"
 
@@ -112,14 +110,10 @@ def from_key(key: str) -> Candidate | None:
 
 def _named(preset: str, channel: str, key: str, robot: str, base: str) -> Candidate | None:
     options = f"--robot {robot}" + (f" --base {base}" if base != "coview" else "")
-    return _valid(
-        preset, channel, key, options if preset == "native" else f"--preset {preset} {options}", robot, base
-    )
+    return _valid(preset, channel, key, options if preset == "native" else f"--preset {preset} {options}", robot, base)
 
 
-def _ros_topic(
-    preset: str, channel: str, topic: str, domain: str = "0", ending: str = ""
-) -> Candidate | None:
+def _ros_topic(preset: str, channel: str, topic: str, domain: str = "0", ending: str = "") -> Candidate | None:
     """Return the candidate of a ROS topic: by the preset where its name is the preset's, else by an explicit key."""
     more = f" --domain {domain}" if domain != "0" else ""
     robot, _, rest = topic.partition("/")
@@ -130,9 +124,7 @@ def _ros_topic(
     return Candidate(channel, f"/{topic}", f"--preset {preset}{more} {option} '{key}'")
 
 
-def _valid(
-    preset: str, channel: str, where: str, options: str, robot: str, base: str = "coview"
-) -> Candidate | None:
+def _valid(preset: str, channel: str, where: str, options: str, robot: str, base: str = "coview") -> Candidate | None:
     """Return the candidate; None if its names are none that the options accept."""
     try:
         robot_keys(preset, base, robot)

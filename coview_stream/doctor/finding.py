@@ -35,9 +35,7 @@ class Finding:
         """Return one printable line, without control characters that came from the network."""
         what = f"{self.robot} {self.what}" if self.robot else self.what
         remedy = f"  ({self.remedy})" if self.remedy else ""
-        return printable(
-            f"{self.verdict:<{_VERDICT_WIDTH}}  {what:<{_WHAT_WIDTH}}  {self.found}{remedy}"
-        ).rstrip()
+        return printable(f"{self.verdict:<{_VERDICT_WIDTH}}  {what:<{_WHAT_WIDTH}}  {self.found}{remedy}").rstrip()
 
     def to_json(self) -> dict[str, str | None]:
         """Return plain data, for JSON."""

@@ -39,9 +39,7 @@ def python_finding(version: tuple[int, ...]) -> Finding:
     text = f"{'.'.join(map(str, version))}, {platform.system()} {platform.machine()}"
     if (3, 11) <= version[:2] < (3, 14):
         return Finding("ok", "python", text)
-    return Finding(
-        "warn", "python", text, "3.11, 3.12 and 3.13 are tested: make the environment with one of them"
-    )
+    return Finding("warn", "python", text, "3.11, 3.12 and 3.13 are tested: make the environment with one of them")
 
 
 def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
@@ -51,9 +49,7 @@ def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
         text += f", {quota:g} of them at a time (container limit)"
     usable = cores if quota is None else min(cores, quota)
     if usable < 2:
-        return Finding(
-            "warn", "processor", text, "poses may come late during a search: give a node 2 or more"
-        )
+        return Finding("warn", "processor", text, "poses may come late during a search: give a node 2 or more")
     return Finding("ok", "processor", text)
 
 
@@ -63,9 +59,7 @@ def memory_finding(total: int | None, available: int | None) -> Finding:
         return Finding("ok", "memory", "unknown on this system")
     text = f"{available / GB:.1f} GB of {total / GB:.1f} GB available"
     if available < MIN_MEMORY:
-        return Finding(
-            "warn", "memory", text, f"a node needs {MIN_MEMORY / GB:g} GB and more: end other programs"
-        )
+        return Finding("warn", "memory", text, f"a node needs {MIN_MEMORY / GB:g} GB and more: end other programs")
     return Finding("ok", "memory", text)
 
 
@@ -102,9 +96,7 @@ def zenoh_finding(found: dict[str, Any]) -> Finding:
         return Finding("FAIL", "zenoh", str(found["error"]), "`pip install 'eclipse-zenoh>=1.10'`")
     parts = str(found["version"]).split(".")[:2]
     if all(p.isdigit() for p in parts) and tuple(map(int, parts)) < _MIN_ZENOH:
-        return Finding(
-            "warn", "zenoh", str(found["version"]), "tested with 1.10 and newer: upgrade eclipse-zenoh"
-        )
+        return Finding("warn", "zenoh", str(found["version"]), "tested with 1.10 and newer: upgrade eclipse-zenoh")
     return Finding("ok", "zenoh", str(found["version"]))
 
 
@@ -121,9 +113,7 @@ def open3d_finding(found: dict[str, Any]) -> Finding:
     """Judge Open3D: normals and outliers of maps to be built, and ray casting in simulated worlds."""
     if "error" in found:
         text, _, remedy = str(found["error"]).removeprefix("DependencyError: ").partition("; ")
-        return Finding(
-            "warn", "open3d", f"{text}: build, simulate and demo will not work, the rest does", remedy
-        )
+        return Finding("warn", "open3d", f"{text}: build, simulate and demo will not work, the rest does", remedy)
     return Finding("ok", "open3d", str(found["version"]))
 
 
@@ -145,13 +135,7 @@ def memory() -> tuple[int | None, int | None]:
             fields[name] = int(number[0]) * 1024
     total, available = fields.get("MemTotal"), fields.get("MemAvailable")
     limit, used = _read("/sys/fs/cgroup/memory.max").strip(), _read("/sys/fs/cgroup/memory.current").strip()
-    if (
-        total is not None
-        and available is not None
-        and limit.isdigit()
-        and used.isdigit()
-        and int(limit) < total
-    ):
+    if total is not None and available is not None and limit.isdigit() and used.isdigit() and int(limit) < total:
         return int(limit), min(available, max(0, int(limit) - int(used)))
     return total, available
 

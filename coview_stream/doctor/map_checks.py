@@ -28,9 +28,7 @@ def open_map(path: Path) -> tuple[BaseMap | None, Finding]:
         base_map = BaseMap.load(path)
     except MapError as error:
         return None, from_error("map", error)
-    text = (
-        f"{path}: format {VERSION}, {len(base_map)} stations, {len(base_map.points)} points, checksum holds"
-    )
+    text = f"{path}: format {VERSION}, {len(base_map)} stations, {len(base_map.points)} points, checksum holds"
     return base_map, Finding("ok", "map", text)
 
 
@@ -38,9 +36,7 @@ def map_findings(base_map: BaseMap, size: int, available: int | None) -> Iterato
     """Judge an open map whose file has ``size`` bytes, with ``available`` bytes of memory (None: unknown)."""
     yield Finding("ok", "map sha256", base_map.sha256)
     if not len(base_map):
-        yield Finding(
-            "FAIL", "map stations", "none: nowhere to search", "build it again, from ground and walls"
-        )
+        yield Finding("FAIL", "map stations", "none: nowhere to search", "build it again, from ground and walls")
     yield _features_finding(base_map)
     needed = node_memory(base_map)
     text = f"a node needs about {needed / GB:.1f} GB, and {size / GB:.2f} GB of page cache for the file"

@@ -33,9 +33,7 @@ def connection_finding(transport: Transport, connect: Sequence[str], wait: Wait 
     if _connected(transport):
         return Finding("ok", "network", f"connected: {_counts(transport.connection())}")
     if not connect:
-        return Finding(
-            "FAIL", "network", "nothing has connected", "start the others, and name this endpoint to them"
-        )
+        return Finding("FAIL", "network", "nothing has connected", "start the others, and name this endpoint to them")
     reasons = [(endpoint, try_tcp(endpoint)) for endpoint in connect]
     found = "no session: " + ", ".join(f"{endpoint} {reason}" for endpoint, reason in reasons)
     if any(reason == _OPEN for _, reason in reasons):
@@ -75,9 +73,7 @@ def _counts(connection: Connection) -> str:
     return ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
 
 
-def robot_findings(
-    capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None
-) -> Iterator[Finding]:
+def robot_findings(capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None) -> Iterator[Finding]:
     """Judge all of one robot; ``candidates`` are what else is on the network, ``sha256`` the map's if one is known."""
     yield from cloud_findings(capture, suggestion(candidates, "cloud"))
     yield from odometry_findings(capture, suggestion(candidates, "odometry"))

@@ -83,9 +83,7 @@ def differing(native: Any, twin: Any) -> list[str]:
         "describe_points": (cloud, np.zeros(3), 20, 60, 50.0),
     }
     return [
-        name
-        for name, args in cases.items()
-        if not _close(getattr(native, name)(*args), getattr(twin, name)(*args))
+        name for name, args in cases.items() if not _close(getattr(native, name)(*args), getattr(twin, name)(*args))
     ]
 
 

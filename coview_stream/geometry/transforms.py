@@ -66,9 +66,7 @@ def log_so3(R: Reals) -> Floats:
     turn *= np.where(turn[..., 3:] < 0, -1.0, 1.0)
     sine = np.linalg.norm(turn[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, turn[..., 3:])
-    return np.asarray(
-        turn[..., :3] * np.where(sine < _SMALL, 2.0, angle / np.where(sine < _SMALL, 1.0, sine))
-    )
+    return np.asarray(turn[..., :3] * np.where(sine < _SMALL, 2.0, angle / np.where(sine < _SMALL, 1.0, sine)))
 
 
 def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:

@@ -126,9 +126,7 @@ class Localizer:
             self._update(match, event)  # the graph of poses and the state
         return self.fix()
 
-    def add_frame(
-        self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False
-    ) -> SearchRequest | None:
+    def add_frame(self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
         """:meth:`step` without the search, and so quick.
 
         Args:
@@ -232,9 +230,7 @@ class Localizer:
         if frame.keyframe is None:
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
-        return SearchRequest.of(
-            self._buffer, frame.keyframe, frame.cloud, spec, travelled, self._epoch, hints
-        )
+        return SearchRequest.of(self._buffer, frame.keyframe, frame.cloud, spec, travelled, self._epoch, hints)
 
     def _begin_tracking(self, result: SearchResult) -> MapMatch | None:
         """Begin at the place that a search has accepted, if any, with a registration of the newest frame there."""

@@ -74,9 +74,7 @@ class RunResult:
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres."""
         last = self.posed[-1] if self.posed else None
-        latency = (
-            np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
-        )
+        latency = np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
         return {
             "state": self.state.reported,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
@@ -121,9 +119,7 @@ def locate(
         if progress:
             progress(index + 1, len(run), fix)
     if not located.fixes:
-        raise InputError(
-            f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}"
-        )
+        raise InputError(f"{run.path}: not one of {len(run)} frames could be used; first: {located.skipped[0]}")
     return located
 
 
@@ -173,9 +169,7 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
         with atomic_file(folder / "result.json") as stream:
             stream.write(text.encode())
     except OSError as error:
-        raise InputError(
-            f"{folder}: cannot write the results ({error.strerror}); choose another place"
-        ) from error
+        raise InputError(f"{folder}: cannot write the results ({error.strerror}); choose another place") from error
 
 
 def _named(message: str, path: Path) -> str:
@@ -204,10 +198,7 @@ def _in_file_frame(fix: Fix, frame: Frame) -> Fix:
 def summary(located: RunResult) -> str:
     """Say it in a few lines for a person."""
     posed = located.posed
-    lines = [
-        f"{'state':<18} {located.state.reported}",
-        f"{'localised':<18} {len(posed)} of {located.frames} frames",
-    ]
+    lines = [f"{'state':<18} {located.state.reported}", f"{'localised':<18} {len(posed)} of {located.frames} frames"]
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")

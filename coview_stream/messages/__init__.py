@@ -28,13 +28,7 @@ from coview_stream.errors import ConfigError, MessageError
 from coview_stream.messages import foxglove, json_messages, keelson, raw, ros2
 from coview_stream.messages.choose import Channel, codec_for
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
-from coview_stream.messages.validation import (
-    MAX_PAYLOAD,
-    MAX_POINTS,
-    OversizedError,
-    check_size,
-    read_attachment,
-)
+from coview_stream.messages.validation import MAX_PAYLOAD, MAX_POINTS, OversizedError, check_size, read_attachment
 
 __all__ = [
     "CLOUD_CODECS",

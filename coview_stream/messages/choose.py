@@ -37,25 +37,18 @@ _SCHEMAS: dict[str, tuple[str, tuple[Channel, ...]]] = {
     "foxglove.frametransform": ("foxglove", ("odometry", "pose")),
     "core.envelope": ("keelson", ("cloud", "odometry", "pose")),
 }
-_KEELSON: dict[str, tuple[Channel, ...]] = {
-    "point_cloud": ("cloud",),
-    "frame_transform": ("odometry", "pose"),
-}
+_KEELSON: dict[str, tuple[Channel, ...]] = {"point_cloud": ("cloud",), "frame_transform": ("odometry", "pose")}
 _MAGIC = ((b"\0\0\0\0", "cdr"), (b"\0\1\0\0", "cdr"), (b"{", "json"))
 _RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
 _KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
 _MAX_ENCODING = 256  # characters
 
 
-def codec_for(
-    channel: Channel, names: Collection[str], sample: Sample, option: str | None, hint: str | None
-) -> str:
+def codec_for(channel: Channel, names: Collection[str], sample: Sample, option: str | None, hint: str | None) -> str:
     """Choose one of the codecs ``names``; ConfigError for a wrong option or hint, EncodingError if none fits."""
     for setting, name in (("option", option), ("hint", hint)):
         if name is not None and name not in names:
-            raise ConfigError(
-                f"encoding {setting} {name!r} for {channel}; it must be one of {', '.join(names)}"
-            )
+            raise ConfigError(f"encoding {setting} {name!r} for {channel}; it must be one of {', '.join(names)}")
     if option is not None:
         return option
     allowed, by_key = _claims(channel, sample.encoding[: _MAX_ENCODING + 1], sample.key)
@@ -64,9 +57,7 @@ def codec_for(
     else:
         name = by_key or hint or _by_magic(sample)
     if name not in names:
-        raise EncodingError(
-            f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {channel}"
-        )
+        raise EncodingError(f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {channel}")
     return name
 
 

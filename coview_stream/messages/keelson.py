@@ -27,9 +27,7 @@ def _open(envelope: bytes) -> memoryview:
 def _close(stamp_ns: int, payload: bytes) -> Encoded:
     """Enclose in an envelope, dated with the sensor's time: a codec has no clock."""
     enclosed_at = protobuf_wire.timestamp(*stamp_split(stamp_ns))
-    envelope = protobuf_wire.sized_field(_ENCLOSED_AT, enclosed_at) + protobuf_wire.sized_field(
-        _PAYLOAD, payload
-    )
+    envelope = protobuf_wire.sized_field(_ENCLOSED_AT, enclosed_at) + protobuf_wire.sized_field(_PAYLOAD, payload)
     return Encoded(envelope, _ENCODING)
 
 

@@ -21,9 +21,7 @@ _XYZ = (("x", "<f4", 0), ("y", "<f4", 4), ("z", "<f4", 8))
 def _decode(sample: Sample, columns: int) -> CloudMessage:
     stamp_ns, _ = read_attachment(sample.attachment)
     if stamp_ns is None:
-        raise MessageError(
-            "no stamp: a raw layout needs an attachment of 8 bytes, int64 little-endian nanoseconds"
-        )
+        raise MessageError("no stamp: a raw layout needs an attachment of 8 bytes, int64 little-endian nanoseconds")
     row = 4 * columns
     if len(sample.payload) % row:
         raise MessageError(f"{len(sample.payload)} bytes are no whole number of {row}-byte rows")

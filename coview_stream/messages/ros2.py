@@ -69,9 +69,7 @@ def decode_cloud(sample: Sample) -> CloudMessage:
     _refuse_many_fields(sample.payload)
     cloud = _read(sample.payload, CLOUD)
     order = ">" if cloud.is_bigendian else "<"
-    fields = tuple(
-        (f.name, order + _KINDS[f.datatype], f.offset) for f in cloud.fields if f.datatype in _KINDS
-    )
+    fields = tuple((f.name, order + _KINDS[f.datatype], f.offset) for f in cloud.fields if f.datatype in _KINDS)
     table = Table(cloud.data, fields, cloud.point_step, cloud.width, cloud.height, cloud.row_step)
     return read_table(table, _stamp(cloud))
 

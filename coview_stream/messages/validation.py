@@ -43,9 +43,7 @@ def check_points(count: int) -> None:
 def stamp_from(value: object) -> int:
     """Check that ``value`` is a whole number of nanoseconds in the int64 range, and return it (else MessageError)."""
     if not isinstance(value, int) or isinstance(value, bool):
-        raise MessageError(
-            f"the stamp is of type {type(value).__name__}; write a whole number of nanoseconds"
-        )
+        raise MessageError(f"the stamp is of type {type(value).__name__}; write a whole number of nanoseconds")
     if not -(2**63) <= value < 2**63:
         raise MessageError("the stamp lies outside the int64 range: write nanoseconds")
     return value

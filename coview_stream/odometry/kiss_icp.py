@@ -55,8 +55,7 @@ class KissRegistration:
 def _settings(config: LidarOdometryConfig) -> tuple[Any, Any]:
     """Return the class ``KissICP`` and its configuration; DependencyError where there is no kiss-icp."""
     pipeline, configuration = (
-        require_library(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry")
-        for module in ("kiss_icp", "config")
+        require_library(f"kiss_icp.{module}", "kiss-icp>=1.2", "lidar odometry") for module in ("kiss_icp", "config")
     )
     settings = configuration.KISSConfig()
     settings.data.min_range, settings.data.max_range = config.min_range, config.max_range

@@ -50,9 +50,7 @@ class LidarOdometry:
             meanwhile is missing from the odometry then.
     """
 
-    def __init__(
-        self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None
-    ) -> None:
+    def __init__(self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None) -> None:
         """Start without a frame; ``registration`` replaces kiss-icp.
 
         Raises:
@@ -161,11 +159,7 @@ class LidarOdometry:
         """Refuse a motion that no robot makes; the local map, which holds the frame at a wrong place, is begun anew."""
         far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
         allowed = _SLACK + self.config.max_speed * seconds
-        if (
-            is_pose(step)
-            and far <= allowed
-            and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds)
-        ):
+        if is_pose(step) and far <= allowed and wide <= max(_SLACK_ANGLE, self.config.max_turn_rate * seconds):
             return
         self._restart()
         raise CloudError(
@@ -184,9 +178,7 @@ class LidarOdometry:
         self._step, self._step_seconds = np.eye(4), 1.0
 
 
-def _validated(
-    points: Points, times: Floats | None, config: LidarOdometryConfig
-) -> tuple[Points, Floats | None]:
+def _validated(points: Points, times: Floats | None, config: LidarOdometryConfig) -> tuple[Points, Floats | None]:
     """Return the finite points, a copy (N, 3) float32, and their times (N,).
 
     Raises:
@@ -195,9 +187,7 @@ def _validated(
     rows = cloud_rows(points)
     at = None if times is None else to_array(times, np.float64, "times")
     if at is not None and at.shape != (len(rows),):
-        raise CloudError(
-            f"cloud has {len(rows)} points and times of shape {at.shape}; give one time per point"
-        )
+        raise CloudError(f"cloud has {len(rows)} points and times of shape {at.shape}; give one time per point")
     finite, kept = finite_rows(rows)
     if at is not None and kept is not None:
         at = at[kept]

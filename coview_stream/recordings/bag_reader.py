@@ -63,9 +63,7 @@ class BagReader:
             found[key] = found.get(key, 0) + connection.msgcount
         return found
 
-    def messages(
-        self, topics: Mapping[str, str], start: int | None = None
-    ) -> Iterator[tuple[str, int, bytes]]:
+    def messages(self, topics: Mapping[str, str], start: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, arrival in ns, CDR) of the topics (name: type), in order of arrival, from ``start`` on.
 
         Arrival is the recorder's clock, good for finding a message again and for nothing else.

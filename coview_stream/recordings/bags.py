@@ -63,9 +63,7 @@ def open_bag(
         survey = _survey(reader, topics)
         return _pair(reader, clouds, survey, from_clouds(_without_odometry(reader, clouds, survey)))
     if explicit is not None and odometry_topic is not None:
-        raise RunError(
-            f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them"
-        )
+        raise RunError(f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them")
     # a single scan needs no odometry, as among files
     lone = counts[ros2.CLOUD, clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
     if explicit is None and not lone:
@@ -80,9 +78,7 @@ class BagClouds:
     Read in order, they cost one pass over the recording; read in another order, each is sought by its arrival.
     """
 
-    def __init__(
-        self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses
-    ) -> None:
+    def __init__(self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses) -> None:
         self.reader, self.topic, self.track = reader, topic, track
         self.stamps, self.arrivals, self.poses = stamps, arrivals, poses
         self._lock = threading.Lock()  # a replay reads on another thread
@@ -166,9 +162,7 @@ def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
     return survey
 
 
-def _choose(
-    path: Path, counts: dict[tuple[str, str], int], kind: str, wanted: str | None, option: str
-) -> str:
+def _choose(path: Path, counts: dict[tuple[str, str], int], kind: str, wanted: str | None, option: str) -> str:
     """Return the only topic of the type, or the wanted one."""
     all_of_kind = {topic: count for (found, topic), count in counts.items() if found == kind}
     full = {topic: count for topic, count in all_of_kind.items() if count} or all_of_kind

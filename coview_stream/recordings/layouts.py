@@ -92,9 +92,7 @@ def _frames(folder: Path) -> tuple[Path, ...]:
     """
     files = [file for file in folder.iterdir() if is_cloud_name(file)]
     if not files:
-        raise RunError(
-            f"{folder}: no frames ({', '.join(sorted(CLOUD_SUFFIXES))}); put one cloud per scan there"
-        )
+        raise RunError(f"{folder}: no frames ({', '.join(sorted(CLOUD_SUFFIXES))}); put one cloud per scan there")
     for file in files:
         if not file.is_file():
             raise RunError(f"{file}: is no file (a directory or a broken link); put the cloud itself there")
@@ -144,9 +142,7 @@ def read_stamps(layout: Layout) -> Floats | None:
 def _check_count(file: Path, count: int, what: str, layout: Layout) -> None:
     if count != len(layout.frames):
         relation = "too short" if count < len(layout.frames) else "too long"
-        raise RunError(
-            f"{file}: {relation}, {count} {what} for {len(layout.frames)} frames; give one line per frame"
-        )
+        raise RunError(f"{file}: {relation}, {count} {what} for {len(layout.frames)} frames; give one line per frame")
 
 
 def _kitti(layout: Layout, file: Path) -> tuple[Floats, Poses]:
@@ -187,6 +183,4 @@ def _refuse_camera_poses(poses: Poses, file: Path) -> None:
     steps = np.einsum("nij,ni->nj", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
     x, _, z = np.abs(steps).sum(axis=0)
     if z > 5.0 and z > 5.0 * x:
-        raise RunError(
-            f"{file}: poses drive along z, so they are the camera's; add KITTI's calib.txt with Tr"
-        )
+        raise RunError(f"{file}: poses drive along z, so they are the camera's; add KITTI's calib.txt with Tr")

@@ -96,11 +96,7 @@ def _of_bag(bag: Path, lidar: LidarOdometry | None, topic: str | None, progress:
 
 
 def _place_all(
-    path: Path,
-    lidar: LidarOdometry,
-    count: int,
-    place: Callable[[int], Pose],
-    progress: Progress | None = None,
+    path: Path, lidar: LidarOdometry, count: int, place: Callable[[int], Pose], progress: Progress | None = None
 ) -> Placed:
     """Place ``count`` frames one after the other, and leave out those that cannot be placed.
 
@@ -129,13 +125,9 @@ def _place_all(
             f"patches of wall: the sensor leans {lean:.1f} deg{slope}"
         )
     if failed:
-        notes.append(
-            f"{path}: lidar odometry could not place {len(failed)} of {count} frames; first: {failed[0]}"
-        )
+        notes.append(f"{path}: lidar odometry could not place {len(failed)} of {count} frames; first: {failed[0]}")
     if lidar.restarts:
-        notes.append(
-            f"{path}: lidar odometry began anew {lidar.restarts} times; what was driven there is missing"
-        )
+        notes.append(f"{path}: lidar odometry began anew {lidar.restarts} times; what was driven there is missing")
     return Placed(kept, np.array(poses), tuple(notes))
 
 

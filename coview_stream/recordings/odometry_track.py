@@ -31,9 +31,7 @@ class Track:
         self.poses = poses[first]
         seconds = _NS * np.diff(self.stamps)
         driven = np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1)
-        steady = (seconds <= config.max_gap) & (
-            driven <= np.maximum(_JUMP_DISTANCE, config.max_speed * seconds)
-        )
+        steady = (seconds <= config.max_gap) & (driven <= np.maximum(_JUMP_DISTANCE, config.max_speed * seconds))
         self._part = np.concatenate([[0], np.cumsum(~steady)])
 
     def at(self, stamps: Ints) -> tuple[Poses, Bools]:

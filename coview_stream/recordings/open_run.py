@@ -60,9 +60,7 @@ def open_run(
 
         return open_bag(bag, explicit, cloud_topic, odometry_topic)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):
-        raise RunError(
-            f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out"
-        )
+        raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out")
     layout = find_layout(path)
     count = len(layout.frames)
     if explicit is None and layout.odometry is None:

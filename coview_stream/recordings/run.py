@@ -92,13 +92,7 @@ class Run:
                 "write frames relative to the sensor"
             )
         return Frame(
-            index,
-            float(self.stamps[index]),
-            cloud.points,
-            self.poses[index],
-            cloud.origin,
-            path,
-            cloud.dropped,
+            index, float(self.stamps[index]), cloud.points, self.poses[index], cloud.origin, path, cloud.dropped
         )
 
 

@@ -129,9 +129,7 @@ def driven(poses: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(steps)])[: len(poses)]
 
 
-def evaluate(
-    estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Pose] | None = None
-) -> Evaluation:
+def evaluate(estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Pose] | None = None) -> Evaluation:
     """Compare an estimated trajectory with the truth; an empty one is "not localised", never an error.
 
     Args:

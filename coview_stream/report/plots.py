@@ -79,9 +79,7 @@ def plot_trajectory(
         shift = draw_base_map(axes, base)
         if truth is not None and len(truth):
             line = np.asarray(truth, dtype=np.float64) - shift
-            axes.plot(
-                line[:, 0], line[:, 1], color=TRUTH, linewidth=1.0, linestyle=(0, (4, 2)), label="truth"
-            )
+            axes.plot(line[:, 0], line[:, 1], color=TRUTH, linewidth=1.0, linestyle=(0, (4, 2)), label="truth")
         _draw_states(axes, positions - shift, drawn, np.asarray(states, dtype=object))
         if not drawn.any():
             draw_notice(axes, "not localised: no frame has a pose")
@@ -102,9 +100,7 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
         axes.scatter(at[:, 0], at[:, 1], s=12, color=colour, linewidths=0, label=label, zorder=3)
     if drawn.any():
         x, y = positions[int(np.argmax(drawn)), :2]
-        axes.scatter(
-            x, y, s=90, marker="o", facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4
-        )
+        axes.scatter(x, y, s=90, marker="o", facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4)
 
 
 def plot_errors(
@@ -151,11 +147,7 @@ def _draw_false(axes: Any, distance: Reals, values: Reals, limit: float) -> None
 
 
 def plot_descriptor_pair(
-    query: Reals,
-    winner: Reals,
-    shift: int,
-    path: Path,
-    titles: tuple[str, str] = ("keyframe", "winning station"),
+    query: Reals, winner: Reals, shift: int, path: Path, titles: tuple[str, str] = ("keyframe", "winning station")
 ) -> None:
     """Draw two polar descriptors (R, S) side by side on one colour scale.
 

@@ -13,12 +13,7 @@ import numpy as np
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats, Reals
 
-STATE_COLOURS = {
-    "SEARCHING": "#999999",
-    "AMBIGUOUS": "#E69F00",
-    "TRACKING": "#0072B2",
-    "LOST": "#D55E00",
-}
+STATE_COLOURS = {"SEARCHING": "#999999", "AMBIGUOUS": "#E69F00", "TRACKING": "#0072B2", "LOST": "#D55E00"}
 """Colours of Okabe and Ito: distinct in every common form of colour blindness."""
 
 TRUTH = "#000000"
@@ -69,9 +64,7 @@ def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, 
         try:
             drawing.savefig(Path(path))
         except (OSError, ValueError) as error:
-            raise InputError(
-                f"{path}: cannot be written ({error}); use .png and an existing directory"
-            ) from error
+            raise InputError(f"{path}: cannot be written ({error}); use .png and an existing directory") from error
 
 
 def draw_base_map(axes: Any, points: Reals) -> Floats:
@@ -85,9 +78,7 @@ def draw_base_map(axes: Any, points: Reals) -> Floats:
         sample = np.asarray(points[:: max(1, -(-len(points) // MAX_BASE_POINTS))], dtype=np.float64) - shift
         grey, extent = _shaded(sample)
         # one colour where nothing was measured, so that holes look like holes
-        axes.imshow(
-            grey.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest"
-        )
+        axes.imshow(grey.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(_axis_label("east", shift[0]))
     axes.set_ylabel(_axis_label("north", shift[1]))

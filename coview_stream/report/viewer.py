@@ -40,8 +40,7 @@ class PoseViewer:
             self._rerun.log(f"{name}/body", axes, static=True)
         self._set_time(pose.stamp_ns)
         self._rerun.log(
-            f"{name}/body",
-            self._rerun.Transform3D(translation=position, rotation=self._rerun.Quaternion(xyzw=row[3:])),
+            f"{name}/body", self._rerun.Transform3D(translation=position, rotation=self._rerun.Quaternion(xyzw=row[3:]))
         )
         self._extend(name, position)
 

@@ -75,22 +75,14 @@ def _lines(size: float, flight: Flight) -> Floats:
 
 
 def _strip(
-    caster: Caster,
-    heading: float,
-    line: float,
-    size: float,
-    density: float,
-    rng: np.random.Generator,
-    flight: Flight,
+    caster: Caster, heading: float, line: float, size: float, density: float, rng: np.random.Generator, flight: Flight
 ) -> Floats:
     half, reach = size / 2, size / np.sqrt(2)
     width = 2 * flight.altitude * np.tan(flight.swath)
     # the overlap brings some squares twice; thin each strip so that the mean density is what was asked for
     spacing = 1.0 / np.sqrt(density * (1 - _OVERLAP) if len(_lines(size, flight)) > 1 else density)
     sweeps, beams = int(2 * reach / spacing), int(width / spacing)
-    turn = np.array(
-        [[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]]
-    )
+    turn = np.array([[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
     points = []
     per_block = max(1, 400_000 // beams)
     for first in range(0, sweeps, per_block):

@@ -66,9 +66,7 @@ class Caster:
             return Hits(np.zeros(0, np.float32), np.zeros(0, np.float32))
         return Hits(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def _cast_block(
-        self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float
-    ) -> Hits:
+    def _cast_block(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
         count = len(rays)
         distance, incidence = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
         alive: Indices = np.arange(count, dtype=np.intp)

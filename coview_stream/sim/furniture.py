@@ -40,9 +40,7 @@ def _leaves_lane_free(rows: Floats, route: Floats) -> Bools:
     tree = cKDTree(route)
     reach = np.where(rows[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
     along = reach * np.column_stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])])
-    ends = np.stack(
-        [rows[:, :2] - along, rows[:, :2] - along / 2, rows[:, :2] + along / 2, rows[:, :2] + along]
-    )
+    ends = np.stack([rows[:, :2] - along, rows[:, :2] - along / 2, rows[:, :2] + along / 2, rows[:, :2] + along])
     return np.asarray((tree.query(ends)[0] > _MIN_CLEARANCE).all(axis=0))
 
 
@@ -67,9 +65,7 @@ def _vehicle(kind: float) -> Mesh:
         cabin = placed(frustum(2.5 * scale, 1.65, 0.6, 1.6 * scale, 1.4), -0.2, 0, 0.9)
         return join([body, cabin])
     if kind < _LORRIES:
-        return join(
-            [placed(box(4.9, 1.9, 1.9), -0.3, 0, 0.25), placed(frustum(0.9, 1.8, 0.9, 0.5, 1.7), 2.5, 0, 0.3)]
-        )
+        return join([placed(box(4.9, 1.9, 1.9), -0.3, 0, 0.25), placed(frustum(0.9, 1.8, 0.9, 0.5, 1.7), 2.5, 0, 0.3)])
     return join([placed(box(6.2, 2.4, 2.7), -0.9, 0, 0.9), placed(box(2.0, 2.3, 2.5), 3.3, 0, 0.4)])
 
 

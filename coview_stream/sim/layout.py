@@ -51,12 +51,7 @@ def directions(points: Floats) -> Floats:
 
 
 def grid_layout(
-    rng: np.random.Generator,
-    size: float,
-    half: float,
-    spacing: tuple[float, float],
-    half_width: float,
-    bend: float,
+    rng: np.random.Generator, size: float, half: float, spacing: tuple[float, float], half_width: float, bend: float
 ) -> Layout:
     """Return blocks between crossing streets; the loop goes round some. Streets curve by ``bend`` metres."""
     yaw = rng.uniform(0, np.pi / 2)
@@ -71,10 +66,7 @@ def grid_layout(
     def warp(points: Floats) -> Floats:
         x, y = points.T
         bent = np.column_stack(
-            [
-                x + bend * np.sin(y * 2 * np.pi / length + phase[0]),
-                y + bend * np.sin(x * 6.0 / length + phase[1]),
-            ]
+            [x + bend * np.sin(y * 2 * np.pi / length + phase[0]), y + bend * np.sin(x * 6.0 / length + phase[1])]
         )
         c, s = np.cos(yaw), np.sin(yaw)
         return np.asarray(bent @ np.array([[c, s], [-s, c]]))
@@ -156,14 +148,7 @@ class Site:
     """
 
     def __init__(
-        self,
-        rng: np.random.Generator,
-        layout: Layout,
-        half: float,
-        *,
-        relief: float,
-        roughness: float,
-        ditch: float,
+        self, rng: np.random.Generator, layout: Layout, half: float, *, relief: float, roughness: float, ditch: float
     ) -> None:
         self.half = half
         self.layout = layout

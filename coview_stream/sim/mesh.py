@@ -103,9 +103,7 @@ def ellipsoid(rings: int = 5, sides: int = 8) -> Mesh:
     polar = np.pi * np.arange(1, rings) / rings
     angle = np.arange(sides) * 2 * np.pi / sides
     P, A = np.meshgrid(polar, angle, indexing="ij")
-    body = np.column_stack(
-        [(np.sin(P) * np.cos(A)).ravel(), (np.sin(P) * np.sin(A)).ravel(), np.cos(P).ravel()]
-    )
+    body = np.column_stack([(np.sin(P) * np.cos(A)).ravel(), (np.sin(P) * np.sin(A)).ravel(), np.cos(P).ravel()])
     vertices = np.concatenate([body, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     north, south, faces = len(body), len(body) + 1, []
     for k in range(sides):

@@ -49,9 +49,7 @@ class OdometryConfig:
         for field in fields(self):
             limit = 1e5 if field.name == "offset" else 1.0
             if not 0.0 <= getattr(self, field.name) <= limit:
-                raise ConfigError(
-                    f"{field.name}: {getattr(self, field.name)!r} is not within 0 and {limit:g}"
-                )
+                raise ConfigError(f"{field.name}: {getattr(self, field.name)!r} is not within 0 and {limit:g}")
 
 
 def drive(scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator) -> Floats:

@@ -198,9 +198,7 @@ def _enclosure(rng: np.random.Generator, site: Site, start: Floats, end: Floats)
     gate = int(rng.integers(0, len(line) - 1))
     thickness, height = [(0.7, 1.5), (0.25, 1.1), (0.06, 1.8)][int(rng.integers(3))]
     height *= rng.uniform(0.8, 1.2)
-    return join(
-        vegetation.strip(site, part, thickness, height) for part in (line[: gate + 1], line[gate + 1 :])
-    )
+    return join(vegetation.strip(site, part, thickness, height) for part in (line[: gate + 1], line[gate + 1 :]))
 
 
 def _draw_plot(rng: np.random.Generator, spec: Kind) -> tuple[Plot, float, float]:
@@ -240,6 +238,4 @@ def _street_furniture(rng: np.random.Generator, site: Site, spec: Kind) -> tuple
     spacing = spec.pole_spacing or 40.0
     posts = furniture.spots(rng, site.layout, spacing / 2, site.layout.half_width + 1.1)
     used = len(posts) // 2 if spec.pole_spacing else 0
-    return _Movable(parked[:taken], parked[taken:] if taken else parked[:0]), _Movable(
-        posts[:used], posts[used:]
-    )
+    return _Movable(parked[:taken], parked[taken:] if taken else parked[:0]), _Movable(posts[:used], posts[used:])

@@ -96,9 +96,7 @@ def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) ->
     bar = bar or _Bar(False)
     bar.begin("airborne scan", 100)
     strips, before = [], 0
-    for done, points in airborne_scan(
-        Caster(scene.mapped), config.size, config.density, _stream(config, _AIRBORNE)
-    ):
+    for done, points in airborne_scan(Caster(scene.mapped), config.size, config.density, _stream(config, _AIRBORNE)):
         strips.append(points)
         bar.advance(int(100 * done) - before)
         before = int(100 * done)

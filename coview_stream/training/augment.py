@@ -36,10 +36,7 @@ def _fell(image: Image, rng: np.random.Generator) -> None:
     height, width = image.shape[1:]
     count = rng.poisson(rng.uniform(0.0, _MAX_FALLEN) * height * width * CELL**2)
     for row, column, radius in zip(
-        rng.integers(height, size=count),
-        rng.integers(width, size=count),
-        rng.uniform(*_RADII, count),
-        strict=True,
+        rng.integers(height, size=count), rng.integers(width, size=count), rng.uniform(*_RADII, count), strict=True
     ):
         reach = int(radius / CELL) + 1
         rows = slice(max(0, row - reach), row + reach + 1)
@@ -67,6 +64,4 @@ def _hide(image: Image, aerial: bool, rng: np.random.Generator) -> None:
 
 
 def _weaker(layer: Image, factor: float) -> Image:
-    return np.asarray(
-        np.clip(128.0 + factor * (layer.astype(np.float32) - 128.0), 0.0, 255.0).astype(np.uint8)
-    )
+    return np.asarray(np.clip(128.0 + factor * (layer.astype(np.float32) - 128.0), 0.0, 255.0).astype(np.uint8))

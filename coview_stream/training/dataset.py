@@ -137,9 +137,7 @@ def write_dataset(
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{directory}: cannot be made ({error.strerror}); choose another directory"
-        ) from error
+        raise InputError(f"{directory}: cannot be made ({error.strerror}); choose another directory") from error
     paths = {int(seed): directory / f"{int(seed)}.npz" for seed in seeds}
     missing = [seed for seed, path in paths.items() if not path.exists()]
     report = progress or (lambda seed, seconds: None)

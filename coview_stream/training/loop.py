@@ -65,9 +65,7 @@ def train(
     return net
 
 
-def _step(
-    net: PlaceNet, worlds: Sequence[WorldViews], config: TrainingConfig, rng: np.random.Generator
-) -> Losses:
+def _step(net: PlaceNet, worlds: Sequence[WorldViews], config: TrainingConfig, rng: np.random.Generator) -> Losses:
     batch = draw_batch(worlds, min(config.pieces, len(worlds)), config.each, rng)
     encoded = [
         net(_tensor(images), VIEWS.index(view))
@@ -96,22 +94,13 @@ def _schedule(step: int, steps: int) -> float:
     return rise * (_FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
 
-def _keep(
-    path: Path, net: PlaceNet, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig
-) -> None:
-    state = {
-        "net": net.state_dict(),
-        "optimiser": optimiser.state_dict(),
-        "step": step,
-        "config": asdict(config),
-    }
+def _keep(path: Path, net: PlaceNet, optimiser: torch.optim.Optimizer, step: int, config: TrainingConfig) -> None:
+    state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "step": step, "config": asdict(config)}
     with atomic_path(path) as part:
         torch.save(state, part)
 
 
-def _restore(
-    path: Path | None, net: PlaceNet, optimiser: torch.optim.Optimizer, config: TrainingConfig
-) -> int:
+def _restore(path: Path | None, net: PlaceNet, optimiser: torch.optim.Optimizer, config: TrainingConfig) -> int:
     if path is None or not path.is_file():
         return 0
     try:
@@ -120,9 +109,7 @@ def _restore(
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         raise InputError(f"{path}: not the state of a training ({error}); delete it to start anew") from error
     if not same:
-        raise InputError(
-            f"{path}: a training of other numbers; delete it to start anew, or choose another folder"
-        )
+        raise InputError(f"{path}: a training of other numbers; delete it to start anew, or choose another folder")
     net.load_state_dict(state["net"])
     optimiser.load_state_dict(state["optimiser"])
     return int(state["step"])

@@ -42,12 +42,7 @@ Encoded = tuple[Tensor, Tensor, Tensor]
 
 
 def losses(
-    query: Encoded,
-    piece: Encoded,
-    piece_of: Tensor,
-    poses: Tensor,
-    wrong_yaws: Tensor,
-    seen: tuple[Tensor, Tensor],
+    query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, wrong_yaws: Tensor, seen: tuple[Tensor, Tensor]
 ) -> Losses:
     """Compare Q encoded queries with G encoded pieces.
 
@@ -107,9 +102,7 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
     return target
 
 
-def local_loss(
-    query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]
-) -> Tensor:
+def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:
     """Make corresponding cells similar and others not, and sigma the error of that.
 
     A cross-entropy e over corresponding points, each way, plus e / sigma + log sigma with e held constant, so that a

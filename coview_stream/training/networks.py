@@ -166,9 +166,7 @@ def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
 
     def encode(image: Image) -> Features:
         with torch.no_grad():
-            local, sigma, place = net(
-                torch.from_numpy(image[None].astype("float32") / 255.0), VIEWS.index(view)
-            )
+            local, sigma, place = net(torch.from_numpy(image[None].astype("float32") / 255.0), VIEWS.index(view))
         return Features(local[0].numpy(), sigma[0, 0].numpy(), place[0].numpy())
 
     return encode

@@ -65,9 +65,7 @@ def search_queries(
             volume = correlate(*downsample(query.local, weights(query.sigma)), index, yaws)
             found, scores = best_places(volume, yaws, world.corner)
             results.append(
-                SearchedQuery(
-                    number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores
-                )
+                SearchedQuery(number, str(world.sensor[k]), float(world.travelled[k]), found, world.poses[k], scores)
             )
     return results
 

@@ -166,6 +166,4 @@ def _require_within(name: str, value: Any, bounds: Range) -> None:
     single = {field.name for field in fields(Recipe) if field.type in ("int", "float")}
     ends = (value, value) if name in single else tuple(value)
     if len(ends) != 2 or not low <= ends[0] <= ends[1] <= high:
-        raise ConfigError(
-            f"{name}: {value!r} is out of range; stay, smallest first, within {low:g} to {high:g}"
-        )
+        raise ConfigError(f"{name}: {value!r} is out of range; stay, smallest first, within {low:g} to {high:g}")

@@ -56,23 +56,11 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     leaves = tree_meshes.crowns(rng, trees)
     bushes = tree_meshes.bushes(rng, terrain, understory)
     solid = [terrain.mesh(), *_litter(rng, terrain)]
-    woody = [
-        tree_meshes.stems(trees),
-        tree_meshes.branches(rng, trees, _branch_counts(rng, trees, any(winters))),
-    ]
+    woody = [tree_meshes.stems(trees), tree_meshes.branches(rng, trees, _branch_counts(rng, trees, any(winters)))]
     there, leafed = _fates(rng, len(xy), mortality)
     shifts = (None, rng.normal(0, wind, (len(xy), 2)))
     epochs = [
-        _epoch(
-            rng,
-            solid,
-            woody,
-            leaves,
-            bushes,
-            there[k],
-            leafed[k] & tree_meshes.leafy(trees, winters[k]),
-            shifts[k],
-        )
+        _epoch(rng, solid, woody, leaves, bushes, there[k], leafed[k] & tree_meshes.leafy(trees, winters[k]), shifts[k])
         for k in range(2)
     ]
     drawn = {
@@ -104,9 +92,7 @@ def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
     return (first, first) if rng.random() < 0.5 else (first, second)
 
 
-def _fates(
-    rng: np.random.Generator, count: int, mortality: float
-) -> tuple[tuple[Bools, Bools], tuple[Bools, Bools]]:
+def _fates(rng: np.random.Generator, count: int, mortality: float) -> tuple[tuple[Bools, Bools], tuple[Bools, Bools]]:
     """Draw masks of the trees that stand and of those with leaves, at each epoch; a share of ``mortality`` differs."""
     fate = np.where(rng.random(count) < mortality, rng.integers(1, 4, count), 0)
     everyone = np.ones(count, dtype=bool)

@@ -128,11 +128,7 @@ def _headings(path: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _poses(
-    rng: np.random.Generator,
-    recipe: Recipe,
-    xy: Floats,
-    heading: Floats,
-    ground: Callable[[Floats, Floats], Floats],
+    rng: np.random.Generator, recipe: Recipe, xy: Floats, heading: Floats, ground: Callable[[Floats, Floats], Floats]
 ) -> Floats:
     """Draw poses (K, 4, 4) of the sensor at (K, 2), tilted with the ground under the robot and swaying."""
     x, y = xy.T
@@ -142,9 +138,7 @@ def _poses(
     lean = np.arctan2(np.column_stack([left, -ahead]), _WHEELBASE)
     lean += np.radians(recipe.draw(rng, "tilt")) * rng.normal(size=lean.shape)
     poses = np.tile(np.eye(4), (len(xy), 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler(
-        "ZYX", np.column_stack([heading, lean[:, 1], lean[:, 0]])
-    ).as_matrix()
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", np.column_stack([heading, lean[:, 1], lean[:, 0]])).as_matrix()
     height = recipe.draw(rng, "sensor_height")
     poses[:, :3, 3] = np.column_stack([x, y, ground(x, y) + height])
     return poses

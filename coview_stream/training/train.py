@@ -128,9 +128,7 @@ def train_session(
         history.append([float(x.detach()) for x in (found.dense, found.local, found.place)] + [found.recall])
         if (step + 1) % _REPORT_STEPS == 0:
             dense, local, place, found_share = np.mean(history[-_REPORT_STEPS:], axis=0)
-            say(
-                f"step {step + 1}: dense {dense:.3f}, local {local:.3f}, place {place:.3f}, recall {found_share:.2f}"
-            )
+            say(f"step {step + 1}: dense {dense:.3f}, local {local:.3f}, place {place:.3f}, recall {found_share:.2f}")
 
     net = train(worlds[: plan.worlds], plan.training, report, out / "checkpoint.pt")
     say("evaluating")

@@ -92,9 +92,7 @@ def draw_species(rng: np.random.Generator, recipe: Recipe) -> list[Species]:
     return species
 
 
-def draw_trees(
-    rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: Floats, species: list[Species]
-) -> Trees:
+def draw_trees(rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: Floats, species: list[Species]) -> Trees:
     """Draw the sizes of trees that stand at (N, 2)."""
     count = len(xy)
     kind = _species_of(rng, xy, len(species))

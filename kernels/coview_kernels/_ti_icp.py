@@ -41,9 +41,7 @@ RUNNING, DONE, LOST = 0, 1, 2
 @ti.func
 def placed(T: ti.template(), p):
     x, y, z = p[0], p[1], p[2]
-    return ti.Vector(
-        [T[4 * d] * x + T[4 * d + 1] * y + T[4 * d + 2] * z + T[4 * d + 3] for d in ti.static(range(3))]
-    )
+    return ti.Vector([T[4 * d] * x + T[4 * d + 1] * y + T[4 * d + 2] * z + T[4 * d + 3] for d in ti.static(range(3))])
 
 
 @ti.func

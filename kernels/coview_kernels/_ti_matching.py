@@ -131,23 +131,12 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
             for r in range(rings):
                 for b in range(blocks):
                     at, under = r * 2 * blocks + b, (r * 2 + 1) * blocks + b
-                    p, q = (
-                        second[b] * numbers[at] * step_size[at],
-                        second[b] * numbers[under] * step_size[under],
-                    )
-                    s, t = (
-                        second[b] * numbers[under] * step_size[at],
-                        -second[b] * numbers[at] * step_size[under],
-                    )
+                    p, q = (second[b] * numbers[at] * step_size[at], second[b] * numbers[under] * step_size[under])
+                    s, t = (second[b] * numbers[under] * step_size[at], -second[b] * numbers[at] * step_size[under])
                     t = ti.select(b == 0, q, t)
                     q = ti.select(b == 0, 0.0, q)
                     s = ti.select(b == 0, 0.0, s)
-                    wp, wq, ws, wt = (
-                        ti.floor(p + 0.5),
-                        ti.floor(q + 0.5),
-                        ti.floor(s + 0.5),
-                        ti.floor(t + 0.5),
-                    )
+                    wp, wq, ws, wt = (ti.floor(p + 0.5), ti.floor(q + 0.5), ti.floor(s + 0.5), ti.floor(t + 0.5))
                     query[at], query[under] = ti.cast(wp, i16), ti.cast(wq, i16)
                     query[size + at], query[size + under] = ti.cast(ws, i16), ti.cast(wt, i16)
                     dp, dq, ds, dt = wp - p, wq - q, ws - s, wt - t
@@ -177,9 +166,7 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
                         total += value
                         turn[(6 + at) * lanes + n] = ti.cast(ti.floor(value + 0.5), i16)
                     total = ti.floor(total * (rows / 2.0 / 65536.0) + half / 2.0 + 0.5)
-                    turn[part * lanes + n] = ti.cast(
-                        ti.select(part == 0 and n >= shifts, -30000.0, total), i16
-                    )
+                    turn[part * lanes + n] = ti.cast(ti.select(part == 0 and n >= shifts, -30000.0, total), i16)
             found[0] = span
             found[1] = unit
             found[2] = rounding + error + (0.75 * (2 * blocks + 1) + 4.0) * unit + 3e-5

@@ -5,9 +5,7 @@ from coview_kernels import runtime
 
 ti = runtime.library()
 
-ROWS = ti.types.ndarray(
-    ti.i32, 1
-)  # flat: with four to a row, known here, an index costs no look at the shape
+ROWS = ti.types.ndarray(ti.i32, 1)  # flat: with four to a row, known here, an index costs no look at the shape
 
 SLACK = 1e-9  # metres, and of the distance: more than rounding moves a face between two cells
 FAR = 1e18  # metres, stands for no face

@@ -53,9 +53,7 @@ def as_finite64(name: str, value: npt.ArrayLike, *shape: int | None) -> F64:
 
 def _as_array(name: str, value: npt.ArrayLike, dtype: Any, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
     array = np.ascontiguousarray(value, dtype=dtype)
-    fits = array.ndim == len(shape) and all(
-        n is None or n == m for n, m in zip(shape, array.shape, strict=True)
-    )
+    fits = array.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, array.shape, strict=True))
     if not fits:
         wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
         raise ValueError(f"{name} has shape {np.shape(value)}, expected {wanted}")

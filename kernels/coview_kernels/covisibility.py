@@ -18,11 +18,7 @@ from coview_kernels.launch import Launch
 _MIN_BINS = 10_000  # for a kernel to be quicker: 8 grids of 20 x 60 (measured)
 
 
-def coview(
-    max_height: npt.ArrayLike,
-    count: npt.ArrayLike,
-    vertical: Vertical = "max",
-) -> F32:
+def coview(max_height: npt.ArrayLike, count: npt.ArrayLike, vertical: Vertical = "max") -> F32:
     """Eqs 1-4: the co-view context, one height per bin that both a ground robot and an airborne scanner see.
 
     A bin is occupied where its count is positive. It is *horizontally* visible (eq. 2) if no nearer bin of its sector

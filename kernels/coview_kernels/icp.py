@@ -129,12 +129,7 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     information = state[_INFORMATION:_SUMS].reshape(6, 6).copy()
     squares, weights, pairs = state[_SUMS + 27 : _SUMS + 30]
     return Alignment(
-        pose,
-        information,
-        math.sqrt(squares / weights),
-        int(pairs),
-        int(state[_TOTAL]),
-        bool(state[_CONVERGED]),
+        pose, information, math.sqrt(squares / weights), int(pairs), int(state[_TOTAL]), bool(state[_CONVERGED])
     )
 
 

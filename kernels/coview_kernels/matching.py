@@ -26,9 +26,7 @@ _BATCH = 256  # stations scored at a time, best bounds first: later ones may dro
 _ROUNDING = 2e-9
 _FLOAT32_ERROR = 2e-5  # of all_shift_distance
 _MAX_K = 128  # of the kernel; NumPy scores for a larger k
-_MAX_LISTED = (
-    2048  # stations that may be among the best; the kernel looks through all for each that it scores
-)
+_MAX_LISTED = 2048  # stations that may be among the best; the kernel looks through all for each that it scores
 _MIN_PARALLEL = 4_096  # stations from which other threads are worth waking
 _FRESH, _K = 23, 24  # arguments of the kernel that change
 
@@ -68,8 +66,7 @@ class MatchIndex:
         if descriptors.dtype not in (np.float16, np.float32):
             raise ValueError(f"descriptors are {descriptors.dtype}, expected float16 or float32")
         if not all(
-            np.isfinite(descriptors[i : i + _CHECK_BATCH]).all()
-            for i in range(0, len(descriptors), _CHECK_BATCH)
+            np.isfinite(descriptors[i : i + _CHECK_BATCH]).all() for i in range(0, len(descriptors), _CHECK_BATCH)
         ):
             raise ValueError("descriptors hold NaN or inf")
         self.descriptors = descriptors

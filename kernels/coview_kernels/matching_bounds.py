@@ -69,9 +69,7 @@ class QuantizedStations:
         self.lanes = -(-self.shifts // 16) * 16
         self.rotations = self._rotations()
         self.fourier = self._fourier()
-        self.step = self._quantization_steps(
-            descriptors[:: -(-m // _MAX_SAMPLE) or 1]
-        )  # evenly, at most _MAX_SAMPLE
+        self.step = self._quantization_steps(descriptors[:: -(-m // _MAX_SAMPLE) or 1])  # evenly, at most _MAX_SAMPLE
         self.stations = aligned_zeros((m, self.rings, self.blocks))
         self.residual = np.empty(m, dtype=np.float32)
         norm = np.zeros(self.blocks)

@@ -75,9 +75,7 @@ class PointGrid:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
-def nearest(
-    grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.ArrayLike | None = None
-) -> tuple[F64, I64]:
+def nearest(grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.ArrayLike | None = None) -> tuple[F64, I64]:
     """Find the nearest point of a cloud for each query, nearer than ``radius``; exact, with cKDTree.query's results.
 
     Args:
@@ -116,9 +114,7 @@ def _plain(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple
 def _sort_by_cell(points: F32, edge: float) -> Cells:
     """Sort the points into cells, of a larger ``edge`` if there would be too many."""
     if not len(points):
-        return Cells(
-            np.array([0.0, 0, 0, edge, 1 / edge, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32)
-        )
+        return Cells(np.array([0.0, 0, 0, edge, 1 / edge, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32))
     # by columns: twenty times as fast as along the first axis
     low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
     while True:

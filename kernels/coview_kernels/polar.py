@@ -73,12 +73,7 @@ def _polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float)
 
 
 def describe_points(
-    points: npt.ArrayLike,
-    centre: npt.ArrayLike,
-    rings: int,
-    sectors: int,
-    r_max: float,
-    vertical: Vertical = "max",
+    points: npt.ArrayLike, centre: npt.ArrayLike, rings: int, sectors: int, r_max: float, vertical: Vertical = "max"
 ) -> tuple[PolarGrid, F32, int]:
     """Bin points as :func:`polar_bin` does and describe the grid as :func:`coview` does.
 
@@ -182,9 +177,7 @@ def station_bins(
     if np.any((row < 0) | (row >= top.shape[0]) | (col < 0) | (col >= top.shape[1])):
         raise ValueError(f"rows and cols must lie inside the raster of {top.shape[0]} x {top.shape[1]} cells")
     return runtime.dispatch(
-        _station_bins,
-        reference.station_bins,
-        *(top, count, float(cell), row, col, base, rings, sectors, float(r_max)),
+        _station_bins, reference.station_bins, *(top, count, float(cell), row, col, base, rings, sectors, float(r_max))
     )
 
 

@@ -264,11 +264,7 @@ def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwa
 
 
 def dispatch_here(
-    ready: Callable[[], bool],
-    native: Callable[P, R],
-    plain: Callable[P, R],
-    *args: P.args,
-    **kwargs: P.kwargs,
+    ready: Callable[[], bool], native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwargs: P.kwargs
 ) -> R:
     """Dispatch as :func:`dispatch` does, but run ``native`` on the caller's thread if ``ready()``; the owner waits.
 

@@ -23,9 +23,7 @@ import numpy.typing as npt
 
 from coview_kernels.arrays import C64, F32, as_float32
 
-_MAX_SERIAL = (
-    4000  # elements of a complex matrix up to which OpenBLAS multiplies a vector on one thread (4096)
-)
+_MAX_SERIAL = 4000  # elements of a complex matrix up to which OpenBLAS multiplies a vector on one thread (4096)
 _BATCH = 1024  # candidates transformed at a time: 1.2 MB per 20 x 60 spectrum array stays near the cache
 
 

@@ -30,11 +30,7 @@ _POINTS, _BLOCKS, _CALL, _MERGE = 0, 1, 2, 4  # arguments of the kernel that cha
 
 
 def transform_unique(
-    points: npt.ArrayLike,
-    T: npt.ArrayLike,
-    voxel: float,
-    r_min: float = 0.0,
-    r_max: float = math.inf,
+    points: npt.ArrayLike, T: npt.ArrayLike, voxel: float, r_min: float = 0.0, r_max: float = math.inf
 ) -> tuple[F32, int]:
     """Move a cloud into another frame and keep the first point of each voxel there.
 
@@ -140,9 +136,7 @@ class _KernelPass:
         """Bytes of table and results."""
         return self._moved.nbytes + (16 << self._bits)
 
-    def __call__(
-        self, points: F32, T: F64, voxel: float, r_min: float, r_max: float
-    ) -> tuple[F32, int] | None:
+    def __call__(self, points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int] | None:
         """Return the points kept, in a buffer that the next call overwrites, and the number of rows not finite.
 
         None if the cloud is out of reach, farther than 2^15 voxels from the sensor or 2^29 from the origin.
@@ -156,12 +150,7 @@ class _KernelPass:
             self._allocate(self._bits)
         farthest = min(_MAX_COORDINATE / inverse, _MAX_FLOAT32) if inverse else _MAX_FLOAT32
         self._settings[:12] = T[:3].reshape(-1)
-        self._settings[12:16] = (
-            inverse,
-            min(r_min * r_min, _NO_LIMIT),
-            min(r_max * r_max, _NO_LIMIT),
-            farthest,
-        )
+        self._settings[12:16] = (inverse, min(r_min * r_min, _NO_LIMIT), min(r_max * r_max, _NO_LIMIT), farthest)
         np.floor(sensor, out=self._settings[16:])
         while True:
             kept, infinite, far, cubes = self._run(points, -1 if inverse else 0)

@@ -20,10 +20,7 @@ _EYE, _ORIGIN, _ONE = np.eye(4), np.zeros(3), np.zeros(1, dtype=np.int32)
 def _align() -> None:
     scales = [Scale(1.0, 1.0)]
     align_planes(
-        *(PointGrid(_CLOUD), _CLOUD, _CLOUD, np.ones(2), _EYE, _ORIGIN, scales),
-        keep=1.0,
-        iterations=1,
-        min_pairs=1,
+        *(PointGrid(_CLOUD), _CLOUD, _CLOUD, np.ones(2), _EYE, _ORIGIN, scales), keep=1.0, iterations=1, min_pairs=1
     )
 
 

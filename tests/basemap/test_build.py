@@ -93,10 +93,7 @@ def test_two_storeys_give_two_stations_in_one_cell(tmp_path):
     walls = []
     for side in (-8.0, 8.0):
         a, h = (v.ravel() for v in np.meshgrid(axis, z))
-        walls += [
-            np.column_stack([np.full_like(a, side), a, h]),
-            np.column_stack([a, np.full_like(a, side), h]),
-        ]
+        walls += [np.column_stack([np.full_like(a, side), a, h]), np.column_stack([a, np.full_like(a, side), h])]
     yard = np.random.default_rng(0).uniform(-25, 25, (30_000, 2))
     yard = yard[(np.abs(yard) > 8).any(axis=1)]
     ground = np.column_stack([yard, np.zeros(len(yard))])

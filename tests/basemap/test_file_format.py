@@ -77,18 +77,13 @@ def test_changed_content_changes_the_hash(path, tmp_path, name):
     changed[name] = changed[name].copy()
     changed[name].flat[0] += 1
     assert file_format.save(tmp_path / "other.coview", changed, PARAMETERS) != file_format.load(path)[2]
-    assert (
-        file_format.save(tmp_path / "more.coview", arrays(), PARAMETERS | {"crs": None})
-        != file_format.load(path)[2]
-    )
+    assert file_format.save(tmp_path / "more.coview", arrays(), PARAMETERS | {"crs": None}) != file_format.load(path)[2]
 
 
 def test_hash_does_not_depend_on_memory_layout(path, tmp_path):
     turned = {name: np.asfortranarray(array) for name, array in arrays().items()}
     assert file_format.save(tmp_path / "turned.coview", turned, PARAMETERS) == file_format.load(path)[2]
-    np.testing.assert_array_equal(
-        file_format.load(tmp_path / "turned.coview")[0]["points"], arrays()["points"]
-    )
+    np.testing.assert_array_equal(file_format.load(tmp_path / "turned.coview")[0]["points"], arrays()["points"])
 
 
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
@@ -168,15 +163,7 @@ def test_forged_header_is_refused(path, change):
 
 @pytest.mark.parametrize(
     "content",
-    [
-        b"",
-        b"\x00" * 8,
-        b"LASF" + b"\x00" * 400,
-        b"{}",
-        b"\x02" + b"\x00" * 7 + b"{}",
-        b"\xff" * 100,
-        b"7 text\n" * 50,
-    ],
+    [b"", b"\x00" * 8, b"LASF" + b"\x00" * 400, b"{}", b"\x02" + b"\x00" * 7 + b"{}", b"\xff" * 100, b"7 text\n" * 50],
 )
 def test_file_that_is_not_a_map_is_refused(tmp_path, content):
     path = tmp_path / "other.coview"

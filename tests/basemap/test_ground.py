@@ -110,9 +110,7 @@ def test_cloth_tiles_have_no_seams() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 3, 49])
 def test_few_points_are_all_ground(count: int) -> None:
-    points = np.random.default_rng(7).uniform(0, 1, (count, 3)).astype(np.float32) * np.float32(
-        [20, 20, 0.05]
-    )
+    points = np.random.default_rng(7).uniform(0, 1, (count, 3)).astype(np.float32) * np.float32([20, 20, 0.05])
     assert ground_mask(points).shape == (count,)
     assert ground_mask(points).all()
 
@@ -151,9 +149,7 @@ def test_push_pull_filling_keeps_known_cells_and_stays_within_their_range() -> N
 def storeys() -> npt.NDArray[np.float32]:
     """A two-storey house on a field, with a canopy, a bridge in the open and a table on the upper floor."""
     rng = np.random.default_rng(9)
-    canopy = np.column_stack(
-        [rng.uniform(14, 26, 20_000), rng.uniform(-20, 20, 20_000), rng.uniform(2.5, 9, 20_000)]
-    )
+    canopy = np.column_stack([rng.uniform(14, 26, 20_000), rng.uniform(-20, 20, 20_000), rng.uniform(2.5, 9, 20_000)])
     parts = [
         _slab((-30, 30), (-30, 30), 0.0, 1),
         *(_slab((-10, 10), (-8, 8), z, i) for i, z in enumerate((3.0, 3.3, 6.3))),

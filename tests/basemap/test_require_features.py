@@ -139,10 +139,7 @@ def test_track_engine_loads_no_network(learned_map, weights):
 
 
 def test_serve_warns_once_and_runs_without_learned_features(learned_map, tmp_path, monkeypatch, caplog):
-    parameters = {
-        **learned_map.parameters,
-        "learned": {**learned_map.parameters["learned"], "weights": "0" * 64},
-    }
+    parameters = {**learned_map.parameters, "learned": {**learned_map.parameters["learned"], "weights": "0" * 64}}
     BaseMap(learned_map._arrays, parameters).save(tmp_path / "old.coview")
     relocs = []
 

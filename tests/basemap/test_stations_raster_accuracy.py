@@ -17,9 +17,7 @@ def both():
     return {name: (described[name][chosen].astype(np.float32), exact[name]) for name in exact}
 
 
-@pytest.mark.parametrize(
-    ("channel", "share", "distance"), [("scan_context", 0.05, 0.06), ("coview", 0.07, 0.1)]
-)
+@pytest.mark.parametrize(("channel", "share", "distance"), [("scan_context", 0.05, 0.06), ("coview", 0.07, 0.1)])
 def test_raster_descriptor_bins_are_close_to_exact_bins(both, channel, share, distance):
     found, exact = both[channel]
     assert (np.abs(found - exact) > 0.5).mean() < share

@@ -32,10 +32,7 @@ def test_sorting_keeps_every_point_with_its_normal(cloud, tiled):
     assert rows(points) == rows(cloud[0])
     order, before = np.lexsort(points.T), np.lexsort(cloud[0].T)
     away = np.einsum("ij,ij->i", packed[order] / 127.0, cloud[1][before])
-    assert (
-        np.degrees(np.arccos(np.clip(away / np.linalg.norm(packed[order] / 127.0, axis=1), -1, 1))).max()
-        < 0.5
-    )
+    assert np.degrees(np.arccos(np.clip(away / np.linalg.norm(packed[order] / 127.0, axis=1), -1, 1))).max() < 0.5
 
 
 def test_tile_index_covers_cloud_without_gap_or_overlap(tiled):

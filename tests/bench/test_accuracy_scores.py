@@ -97,8 +97,7 @@ def test_a_crash_costs_one_row(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("shift", "degrees", "verdict"),
-    [(2.9, 8.9, True), (3.1, 0.0, False), (0.0, 9.1, False), (0.0, -8.9, True)],
+    ("shift", "degrees", "verdict"), [(2.9, 8.9, True), (3.1, 0.0, False), (0.0, 9.1, False), (0.0, -8.9, True)]
 )
 def test_a_place_is_right_within_three_metres_and_nine_degrees(shift, degrees, verdict):
     position = np.array([12.0, -5.0, 1.5])
@@ -110,24 +109,9 @@ def test_a_place_is_right_within_three_metres_and_nine_degrees(shift, degrees, v
 
 def test_ablation_totals_count_runs_without_a_fix():
     errors = {"mean": 0.02}
-    got = {
-        "keyframes": 4,
-        "top1": 3,
-        "windows": 0,
-        "coarse": 0,
-        "success": True,
-        "false_frames": 0,
-        "posed": 5,
-    }
+    got = {"keyframes": 4, "top1": 3, "windows": 0, "coarse": 0, "success": True, "false_frames": 0, "posed": 5}
     found = got | {"translation": errors, "rotation": errors, "first_fix_m": 4.0}
-    lost = got | {
-        "success": False,
-        "posed": 0,
-        "top1": 0,
-        "translation": None,
-        "rotation": None,
-        "first_fix_m": None,
-    }
+    lost = got | {"success": False, "posed": 0, "top1": 0, "translation": None, "rotation": None, "first_fix_m": None}
     row = ablation.total("a", [found, lost, lost])
     assert row.ours == 25.0
     assert row.details["cells"] == ["0.25", "-", "1 of 3", "0 of 5", "0.020", "0.020", "-"]

@@ -30,9 +30,7 @@ def fake(asked):
 
 @pytest.fixture
 def planted(monkeypatch):
-    module = SimpleNamespace(
-        rows=fake, tables=lambda rows, asked: {"wide": f"{len(rows)} rows"}, __doc__="Made up."
-    )
+    module = SimpleNamespace(rows=fake, tables=lambda rows, asked: {"wide": f"{len(rows)} rows"}, __doc__="Made up.")
     monkeypatch.setattr(Benchmark, "load", lambda self: module)
     monkeypatch.setitem(BENCHMARKS, "fake", Benchmark("fake", "made up"))
 
@@ -78,11 +76,7 @@ def test_every_row_is_printed_with_its_verdict_and_written(planted, tmp_path, ca
     assert verdicts == ["holds", "informs", "holds"]
     assert "bench fake wide\n\n3 rows\n" in out
     assert "2 of 2 targets hold" in out
-    assert [row["name"] for row in json.loads(file.read_text())] == [
-        "fake/first",
-        "fake/second",
-        "fake/quick",
-    ]
+    assert [row["name"] for row in json.loads(file.read_text())] == ["fake/first", "fake/second", "fake/quick"]
     assert [path.name for path in tmp_path.iterdir()] == ["rows.json"]
     assert bench.main(["fake", "--read", str(file)]) == 0
     assert capfd.readouterr().out.splitlines()[:7] == out.splitlines()[:7]

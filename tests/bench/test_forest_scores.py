@@ -48,14 +48,7 @@ def answer(off, kind="forest rows dense steep leaf-off column", sensor="vlp16", 
 
 def chain(before, after, believed=True):
     """What one method's places were registered to."""
-    return {
-        "before": before,
-        "after": after,
-        "score": 0.5,
-        "passes": believed,
-        "accepted": believed,
-        "ms": 80.0,
-    }
+    return {"before": before, "after": after, "score": 0.5, "passes": believed, "accepted": believed, "ms": 80.0}
 
 
 def cells(text, row):
@@ -106,10 +99,7 @@ def test_every_methods_places_are_registered_and_judged_alike():
     poor = {name: chain([9.0, 20.0], None, believed=False) for name in BASELINES}
     poor["both"] = chain([1.0, 2.0], [0.2, 0.9])
     answers = [answer([1.0]), answer([1.0], chains=poor), answer([1.0], kind="town", chains=poor)]
-    lines = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in compared_table(answers).splitlines()[2:]
-    ]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in compared_table(answers).splitlines()[2:]]
     assert [line[:3] for line in lines[:5]] == [["all", "3", name] for name in (*BASELINES, "learned")]
     assert {line[0] for line in lines} == {"all", "forest", "built"}
     assert len(compared_table(answers[:2]).splitlines()) == 2 + 5  # all are forests: once is enough
@@ -130,10 +120,7 @@ def test_worlds_on_disk_alone_have_tables_of_their_own():
 
 def test_what_is_believed_and_wrong_is_false():
     wrong = [answer([40.0], after=[40.0, 0.1]), answer([1.0], after=[0.1, 6.0], accepted=False)]
-    right = [
-        answer([1.0], after=[1.9, 4.9]),
-        answer([40.0], after=[40.0, 90.0], passes=False, accepted=False),
-    ]
+    right = [answer([1.0], after=[1.9, 4.9]), answer([40.0], after=[40.0, 90.0], passes=False, accepted=False)]
     assert [false(each, "passes") for each in wrong + right] == [True, True, False, False]
     assert [false(each, "accepted") for each in wrong + right] == [True, False, False, False]
     row = cells(metric_table(wrong + right), "all")

@@ -18,9 +18,7 @@ def tried(name, *answers, scene="town", trouble=""):
 
 def test_right_and_vouched_for_are_two_things():
     far = answer(40.0)
-    done = tried(
-        "X", answer(0.2), answer(2.9), answer(0.1, 5.1), far, answer(0.3, vouched=False), answer(None, None)
-    )
+    done = tried("X", answer(0.2), answer(2.9), answer(0.1, 5.1), far, answer(0.3, vouched=False), answer(None, None))
     assert done.succeeded() == 2
     assert done.succeeded(1.0) == 1
     assert done.false_accepts() == 3

@@ -81,12 +81,7 @@ def test_reactions_and_staleness_are_counted_from_the_put_of_the_frame():
 
 def test_statuses_and_ages_name_frames():
     assert stream_scores.corrected([posed(1.0, 5 * SECOND, age=0.25), posed(2.0)]) == [(1.0, 4.75e9)]
-    rows = [
-        told(1.0, last_frame_ns=7),
-        told(2.0),
-        told(3.0, last_frame_ns=None),
-        told(4.0, counters={"dropped": 3}),
-    ]
+    rows = [told(1.0, last_frame_ns=7), told(2.0), told(3.0, last_frame_ns=None), told(4.0, counters={"dropped": 3})]
     assert stream_scores.processed(rows) == [(1.0, 7.0)]
     assert stream_scores.counter(rows, "dropped") == 3
     assert stream_scores.counter([*rows, told(5.0)], "dropped") == 3

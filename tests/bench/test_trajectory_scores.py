@@ -86,9 +86,7 @@ def test_false_seconds_last_until_the_next_frame_and_no_longer_than_half_a_secon
     poses[4, :3, :3] = rot_z(np.radians(5.1))
     stamps = [0.0, 0.1, 0.3, 0.4, 5.0]
     reasons = ["", "", "gone", "", ""]
-    figures = score(
-        told(states, poses, reasons, stamps=stamps), np.tile(np.eye(4), (5, 1, 1)), np.arange(5.0), []
-    )
+    figures = score(told(states, poses, reasons, stamps=stamps), np.tile(np.eye(4), (5, 1, 1)), np.arange(5.0), [])
     assert figures["false_frames"] == 3
     assert figures["false_s"] == pytest.approx(0.2 + 0.5 + 0.15)  # the last one lasts a median gap
     assert figures["doubtful_frames"] == 2

@@ -32,12 +32,7 @@ def test_build_writes_and_describes_a_map(cloud, tmp_path, capsys):
     built = BaseMap.load(target)
     assert built.config.block == 3.0
     assert built.descriptor_config.radius == 20.0
-    for fact in (
-        f"{len(built)} stations",
-        f"{len(built.points)} kept",
-        f"{target.stat().st_size} bytes",
-        " s,",
-    ):
+    for fact in (f"{len(built)} stations", f"{len(built.points)} kept", f"{target.stat().st_size} bytes", " s,"):
         assert fact in out
 
 

@@ -28,9 +28,7 @@ def run_folder(tmp_path_factory):
     rng = np.random.default_rng(2)
     for k in range(6):
         write_cloud(folder / "frames" / f"{k:06d}.pcd", rng.normal(size=(500, 3)).astype(np.float32))
-    write_tum(
-        folder / "odometry.tum", 20.0 + np.arange(6), [pose_from(np.eye(3), [k, 0, 0]) for k in range(6)]
-    )
+    write_tum(folder / "odometry.tum", 20.0 + np.arange(6), [pose_from(np.eye(3), [k, 0, 0]) for k in range(6)])
     return folder
 
 

@@ -92,9 +92,7 @@ def test_serve_runs_last_pose_keeper_unless_no_state(monkeypatch, world_file, tm
     monkeypatch.setattr(opening, "warn_if_served_already", lambda *args: None)
     for name in ("start", "wait_ready", "close"):
         monkeypatch.setattr(EngineProcess, name, lambda self, *args: None)
-    options = opening.ServeOptions(
-        world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None
-    )
+    options = opening.ServeOptions(world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None)
     node = opening.open_node(options)
     try:
         assert ("coview-memory" in [t.name for t in node._threads]) == kept

@@ -95,9 +95,7 @@ def test_watch_prints_json_lines_of_all_robots(node, watch, capsys):
     assert watch(node.endpoint, "--json", times=24) == 0
     captured = capsys.readouterr()
     records = [json.loads(line) for line in captured.out.splitlines()]
-    assert {r["key"] for r in records} == {
-        f"coview/{n}/out/{w}" for n in ("r1", "r2") for w in ("pose", "status")
-    }
+    assert {r["key"] for r in records} == {f"coview/{n}/out/{w}" for n in ("r1", "r2") for w in ("pose", "status")}
     pose = next(r for r in records if r["key"] == "coview/r1/out/pose")
     assert pose["robot"] == "r1"
     assert pose["stamp_ns"] == 7

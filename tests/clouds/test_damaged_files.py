@@ -20,20 +20,11 @@ HEADER = "VERSION 0.7\nFIELDS {f}\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_missing_file_empty_file_directory_and_junk_are_refused(tmp_path: Path, suffix: str) -> None:
-    for name, content in (
-        ("text", b"just some words\n" * 40),
-        ("html", b"<!DOCTYPE html><html>" + b" " * 43),
-    ):
+    for name, content in (("text", b"just some words\n" * 40), ("html", b"<!DOCTYPE html><html>" + b" " * 43)):
         (tmp_path / f"{name}{suffix}").write_bytes(content)
     (tmp_path / f"empty{suffix}").touch()
     (tmp_path / f"folder{suffix}").mkdir()
-    reasons = {
-        "missing": "no such file",
-        "empty": "empty",
-        "folder": "directory",
-        "text": "text",
-        "html": "HTML",
-    }
+    reasons = {"missing": "no such file", "empty": "empty", "folder": "directory", "text": "text", "html": "HTML"}
     for name, reason in reasons.items():
         with pytest.raises(CloudError, match=reason) as caught:
             read_cloud(tmp_path / f"{name}{suffix}")
@@ -55,9 +46,7 @@ def test_file_with_only_nan_points_is_refused(tmp_path: Path, suffix: str) -> No
         read_cloud(tmp_path / f"a{suffix}")
 
 
-@pytest.mark.parametrize(
-    ("real", "named"), [(".ply", ".pcd"), (".pcd", ".laz"), (".laz", ".ply"), (".npy", ".bin")]
-)
+@pytest.mark.parametrize(("real", "named"), [(".ply", ".pcd"), (".pcd", ".laz"), (".laz", ".ply"), (".npy", ".bin")])
 def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: str) -> None:
     write_cloud(tmp_path / f"a{real}", POINTS[:52])
     os.rename(tmp_path / f"a{real}", tmp_path / f"a{named}")  # noqa: PTH104 - Path.rename reads worse here
@@ -78,26 +67,18 @@ def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: 
         ("a.pcd", HEADER.format(f="x y z", n=2).replace("SIZE 4", "SIZE 3").encode(), "TYPE and SIZE"),
         ("a.pcd", HEADER.format(f="x y z", n=2).replace("ascii", "zip").encode(), "unknown encoding"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "without a vertex"),
-        (
-            "a.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
-            "have no y, z",
-        ),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "have no y, z"),
         ("a.ply", b"ply\nformat odd 1.0\nend_header\n", "damaged PLY header"),
         ("a.bin", b"\x01\xff" * 15, "no multiple"),
     ],
 )
-def test_damaged_content_is_refused_with_reason(
-    tmp_path: Path, name: str, content: bytes, reason: str
-) -> None:
+def test_damaged_content_is_refused_with_reason(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CloudError, match=reason):
         read_cloud(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    "array", [np.zeros(9), np.zeros((4, 2)), np.array([["a"] * 3]), np.array([[None] * 3])]
-)
+@pytest.mark.parametrize("array", [np.zeros(9), np.zeros((4, 2)), np.array([["a"] * 3]), np.array([[None] * 3])])
 def test_npy_of_wrong_shape_or_type_is_refused(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "a.npy", array, allow_pickle=True)
     with pytest.raises(CloudError, match=r"a\.npy"):
@@ -164,10 +145,6 @@ def test_huge_point_counts_are_refused_before_allocating(
     else:
         content[103] = 0xF0
     (tmp_path / "a.laz").write_bytes(content)
-    reasons = {
-        "table outside": "chunk table",
-        "too many chunks": "more chunks",
-        "too many records": "more variable",
-    }
+    reasons = {"table outside": "chunk table", "too many chunks": "more chunks", "too many records": "more variable"}
     with pytest.raises(CloudError, match=reasons[damage]):
         read_cloud(tmp_path / "a.laz")

@@ -45,10 +45,7 @@ def test_pole_fills_its_cell_and_layers_on_any_slope(slope: tuple[float, float])
 
 def test_image_does_not_depend_on_point_density() -> None:
     cloud = np.concatenate([ground(), pole(3.1, 3.1, 0.0, 0.5, 9.0)])
-    once, often = (
-        birds_eye_view(cloud, CORNER, SHAPE),
-        birds_eye_view(np.repeat(cloud, 5, axis=0), CORNER, SHAPE),
-    )
+    once, often = (birds_eye_view(cloud, CORNER, SHAPE), birds_eye_view(np.repeat(cloud, 5, axis=0), CORNER, SHAPE))
     assert np.array_equal(once[:SEEN], often[:SEEN])
 
 

@@ -9,9 +9,7 @@ from coview_stream.basemap.stations import aligned_corner, describe_stations, ra
 from coview_stream.config import DescriptorConfig
 from coview_stream.descriptors.coview import describe, ground_below, ring_key
 
-ALL = DescriptorConfig(
-    radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "coview_strict")
-)
+ALL = DescriptorConfig(radius=20.0, rings=10, sectors=12, channels=("scan_context", "coview", "coview_strict"))
 
 
 def polar(r, degrees, z):
@@ -25,15 +23,11 @@ def lattice(rng, half=20, top=5):
     x, y = (v.ravel() for v in np.meshgrid(axis, axis))
     level = rng.integers(0, 2 * top, len(x)) * (rng.random(len(x)) < 0.2)
     points = [np.column_stack([x, y, np.full(len(x), 0.25)])]
-    points += [
-        np.column_stack([x, y, 0.25 + 0.5 * k * np.ones(len(x))])[level >= k] for k in range(1, 2 * top)
-    ]
+    points += [np.column_stack([x, y, 0.25 + 0.5 * k * np.ones(len(x))])[level >= k] for k in range(1, 2 * top)]
     return np.concatenate(points).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    ("degrees", "sector"), [(1.0, 0), (29.0, 0), (31.0, 1), (95.0, 3), (-1.0, 11), (181.0, 6)]
-)
+@pytest.mark.parametrize(("degrees", "sector"), [(1.0, 0), (29.0, 0), (31.0, 1), (95.0, 3), (-1.0, 11), (181.0, 6)])
 @pytest.mark.parametrize(("r", "ring"), [(0.5, 0), (1.9, 0), (2.1, 1), (19.9, 9)])
 def test_point_falls_in_its_ring_and_sector(r, ring, degrees, sector):
     centre = np.array([100.0, -50.0, 7.0])
@@ -89,9 +83,7 @@ def test_ground_below_on_a_slope(slope):
     xy = np.random.default_rng(2).uniform(-15, 15, (8000, 2))
     points = np.column_stack([xy, 12.0 + slope * xy[:, 0]]).astype(np.float32)
     # the lowest point of a 1 m cell lies half a cell downhill and more
-    assert ground_below(points, np.array([0.0, 0.0, 14.0])) == pytest.approx(
-        12.0, abs=0.05 + 0.7 * abs(slope)
-    )
+    assert ground_below(points, np.array([0.0, 0.0, 14.0])) == pytest.approx(12.0, abs=0.05 + 0.7 * abs(slope))
 
 
 def test_ground_below_with_clutter():
@@ -109,9 +101,7 @@ def test_ground_below_uses_points_near_the_robot_only():
     near = polar(4.0, np.arange(0.0, 360, 5), 0.0)
     far = polar(7.0, np.arange(0.0, 360, 1), -30.0)
     shift = np.array([300, -200, 50], np.float32)
-    assert ground_below(
-        np.concatenate([near, far]) + shift, np.array([300.0, -200.0, 52.0])
-    ) == pytest.approx(50.0)
+    assert ground_below(np.concatenate([near, far]) + shift, np.array([300.0, -200.0, 52.0])) == pytest.approx(50.0)
 
 
 def test_without_ground_points_sensor_height_is_returned():

@@ -69,21 +69,9 @@ def test_missing_odometry_is_ok_when_node_computes_it():
     [
         (Sample(KEYS.cloud, b"\x93NUMPY", "application/x-npy"), "application/x-npy", "send one of xyz"),
         (Sample(KEYS.cloud, cloud(0.0).payload, "video/h264"), "video/h264", "--cloud-encoding cdr"),
-        (
-            Sample(KEYS.cloud, cloud(0, codec="foxglove").payload),
-            "no encoding is set",
-            "--cloud-encoding foxglove",
-        ),
-        (
-            Sample(KEYS.cloud, SWEEP.tobytes(), "", ns(0).to_bytes(8, "little")),
-            "no encoding",
-            "--cloud-encoding xyz",
-        ),
-        (
-            Sample(KEYS.cloud, SWEEP.tobytes(), "application/octet-stream;layout=xyz"),
-            "no stamp",
-            "streaming.md",
-        ),
+        (Sample(KEYS.cloud, cloud(0, codec="foxglove").payload), "no encoding is set", "--cloud-encoding foxglove"),
+        (Sample(KEYS.cloud, SWEEP.tobytes(), "", ns(0).to_bytes(8, "little")), "no encoding", "--cloud-encoding xyz"),
+        (Sample(KEYS.cloud, SWEEP.tobytes(), "application/octet-stream;layout=xyz"), "no stamp", "streaming.md"),
         (Sample(KEYS.cloud, bytes(17 << 20)), "bytes", "--max-payload"),
     ],
 )
@@ -159,8 +147,7 @@ def test_odometry_with_a_gap_or_low_rate_is_reported():
 )
 def test_one_odometry_sample_per_frame_is_enough(clouds, samples, verdict):
     robot = capture(
-        [(t + 0.05, cloud(t)) for t in steps(clouds)] if clouds else [],
-        [(t, odometry(t)) for t in steps(samples)],
+        [(t + 0.05, cloud(t)) for t in steps(clouds)] if clouds else [], [(t, odometry(t)) for t in steps(samples)]
     )
     found = next(f for f in odometry_findings(robot, "") if f.what == "odometry")
     assert found.verdict == verdict, found.line()
@@ -169,12 +156,7 @@ def test_one_odometry_sample_per_frame_is_enough(clouds, samples, verdict):
 
 @pytest.mark.parametrize(
     ("degrees", "verdict", "part"),
-    [
-        (5, "ok", "tilt 5.0"),
-        (30, "warn", "tilt 30.0"),
-        (90, "FAIL", "tilt 90.0"),
-        (0, "ok", "no roll and pitch"),
-    ],
+    [(5, "ok", "tilt 5.0"), (30, "warn", "tilt 30.0"), (90, "FAIL", "tilt 90.0"), (0, "ok", "no roll and pitch")],
 )
 def test_odometry_tilt_against_gravity_is_reported(degrees, verdict, part):
     T = pose_from(Rotation.from_euler("x", degrees, degrees=True).as_matrix(), [0.0, 0.0, 0.0])

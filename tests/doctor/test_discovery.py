@@ -31,9 +31,7 @@ def test_known_keys_are_recognised(key, channel, options):
     assert (candidate.channel, candidate.options) == (channel, options)
 
 
-@pytest.mark.parametrize(
-    "key", ["", "in", "r1/out/pose", "a/b/in/image", "points", "@v0/x", "a/@v0/b", "b/?/in/cloud"]
-)
+@pytest.mark.parametrize("key", ["", "in", "r1/out/pose", "a/b/in/image", "points", "@v0/x", "a/@v0/b", "b/?/in/cloud"])
 def test_unknown_keys_are_ignored(key):
     assert from_key(key) is None
 
@@ -96,9 +94,7 @@ def test_discovery_uses_keys_and_tokens():
         "hq/@v0/ship/pubsub/point_cloud/os",
         "/r3/odom",
     ]
-    assert (
-        suggestion(candidates, "odometry") == "odometry comes on /r3/odom: try --preset rmw_zenoh --robot r3"
-    )
+    assert suggestion(candidates, "odometry") == "odometry comes on /r3/odom: try --preset rmw_zenoh --robot r3"
     assert suggestion(candidates, "cloud").count(": try ") == 3
     assert net.raised == []
 

@@ -83,9 +83,7 @@ def test_wrong_kernel_result_is_named():
         grid, dropped = reference.polar_bin(*args)
         return tuple(np.asarray(part) // 2 for part in grid), dropped
 
-    wrong = SimpleNamespace(
-        **{name: getattr(reference, name) for name in kernels.__all__ if hasattr(reference, name)}
-    )
+    wrong = SimpleNamespace(**{name: getattr(reference, name) for name in kernels.__all__ if hasattr(reference, name)})
     assert probes.differing(wrong, reference) == []
     wrong.polar_bin = half
     assert probes.differing(wrong, reference) == ["polar_bin"]

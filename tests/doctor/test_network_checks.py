@@ -44,10 +44,7 @@ def test_findings_of_a_robot_and_its_node():
     net = MemoryTransport()
     net.announce(KEYS.alive)
     status = {"state": "SEARCHING", "reason": "too few keyframes", "map_sha256": "ab"}
-    said = [
-        (0.5, Sample(KEYS.status, json.dumps(status).encode())),
-        (0.6, Sample(KEYS.status, b"\xff")),
-    ]
+    said = [(0.5, Sample(KEYS.status, json.dumps(status).encode())), (0.6, Sample(KEYS.status, b"\xff"))]
     found = findings(net, [*DRIVE, *said])
     assert {f.what: f.verdict for f in found} == {
         "clouds": "ok",
@@ -75,20 +72,14 @@ def test_messages_after_the_capture_are_not_counted():
 def test_silent_robot_is_told_keys_of_other_robots():
     other = robot_keys("native", "coview", "r2")
     found = findings(MemoryTransport(), [(3.5, Sample(KEYS.cloud, b"x"))], keys=[other])
-    assert [(f.verdict, f.what) for f in found] == [
-        ("FAIL", "clouds"),
-        ("FAIL", "odometry"),
-        ("warn", "node"),
-    ]
+    assert [(f.verdict, f.what) for f in found] == [("FAIL", "clouds"), ("FAIL", "odometry"), ("warn", "node")]
     assert found[0].remedy == "clouds come on coview/r1/in/cloud: try --robot r1"
     assert "does the robot publish" in found[1].remedy
 
 
 def test_robots_on_the_network_are_listed_without_robot_option():
     found = findings(MemoryTransport(), [(0.5, cloud(0.0))], keys=[])
-    assert [(f.verdict, f.found) for f in found] == [
-        ("ok", "clouds come on coview/r1/in/cloud: try --robot r1")
-    ]
+    assert [(f.verdict, f.found) for f in found] == [("ok", "clouds come on coview/r1/in/cloud: try --robot r1")]
     assert [f.verdict for f in findings(MemoryTransport(), [], keys=[])] == ["warn"]
 
 

@@ -2,14 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from coview_stream.geometry.transforms import (
-    exp_so3,
-    log_so3,
-    matrix_to_quat,
-    nearest_rotation,
-    quat_to_matrix,
-    slerp,
-)
+from coview_stream.geometry.transforms import exp_so3, log_so3, matrix_to_quat, nearest_rotation, quat_to_matrix, slerp
 
 RNG = np.random.default_rng(3)
 VECTORS = np.concatenate(
@@ -67,8 +60,6 @@ def test_slerp_matches_scipy():
 def test_nearest_rotation_is_a_rotation(noise):
     R = Rotation.from_rotvec(VECTORS).as_matrix()
     found = nearest_rotation(R + RNG.normal(size=R.shape) * noise)
-    np.testing.assert_allclose(
-        found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14
-    )
+    np.testing.assert_allclose(found @ np.swapaxes(found, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
     np.testing.assert_allclose(found, R, atol=10 * noise + 1e-14)
     assert (np.linalg.det(found) > 0).all()

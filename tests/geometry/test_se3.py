@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from se3 import exp_se3
 
-from coview_stream.geometry.transforms import (
-    adjoint,
-    along_body,
-    along_map,
-    boxminus,
-    boxplus,
-    exp_so3,
-    pose_from,
-)
+from coview_stream.geometry.transforms import adjoint, along_body, along_map, boxminus, boxplus, exp_so3, pose_from
 
 T = pose_from(exp_so3([0.4, -0.7, 1.9]), [300.0, -200.0, 12.0])
 
@@ -42,9 +34,7 @@ def test_body_axes_covariance_matches_sampled_motions():
     gaps = np.array([boxminus(T @ exp_se3(xi), T) for xi in draws[:4000]])
     predicted = along_map(body, T)
     sigma = np.sqrt(np.diag(predicted))
-    np.testing.assert_allclose(
-        np.cov(gaps.T) / np.outer(sigma, sigma), predicted / np.outer(sigma, sigma), atol=0.06
-    )
+    np.testing.assert_allclose(np.cov(gaps.T) / np.outer(sigma, sigma), predicted / np.outer(sigma, sigma), atol=0.06)
 
 
 def test_body_and_map_axes_conversions_are_inverse():

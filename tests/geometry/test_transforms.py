@@ -64,8 +64,7 @@ def test_rotation_angle_is_exact_near_zero_and_pi(turn):
 
 
 @pytest.mark.parametrize(
-    ("given_", "wrapped"),
-    [(0, 0), (np.pi, -np.pi), (-np.pi, -np.pi), (3.5, 3.5 - 2 * np.pi), (-7, -7 + 2 * np.pi)],
+    ("given_", "wrapped"), [(0, 0), (np.pi, -np.pi), (-np.pi, -np.pi), (3.5, 3.5 - 2 * np.pi), (-7, -7 + 2 * np.pi)]
 )
 def test_wrap_angle(given_, wrapped):
     assert g.wrap_angle(given_) == pytest.approx(wrapped)

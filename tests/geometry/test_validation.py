@@ -35,8 +35,7 @@ def test_invalid_pose_is_refused_by_name(bad):
 
 
 @pytest.mark.parametrize(
-    "bad",
-    [np.eye(5), np.full((6, 6), np.inf), np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, -1]), np.ones((6, 6))],
+    "bad", [np.eye(5), np.full((6, 6), np.inf), np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, -1]), np.ones((6, 6))]
 )
 def test_invalid_covariance_is_refused_by_name(bad):
     with pytest.raises(InputError, match="spread"):

@@ -54,9 +54,7 @@ def scan_of(points, rng, truth, outliers, noise):
 def both(grid, normals, local, above, T, pivot, prior=None, scales=SCALES, min_pairs=50, **changes):
     """Answers of the kernel and of its twin."""
     options = FIXED | changes
-    ours = align_planes(
-        grid, normals, local, above, T, pivot, scales, prior=prior, min_pairs=min_pairs, **options
-    )
+    ours = align_planes(grid, normals, local, above, T, pivot, scales, prior=prior, min_pairs=min_pairs, **options)
     belief = None if prior is None else (np.asarray(prior.mean), np.asarray(prior.information))
     plan = Plan(T, pivot, scales, options["keep"], options["iterations"], min_pairs, belief)
     return ours, reference.align_planes(grid.tree, normals, local, above, plan)
@@ -117,9 +115,7 @@ def test_converges_from_a_start_half_a_radian_off():
     middle = points.mean(axis=0, dtype=np.float64)
     local, above, pivot = scan_of(points, rng, pose([0, 0, 0], middle), 0.0, 0.0)
     start = pose([0.05, -0.1, 0.5], np.add(middle, [0.5, -0.4, 0.3]))
-    ours, plain = both(
-        PointGrid(points), normals, local, above, start, pivot, scales=(Scale(9.0, 3.0), *SCALES)
-    )
+    ours, plain = both(PointGrid(points), normals, local, above, start, pivot, scales=(Scale(9.0, 3.0), *SCALES))
     assert_same(ours, plain, pivot)
 
 

@@ -169,9 +169,7 @@ def test_kernel_agrees_with_numpy_to_the_bit(shape):
 @pytest.mark.parametrize("scale", [1.0, 0.0])
 def test_top_k_of_near_duplicates_with_and_without_spectra(scale):
     rng = np.random.default_rng(7)
-    desc = (rng.uniform(1, 9, (1, 6, 20)) + scale * 1e-2 * rng.standard_normal((2500, 6, 20))).astype(
-        np.float16
-    )
+    desc = (rng.uniform(1, 9, (1, 6, 20)) + scale * 1e-2 * rng.standard_normal((2500, 6, 20))).astype(np.float16)
     index, spectra = ck.MatchIndex(desc), ck.column_spectra(desc)
     query = rng.uniform(1, 9, (6, 20)).astype(np.float32)
     for k in (1, 7, 400):

@@ -29,9 +29,7 @@ def finite(points):
     return points[np.isfinite(points).all(axis=1)]
 
 
-@given(
-    clouds(), clouds(), poses(), st.sampled_from([0.3, 2.5, 9.0, 200.0]), st.sampled_from([0.4, 1.0, 30.0])
-)
+@given(clouds(), clouds(), poses(), st.sampled_from([0.3, 2.5, 9.0, 200.0]), st.sampled_from([0.4, 1.0, 30.0]))
 def test_kernel_agrees_with_numpy(cloud, queries, T, radius, cell):
     grid = PointGrid(finite(cloud), cell)
     distance, index = nearest(grid, queries, radius)
@@ -53,9 +51,7 @@ def test_kernel_and_numpy_agree_with_brute_force(cloud, queries, radius):
         assert_answers(cloud, queries, *answer, expected)
 
 
-@pytest.mark.parametrize(
-    "stretch", [[1, 1, 1], [1, 1, 1000], [3000, 3000, 1], [1e6, 1, 1e6], [0, 0, 1], [0, 0, 0]]
-)
+@pytest.mark.parametrize("stretch", [[1, 1, 1], [1, 1, 1000], [3000, 3000, 1], [1e6, 1, 1e6], [0, 0, 1], [0, 0, 0]])
 def test_wide_high_and_flat_clouds(stretch):
     """Wide ones get larger cells, high ones a topmost layer that holds the rest, flat ones a single row."""
     rng = np.random.default_rng(1)

@@ -22,12 +22,7 @@ def assert_same(grid, expected):
         assert ours.shape == theirs.shape
 
 
-@given(
-    clouds(),
-    SIZES,
-    st.sampled_from([5.0, 50.0]),
-    st.sampled_from([(0, 0, 0), (2.5, -7.5, 1.0), (0.1, 0.2, 0.3)]),
-)
+@given(clouds(), SIZES, st.sampled_from([5.0, 50.0]), st.sampled_from([(0, 0, 0), (2.5, -7.5, 1.0), (0.1, 0.2, 0.3)]))
 def test_polar_bin_agrees_with_numpy(points, size, r_max, centre):
     grid, dropped = polar_bin(points, centre, *size, r_max)
     expected, expected_dropped = reference.polar_bin(points, np.array(centre, dtype=float), *size, r_max)
@@ -35,11 +30,7 @@ def test_polar_bin_agrees_with_numpy(points, size, r_max, centre):
     assert dropped == expected_dropped == np.count_nonzero(~np.isfinite(points).all(axis=1))
 
 
-@given(
-    clouds(),
-    SIZES,
-    st.sampled_from(["max", "off"]),
-)
+@given(clouds(), SIZES, st.sampled_from(["max", "off"]))
 def test_describe_points_is_polar_bin_and_coview(points, size, vertical):
     centre = np.array([2.5, -7.5, 1.0])
     grid, context, dropped = describe_points(points, centre, *size, 50.0, vertical)
@@ -111,9 +102,7 @@ def test_kernel_and_numpy_agree_on_sector_edges(sectors):
     angle = np.arange(sectors) * 2 * np.pi / sectors
     radius = np.linspace(0.1, 49.9, 40)
     on = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-    points = np.concatenate([np.c_[(on * np.float32(r)), np.zeros(sectors)] for r in radius]).astype(
-        np.float32
-    )
+    points = np.concatenate([np.c_[(on * np.float32(r)), np.zeros(sectors)] for r in radius]).astype(np.float32)
     grid, _ = polar_bin(points, (0, 0, 0), 20, sectors, 50.0)
     assert_same(grid, reference.polar_bin(points, np.zeros(3), 20, sectors, 50.0)[0])
     assert grid.count.sum() == len(points)
@@ -156,9 +145,7 @@ def test_polar_bin_of_two_million_points():
 def rasters(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     shape = draw(st.tuples(st.integers(1, 30), st.integers(1, 30)))
-    count = rng.integers(0, 4, shape).astype(np.int32) * (
-        rng.random(shape) < draw(st.sampled_from([0.1, 0.9]))
-    )
+    count = rng.integers(0, 4, shape).astype(np.int32) * (rng.random(shape) < draw(st.sampled_from([0.1, 0.9])))
     top = rng.normal(100, 5, shape).astype(np.float32)
     stations = draw(st.integers(0, 5))
     at = rng.integers(0, shape[0], stations), rng.integers(0, shape[1], stations)

@@ -69,9 +69,7 @@ def test_only_runtime_imports_taichi():
     for path in (ROOT / "kernels").rglob("*.py"):
         if path.name != "runtime.py":
             text = path.read_text()
-            assert not any(
-                f"import {name}" in text or f"from {name}" in text for name in ("taichi", "quadrants")
-            )
+            assert not any(f"import {name}" in text or f"from {name}" in text for name in ("taichi", "quadrants"))
 
 
 def test_import_loads_no_backend_and_kernels_print_nothing():
@@ -89,22 +87,17 @@ def test_unknown_backend_raises():
 
 
 def test_numpy_is_used_where_taichi_is_missing():
-    blocked = (
-        "import sys\nsys.modules['taichi'] = sys.modules['quadrants'] = None\nuse()\nprint(ck.backend())"
-    )
+    blocked = "import sys\nsys.modules['taichi'] = sys.modules['quadrants'] = None\nuse()\nprint(ck.backend())"
     assert succeeds(blocked) == "numpy\n"
     done = run_python(
-        "import sys; sys.modules['taichi'] = None\nimport coview_kernels as ck; ck.backend()",
-        COVIEW_KERNELS="taichi",
+        "import sys; sys.modules['taichi'] = None\nimport coview_kernels as ck; ck.backend()", COVIEW_KERNELS="taichi"
     )
     assert "COVIEW_KERNELS=taichi, but it is missing" in done.stderr
 
 
 def test_submit_returns_raises_and_nests():
     assert submit(divmod, 7, 2) == (3, 1)
-    assert (
-        submit(lambda: submit(lambda: polar_bin(np.ones((2, 3)), (0, 0, 0), 1, 1, 9.0)))[0].count[0, 0] == 2
-    )
+    assert submit(lambda: submit(lambda: polar_bin(np.ones((2, 3)), (0, 0, 0), 1, 1, 9.0)))[0].count[0, 0] == 2
     with pytest.raises(ZeroDivisionError):
         submit(divmod, 1, 0)
     assert submit(int) == 0

@@ -33,9 +33,7 @@ def test_first_point_of_each_voxel_is_kept(points, T, voxel):
     for point in points:
         if not np.isfinite(point).all():
             continue
-        moved = (T[:3, 0] * point[0] + T[:3, 1] * point[1] + T[:3, 2] * point[2] + T[:3, 3]).astype(
-            np.float32
-        )
+        moved = (T[:3, 0] * point[0] + T[:3, 1] * point[1] + T[:3, 2] * point[2] + T[:3, 3]).astype(np.float32)
         cell = tuple(np.floor(moved.astype(np.float64) * (1.0 / voxel)))
         if np.isfinite(moved).all() and cell not in seen:
             seen.add(cell)
@@ -235,10 +233,7 @@ def test_other_backends_agree(name):
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [((np.nan,), "voxel"), ((1.0, -1.0), "r_min")],
-)
+@pytest.mark.parametrize(("arguments", "name"), [((np.nan,), "voxel"), ((1.0, -1.0), "r_min")])
 def test_voxel_filter_errors_name_the_limit(arguments, name):
     with pytest.raises(ValueError, match=name):
         VoxelFilter(*arguments)

@@ -50,11 +50,7 @@ def test_rejected_registration_gives_doubted_state_without_pose(found, world_dri
     assert doubtful.drift is None
     assert doubtful.confidence == 0.0
     assert doubtful.evidence.score < RULE.tracking_min_score
-    assert doubtful.evidence.cause in (
-        RejectionReason.GROUND,
-        RejectionReason.FITNESS,
-        RejectionReason.FREE_SPACE,
-    )
+    assert doubtful.evidence.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
     known = found.step(world_drive.clouds[6], world_drive.T_odom_body[6], 3.0)
     assert known.state is State.TRACKING
     assert right(known, world_drive.T_map_body[6])
@@ -140,11 +136,7 @@ def test_kidnapped_robot_gets_no_wrong_pose(world_map, world_drive, to):
     lost = [fix for fix in fixes if fix.state is State.LOST]
     assert lost
     assert f"{RULE.max_rejections} registrations rejected" in lost[0].evidence.reason
-    assert lost[0].evidence.cause in (
-        RejectionReason.FITNESS,
-        RejectionReason.FREE_SPACE,
-        RejectionReason.GROUND,
-    )
+    assert lost[0].evidence.cause in (RejectionReason.FITNESS, RejectionReason.FREE_SPACE, RejectionReason.GROUND)
     assert went[-1].state is State.TRACKING
 
 
@@ -171,8 +163,7 @@ def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive,
         begin += 1
         known.append(localizer.step(clouds[begin - 1], slow_drive.T_odom_body[begin - 1], 0.1 * begin))
     fixes = [
-        localizer.step(clouds[k], slow_drive.T_odom_body[begin - 1], 0.1 * k + 0.1)
-        for k in range(begin, len(clouds))
+        localizer.step(clouds[k], slow_drive.T_odom_body[begin - 1], 0.1 * k + 0.1) for k in range(begin, len(clouds))
     ]
     assert len(fixes) > 8
     for fix, T in zip(fixes, truth[begin:], strict=True):
@@ -211,9 +202,7 @@ def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive
 
 
 @pytest.mark.slow
-def test_pose_returns_at_once_after_short_cover_and_with_confirmations_after_long_cover(
-    world_map, world_drive
-):
+def test_pose_returns_at_once_after_short_cover_and_with_confirmations_after_long_cover(world_map, world_drive):
     """Meanwhile it may have been carried: one frame could fit by chance."""
     waits = []
     for seconds in (0.5 * RULE.max_doubt_s, 2.0 * RULE.max_doubt_s):

@@ -43,9 +43,7 @@ def test_tracking_begins_by_an_accepted_place_or_a_verified_one():
 
 
 def test_only_an_accepted_place_ends_lost():
-    assert [event for event in Event if next_state(State.LOST, event) is not State.LOST] == [
-        Event.PLACE_ACCEPTED
-    ]
+    assert [event for event in Event if next_state(State.LOST, event) is not State.LOST] == [Event.PLACE_ACCEPTED]
 
 
 def test_only_a_known_place_is_doubted_or_lost():

@@ -109,17 +109,11 @@ def pb_in_frame(frame: str = "odom", **pose: tuple[float, ...]) -> bytes:
 
 def pb_transform(parent: str = "odom", child: str = "base_link") -> bytes:
     rotation = sized(5, doubles(*TURN))
-    return (
-        stamp() + sized(2, parent.encode()) + sized(3, child.encode()) + sized(4, doubles(1, 2, 3)) + rotation
-    )
+    return stamp() + sized(2, parent.encode()) + sized(3, child.encode()) + sized(4, doubles(1, 2, 3)) + rotation
 
 
 def pb_cloud(
-    data: bytes,
-    fields: list[tuple[str, int, int]],
-    step: int,
-    pose: bytes | None = None,
-    head: bytes | None = None,
+    data: bytes, fields: list[tuple[str, int, int]], step: int, pose: bytes | None = None, head: bytes | None = None
 ) -> bytes:
     """foxglove.PointCloud from (name, offset, type) and its rows."""
     out = stamp() if head is None else head

@@ -92,9 +92,7 @@ def test_option_beats_encoding_beats_key_beats_hint_beats_magic():
     assert cloud_codec(cdr, "", NATIVE) == "cdr"
 
 
-@pytest.mark.parametrize(
-    "mute", ["", "zenoh/bytes", "zenoh/string", "application/octet-stream", " Zenoh/Bytes "]
-)
+@pytest.mark.parametrize("mute", ["", "zenoh/bytes", "zenoh/string", "application/octet-stream", " Zenoh/Bytes "])
 def test_generic_encodings_fall_back_to_key_hint_and_magic(mute):
     assert cloud_codec(b"?", mute, RMW) == "cdr"
     assert cloud_codec(b"?", mute, NATIVE, hint="xyz") == "xyz"
@@ -112,11 +110,7 @@ def test_bare_protobuf_is_decided_by_key_or_hint():
 
 @pytest.mark.parametrize(
     "key",
-    [
-        RMW_ODOM,
-        "0/x/tf2_msgs::msg::dds_::TFMessage_/RIHS01_ab",
-        KEELSON.replace("point_cloud", "frame_transform"),
-    ],
+    [RMW_ODOM, "0/x/tf2_msgs::msg::dds_::TFMessage_/RIHS01_ab", KEELSON.replace("point_cloud", "frame_transform")],
 )
 def test_key_with_non_cloud_type_is_an_error_naming_it(key):
     with pytest.raises(EncodingError, match=r"cannot carry|no codec knows") as caught:

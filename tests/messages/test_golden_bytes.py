@@ -49,10 +49,7 @@ JSON_POSE = (
 
 CLOUDS = {
     "xyz": ("application/octet-stream;layout=xyz", bytes.fromhex(ROWS)),
-    "xyzi": (
-        "application/octet-stream;layout=xyzi",
-        bytes.fromhex(ROWS[:24] + 8 * "0" + ROWS[24:] + 8 * "0"),
-    ),
+    "xyzi": ("application/octet-stream;layout=xyzi", bytes.fromhex(ROWS[:24] + 8 * "0" + ROWS[24:] + 8 * "0")),
     "foxglove": ("application/protobuf;foxglove.PointCloud", bytes.fromhex(FOXGLOVE_CLOUD)),
     "cdr": ("application/cdr;sensor_msgs/msg/PointCloud2", bytes.fromhex(CDR_CLOUD)),
     "keelson": ("application/protobuf;core.Envelope", envelope(bytes.fromhex(FOXGLOVE_CLOUD))),

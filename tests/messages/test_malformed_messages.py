@@ -273,9 +273,7 @@ def test_random_bytes_raise_message_error(decode, name, payload, attachment):
 def test_mutated_messages_raise_only_message_error(decode, name, data):
     payload = bytearray(data.draw(st.sampled_from([*VALID.values(), *OTHER_VALID])))
     for _ in range(data.draw(st.integers(1, 4))):
-        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(
-            st.sampled_from([0, 1, 0x7F, 0x80, 0xFF])
-        )
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.sampled_from([0, 1, 0x7F, 0x80, 0xFF]))
     cut = data.draw(st.sampled_from([0, 0, 1, 5]))
     sample = Sample("some/key", bytes(payload[: len(payload) - cut]), "", bytes(8))
     said = complaint(decode, sample, option=name)

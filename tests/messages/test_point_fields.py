@@ -56,9 +56,7 @@ def test_cdr_of_both_byte_orders_and_any_frame_name(order, frame):
 
 @pytest.mark.parametrize("cdr_order", ["<", ">"])
 def test_big_endian_point_data(cdr_order):
-    rows = rows_of(
-        [("x", ">f4"), ("y", ">f4"), ("z", ">f4"), ("t", ">u4"), ("ring", ">u2")], t=[5, 10], ring=[1, 300]
-    )
+    rows = rows_of([("x", ">f4"), ("y", ">f4"), ("z", ">f4"), ("t", ">u4"), ("ring", ">u2")], t=[5, 10], ring=[1, 300])
     read = read_ros(rows, big=True, order=cdr_order)
     np.testing.assert_array_equal(read.points, POINTS)
     np.testing.assert_allclose(read.times, [5e-9, 1e-8], rtol=1e-12)
@@ -70,15 +68,7 @@ def test_big_endian_point_data(cdr_order):
     "dtype",
     [
         [("x", "<f8"), ("y", "<f8"), ("z", "<f8")],
-        [
-            ("_", "V1"),
-            ("x", "<f4"),
-            ("y", "<f4"),
-            ("z", "<f4"),
-            ("_p", "V4"),
-            ("intensity", "<f4"),
-            ("_q", "V3"),
-        ],
+        [("_", "V1"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("_p", "V4"), ("intensity", "<f4"), ("_q", "V3")],
         [("z", "<f4"), ("intensity", "u1"), ("y", "<f8"), ("x", "<f4")],
         [("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("rgb", "<f4")],
     ],
@@ -118,10 +108,7 @@ def test_non_finite_points_are_kept_and_float64_overflow_is_infinite():
 
 @pytest.mark.filterwarnings("error")
 def test_signalling_nan_and_infinity_raise_no_warnings():
-    signal32, signal64 = (
-        np.array([0x7FA00000], "<u4").view("<f4"),
-        np.array([0x7FF4 << 48], "<u8").view("<f8"),
-    )
+    signal32, signal64 = (np.array([0x7FA00000], "<u4").view("<f4"), np.array([0x7FF4 << 48], "<u8").view("<f8"))
     dtype = [("x", "<f8"), ("y", "<f8"), ("z", "<f4"), ("time", "<f4"), ("ring", "<f4")]
     rows = np.zeros(3, dtype)
     rows["x"], rows["time"][1:], rows["ring"] = [1, np.inf, -np.inf], [np.inf, -np.inf], np.inf
@@ -161,9 +148,7 @@ def test_point_times_by_type_and_magnitude(read, name, kind, values):
 
 
 def test_stamp_at_end_of_sweep_gives_negative_point_times():
-    rows = rows_of(
-        [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")], timestamp=STAMP / SECOND - TIMES
-    )
+    rows = rows_of([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")], timestamp=STAMP / SECOND - TIMES)
     np.testing.assert_allclose(read_ros(rows).times, -TIMES, atol=5e-7)
 
 

@@ -82,8 +82,7 @@ def test_gravity_option_keywords():
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "up", "0 0 -1", "1,2", "0,0,0", "0,0,nan", "1,0,0", "0,0,x", "0,0,-1,", "0,0,0,0"],
+    "text", ["", "up", "0 0 -1", "1,2", "0,0,0", "0,0,nan", "1,0,0", "0,0,x", "0,0,-1,", "0,0,0,0"]
 )
 def test_invalid_gravity_is_refused(text):
     with pytest.raises(ConfigError, match="gravity"):
@@ -96,8 +95,7 @@ def test_accelerometer_sign_is_explained():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"voxel": 0.0}, {"max_gap": np.nan}, {"max_range": 0.5}, {"gravity": "moon"}, {"gravity": (1.0, 2.0)}],
+    "wrong", [{"voxel": 0.0}, {"max_gap": np.nan}, {"max_range": 0.5}, {"gravity": "moon"}, {"gravity": (1.0, 2.0)}]
 )
 def test_lidar_odometry_config_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError):

@@ -133,11 +133,7 @@ def test_older_sample_is_ignored():
         (0.95, 0.0, SampleKind.CONTINUES),
         (1.05, 0.0, SampleKind.JUMP),
         (-1.05, 0.0, SampleKind.JUMP),
-        (
-            0.0,
-            np.radians(23),
-            SampleKind.JUMP,
-        ),  # 20 rad/s for 10 ms are 11 degrees, and 20 are always allowed
+        (0.0, np.radians(23), SampleKind.JUMP),  # 20 rad/s for 10 ms are 11 degrees, and 20 are always allowed
         (0.0, np.radians(19), SampleKind.CONTINUES),
     ],
 )
@@ -258,11 +254,7 @@ def test_empty_buffer_has_no_segment():
     assert segment.poses.shape == (0, 4, 4)
 
 
-stamps = st.one_of(
-    st.integers(0, 60).map(lambda k: 0.05 * k),
-    st.floats(-10.0, 10.0),
-    st.floats(-9e8, 9e8),
-)
+stamps = st.one_of(st.integers(0, 60).map(lambda k: 0.05 * k), st.floats(-10.0, 10.0), st.floats(-9e8, 9e8))
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

@@ -27,9 +27,7 @@ def header(stamp_ns: int, frame: str) -> object:
     return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
-def cloud(
-    stamp_ns: int, points: np.ndarray, times: np.ndarray | None = None, order: str = "<", frame: str = "body"
-):
+def cloud(stamp_ns: int, points: np.ndarray, times: np.ndarray | None = None, order: str = "<", frame: str = "body"):
     columns = [(name, "f4", points[:, k]) for k, name in enumerate("xyz")]
     if times is not None:
         columns.append(("time", "f4", times))
@@ -86,9 +84,7 @@ def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compre
     if compression:
         writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
     with writer:
-        connections = {
-            topic: writer.add_connection(topic, _type(m), typestore=STORE) for topic, m in topics.items()
-        }
+        connections = {topic: writer.add_connection(topic, _type(m), typestore=STORE) for topic, m in topics.items()}
         for arrived, topic, kind, item in _in_turn(topics):
             data = item if isinstance(item, bytes) else STORE.serialize_cdr(item, kind)
             writer.write(connections[topic], arrived, data)
@@ -97,9 +93,7 @@ def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compre
 
 def _write_ros1(path: Path, topics: dict[str, list]) -> Path:
     with Ros1Writer(path) as writer:
-        connections = {
-            topic: writer.add_connection(topic, _type(m), typestore=ROS1) for topic, m in topics.items()
-        }
+        connections = {topic: writer.add_connection(topic, _type(m), typestore=ROS1) for topic, m in topics.items()}
         for arrived, topic, kind, item in _in_turn(topics):
             raw = STORE.cdr_to_ros1(bytes(STORE.serialize_cdr(item, kind)), kind)
             writer.write(connections[topic], arrived, raw)

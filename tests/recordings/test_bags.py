@@ -91,10 +91,7 @@ def test_sweep_is_deskewed(tmp_path, order, begin, end):
     stamp = START + 400_000_000
     world = transform(T_at(stamp), rng.uniform(-25, 25, (300, 3)))
     times = rng.uniform(begin, end, len(world))
-    swept = [
-        transform(inverse(T_at(stamp + round(1e9 * t))), p[None])[0]
-        for p, t in zip(world, times, strict=True)
-    ]
+    swept = [transform(inverse(T_at(stamp + round(1e9 * t))), p[None])[0] for p, t in zip(world, times, strict=True)]
     at_once = transform(inverse(T_at(stamp)), world)
     swept[7][1] = np.nan
     messages = [cloud(stamp, np.array(swept, np.float32), times, order)]
@@ -129,17 +126,9 @@ def test_bag_can_be_read_from_another_thread(tmp_path):
 
 
 def test_several_cloud_topics_need_topic_option(tmp_path):
-    topics = {
-        "/rear": clouds(CLOUD_NS[:3]),
-        "/front": clouds(),
-        "/odom": driven(),
-        "/wheel": driven(),
-        "/idle": [],
-    }
+    topics = {"/rear": clouds(CLOUD_NS[:3]), "/front": clouds(), "/odom": driven(), "/wheel": driven(), "/idle": []}
     bag = write_bag(tmp_path / "bag", topics)
-    listed = (
-        r"2 topics with sensor_msgs/msg/PointCloud2; choose by --cloud-topic: .*/front \(8 mess.*/rear \(3 "
-    )
+    listed = r"2 topics with sensor_msgs/msg/PointCloud2; choose by --cloud-topic: .*/front \(8 mess.*/rear \(3 "
     with pytest.raises(RunError, match=listed):
         open_run(bag)
     with pytest.raises(RunError, match=r"--odometry-topic: /odom \(50 messages\), /wheel"):
@@ -239,24 +228,9 @@ def _without(bag):
     [
         ("mcap", "", _cut, "end magic.*mcap recover"),
         ("sqlite3", "", _cut, "malformed.*repair it"),
-        (
-            "mcap",
-            "STORAGE",
-            _unknown_codec,
-            r"Unsupported chunk compression 'snap'\); write it again with zstd",
-        ),
-        (
-            "sqlite3",
-            "MESSAGE",
-            lambda b: _metadata(b, "zstd", "brotli"),
-            "'brotli' is not supported.*ros2 bag convert",
-        ),
-        (
-            "mcap",
-            "",
-            lambda b: _metadata(b, "storage_identifier: mcap", "storage_identifier: other"),
-            "'other'",
-        ),
+        ("mcap", "STORAGE", _unknown_codec, r"Unsupported chunk compression 'snap'\); write it again with zstd"),
+        ("sqlite3", "MESSAGE", lambda b: _metadata(b, "zstd", "brotli"), "'brotli' is not supported.*ros2 bag convert"),
+        ("mcap", "", lambda b: _metadata(b, "storage_identifier: mcap", "storage_identifier: other"), "'other'"),
         ("mcap", "", lambda b: _metadata(b, "version: 9", "{"), "YAML.*ros2 bag reindex"),
         ("mcap", "", _without, "missing.*repair it"),
     ],
@@ -277,14 +251,8 @@ def test_unreadable_bags_are_refused_with_reason(tmp_path, storage, compression,
         ({"/points": [], "/odom": driven()}, "not one cloud"),
         ({"/points": clouds()}, r"no topic with nav_msgs/msg/Odometry; give --odometry FILE"),
         ({"/points": [b"\0\1\0\0"] * 3, "/odom": driven()}, "not one cloud"),
-        (
-            {"/points": clouds([0, 0, 0]), "/odom": driven()},
-            r"0\.000 to 0\.000 s, odometry 17.*clocks the same",
-        ),
-        (
-            {"/points": clouds(), "/odom": driven([*ODOMETRY_NS, START - 10**10, START])},
-            "odometry go back by 1",
-        ),
+        ({"/points": clouds([0, 0, 0]), "/odom": driven()}, r"0\.000 to 0\.000 s, odometry 17.*clocks the same"),
+        ({"/points": clouds(), "/odom": driven([*ODOMETRY_NS, START - 10**10, START])}, "odometry go back by 1"),
     ],
 )
 def test_bags_without_usable_topics_are_refused(tmp_path, topics, reason):

@@ -96,16 +96,7 @@ def test_locate_command_with_lidar_odometry(world_file, bare, world_drive, tmp_p
     monkeypatch.setattr(module, "KissRegistration", lambda config: Truth(world_drive.T_map_body))
     times(bare, 100.0 + 0.5 * np.arange(7))
     out = tmp_path / "out"
-    command = [
-        "locate",
-        str(world_file),
-        str(bare),
-        "-o",
-        str(out),
-        "--no-pictures",
-        "--odometry",
-        "kiss-icp",
-    ]
+    command = ["locate", str(world_file), str(bare), "-o", str(out), "--no-pictures", "--odometry", "kiss-icp"]
     assert main(command) == 0
     assert "down is taken from the ground" in capsys.readouterr().err
     stamps, poses = read_tum(out / "trajectory.tum")
@@ -136,15 +127,7 @@ def complaint(capsys):
 def test_missing_kiss_icp_is_one_line(world_file, world_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
-    command = [
-        "locate",
-        str(world_file),
-        str(world_run),
-        "-o",
-        str(tmp_path / "out"),
-        "--odometry",
-        "kiss-icp",
-    ]
+    command = ["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), "--odometry", "kiss-icp"]
     assert main(command) == 2
     assert "pip install 'kiss-icp>=1.2'" in complaint(capsys)
     assert not (tmp_path / "out").exists()

@@ -61,12 +61,7 @@ def test_statistics_differ_where_errors_do():
 
 @pytest.mark.parametrize(
     ("error", "right"),
-    [
-        ({"t": (2.99, 0, 0)}, True),
-        ({"t": (3.01, 0, 0)}, False),
-        ({"yaw_deg": 4.99}, True),
-        ({"yaw_deg": -5.01}, False),
-    ],
+    [({"t": (2.99, 0, 0)}, True), ({"t": (3.01, 0, 0)}, False), ({"yaw_deg": 4.99}, True), ({"yaw_deg": -5.01}, False)],
 )
 def test_success_thresholds(error, right):
     verdict = evaluate(shifted(**error), straight_truth())

@@ -26,7 +26,5 @@ def base(scene):
 def run(scene):
     """(true poses, points of all frames in the scene frame)."""
     _, truth, _ = trajectories(scene, CONFIG)
-    clouds = [
-        points @ T[:3, :3].T + T[:3, 3] for T, points in zip(truth, frames(scene, CONFIG, truth), strict=True)
-    ]
+    clouds = [points @ T[:3, :3].T + T[:3, 3] for T, points in zip(truth, frames(scene, CONFIG, truth), strict=True)]
     return truth, np.concatenate(clouds)

@@ -54,9 +54,7 @@ def test_scene_triangles_are_valid(any_scene):
 def test_scene_change_keeps_the_map_and_replaces_configured_share():
     before, after = build_scene("village", 3, 140.0), build_scene("village", 3, 140.0, changed=0.3)
     for name in ("solid", "foliage"):
-        np.testing.assert_array_equal(
-            getattr(before.mapped, name).vertices, getattr(after.mapped, name).vertices
-        )
+        np.testing.assert_array_equal(getattr(before.mapped, name).vertices, getattr(after.mapped, name).vertices)
     old = {tuple(v) for v in np.round(after.mapped.foliage.vertices, 6)}
     new = {tuple(v) for v in np.round(after.now.foliage.vertices, 6)}
     kept = len(old & new) / len(old)

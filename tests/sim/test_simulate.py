@@ -121,13 +121,7 @@ def test_invalid_simulation_config_is_refused(field, value):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        ["--scene", "moon"],
-        ["--size", "5"],
-        ["--utm", "--origin", "1", "2", "3"],
-        ["--drift", "-1"],
-        ["--seed", "x"],
-    ],
+    [["--scene", "moon"], ["--size", "5"], ["--utm", "--origin", "1", "2", "3"], ["--drift", "-1"], ["--seed", "x"]],
 )
 def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, capsys):
     assert main(["simulate", str(tmp_path / "w"), *options]) == 2

@@ -26,9 +26,7 @@ def test_exported_card_names_each_weights_file(tmp_path: Path) -> None:
     assert noted == {"steps": 7, "sha256": {path.name: file_sha256(path) for path in written}}
     assert card == {"steps": 7}
     image = np.random.default_rng(0).integers(0, 256, (LAYERS, 64, 96)).astype(np.uint8)
-    np.testing.assert_allclose(
-        Network("ground", tmp_path)(image).local, encoder(net, "ground")(image).local, atol=1e-4
-    )
+    np.testing.assert_allclose(Network("ground", tmp_path)(image).local, encoder(net, "ground")(image).local, atol=1e-4)
     shutil.copy(tmp_path / "aerial.onnx", tmp_path / "ground.onnx")
     with pytest.raises(InputError, match="not the weights that card"):
         Network("ground", tmp_path)

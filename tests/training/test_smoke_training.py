@@ -43,9 +43,7 @@ def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
         train_session(tmp_path, short)
 
 
-@pytest.mark.parametrize(
-    "options", [["--first-world", "18999"], ["--first-world", "20000"], ["--first-world", "-5"]]
-)
+@pytest.mark.parametrize("options", [["--first-world", "18999"], ["--first-world", "20000"], ["--first-world", "-5"]])
 def test_held_out_worlds_are_refused_for_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:

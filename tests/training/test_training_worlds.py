@@ -10,14 +10,7 @@ from scipy.spatial import cKDTree
 
 from coview_stream.descriptors.birds_eye_view import LAYERS
 from coview_stream.errors import ConfigError, InputError
-from coview_stream.training.dataset import (
-    QUERY_CELLS,
-    WorldViews,
-    read_world,
-    world_views,
-    write_dataset,
-    write_world,
-)
+from coview_stream.training.dataset import QUERY_CELLS, WorldViews, read_world, world_views, write_dataset, write_world
 from coview_stream.training.paths import CLEARANCE, between_trees
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import INCLINATION, trained_sensor

@@ -35,11 +35,7 @@ def swap_rotation_translation(covariance: Floats) -> Floats:
 
 
 def remove_prior(
-    T_map_body: Pose,
-    information: Floats,
-    T_map_prior: Pose,
-    prior_information: Floats,
-    config: RegistrationConfig,
+    T_map_body: Pose, information: Floats, T_map_prior: Pose, prior_information: Floats, config: RegistrationConfig
 ) -> Measured:
     """Take a prior out of a registration again, so that a graph that knows it already does not count it twice.
 

@@ -203,11 +203,7 @@ def about_pivot(H: Floats, b: Floats, T: Pose, pivot: Floats) -> tuple[Floats, F
 
 
 def fused_step(
-    information: Floats,
-    gradient: Floats,
-    T: Pose,
-    pivot: Floats,
-    prior: kernels.Belief | None,
+    information: Floats, gradient: Floats, T: Pose, pivot: Floats, prior: kernels.Belief | None
 ) -> tuple[Floats, Floats]:
     """Gauss-Newton's step (6,) to the most probable pose by pairs and prior, and the information of both (6, 6)."""
     if prior is not None:

@@ -81,12 +81,7 @@ class Evidence:
 
 
 def verify(
-    source: RegistrationCloud,
-    T_map_source: Pose,
-    seen: RangeImage,
-    T_map_body: Pose,
-    target: LocalMap,
-    surveyed: Bools,
+    source: RegistrationCloud, T_map_source: Pose, seen: RangeImage, T_map_body: Pose, target: LocalMap, surveyed: Bools
 ) -> Evidence:
     """Return the evidence for a registered pose.
 
@@ -184,9 +179,7 @@ def _on_surface(points: Reals, partner: Ints, target: LocalMap) -> Bools:
 def _beam_cells(points: Reals, ranges: Reals) -> Ints:
     """Cell (N,) of the range image that each of (N, 3) points at ``ranges`` (N,) lies in."""
     azimuth = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
-    elevation = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / _BEAM).astype(
-        np.int64
-    )
+    elevation = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / _BEAM).astype(np.int64)
     return np.asarray(elevation * _COLUMNS + azimuth)
 
 

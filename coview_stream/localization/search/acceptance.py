@@ -55,9 +55,7 @@ class AcceptanceTest:
             return SearchResult(None, evidence, request.travelled, request.epoch)
         best = candidates[0]
         here = [same_place(c.T_map_odom, best.T_map_odom, request) for c in candidates]
-        rival = max(
-            (c.evidence.score for c, same in zip(candidates, here, strict=True) if not same), default=0.0
-        )
+        rival = max((c.evidence.score for c, same in zip(candidates, here, strict=True) if not same), default=0.0)
         lead = max(c.hypothesis.lead for c, same in zip(candidates, here, strict=True) if same)
         if not self._agrees(best, request):
             self.clear()
@@ -95,21 +93,15 @@ class AcceptanceTest:
         if evidence.score < min_score or evidence.inside < rule.min_overlap:
             return State.SEARCHING, f"no place fits: best score {evidence.score:.2f}, {min_score:.2f} needed"
         if evidence.ground < min_ground:
-            return (
-                State.AMBIGUOUS,
-                f"the ground does not fit: {evidence.ground:.2f}, {min_ground:.2f} needed",
-            )
+            return (State.AMBIGUOUS, f"the ground does not fit: {evidence.ground:.2f}, {min_ground:.2f} needed")
         if evidence.score - rival < min_lead:
             return State.AMBIGUOUS, f"two places fit: scores {evidence.score:.2f} and {rival:.2f}"
         return State.AMBIGUOUS, ""
 
-    def _has_rivals(
-        self, best: Candidate, candidates: list[Candidate], request: SearchRequest, votes: int
-    ) -> bool:
+    def _has_rivals(self, best: Candidate, candidates: list[Candidate], request: SearchRequest, votes: int) -> bool:
         """Whether enough keyframes have voted for what else it might be; a place found by votes needs no more."""
         voted = any(
-            c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, request)
-            for c in candidates
+            c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, request) for c in candidates
         )
         return voted or votes >= self.config.acceptance.confirmations
 

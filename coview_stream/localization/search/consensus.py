@@ -82,9 +82,7 @@ class Consensus:
         """Forget all votes."""
         self._votes.clear()
 
-    def vote(
-        self, centre: Floats, distances: Mapping[Channel, ScoreVolume] | Mapping[str, ScoreVolume]
-    ) -> None:
+    def vote(self, centre: Floats, distances: Mapping[Channel, ScoreVolume] | Mapping[str, ScoreVolume]) -> None:
         """Add one keyframe's distances (M, S) per channel; ``centre`` (3,) is its descriptor's zero, odometry frame.
 
         Channels are standardised (median and MAD over all hypotheses) before they are averaged: how far a

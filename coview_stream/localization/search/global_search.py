@@ -29,11 +29,7 @@ class GlobalSearch:
     """
 
     def __init__(
-        self,
-        base_map: BaseMap,
-        config: LocalizerConfig,
-        local_maps: LocalMaps,
-        index: SearchIndex | None = None,
+        self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, index: SearchIndex | None = None
     ) -> None:
         """Search a map; searches of one map may share ``index``. Raises what :meth:`SearchIndex.of` does."""
         self.base_map = base_map
@@ -85,9 +81,7 @@ class GlobalSearch:
             self.clear()
             self._epoch = request.epoch
         scan = ScanInput(
-            prepare_scan(request.submap, request.position, self.config.registration),
-            request.cloud,
-            request.T_odom_body,
+            prepare_scan(request.submap, request.position, self.config.registration), request.cloud, request.T_odom_body
         )
         votes = self._vote(request)  # eqs 1-9: descriptors, distances to all stations at all turns
         hypotheses, hints = self._propose(request)  # eq. 12: peaks of the consensus as T_map_odom

@@ -12,9 +12,7 @@ from coview_stream.config import KeyframeConfig
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose
 
-_PENDING_POINTS = (
-    200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
-)
+_PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
 
 # of OdometryCheck
 _VOXEL = 1.0  # metres; set by hand
@@ -67,9 +65,7 @@ class KeyframeBuffer:
 
     def voxelize(self, cloud: Points, T_odom_body: Pose) -> Points:
         """Reduce one frame (N, 3), body frame, to :attr:`newest`, without adding it to a keyframe."""
-        self.newest = self._filter(cloud, T_odom_body)[
-            0
-        ].copy()  # the next frame overwrites the filter's array
+        self.newest = self._filter(cloud, T_odom_body)[0].copy()  # the next frame overwrites the filter's array
         return self.newest
 
     def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:

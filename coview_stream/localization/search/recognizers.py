@@ -67,9 +67,7 @@ class SearchIndex:
         from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
         block = base_map.config.block
-        return cls(
-            retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block)
-        )
+        return cls(retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block))
 
     def prepare(self) -> None:
         """Load and compute what the first query would; raises :class:`CoViewError` if something is missing."""
@@ -90,9 +88,7 @@ class CoViewRecognizer:
         self.base_map = base_map
         self.config = config
         self.retrieval = retrieval
-        self.consensus = Consensus(
-            base_map.stations, base_map.config.block, replace(config.consensus, peaks=peaks)
-        )
+        self.consensus = Consensus(base_map.stations, base_map.config.block, replace(config.consensus, peaks=peaks))
         self.last_query: dict[Channel, Descriptor] = {}
 
     def vote(self, request: SearchRequest) -> None:

@@ -90,9 +90,7 @@ class Refinement:
         level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
         upright = Prior(level, gravity_information(settings.gravity_sigma))
         iterations = None if thinned is None else _COARSE_ITERATIONS
-        match = register_and_verify(
-            self.base_map, scan, start, target, settings, scales, upright, thinned, iterations
-        )
+        match = register_and_verify(self.base_map, scan, start, target, settings, scales, upright, thinned, iterations)
         if match.registration is None or tilt_of(match.T_map_odom) > self.config.acceptance.max_tilt:
             return None
         return Candidate(hypothesis, match.registration, match.evidence)

@@ -11,9 +11,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
-_SUBMAP_KEYFRAMES = (
-    4  # of the newest in the submap that is registered: more are smeared by drift; set by hand
-)
+_SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift; set by hand
 _SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
 _SAME_ANGLE = np.radians(5.0)  # likewise
 
@@ -94,11 +92,7 @@ class SearchRequest:
 
 
 def same_place(
-    T_a: Pose,
-    T_b: Pose,
-    request: SearchRequest,
-    distance: float = _SAME_DISTANCE,
-    angle: float = float(_SAME_ANGLE),
+    T_a: Pose, T_b: Pose, request: SearchRequest, distance: float = _SAME_DISTANCE, angle: float = float(_SAME_ANGLE)
 ) -> bool:
     """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
     a, b = T_a @ request.T_odom_body, T_b @ request.T_odom_body

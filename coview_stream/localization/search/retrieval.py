@@ -16,9 +16,7 @@ from coview_stream.geometry.arrays import Complexes, Floats32
 ScoreVolume = Floats32
 """(M, S): one number for each station and shift."""
 
-_CACHE_BYTES = (
-    400_000_000  # spectra of all stations are kept if they fit, else made anew block by block; set by hand
-)
+_CACHE_BYTES = 400_000_000  # spectra of all stations are kept if they fit, else made anew block by block; set by hand
 _BLOCK = 8192  # stations whose spectra are made at a time; set by hand
 
 

@@ -65,12 +65,7 @@ class DisplacementCheck:
         return share is not None and share < _DROP * self.usual
 
 
-def share_on_map(
-    points: Points,
-    position: Floats,
-    T: Pose,
-    target: LocalMap,
-) -> float | None:
+def share_on_map(points: Points, position: Floats, T: Pose, target: LocalMap) -> float | None:
     """Share of the points above the ground that have a map point near them; None if they are too few to tell.
 
     Arguments are those of :meth:`DisplacementCheck.learn`.

@@ -63,12 +63,7 @@ class MapMatcher:
         self.baseline = baseline
 
     def match(
-        self,
-        scan: ScanInput,
-        belief: Estimate,
-        target: LocalMap,
-        scales: tuple[float, ...],
-        graph: PoseGraph,
+        self, scan: ScanInput, belief: Estimate, target: LocalMap, scales: tuple[float, ...], graph: PoseGraph
     ) -> MapMatch:
         """Register (eq. 13), verify and judge; where the numbers leave nothing to hold on to, the belief stays.
 
@@ -96,9 +91,7 @@ class MapMatcher:
             cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
         try:
             T_map_body = found.T_map_odom @ scan.T_odom_body
-            own = remove_prior(
-                T_map_body, found.registration.information, belief.T_map_body, information, settings
-            )
+            own = remove_prior(T_map_body, found.registration.information, belief.T_map_body, information, settings)
             covariance = registration_covariance(own.information, settings)
             innovation = graph.innovation(own.T_map_body, covariance)
         except InputError as error:

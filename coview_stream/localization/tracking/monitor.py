@@ -107,9 +107,7 @@ class EvidenceBaseline:
     def _fallen_furthest(self, evidence: Evidence, told: str) -> tuple[RejectionReason, str]:
         """Return the part of the evidence that has fallen furthest below what is usual."""
         usual = self.usual
-        structure = (
-            evidence.near * evidence.covered / ((usual.near * usual.covered if usual else 0.0) or 0.25)
-        )
+        structure = evidence.near * evidence.covered / ((usual.near * usual.covered if usual else 0.0) or 0.25)
         ground = evidence.ground / ((usual.ground if usual else 0.0) or 1.0)
         space = evidence.free_space / ((usual.free_space if usual else 0.0) or 1.0)
         worst = min(structure, ground, space)
@@ -185,9 +183,6 @@ class LossMonitor:
             needed = self._rule.confirmations
             if self._confirmations < needed:
                 after = f"after {self._lasted:.0f} s of doubt"
-                return (
-                    Event.VERIFICATION_REQUIRED,
-                    f"verified {self._confirmations} of {needed} times {after}",
-                )
+                return (Event.VERIFICATION_REQUIRED, f"verified {self._confirmations} of {needed} times {after}")
         self.clear()
         return Event.MATCH_VERIFIED, verdict.reason

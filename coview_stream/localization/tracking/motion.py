@@ -58,9 +58,7 @@ class Drift:
     @classmethod
     def of(cls, config: TrackingConfig) -> Drift:
         """Return the configured rates."""
-        return cls(
-            config.position_drift, config.height_drift, config.tilt_drift, config.yaw_drift, config.turn_drift
-        )
+        return cls(config.position_drift, config.height_drift, config.tilt_drift, config.yaw_drift, config.turn_drift)
 
     def variances(self, driven: float, turned: float) -> Floats:
         """Variances (6,) over (rx, ry, rz, x, y, z) that gather in metres driven and radians turned."""

@@ -28,15 +28,7 @@ import numpy as np
 from coview_stream.config import GraphConfig
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import (
-    Pose,
-    adjoint,
-    along_body,
-    along_map,
-    boxminus,
-    inverse,
-    orthonormal,
-)
+from coview_stream.geometry.transforms import Pose, adjoint, along_body, along_map, boxminus, inverse, orthonormal
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
 # set by hand

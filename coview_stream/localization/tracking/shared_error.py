@@ -56,11 +56,7 @@ class SharedErrorModel:
 
 
 def clustered_covariance(
-    source: RegistrationCloud,
-    T_map_source: Pose,
-    target: LocalMap,
-    pivot: Floats,
-    config: RegistrationConfig,
+    source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, config: RegistrationConfig
 ) -> Floats | None:
     """Return the covariance (6, 6) over (rx, ry, rz, x, y, z) about ``pivot``, map axes; None if too little was seen.
 

@@ -134,9 +134,7 @@ class Tracker:
             newest_only: use the newest frame alone: something is wrong with it, or with what came before.
         """
         belief = self._predict(T_odom_body, standing_still)
-        self._scans.keep_newest(
-            1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES
-        )
+        self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
         self._unregistered = 0
         target = self._target(T_odom_body)
         if target is None:

@@ -78,9 +78,7 @@ class ReplayReport:
         if self.damaged:
             lines.append(f"{self.damaged} damaged frames left out, the first: {self.first_error}")
         if not self.heard:
-            lines.append(
-                "nothing subscribed: is a node running, connected, and for this --robot, --base and --preset?"
-            )
+            lines.append("nothing subscribed: is a node running, connected, and for this --robot, --base and --preset?")
         return "\n".join(lines)
 
 
@@ -96,11 +94,7 @@ class _EncodedSample:
 
 
 def replay(
-    run: Run,
-    sender: Sender,
-    config: ReplayConfig,
-    clock: Clock,
-    on_frame: Callable[[int], None] = lambda frames: None,
+    run: Run, sender: Sender, config: ReplayConfig, clock: Clock, on_frame: Callable[[int], None] = lambda frames: None
 ) -> ReplayReport:
     """Send the whole run, or until the clock says to end.
 

@@ -116,6 +116,4 @@ def _between(run: Run, dues: Floats, k: int, rate: float) -> Iterator[ScheduledS
         return
     for share in np.arange(1, count) / count:
         due, stamp = (a[k] + share * (a[k + 1] - a[k]) for a in (dues, run.stamps))
-        yield ScheduledSample(
-            float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None
-        )
+        yield ScheduledSample(float(due), float(stamp), interpolate(run.poses[k], run.poses[k + 1], share), None)

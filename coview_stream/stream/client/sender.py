@@ -55,9 +55,7 @@ class Sender:
             odometry_encoding or keys.odometry_hint or "json", ODOMETRY_ENCODINGS, "odometry encoding"
         )
         self.cloud_key = _publishing_key(keys.cloud, keys.rmw, "sensor_msgs/msg/PointCloud2", "--cloud-key")
-        self.odometry_key = _publishing_key(
-            keys.odometry, keys.rmw, "nav_msgs/msg/Odometry", "--odometry-key"
-        )
+        self.odometry_key = _publishing_key(keys.odometry, keys.rmw, "nav_msgs/msg/Odometry", "--odometry-key")
         self._bare = keys.bare
         self._last_cloud = -math.inf
         self._cloud = _publisher(transport, self.cloud_key, "bulk", keys.rmw)

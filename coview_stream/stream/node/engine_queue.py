@@ -88,10 +88,7 @@ class EngineQueue:
         if self._frame is None or self._frame_under_way is not None:
             return None
         job = replace(
-            self._frame.job,
-            require_verification=require_verification,
-            search_result=self._search_result,
-            hint=hint,
+            self._frame.job, require_verification=require_verification, search_result=self._search_result, hint=hint
         )
         self._frame_under_way = replace(self._frame, job=job)
         self._frame = self._search_result = None
@@ -124,9 +121,7 @@ class EngineQueue:
         if job.epoch != self.epoch:
             return False
         self._frame_under_way = None
-        self._search_result = (
-            self._search_result or job.search_result
-        )  # not applied: it goes with the next frame
+        self._search_result = self._search_result or job.search_result  # not applied: it goes with the next frame
         return True
 
     # ---- requests for the search engine

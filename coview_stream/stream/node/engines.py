@@ -134,9 +134,7 @@ class SearchEngine:
         self._index.prepare()
 
 
-def open_engine(
-    kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None
-) -> Engine:
+def open_engine(kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None) -> Engine:
     """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map.
 
     Raises:

@@ -57,9 +57,7 @@ class FrameSync:
 
     def add(self, message: CloudMessage, now: float) -> None:
         """Take in a frame that came at local time ``now``."""
-        if message.stamp_ns == self._passed_ns or any(
-            f.message.stamp_ns == message.stamp_ns for f in self._waiting
-        ):
+        if message.stamp_ns == self._passed_ns or any(f.message.stamp_ns == message.stamp_ns for f in self._waiting):
             self.counters.duplicate += 1
         elif self._passed_ns is not None and message.stamp_ns < self._passed_ns:
             self.counters.out_of_order += 1

@@ -139,9 +139,7 @@ class LidarFrameQueue:
     is known of the motion yet. Frames that end here are counted.
     """
 
-    def __init__(
-        self, robot: str, config: NodeConfig, lidar: LidarOdometryConfig, counters: Counters
-    ) -> None:
+    def __init__(self, robot: str, config: NodeConfig, lidar: LidarOdometryConfig, counters: Counters) -> None:
         self.robot = robot
         self.config = config
         self.lidar = lidar

@@ -23,9 +23,7 @@ class OdometryEngine:
 
     kernels: tuple[str, ...] = ()
 
-    def __init__(
-        self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration
-    ) -> None:
+    def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration
         self._robots: dict[str, tuple[int, LidarOdometry]] = {}
         self._trajectories: dict[str, tuple[int, int]] = {}  # epoch and restarts at the newest pose

@@ -95,9 +95,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         from coview_stream.stream.node.node import Node
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
-        transport = open_transport(
-            options.connect, options.listen, options.zenoh_config, options.node.max_payload
-        )
+        transport = open_transport(options.connect, options.listen, options.zenoh_config, options.node.max_payload)
         warn_if_served_already(transport, options.keys)
         sessions = make_sessions(options, base_map.sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
@@ -120,9 +118,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         if isinstance(error, DiedError):
             raise MapError(f"{options.map_path}: {error} while it opened the map") from error
         raise
-    log.info(
-        "ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names)
-    )
+    log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names))
     return node
 
 
@@ -145,10 +141,7 @@ def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
     codecs = (options.cloud_codec, options.odometry_codec)
     if options.lidar is None:
         return [Session(keys, map_sha256, options.node, codecs=codecs) for keys in options.keys]
-    return [
-        LidarSession(keys, map_sha256, options.node, codecs=codecs, lidar=options.lidar)
-        for keys in options.keys
-    ]
+    return [LidarSession(keys, map_sha256, options.node, codecs=codecs, lidar=options.lidar) for keys in options.keys]
 
 
 def warn_if_served_already(transport: Transport, keys: Sequence[RobotKeys]) -> None:

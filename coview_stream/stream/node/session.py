@@ -93,9 +93,7 @@ class Session:
     def on_odometry(self, sample: Sample, now: float) -> None:
         """Take in an odometry sample. Never raises for what the sample holds."""
         try:
-            message = decode_odometry(
-                sample, self.codecs[1], self.keys.odometry_hint, self.config.max_payload
-            )
+            message = decode_odometry(sample, self.codecs[1], self.keys.odometry_hint, self.config.max_payload)
         except MessageError as error:
             self._count_undecodable(error, sample.key, "odometry_")
             return

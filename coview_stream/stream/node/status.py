@@ -111,13 +111,7 @@ class Reporter:
         self._publishers[robot].put(Encoded(json.dumps(document).encode(), _JSON))
 
 
-def status(
-    session: Session,
-    connection: Connection,
-    reconnects: int,
-    rate: float,
-    uptime: float,
-) -> dict[str, Any]:
+def status(session: Session, connection: Connection, reconnects: int, rate: float, uptime: float) -> dict[str, Any]:
     """Return the plain data of ``out/status``; its ``stamp_ns`` is the node's wall clock, all others the robot's."""
     state, reason = session.state()
     age = session.age()
@@ -139,11 +133,7 @@ def status(
         "engine_ms": queue.engine_latency.to_json(),
         "longest_wait_s": round(queue.longest_wait, 3),
         "counters": session.counters.to_json(),
-        "connection": {
-            "routers": list(connection.routers),
-            "peers": list(connection.peers),
-            "reconnects": reconnects,
-        },
+        "connection": {"routers": list(connection.routers), "peers": list(connection.peers), "reconnects": reconnects},
         "errors": list(session.errors.texts),
     }
 

@@ -39,13 +39,9 @@ def check_prefix(text: str, option: str) -> str:
 def _checked_plain(chunk: str, text: str, option: str) -> str:
     found = _FORBIDDEN.search(chunk)
     if found:
-        raise ConfigError(
-            f"{option} {text!r} holds {found.group()!r}, which zenoh reserves in keys: leave it out"
-        )
+        raise ConfigError(f"{option} {text!r} holds {found.group()!r}, which zenoh reserves in keys: leave it out")
     if chunk.startswith("@"):
-        raise ConfigError(
-            f"{option} {text!r}: a part that starts with '@' is hidden from zenoh wildcards: rename it"
-        )
+        raise ConfigError(f"{option} {text!r}: a part that starts with '@' is hidden from zenoh wildcards: rename it")
     if not chunk.isprintable():
         raise ConfigError(f"{option} {text!r} holds unprintable characters: leave them out")
     return text

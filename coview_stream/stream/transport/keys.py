@@ -13,12 +13,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.transport.key_expressions import (
-    check_chunk,
-    check_expression,
-    check_prefix,
-    matches,
-)
+from coview_stream.stream.transport.key_expressions import check_chunk, check_expression, check_prefix, matches
 from coview_stream.stream.transport.rmw import dds_type, type_hash
 
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -60,9 +55,7 @@ class Preset:
 
 PRESETS: dict[str, Preset] = {
     "native": Preset(
-        cloud="{base}/{robot}/in/cloud",
-        odometry="{base}/{robot}/in/odom",
-        pose="{base}/{robot}/out/pose",
+        cloud="{base}/{robot}/in/cloud", odometry="{base}/{robot}/in/odom", pose="{base}/{robot}/out/pose"
     ),
     "ros2dds": Preset(
         cloud="{robot}/points",
@@ -151,11 +144,7 @@ def robot_keys(
     if not 0 <= domain <= 232:
         raise ConfigError(f"--domain {domain} is not a ROS domain id: 0 to 232")
     row = PRESETS[preset]
-    values = {
-        "base": check_prefix(base, "--base"),
-        "robot": check_chunk(robot, "--robot"),
-        "domain": str(domain),
-    }
+    values = {"base": check_prefix(base, "--base"), "robot": check_chunk(robot, "--robot"), "domain": str(domain)}
     if row.rmw:
         values["pose_hash"] = type_hash(POSE_TYPE, humble)
     pose_key = _filled(pose or row.pose, values, "--pose-key", wildcards=False)
@@ -183,9 +172,7 @@ def _filled(template: str, values: dict[str, str], option: str, wildcards: bool 
     def value(found: re.Match[str]) -> str:
         name = found.group(1)
         if name not in values:
-            raise ConfigError(
-                f"{option} {template!r}: unknown placeholder {{{name}}}: there are {', '.join(values)}"
-            )
+            raise ConfigError(f"{option} {template!r}: unknown placeholder {{{name}}}: there are {', '.join(values)}")
         return values[name]
 
     return check_expression(re.sub(r"\{([^{}]*)\}", value, template), option, wildcards)

@@ -82,9 +82,7 @@ class MemoryTransport:
         """Hold a token until :meth:`close`."""
         self._tokens.append(check_expression(key, "key", wildcards=False))
 
-    def query(
-        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
-    ) -> dict[str, Any]:
+    def query(self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0) -> dict[str, Any]:
         """Call the handler that :meth:`answer` declared; there is nothing to wait for.
 
         Raises:
@@ -103,9 +101,7 @@ class MemoryTransport:
         """Return those of :attr:`announced` that match, sorted, each once."""
         return sorted({token for token in self.announced if matches(expression, token)})
 
-    def await_subscriber(
-        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
-    ) -> bool:
+    def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
         """Return True at once: every publication counts as heard, as :attr:`published` keeps it."""
         return True
 

@@ -64,9 +64,7 @@ class Transport(Protocol):
         """Hold a liveliness token on ``key`` until :meth:`close`."""
         ...
 
-    def query(
-        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
-    ) -> dict[str, Any]:
+    def query(self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0) -> dict[str, Any]:
         """Query ``key`` and return the first JSON reply.
 
         Raises:
@@ -82,9 +80,7 @@ class Transport(Protocol):
         """
         ...
 
-    def await_subscriber(
-        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
-    ) -> bool:
+    def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
         """Wait up to ``seconds`` for a subscriber to ``key``; False if there is none by then.
 
         ``wait(seconds)`` passes the time between two looks; a true return value of it ends the waiting early.

@@ -61,9 +61,7 @@ _REMEDIES = {
     "machine that has it",
 }
 
-_MESSAGE = re.compile(
-    r'JSON error: Message \{ msg: "((?:[^"\\]|\\.)*)", location: (?:Some\(.*?line: (\d+),.*|None.*)'
-)
+_MESSAGE = re.compile(r'JSON error: Message \{ msg: "((?:[^"\\]|\\.)*)", location: (?:Some\(.*?line: (\d+),.*|None.*)')
 _SYNTAX = re.compile(r"^--> (\d+):(\d+) \|.*\| = (.*)$")
 _FIELD = re.compile(r"unknown field `([^`]*)`(?:, (?:expected (?:one of )?)?(.*?))?(?=$| at line )")
 _PLACE = re.compile(r" at line (\d+) column \d+")
@@ -109,10 +107,7 @@ def compose(connect: Sequence[str] = (), listen: Sequence[str] = (), path: Path 
         _insert(config, "connect/endpoints", list(connect))
     _set_listen(config, listen)
     if _get(config, "mode") is None:
-        has_listen, has_connect = (
-            bool(_get(config, "listen/endpoints")),
-            bool(_get(config, "connect/endpoints")),
-        )
+        has_listen, has_connect = (bool(_get(config, "listen/endpoints")), bool(_get(config, "connect/endpoints")))
         _insert(config, "mode", "client" if has_connect and not has_listen else "peer")
     for key, value in _DEFAULTS.items():
         if _is_unset(config, key):
@@ -145,9 +140,7 @@ def _load(path: Path | None) -> tuple[Any, str]:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         what = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise TransportError(
-            f"zenoh configuration {path}: {what}: give a JSON5 file that can be read"
-        ) from error
+        raise TransportError(f"zenoh configuration {path}: {what}: give a JSON5 file that can be read") from error
     with zenoh_errors(f"zenoh configuration {path}"):
         return zenoh.Config.from_file(str(path)), text
 
@@ -189,9 +182,7 @@ def _check_endpoint(endpoint: str, option: str) -> None:
     if protocol in _WITH_PORT:
         found = _HOST_PORT.fullmatch(address)
         if not found:
-            raise TransportError(
-                f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447"
-            )
+            raise TransportError(f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447")
         min_port = 0 if option == "--listen" else 1  # listening on 0 takes any that is free
         if not min_port <= int(found.group(2)) <= 65535:
             raise TransportError(f"{option} {endpoint!r}: port must be 1..65535, such as 7447")

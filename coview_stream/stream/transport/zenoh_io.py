@@ -64,9 +64,7 @@ def plain(sample: Any, max_payload: int | None = None) -> Sample:
     size = len(sample.payload) + (0 if attachment is None else len(attachment))
     if max_payload is not None and size > max_payload:
         return Sample(key, b"", encoding, size=size)
-    return Sample(
-        key, sample.payload.to_bytes(), encoding, None if attachment is None else attachment.to_bytes()
-    )
+    return Sample(key, sample.payload.to_bytes(), encoding, None if attachment is None else attachment.to_bytes())
 
 
 def quality(urgency: Urgency) -> dict[str, Any]:
@@ -141,9 +139,7 @@ def _json_object(key: str, payload: bytes) -> dict[str, Any]:
     try:
         return read_object(payload)
     except MessageError as error:
-        raise TransportError(
-            f"{key}: the answer is no JSON object ({error}); is this a coview_stream node?"
-        ) from error
+        raise TransportError(f"{key}: the answer is no JSON object ({error}); is this a coview_stream node?") from error
 
 
 def _error_of(payload: bytes) -> str:

@@ -34,10 +34,7 @@ _QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's rec
 
 
 def open_transport(
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
-    config: Path | None = None,
-    max_payload: int | None = None,
+    connect: Sequence[str] = (), listen: Sequence[str] = (), config: Path | None = None, max_payload: int | None = None
 ) -> ZenohTransport:
     """Open a zenoh session.
 
@@ -127,9 +124,7 @@ class ZenohTransport:
 
         self._declare(key, declare)
 
-    def query(
-        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0
-    ) -> dict[str, Any]:
+    def query(self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0) -> dict[str, Any]:
         """Query ``key``, after waiting for the first router if need be, and return the first JSON reply.
 
         Raises:
@@ -158,9 +153,7 @@ class ZenohTransport:
             replies = [reply.ok for reply in session.liveliness().get(expression, timeout=timeout)]
         return sorted({str(sample.key_expr) for sample in replies if sample is not None})
 
-    def await_subscriber(
-        self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep
-    ) -> bool:
+    def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
         """Wait up to ``seconds`` for a subscriber to ``key``; False if there is none by then.
 
         ``wait(seconds)`` passes the time between two looks; a true return value of it ends the waiting early.
@@ -244,9 +237,7 @@ class ZenohTransport:
             self.close()
             raise error
         if error is not None:
-            _log.warning(
-                "no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where
-            )
+            _log.warning("no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where)
 
     def _keep_trying(self, first: SimpleQueue[TransportError | None]) -> None:
         while not self._closing.is_set():

@@ -31,12 +31,7 @@ def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) 
 
 
 def describe_points(
-    points: F32,
-    centre: F64,
-    rings: int,
-    sectors: int,
-    r_max: float,
-    vertical: Vertical = "max",
+    points: F32, centre: F64, rings: int, sectors: int, r_max: float, vertical: Vertical = "max"
 ) -> tuple[PolarGrid, F32, int]:
     """See :func:`coview_kernels.describe_points`."""
     grid, dropped = polar_bin(points, centre, rings, sectors, r_max)

@@ -9,9 +9,7 @@ import numpy as np
 from coview_kernels.arrays import F32, F64, I64
 
 
-def transform_unique(
-    points: F32, T: F64, voxel: float, r_min: float = 0.0, r_max: float = math.inf
-) -> tuple[F32, int]:
+def transform_unique(points: F32, T: F64, voxel: float, r_min: float = 0.0, r_max: float = math.inf) -> tuple[F32, int]:
     """See :func:`coview_kernels.transform_unique`."""
     x, y, z = points.astype(np.float64).T
     # written out, not a BLAS product: the order of the roundings is part of the contract with the kernel

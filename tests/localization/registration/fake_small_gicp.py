@@ -38,9 +38,7 @@ def estimate_covariances(cloud, tree, num_neighbors, num_threads):
     cloud.normals = np.linalg.eigh(np.einsum("nki,nkj->nij", gaps, gaps))[1][:, :, 0]
 
 
-def align(
-    target, source, tree, T, registration_type, max_correspondence_distance, num_threads, max_iterations
-):
+def align(target, source, tree, T, registration_type, max_correspondence_distance, num_threads, max_iterations):
     assert (registration_type, num_threads, max_iterations) == ("GICP", 1, 1)
     moved = source.points @ T[:3, :3].T + T[:3, 3]
     distance, partner = tree.tree.query(moved, distance_upper_bound=max_correspondence_distance)

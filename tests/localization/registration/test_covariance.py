@@ -46,9 +46,7 @@ def test_propagated_heading_error_becomes_position_error():
     ends = np.array([boxminus(boxplus(TRUTH, d) @ step, TRUTH @ step) for d in drawn])
     expected = propagate(C, shift)
     scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        np.cov(ends.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.06
-    )
+    np.testing.assert_allclose(np.cov(ends.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.06)
     across = np.array([0.0, 0.0, 0.0, -shift[1], shift[0], 0.0]) / np.hypot(*shift[:2])
     sideways = np.hypot(*shift[:2]) * sigma[2]  # 0.18 m, and what the place was off by before
     assert np.sqrt(across @ expected @ across) == pytest.approx(sideways, rel=0.1)
@@ -117,8 +115,7 @@ def test_zero_information_gives_the_max_sigma(weakest):
 def test_sigma_grows_continuously_as_information_falls():
     sigmas = np.geomspace(0.01, 30.0, 60)
     found = [
-        np.sqrt(registration_covariance(information_of([1e-3] * 3 + [s, 0.01, 0.01]), CONFIG)[3, 3])
-        for s in sigmas
+        np.sqrt(registration_covariance(information_of([1e-3] * 3 + [s, 0.01, 0.01]), CONFIG)[3, 3]) for s in sigmas
     ]
     steps = np.diff(np.log(found))
     assert (steps >= -1e-9).all()

@@ -81,9 +81,7 @@ def test_hessian_and_gradient_match_numerical_derivatives():
 
     def slope(move):
         h = 1e-6
-        return np.column_stack(
-            [(residuals(move(h * e)) - residuals(move(-h * e))) / (2 * h) for e in np.eye(6)]
-        )
+        return np.column_stack([(residuals(move(h * e)) - residuals(move(-h * e))) / (2 * h) for e in np.eye(6)])
 
     r = residuals(TILTED)
     theirs = slope(lambda d: TILTED @ exp_se3(d))
@@ -147,9 +145,7 @@ def test_step_without_prior_is_that_of_the_pairs():
 def test_gicp_and_trimmed_icp_agree_from_one_metre_and_five_degrees(target, centre):
     scan = scan_of(target)
     start = TRUTH @ exp_se3(np.array([0.01, -0.01, np.radians(5.0), 0.8, -0.6, 0.1]))
-    found, other = (
-        register(scan, start, target, c, c.search, centre=centre, iterations=30) for c in (CONFIG, TRIMMED)
-    )
+    found, other = (register(scan, start, target, c, c.search, centre=centre, iterations=30) for c in (CONFIG, TRIMMED))
     assert pose_error(found.T_map_source, TRUTH)[0] < 0.01
     metres, degrees = pose_error(found.T_map_source, other.T_map_source)
     assert metres < 0.02

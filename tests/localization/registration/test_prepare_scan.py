@@ -53,9 +53,7 @@ def test_range_and_count_are_limited_deterministically():
 
 
 def test_one_point_per_voxel():
-    source = prepare_scan(
-        np.repeat(ground(half=5.0), 4, axis=0), np.zeros(3), RegistrationConfig(source_voxel=1.0)
-    )
+    source = prepare_scan(np.repeat(ground(half=5.0), 4, axis=0), np.zeros(3), RegistrationConfig(source_voxel=1.0))
     assert len(np.unique(np.floor(source.points / 1.0), axis=0)) == len(source.points)
 
 

@@ -69,9 +69,7 @@ def test_known_six_dof_offset_is_found(target, scan, offset):
 
 def test_registration_with_forty_percent_outliers(target, scan):
     start = TRUTH @ exp_se3(np.array([0.01, 0.0, 0.06, 0.8, -0.7, 0.1]))
-    metres, degrees = errors(
-        register(with_outliers(scan, 0.4), start, target, CONFIG, CONFIG.search).T_map_source
-    )
+    metres, degrees = errors(register(with_outliers(scan, 0.4), start, target, CONFIG, CONFIG.search).T_map_source)
     assert metres < 0.03
     assert degrees < 0.15
 

@@ -32,9 +32,7 @@ def seen(world_map, world_drive):
     source = prepare_scan(small_world.in_map(world_drive, 3), T[:3, 3], CONFIG)
 
     def evidence(dx=0.0, dy=0.0, degrees=0.0):
-        about = pose_from(np.eye(3), T[:3, 3] + [dx, dy, 0]) @ pose_from(
-            rot_z(np.radians(degrees)), -0 * T[:3, 3]
-        )
+        about = pose_from(np.eye(3), T[:3, 3] + [dx, dy, 0]) @ pose_from(rot_z(np.radians(degrees)), -0 * T[:3, 3])
         wrong = zero @ about @ pose_from(np.eye(3), -T[:3, 3])
         T_body = wrong @ T
         target = maps.around(T_body[:3, 3])
@@ -74,8 +72,7 @@ def test_outside_the_map_is_not_inside(seen):
 def fan(distance, half_degrees=30.0):
     """Returns at equal range, ahead, 0.5 degrees apart, and the ground 1.5 m below the sensor."""
     a, e = (
-        np.radians(v.ravel())
-        for v in np.meshgrid(np.arange(-half_degrees, half_degrees, 0.5), np.arange(-5, 10, 0.5))
+        np.radians(v.ravel()) for v in np.meshgrid(np.arange(-half_degrees, half_degrees, 0.5), np.arange(-5, 10, 0.5))
     )
     rays = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     turn = np.radians(np.arange(0.0, 360.0))
@@ -114,16 +111,11 @@ def test_free_space_uses_robot_heading():
     met, passed = free_space(RangeImage.of(fan(10.2)), pose_from(rot_z(np.pi / 2), [0, 0, 1.5]), turned)
     assert met > 0
     assert passed == 0
-    assert free_space(RangeImage.of(fan(10.2)), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (
-        0,
-        0,
-    )
+    assert free_space(RangeImage.of(fan(10.2)), pose_from(rot_z(-np.pi / 2), [0, 0, 1.5]), turned) == (0, 0)
 
 
 def test_little_structure_scores_low():
-    field = parts(
-        plane([-20, -20, 0], [40, 0, 0], [0, 40, 0], 0.5), plane([5, 0, 0], [0, 1, 0], [0, 0, 2], 0.5)
-    )
+    field = parts(plane([-20, -20, 0], [40, 0, 0], [0, 40, 0], 0.5), plane([5, 0, 0], [0, 1, 0], [0, 0, 2], 0.5))
     target = local_map(*field)
     height = field[0][:, 2].copy()
     source = RegistrationCloud(field[0], height > 0.5, height)
@@ -135,9 +127,7 @@ def test_little_structure_scores_low():
 
 
 def test_points_outside_surveyed_cells_are_ignored(seen):
-    target = local_map(
-        *parts(plane([-20, -20, 0], [40, 0, 0], [0, 40, 0]), plane([9, -9, 0], [0, 18, 0], [0, 0, 4]))
-    )
+    target = local_map(*parts(plane([-20, -20, 0], [40, 0, 0], [0, 40, 0]), plane([9, -9, 0], [0, 18, 0], [0, 0, 4])))
     elsewhere = target.points + np.array([0, 0, 300], np.float32)
     points = np.concatenate([target.points, elsewhere])
     height = np.tile(target.points[:, 2], 2)

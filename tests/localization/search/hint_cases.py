@@ -13,9 +13,7 @@ BESIDE = pose_from(rot_z(2.0), [9.0, -14.0, 0.0])  # another place of the map
 
 
 def follow(localizer, drive, frames, first=0):
-    return [
-        localizer.step(drive.clouds[k], drive.T_odom_body[k], 0.5 * k) for k in range(first, first + frames)
-    ]
+    return [localizer.step(drive.clouds[k], drive.T_odom_body[k], 0.5 * k) for k in range(first, first + frames)]
 
 
 def first_fix(fixes):

@@ -24,9 +24,7 @@ HERE, ELSEWHERE = (pose_from(rot_z(-0.8), [x, 9.0, 0.5]) for x in (3.0, 40.0))
 WEAK = RULE.score + 0.03
 
 
-def candidate(
-    score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0, inside: float = 0.9
-) -> Candidate:
+def candidate(score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0, inside: float = 0.9) -> Candidate:
     hypothesis = Hypothesis(T_map_odom, 5, 2, -3.0, learned=True, lead=lead)
     found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
     return Candidate(hypothesis, found, Evidence(score, score, 1.0, 1.0, inside))

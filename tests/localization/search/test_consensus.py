@@ -8,13 +8,7 @@ import pytest
 from coview_kernels import Nearest
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
-from coview_stream.localization.search.consensus import (
-    Consensus,
-    StationGrid,
-    argsmallest,
-    robust_zscore,
-    yaw_of_shift,
-)
+from coview_stream.localization.search.consensus import Consensus, StationGrid, argsmallest, robust_zscore, yaw_of_shift
 
 BLOCK, S, SIDE = 2.0, 12, 12
 SHIFT = 2  # yaw of odometry in the map: -60 degrees
@@ -128,9 +122,7 @@ def test_missing_station_gets_neutral_score():
     newest = index[visited[-1]]
     assert holed.hypotheses()[0].station == newest
     # as if that keyframe had not voted, but for the normalisation
-    assert holed.scores()[newest, SHIFT] * 2 == pytest.approx(
-        shorter.scores()[newest, SHIFT] * np.sqrt(3), rel=1e-2
-    )
+    assert holed.scores()[newest, SHIFT] * 2 == pytest.approx(shorter.scores()[newest, SHIFT] * np.sqrt(3), rel=1e-2)
 
 
 def test_votes_do_not_wrap_around_map_edges():
@@ -167,9 +159,7 @@ def test_grid_and_lookup_layouts_give_the_same_shifted_sum():
 @pytest.mark.parametrize("kind", ["one road", "two storeys"])
 def test_few_stations_on_a_wide_grid_are_no_raster(kind):
     road = (
-        grid_stations(40)[::41]
-        if kind == "one road"
-        else np.concatenate([grid_stations(4), grid_stations(4, z=4.0)])
+        grid_stations(40)[::41] if kind == "one road" else np.concatenate([grid_stations(4), grid_stations(4, z=4.0)])
     )
     assert not StationGrid(road, BLOCK).is_raster
 

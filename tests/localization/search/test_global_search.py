@@ -32,9 +32,7 @@ from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
 NOTHING = np.empty((0, 3), np.float32)
-REQUEST = SearchRequest(
-    7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING, 5.5, (2, 3)
-)
+REQUEST = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING, 5.5, (2, 3))
 HERE = pose_from(rot_z(-0.8), [3.0, 9.0, 0.5])  # map <- odometry of all candidates that are right
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])  # of the runs through the small world
 TILT = np.radians(4.0)
@@ -50,9 +48,7 @@ def moved(forward=0.0, degrees=0.0):
 def candidate(score, T_map_odom=HERE, inside=0.9, ground=1.0):
     """A made-up candidate: all that is judged is its pose and its evidence."""
     found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return Candidate(
-        Hypothesis(T_map_odom, 5, 2, -3.0), found, Evidence(score / ground, score, ground, 1.0, inside)
-    )
+    return Candidate(Hypothesis(T_map_odom, 5, 2, -3.0), found, Evidence(score / ground, score, ground, 1.0, inside))
 
 
 @pytest.fixture
@@ -108,10 +104,7 @@ REFUSED = {
     "no ground": ([candidate(0.5, ground=RULE.ground - 0.05)], State.AMBIGUOUS),
     "equal rival": ([candidate(0.7), candidate(0.7, moved(20))], State.AMBIGUOUS),
     "close rival": ([candidate(0.7), candidate(0.7 - RULE.lead / 2, moved(20))], State.AMBIGUOUS),
-    "the rival comes third": (
-        [candidate(0.7), candidate(0.69), candidate(0.68, moved(20))],
-        State.AMBIGUOUS,
-    ),
+    "the rival comes third": ([candidate(0.7), candidate(0.69), candidate(0.68, moved(20))], State.AMBIGUOUS),
     "rival heading": ([candidate(0.7), candidate(0.68, moved(0, 180))], State.AMBIGUOUS),
 }
 
@@ -137,9 +130,7 @@ ACCEPTED = {
 def test_good_candidate_is_accepted_after_enough_evidence(search, case):
     best = ACCEPTED[case][0]
     proof = int(np.ceil(RULE.evidence_sum / (best.evidence.score - RULE.evidence_floor)))
-    accepted = [
-        result.accepted for result in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))
-    ]
+    accepted = [result.accepted for result in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))]
     assert accepted[-1] is best
     # no sooner either: weak evidence needs more driving
     assert accepted[: max(proof, RULE.confirmations) - 1] == [None] * (max(proof, RULE.confirmations) - 1)
@@ -162,9 +153,7 @@ def test_agreement_is_measured_at_the_robot_not_at_the_odometry_origin(search):
     turned = moved(0.3 * RULE.agree_distance, 0.9 * np.degrees(RULE.agree_angle))
     assert np.linalg.norm((turned - HERE)[:3, 3]) > RULE.agree_distance
     poses = [HERE, turned] * RULE.confirmations
-    assert (
-        judged(search, *[[candidate(0.7, T)] for T in poses[: RULE.confirmations]])[-1].accepted is not None
-    )
+    assert judged(search, *[[candidate(0.7, T)] for T in poses[: RULE.confirmations]])[-1].accepted is not None
 
 
 WEAK = {

@@ -27,9 +27,7 @@ from coview_stream.localization.state import State
 def test_hint_is_kept_until_accepted_or_reset(world_map, world_drive):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0])
-    requests = [
-        localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)
-    ]
+    requests = [localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k) for k in (0, 1)]
     assert [len(request.hints) for request in requests] == [1, 1]
     np.testing.assert_array_equal(requests[0].hints, requests[1].hints)
     localizer.reset()
@@ -68,10 +66,7 @@ def test_jumped_odometry_hint_is_not_accepted_after_loss(world_map, world_drive)
     localizer, k = lost(world_map, world_drive)
     jump = pose_from(rot_z(0.7), [12.0, -5.0, 0.0])
     for fix, truth in zip(
-        [
-            localizer.step(world_drive.clouds[n], jump @ world_drive.T_odom_body[n], 0.5 * n)
-            for n in range(k, 10)
-        ],
+        [localizer.step(world_drive.clouds[n], jump @ world_drive.T_odom_body[n], 0.5 * n) for n in range(k, 10)],
         world_drive.T_map_body[k:],
         strict=True,
     ):

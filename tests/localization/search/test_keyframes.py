@@ -112,9 +112,7 @@ def test_stored_points_survive_buffer_reuse():
 
 def test_a_frame_can_be_voxelized_without_becoming_part_of_a_keyframe():
     buffer = KeyframeBuffer(CONFIG)
-    np.testing.assert_array_equal(
-        buffer.voxelize(cloud(0), at(0.0)), prepare_scan.voxelized(cloud(0), at(0.0), CONFIG)
-    )
+    np.testing.assert_array_equal(buffer.voxelize(cloud(0), at(0.0)), prepare_scan.voxelized(cloud(0), at(0.0), CONFIG))
     assert buffer.newest is not None
     assert len(buffer.recent(1)) == 0
     assert len(buffer.keyframes) == 0

@@ -85,9 +85,7 @@ def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
 # ---- wrong ones
 
 
-@pytest.mark.parametrize(
-    "off", [BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])]
-)
+@pytest.mark.parametrize("off", [BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])])
 def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, off):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0] @ off)
@@ -142,9 +140,7 @@ def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_d
     localizer = Localizer(lookalike_map)
     consensus = localizer._search.coview.consensus
     found = consensus.hypotheses
-    monkeypatch.setattr(
-        consensus, "hypotheses", lambda: found() if len(consensus) > RULE.confirmations else []
-    )
+    monkeypatch.setattr(consensus, "hypotheses", lambda: found() if len(consensus) > RULE.confirmations else [])
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
     fixes = follow(localizer, world_drive, 8)
     assert all(f.evidence.score > RULE.score for f in fixes[:3])  # the wrong one, and it was alone

@@ -124,21 +124,14 @@ def test_robot_turned_left_is_found_at_its_heading(turn):
     rng = np.random.default_rng(12)
     config = DescriptorConfig(radius=20.0, rings=R, sectors=S, channels=("scan_context",))
     places = [
-        np.column_stack([rng.uniform(-20, 20, (60, 2)), rng.uniform(0.5, 9, 60)]).astype(np.float32)
-        for _ in range(12)
+        np.column_stack([rng.uniform(-20, 20, (60, 2)), rng.uniform(0.5, 9, 60)]).astype(np.float32) for _ in range(12)
     ]
     there = Stations()
-    there.full = {
-        "scan_context": np.stack([describe(p, np.zeros(3), config)["scan_context"] for p in places])
-    }
+    there.full = {"scan_context": np.stack([describe(p, np.zeros(3), config)["scan_context"] for p in places])}
     yaw = 2 * np.pi * turn / S
     c, s = np.cos(yaw), np.sin(yaw)
-    seen = places[8].astype(np.float64) @ np.array(
-        [[c, -s, 0], [s, c, 0], [0, 0, 1]]
-    )  # map -> body: inverse turn
-    volume = Retrieval(there, RetrievalConfig()).distances(
-        describe(seen.astype(np.float32), np.zeros(3), config)
-    )
+    seen = places[8].astype(np.float64) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])  # map -> body: inverse turn
+    volume = Retrieval(there, RetrievalConfig()).distances(describe(seen.astype(np.float32), np.zeros(3), config))
     station, shift = np.unravel_index(volume["scan_context"].argmin(), volume["scan_context"].shape)
     assert station == 8
     assert np.cos(yaw_of_shift(int(shift), S) - yaw) == pytest.approx(1.0)

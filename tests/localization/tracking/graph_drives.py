@@ -25,14 +25,7 @@ class Drive:
 
 
 def drive(
-    keyframes,
-    seed=0,
-    every=3,
-    outliers=0.0,
-    bias=None,
-    odometry=ODOMETRY,
-    registration=REGISTRATION,
-    stray=5.0,
+    keyframes, seed=0, every=3, outliers=0.0, bias=None, odometry=ODOMETRY, registration=REGISTRATION, stray=5.0
 ) -> Drive:
     """Steps of half a metre on a winding way; ``bias`` (6,) is added to every step of odometry."""
     rng = np.random.default_rng(seed)
@@ -62,9 +55,7 @@ def run(graph, drive, odometry=ODOMETRY, registration=REGISTRATION, start=START_
 
 def shift_errors(estimates, truth):
     """Distance (K,) of every estimate from the truth, metres."""
-    return np.array(
-        [np.linalg.norm(e.T_map_body[:3, 3] - T[:3, 3]) for e, T in zip(estimates, truth, strict=True)]
-    )
+    return np.array([np.linalg.norm(e.T_map_body[:3, 3] - T[:3, 3]) for e, T in zip(estimates, truth, strict=True)])
 
 
 def relative(A, B):

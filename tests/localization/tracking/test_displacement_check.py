@@ -38,10 +38,7 @@ def test_share_on_map_is_one_at_the_true_pose(target):
 
 
 def test_share_on_map_falls_with_displacement(target):
-    off = [
-        np.mean(shares(target, boxplus(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0]))))
-        for x in (0.0, 0.6, 5.3)
-    ]
+    off = [np.mean(shares(target, boxplus(T_MAP_ODOM, np.array([0, 0, 0, x, 0.7 * x, 0.0])))) for x in (0.0, 0.6, 5.3)]
     assert off[0] > 1.2 * off[1]
     assert off[1] > off[2]
     assert off[2] < 0.5
@@ -150,9 +147,7 @@ def test_displacement_check_samples_a_bounded_number_of_points(target, monkeypat
     asked = []
     inner = module.kernels.nearest
     monkeypatch.setattr(
-        module.kernels,
-        "nearest",
-        lambda grid, points, reach: asked.append(len(points)) or inner(grid, points, reach),
+        module.kernels, "nearest", lambda grid, points, reach: asked.append(len(points)) or inner(grid, points, reach)
     )
     share_on_map(np.concatenate([yard(k) for k in range(10)]), HERE, T_MAP_ODOM, target)
     assert asked == [module._POINTS]

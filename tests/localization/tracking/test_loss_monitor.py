@@ -30,9 +30,7 @@ def test_loss_monitor_starts_clear(monitor):
     assert monitor.verify(GOOD, 0.0, 0.0) == VERIFIED
 
 
-@pytest.mark.parametrize(
-    "cause", [cause for cause in RejectionReason if cause is not RejectionReason.VERIFIED]
-)
+@pytest.mark.parametrize("cause", [cause for cause in RejectionReason if cause is not RejectionReason.VERIFIED])
 def test_one_rejection_begins_doubt_and_one_verification_clears_it(monitor, cause):
     assert monitor.verify(MatchVerdict(cause, "why"), 1.0, 0.0) == (Event.MATCH_REJECTED, "why")
     assert monitor.verify(GOOD, 2.0, 0.0) == VERIFIED

@@ -10,9 +10,7 @@ from coview_stream.config import AcceptanceConfig
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 
-RULE = AcceptanceConfig(
-    tracking_min_score=0.22, tracking_min_share=0.5, tracking_min_ground=0.5, min_overlap=0.3
-)
+RULE = AcceptanceConfig(tracking_min_score=0.22, tracking_min_share=0.5, tracking_min_ground=0.5, min_overlap=0.3)
 GOOD = Evidence(near=0.8, covered=0.9, ground=0.95, free_space=0.9, inside=1.0)
 
 
@@ -80,10 +78,7 @@ def test_poor_baseline_does_not_lower_the_absolute_threshold():
 
 def test_cause_is_the_share_furthest_below_baseline():
     """Where hardly anything above the ground is ever on the map, rays through what it shows are the news."""
-    baseline, usual = (
-        EvidenceBaseline(),
-        Evidence(near=0.45, covered=0.6, ground=0.9, free_space=0.9, inside=1.0),
-    )
+    baseline, usual = (EvidenceBaseline(), Evidence(near=0.45, covered=0.6, ground=0.9, free_space=0.9, inside=1.0))
     baseline.learn(usual)
     tight = replace(RULE, tracking_min_share=0.9)
     assert baseline.judge(replace(usual, free_space=0.5, near=0.4), tight)[0] is RejectionReason.FREE_SPACE

@@ -39,9 +39,7 @@ def test_move_composes_pose_and_propagates_covariance(graph):
     way = T[:3, 3] - START[:3, 3]
     across = np.array([-way[1], way[0], 0.0])
     found = covariance[3:, 3:] - ODOMETRY[3:, 3:]
-    np.testing.assert_allclose(
-        found, 0.01 * np.outer(across, across) + 1e-6 * np.eye(3), rtol=1e-3, atol=1e-7
-    )
+    np.testing.assert_allclose(found, 0.01 * np.outer(across, across) + 1e-6 * np.eye(3), rtol=1e-3, atol=1e-7)
 
 
 def test_odometry_covariance_is_along_map_axes(graph):
@@ -186,8 +184,7 @@ def test_missing_gtsam_is_named_with_remedy(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("window", 1), ("restart", GraphConfig().window), ("huber", 0.0), ("huber", np.inf)],
+    ("name", "value"), [("window", 1), ("restart", GraphConfig().window), ("huber", 0.0), ("huber", np.inf)]
 )
 def test_graph_config_out_of_range_is_refused(name, value):
     with pytest.raises(ConfigError, match=rf"GraphConfig\.{name}"):

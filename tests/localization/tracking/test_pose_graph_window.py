@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graph_drives import (
-    ODOMETRY,
-    REGISTRATION,
-    START,
-    START_COVARIANCE,
-    drive,
-    relative,
-    run,
-    shift_errors,
-)
+from graph_drives import ODOMETRY, REGISTRATION, START, START_COVARIANCE, drive, relative, run, shift_errors
 
 from coview_stream.config import GraphConfig
 from coview_stream.geometry.transforms import along_body, along_map, boxminus, boxplus
@@ -31,16 +22,12 @@ def dense(way, start=START_COVARIANCE):
     X = [START]
     for step in way.steps:
         X.append(X[-1] @ step)
-    whitener = {
-        name: np.linalg.inv(np.linalg.cholesky(C)) for name, C in [("z", ODOMETRY), ("y", REGISTRATION)]
-    }
+    whitener = {name: np.linalg.inv(np.linalg.cholesky(C)) for name, C in [("z", ODOMETRY), ("y", REGISTRATION)]}
 
     def residuals(X):
         rows = [np.linalg.inv(np.linalg.cholesky(start)) @ boxminus(X[0], START)]
         rows += [whitener["z"] @ boxminus(X[k], X[k - 1] @ step) for k, step in enumerate(way.steps, start=1)]
-        return rows + [
-            whitener["y"] @ boxminus(X[k], seen) for k, seen in enumerate(way.seen) if seen is not None
-        ]
+        return rows + [whitener["y"] @ boxminus(X[k], seen) for k, seen in enumerate(way.seen) if seen is not None]
 
     for _ in range(15):
         r = residuals(X)

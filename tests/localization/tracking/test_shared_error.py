@@ -29,10 +29,7 @@ def street(rng, off):
             n = np.eye(3)[axis]
             place = np.array([x + 8.0, y + 8.0, 0.0])
             seen += [front + place, ground + place]
-            mapped += [
-                front + place + n * rng.normal(0.0, off),
-                ground + place + [0, 0, rng.normal(0.0, off)],
-            ]
+            mapped += [front + place + n * rng.normal(0.0, off), ground + place + [0, 0, rng.normal(0.0, off)]]
             normals += [np.tile(n, (160, 1)), np.tile([0.0, 0.0, 1.0], (160, 1))]
     seen, mapped, normals = (np.concatenate(part).astype(np.float32) for part in (seen, mapped, normals))
     noise = rng.normal(0.0, 0.01, seen.shape).astype(np.float32)

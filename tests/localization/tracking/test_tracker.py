@@ -6,17 +6,7 @@ import numpy as np
 import pytest
 from se3 import exp_se3
 from small_world import pose_error, scan
-from trackers import (
-    OFF,
-    Ride,
-    add_frame,
-    garbage,
-    match_and_update,
-    on_the_way,
-    refused,
-    registration,
-    ride_of,
-)
+from trackers import OFF, Ride, add_frame, garbage, match_and_update, on_the_way, refused, registration, ride_of
 
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
 from coview_stream.geometry.transforms import inverse, pose_from
@@ -168,12 +158,7 @@ def test_pose_tilted_beyond_limit_is_rejected(world_map, world_drive, limit):
     robot = pose_from(np.eye(3), truth[:3, 3])
     config = ruled(max_tilt=limit * tilt, tracking_min_score=0.01, min_overlap=0.01, tracking_min_ground=0.01)
     ride = Ride.begin(
-        world_map,
-        config,
-        world_drive.clouds[4],
-        truth,
-        off=robot @ OFF @ inverse(robot),
-        T_map_odom=robot @ leaning,
+        world_map, config, world_drive.clouds[4], truth, off=robot @ OFF @ inverse(robot), T_map_odom=robot @ leaning
     )
     if limit > 1:
         assert ride.update(world_drive.clouds[4], truth).verified

@@ -57,10 +57,7 @@ def test_random_points_are_not_taken_for_a_slip(world_map, slow_drive, elsewhere
     """Garbage and another world may register anywhere within reach: that is no slip."""
     ride = on_the_way(world_map, slow_drive)
     for cloud in (garbage(), *elsewhere.clouds):
-        assert (
-            refused(ride, cloud, slow_drive.T_map_body[8], newest_only=True).cause
-            is not RejectionReason.ODOMETRY
-        )
+        assert refused(ride, cloud, slow_drive.T_map_body[8], newest_only=True).cause is not RejectionReason.ODOMETRY
 
 
 def test_plausible_drift_is_not_a_slip(world_map, slow_drive):
@@ -68,9 +65,7 @@ def test_plausible_drift_is_not_a_slip(world_map, slow_drive):
     small = pose_from(np.eye(3), [0.0, 0.06, 0.0])
     causes = []
     for trusted in (0.002, 0.1):
-        config = LocalizerConfig(
-            tracking=replace(TrackingConfig(), position_drift=trusted, drift_prior=1000.0)
-        )
+        config = LocalizerConfig(tracking=replace(TrackingConfig(), position_drift=trusted, drift_prior=1000.0))
         ride = on_the_way(world_map, slow_drive, config)
         ride.slips(small, slow_drive.T_map_body[7])
         causes.append(ride.update(slow_drive.clouds[8], slow_drive.T_map_body[8]).cause)
@@ -100,9 +95,7 @@ def stood(world_map, slow_drive, looks, standing_still):
     """Variances of the belief after looking again and again at the same thing."""
     ride = on_the_way(world_map, slow_drive, frames=3)
     for _ in range(looks):
-        assert ride.update(
-            slow_drive.clouds[3], slow_drive.T_map_body[3], standing_still=standing_still
-        ).verified
+        assert ride.update(slow_drive.clouds[3], slow_drive.T_map_body[3], standing_still=standing_still).verified
     return np.diag(ride.tracker.predicted_covariance())
 
 

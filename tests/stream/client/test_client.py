@@ -72,10 +72,7 @@ def test_sent_odometry_has_the_documented_layout(client, net):
 
 
 def test_publishers_have_the_right_urgency(client, net):
-    assert {p.key: p.urgency for p in net.publishers} == {
-        "coview/r1/in/cloud": "bulk",
-        "coview/r1/in/odom": "data",
-    }
+    assert {p.key: p.urgency for p in net.publishers} == {"coview/r1/in/cloud": "bulk", "coview/r1/in/odom": "data"}
 
 
 def test_point_times_are_sent(client, net):
@@ -131,9 +128,7 @@ def test_every_preset_reaches_a_node_of_that_preset(net, preset, cloud_key, has_
     keys = robot_keys(preset, "coview", "r1")
     clouds, odometry = [], []
     net.subscribe(keys.cloud, lambda s: clouds.append(decode_cloud(s, hint=keys.cloud_hint)), "newest")
-    net.subscribe(
-        keys.odometry, lambda s: odometry.append(decode_odometry(s, hint=keys.odometry_hint)), "all"
-    )
+    net.subscribe(keys.odometry, lambda s: odometry.append(decode_odometry(s, hint=keys.odometry_hint)), "all")
     with RobotClient("r1", transport=net, preset=preset) as robot:
         robot.send_odometry(T, 12.5)
         robot.send_cloud(CLOUD, 12.5)

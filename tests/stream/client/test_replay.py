@@ -17,12 +17,7 @@ from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
 from coview_stream.stream.client.replay import replay
-from coview_stream.stream.client.replay_schedule import (
-    ReplayConfig,
-    frame_times,
-    odometry_spacing,
-    schedule,
-)
+from coview_stream.stream.client.replay_schedule import ReplayConfig, frame_times, odometry_spacing, schedule
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -70,9 +65,7 @@ def recorded(run, config, clock=None, **options):
     net, clock = MemoryTransport(), clock or TestClock()
     sent = []
     net.subscribe(KEYS.cloud, lambda s: sent.append((clock.now() - 50.0, "cloud", decode_cloud(s))), "newest")
-    net.subscribe(
-        KEYS.odometry, lambda s: sent.append((clock.now() - 50.0, "odom", decode_odometry(s))), "all"
-    )
+    net.subscribe(KEYS.odometry, lambda s: sent.append((clock.now() - 50.0, "odom", decode_odometry(s))), "all")
     report = replay(run, Sender(net, KEYS, **options), config, clock)
     assert net.raised == []
     return report, sent
@@ -237,9 +230,7 @@ def test_odometry_spacing(run, run_folder):
     assert odometry_spacing(run, ReplayConfig()) == pytest.approx(0.1)
     assert odometry_spacing(run, ReplayConfig(odometry_rate=50.0)) == pytest.approx(0.02)
     assert odometry_spacing(run, ReplayConfig(speed=0.1)) == pytest.approx(1.0)
-    assert odometry_spacing(run, ReplayConfig(rate=100.0)) == pytest.approx(
-        0.1
-    )  # the stamps stay what they are
+    assert odometry_spacing(run, ReplayConfig(rate=100.0)) == pytest.approx(0.1)  # the stamps stay what they are
     assert odometry_spacing(open_run(run_folder / "frames" / "000000.ply"), ReplayConfig()) == 0.0
 
 

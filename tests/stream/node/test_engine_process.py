@@ -31,9 +31,7 @@ from coview_stream.stream.node.jobs import FrameJob
 
 
 def job(points=None, robot="r1"):
-    return FrameJob(
-        robot, 1, 1_000_000_000, np.zeros((20, 3), np.float32) if points is None else points, np.eye(4)
-    )
+    return FrameJob(robot, 1, 1_000_000_000, np.zeros((20, 3), np.float32) if points is None else points, np.eye(4))
 
 
 class Engine:
@@ -98,9 +96,7 @@ def test_killed_engine_process_is_restarted(world_file, world_drive):
         np.testing.assert_array_equal(result.request.cloud, world_drive.clouds[0])
         with pytest.raises(RejectedError, match="finite points"):
             process.run(job(np.zeros((3, 3), np.float32)))
-        assert (
-            process.run(good).request is None
-        )  # the same child, and it remembers: no keyframe without driving on
+        assert process.run(good).request is None  # the same child, and it remembers: no keyframe without driving on
         assert process.pid == first
 
         os.kill(first, signal.SIGKILL)
@@ -165,9 +161,7 @@ def test_replaced_map_is_reported_each_time(world_file):
     process = EngineProcess("track", str(world_file), "0" * 64)
     try:
         for _ in range(2):
-            with pytest.raises(
-                DiedError, match=r"has been replaced by another map; start the node \(serve\) again"
-            ):
+            with pytest.raises(DiedError, match=r"has been replaced by another map; start the node \(serve\) again"):
                 process.run(job())
     finally:
         process.close()

@@ -152,9 +152,7 @@ def test_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_dri
     for k in range(FRAMES):
         for points, T, error in bad:
             with pytest.raises(error):
-                engines[0].run(
-                    FrameJob("careless", 1, round(5e8 * k), points, T, search_result=follower.search_result)
-                )
+                engines[0].run(FrameJob("careless", 1, round(5e8 * k), points, T, search_result=follower.search_result))
         follower.follow(world_drive, [k], reference.verdicts)
     for fix, undisturbed in zip(follower.fixes, reference.fixes, strict=True):
         same(fix, undisturbed)

@@ -55,19 +55,7 @@ def test_each_robot_and_map_has_its_own_file(tmp_path):
     assert load(tmp_path, "r1", "e" * 64) is None
 
 
-NAMES = (
-    "site/hall 3/r1",
-    "..",
-    "a\\b",
-    "C:r1",
-    "Roboter Ä",
-    "R1",
-    "rué" * 90,
-    "con",
-    "a%2Fb",
-    "r1.json",
-    "-",
-)
+NAMES = ("site/hall 3/r1", "..", "a\\b", "C:r1", "Roboter Ä", "R1", "rué" * 90, "con", "a%2Fb", "r1.json", "-")
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -138,9 +138,7 @@ def test_before_the_first_pose_the_reason_names_clouds_not_odometry():
     assert robot.session.state()[1] == "waiting for clouds on coview/r1/in/cloud"
     robot.saw(0.0)
     assert robot.session.state()[1] == "no frame has been processed yet"
-    robot.session.handle_failure(
-        robot.session.take_lidar_frame(), "no ground to take gravity from", rejected=True
-    )
+    robot.session.handle_failure(robot.session.take_lidar_frame(), "no ground to take gravity from", rejected=True)
     assert robot.session.state()[1] == "1 frames were of no use; see errors"
 
 
@@ -163,10 +161,7 @@ def test_failed_or_restarted_odometry_engine_starts_new_epoch(kind):
     if kind == "restarted":
         robot.session.engine_restarted("odometry")
     robot.session.handle_failure(job, "Traceback\nBoom", rejected=False)
-    said = {
-        "failed": "lidar odometry failed on a frame",
-        "restarted": "lidar odometry was started again: it died",
-    }
+    said = {"failed": "lidar odometry failed on a frame", "restarted": "lidar odometry was started again: it died"}
     assert robot.session.state() == (State.LOST, said[kind])
     assert robot.counters.engine_errors == 1
     assert robot.session.odometry.newest is None

@@ -77,10 +77,7 @@ def test_dead_track_engine_loses_all_robots(pair):
     pair.frame("r1", STEP)
     for name in ("r1", "r2"):
         status = pair.status(name)
-        assert (status["state"], status["reason"]) == (
-            "LOST",
-            "the engine was started again: the track engine died",
-        )
+        assert (status["state"], status["reason"]) == ("LOST", "the engine was started again: the track engine died")
         assert status["counters"]["engine_restarts"] == 1
         assert pair.poses(name) == []
     for name in ("r1", "r2"):

@@ -46,16 +46,9 @@ def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
     (raw, *_) = site.net.samples("coview/r1/out/pose")
     assert raw.encoding == "application/json"
     fields = json.loads(raw.payload)
-    assert {
-        "stamp_ns",
-        "robot",
-        "state",
-        "position",
-        "orientation",
-        "covariance",
-        "confidence",
-        "map_sha256",
-    } <= set(fields)
+    assert {"stamp_ns", "robot", "state", "position", "orientation", "covariance", "confidence", "map_sha256"} <= set(
+        fields
+    )
     assert (fields["robot"], fields["state"], fields["map_sha256"]) == ("r1", "TRACKING", SHA)
     assert len(fields["covariance"]) == 36
     status = site.status("r1")

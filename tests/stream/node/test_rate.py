@@ -13,12 +13,7 @@ def beats(metronome, times):
 
 def test_first_tick_is_immediate_then_periodic():
     metronome = Rate(4.0, 100.0)
-    assert beats(metronome, [100.0, 100.1, 100.25, 100.3, 100.5, 100.74, 100.75]) == [
-        100.0,
-        100.25,
-        100.5,
-        100.75,
-    ]
+    assert beats(metronome, [100.0, 100.1, 100.25, 100.3, 100.5, 100.74, 100.75]) == [100.0, 100.25, 100.5, 100.75]
 
 
 def test_late_ticks_do_not_delay_later_ones():
@@ -46,12 +41,7 @@ def test_slack_catches_up_late_ticks():
     clock = Rate(100.0, 0.0, slack=0.05)
     assert clock.beat(0.0)
     assert clock.beat(0.045)  # due at 0.01; the next ones are caught up
-    assert [clock.beat(0.045), clock.beat(0.0451), clock.beat(0.0452), clock.beat(0.0453)] == [
-        True,
-        True,
-        True,
-        False,
-    ]
+    assert [clock.beat(0.045), clock.beat(0.0451), clock.beat(0.0452), clock.beat(0.0453)] == [True, True, True, False]
     assert clock.remaining(0.0453) == pytest.approx(0.0047)
     assert clock.beat(0.2)  # later than the slack: go on from here
     assert not clock.beat(0.2)

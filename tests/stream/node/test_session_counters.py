@@ -49,9 +49,7 @@ def test_engine_error_is_reported_by_its_last_line(robot):
     trace = "Traceback:\n  somewhere\nValueError: boom\n"
     robot.session.handle_failure(robot.session.take_frame(), trace, rejected=False)
     assert counted(robot) == {"received": 1, "engine_errors": 1, "odometry_received": 5}
-    assert list(robot.session.errors.texts) == [
-        "r1: frames that the engine failed at; the first: ValueError: boom"
-    ]
+    assert list(robot.session.errors.texts) == ["r1: frames that the engine failed at; the first: ValueError: boom"]
 
 
 def test_frame_replaced_by_a_newer_one_is_dropped(robot):

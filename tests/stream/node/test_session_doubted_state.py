@@ -127,9 +127,6 @@ def test_loss_has_newest_reason_and_is_counted_once():
             assert robot.session.state() == (State.LOST, "no odometry for 0.5 s")
     assert robot.session.state() == (State.LOST, "in doubt for 60 s")
     assert counted(robot)["losses"] == 1
-    assert changes(robot)[1:] == [
-        ("TRACKING", "LOST", "no odometry for 0.5 s"),
-        ("LOST", "LOST", "in doubt for 60 s"),
-    ]
+    assert changes(robot)[1:] == [("TRACKING", "LOST", "no odometry for 0.5 s"), ("LOST", "LOST", "in doubt for 60 s")]
     robot.session.tick(silent + 0.3)
     assert len(changes(robot)) == 3

@@ -89,9 +89,7 @@ def test_correction_does_not_change_published_stamps(robot):
         sent = robot.session.pose()
         stamps.append(sent.stamp_ns)
         newest = k if k % 2 == 0 else k - 1
-        np.testing.assert_allclose(
-            sent.T_map_body, T_MAP_ODOM @ pose(0.01 * newest) @ pose(0.1 * k), atol=1e-9
-        )
+        np.testing.assert_allclose(sent.T_map_body, T_MAP_ODOM @ pose(0.01 * newest) @ pose(0.1 * k), atol=1e-9)
     assert stamps == sorted(stamps)
     assert stamps[-1] == ns(1.95)
 

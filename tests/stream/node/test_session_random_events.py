@@ -11,12 +11,7 @@ from coview_stream.localization.state import State
 from coview_stream.messages.types import Sample
 
 stamps = st.one_of(
-    st.just("next"),
-    st.just("next"),
-    st.just("next"),
-    st.floats(-2.0, 2.0),
-    st.floats(-9e8, 9e8),
-    st.just("same"),
+    st.just("next"), st.just("next"), st.just("next"), st.floats(-2.0, 2.0), st.floats(-9e8, 9e8), st.just("same")
 )
 quiet = [
     st.tuples(st.just("cloud"), stamps),
@@ -92,9 +87,7 @@ class Chaos:
 
     def answer(self, job, state):
         known = state is State.TRACKING
-        self.session.handle_result(
-            job, tracking(job) if known else unknown(job, state, ask=search_request()), self.now
-        )
+        self.session.handle_result(job, tracking(job) if known else unknown(job, state, ask=search_request()), self.now)
 
     def hold(self):
         counters = self.session.counters

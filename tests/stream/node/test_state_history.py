@@ -56,9 +56,7 @@ def test_odometry_jump_is_in_the_state_history():
 
 def test_state_history_keeps_newest_five_with_running_numbers():
     changes = StateHistory()
-    evidence = KeyframeEvidence(
-        1.0, State.TRACKING, "verified", cause=RejectionReason.VERIFIED, innovation=3.25
-    )
+    evidence = KeyframeEvidence(1.0, State.TRACKING, "verified", cause=RejectionReason.VERIFIED, innovation=3.25)
     for k in range(9):
         state = (State.TRACKING, State.AMBIGUOUS)[k % 2]
         changes.add(state, f"reason {k}", k, evidence)

@@ -4,12 +4,7 @@ import pytest
 import zenoh
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.transport.key_expressions import (
-    check_chunk,
-    check_expression,
-    check_prefix,
-    matches,
-)
+from coview_stream.stream.transport.key_expressions import check_chunk, check_expression, check_prefix, matches
 from coview_stream.stream.transport.keys import PRESETS, robot_keys
 
 POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
@@ -117,23 +112,7 @@ EXPRESSIONS = [
     "a", "a/b", "*", "**", "a/*", "a/**", "*/**", "**/b", "a/**/b", "a/$*x", "a/x$*y$*", "a/@v0/b", "a/@v0/**",
     "@v0", "a b/c",
 ]  # fmt: skip
-WRONG = [
-    "",
-    "/a",
-    "a/",
-    "a//b",
-    "a*",
-    "*a",
-    "a/***",
-    "a/$*",
-    "a/$b",
-    "a$*$*",
-    "a/**/**",
-    "a/**/*",
-    "a?",
-    "#",
-    "$",
-]
+WRONG = ["", "/a", "a/", "a//b", "a*", "*a", "a/***", "a/$*", "a/$b", "a$*$*", "a/**/**", "a/**/*", "a?", "#", "$"]
 
 
 @pytest.mark.parametrize("text", EXPRESSIONS + WRONG)

@@ -16,9 +16,7 @@ def test_port_in_use_names_the_remedy() -> None:
     endpoint = free_endpoint()
     first = open_transport(listen=[endpoint])
     try:
-        with pytest.raises(
-            TransportError, match="holds the port: --connect to it, or another --listen"
-        ) as caught:
+        with pytest.raises(TransportError, match="holds the port: --connect to it, or another --listen") as caught:
             open_transport(listen=[endpoint])
     finally:
         first.close()
@@ -32,11 +30,7 @@ def test_address_of_another_host_is_explained() -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"connect": ["tcp/127.0.0.1:99999"]},
-        {"listen": ["tcp/[::1]:65536"]},
-        {"connect": ["tls/robot.local:0"]},
-    ],
+    [{"connect": ["tcp/127.0.0.1:99999"]}, {"listen": ["tcp/[::1]:65536"]}, {"connect": ["tls/robot.local:0"]}],
 )
 def test_port_out_of_range_is_explained(options: dict[str, list[str]]) -> None:
     (endpoint,) = next(iter(options.values()))
@@ -49,18 +43,10 @@ def test_port_out_of_range_is_explained(options: dict[str, list[str]]) -> None:
     ("name", "text", "said"),
     [
         ("a.json5", "{\n conect: {}\n}", "line 2: unknown key 'conect'; did you mean 'connect'?"),
-        (
-            "a.json5",
-            "{transport: {auth: {usrpwd: {usr: 1}}}}",
-            "line 1: unknown key 'usr'; did you mean 'user'?",
-        ),
+        ("a.json5", "{transport: {auth: {usrpwd: {usr: 1}}}}", "line 1: unknown key 'usr'; did you mean 'user'?"),
         ("a.json5", "{qwertz: 1}", "line 1: unknown key 'qwertz'; take it out"),
         ("a.yaml", "mode: client\nconect: 3\n", "unknown key 'conect'; did you mean 'connect'?"),
-        (
-            "a.json5",
-            '{mode: "klient"}',
-            "line 1: unknown variant `klient`, expected one of `router`, `peer`, `client`",
-        ),
+        ("a.json5", '{mode: "klient"}', "line 1: unknown variant `klient`, expected one of `router`, `peer`, `client`"),
         ("a.json5", '{connect: {endpoints: "x"}}', 'line 1: invalid type: string "x", expected'),
         ("a.json5", "{mode:", "line 1, column 7: expected"),
     ],

@@ -128,9 +128,7 @@ def put(transport: ZenohTransport, key: str, payload: bytes) -> None:
 
 
 @pytest.mark.slow
-def test_tls_example_refuses_clients_without_certificate(
-    certificates: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tls_example_refuses_clients_without_certificate(certificates: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(certificates)
     with secured(certificates) as endpoint:
         anonymous = zenoh.Config()
@@ -163,8 +161,4 @@ def test_tls_example_names_missing_certificate_files() -> None:
 
 def test_every_zenoh_example_is_tested() -> None:
     names = {path.relative_to(EXAMPLES).as_posix() for path in EXAMPLES.rglob("*.json5")}
-    assert names == {
-        "peer.json5",
-        "client.json5",
-        *(f"mtls/{name}.json5" for name in ("router", "robot", "node")),
-    }
+    assert names == {"peer.json5", "client.json5", *(f"mtls/{name}.json5" for name in ("router", "robot", "node"))}

@@ -91,9 +91,7 @@ def test_status_reports_do_not_block_on_stuck_reader():
             begin = time.monotonic()
             for _ in range(1000):  # far more than the link holds
                 report.put(Encoded(bytes(2500)))
-            assert (
-                time.monotonic() - begin < 4.5
-            )  # waiting for a place takes zenoh 5 s, after which it closes the link
+            assert time.monotonic() - begin < 4.5  # waiting for a place takes zenoh 5 s, after which it closes the link
             assert node.connection().peers
         finally:
             reader.kill()

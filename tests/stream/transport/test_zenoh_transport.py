@@ -72,9 +72,7 @@ def test_deletes_are_not_delivered(pair: tuple[ZenohTransport, ZenohTransport]) 
     assert [sample.payload for sample in got] == [b"after"]
 
 
-def test_newest_subscription_skips_and_all_subscription_does_not(
-    pair: tuple[ZenohTransport, ZenohTransport],
-) -> None:
+def test_newest_subscription_skips_and_all_subscription_does_not(pair: tuple[ZenohTransport, ZenohTransport]) -> None:
     node, robot = pair
     go = threading.Event()
     newest: list[bytes] = []
@@ -211,9 +209,7 @@ def test_close_ends_all_threads_and_is_idempotent() -> None:
         transport.answer("c", lambda _: {})
         publisher = transport.publisher("d", "data")
         mine = {thread for thread in threading.enumerate() if thread.name.startswith("coview ")}
-        assert {"coview subscriber a", "coview subscriber b", "coview answers"} <= {
-            thread.name for thread in mine
-        }
+        assert {"coview subscriber a", "coview subscriber b", "coview answers"} <= {thread.name for thread in mine}
         start = time.monotonic()
         transport.close()
         assert time.monotonic() - start < 1.0
@@ -244,9 +240,7 @@ def test_close_ends_all_threads_and_is_idempotent() -> None:
         ),
     ],
 )
-def test_invalid_configuration_is_refused_at_once(
-    options: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_invalid_configuration_is_refused_at_once(options: dict[str, Any], message: str, tmp_path: Path) -> None:
     if "config" in options:
         path = tmp_path / "zenoh.json5"
         path.write_text(options["config"])

@@ -20,12 +20,7 @@ sys.stdin.read()
 
 def router_config(endpoint: str, **more: Any) -> str:
     return json.dumps(
-        {
-            "mode": "router",
-            "listen": {"endpoints": [endpoint]},
-            "scouting": {"multicast": {"enabled": False}},
-            **more,
-        }
+        {"mode": "router", "listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}, **more}
     )
 
 

@@ -77,9 +77,7 @@ def _query_spectra(
     """Transform the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
     half, size = len(weight) // 2, len(yaws) // 2
     # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
-    in_pairs = len(yaws) == 2 * size and np.allclose(
-        np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9
-    )
+    in_pairs = len(yaws) == 2 * size and np.allclose(np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9)
     images = rotate_images(np.concatenate([query, weight[None]]), yaws[:size] if in_pairs else yaws)
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _EPSILON).all():
@@ -92,15 +90,11 @@ def _query_spectra(
 
 def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats) -> None:
     if query.ndim != 3 or weight.shape != query.shape[1:] or yaws.ndim != 1 or not len(yaws):
-        raise ValueError(
-            f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit"
-        )
+        raise ValueError(f"a query {query.shape} with weights {weight.shape} at headings {yaws.shape} does not fit")
     if len(query) != index.dimensions:
         raise ValueError(f"the query has {len(query)} dimensions, the map {index.dimensions}")
     if query.shape[1] > 2 * index.margin:
-        raise ValueError(
-            f"the query has {query.shape[1]} cells a side, the map allows for {2 * index.margin}"
-        )
+        raise ValueError(f"the query has {query.shape[1]} cells a side, the map allows for {2 * index.margin}")
 
 
 def _score(

@@ -60,9 +60,7 @@ class FeatureIndex:
         if self.surveyed.shape != (self.height, self.width):
             raise ValueError(f"surveyed is {self.surveyed.shape}, the features are {features.shape}")
         if block <= 2 * margin:
-            raise ValueError(
-                f"blocks of {block} cells with margins of {margin}: nothing is left between them"
-            )
+            raise ValueError(f"blocks of {block} cells with margins of {margin}: nothing is left between them")
         self.corner = np.asarray(corner, dtype=np.float64)
         self.cell, self.block, self.margin = cell, block, margin
         self.valid = block - 2 * margin
@@ -134,9 +132,7 @@ class FeatureIndex:
         out = np.zeros((*image.shape[:-2], self.block, self.block), dtype=np.float32)
         bottom, right = min(top + self.block, self.height), min(left + self.block, self.width)
         first, second = max(top, 0), max(left, 0)
-        out[..., first - top : bottom - top, second - left : right - left] = image[
-            ..., first:bottom, second:right
-        ]
+        out[..., first - top : bottom - top, second - left : right - left] = image[..., first:bottom, second:right]
         return out
 
 

@@ -92,11 +92,7 @@ def local_minima(values: Reals) -> Bools:
 
 
 def nearest_pairs(
-    query: Floats32,
-    known: Floats32,
-    *,
-    max_pairs: int = 300,
-    possible: Bools | None = None,
+    query: Floats32, known: Floats32, *, max_pairs: int = 300, possible: Bools | None = None
 ) -> tuple[Ints, Floats32]:
     """Pair descriptors each of which is the most similar to the other, by inner product.
 

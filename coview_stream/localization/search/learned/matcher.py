@@ -66,9 +66,7 @@ class FeatureMatcher:
     Nothing is loaded or made before the first query, or :meth:`prepare`.
     """
 
-    def __init__(
-        self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0
-    ) -> None:
+    def __init__(self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0) -> None:
         """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
 
         Raises:
@@ -94,9 +92,7 @@ class FeatureMatcher:
         margin = round(0.5 * _SIZE / self.config.cell)
         surveyed = (whole != 0).any(axis=0)
         # half precision: the features are kept beside their spectra, and come from single bytes anyway
-        return FeatureIndex(
-            whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin
-        )
+        return FeatureIndex(whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin)
 
     @cached_property
     def _feature_blocks(self) -> Ints:

@@ -58,14 +58,10 @@ class LearnedRecognizer:
         if peak.station is None:
             return [peak]
         stations, own = self.consensus.stations, self.consensus.stations[peak.station]
-        others = np.flatnonzero(
-            (np.abs(stations[:, :2] - own[:2]) < 0.25 * self.consensus.grid.block).all(axis=1)
-        )
+        others = np.flatnonzero((np.abs(stations[:, :2] - own[:2]) < 0.25 * self.consensus.grid.block).all(axis=1))
         rises = {int(k): float(stations[k, 2] - own[2]) for k in others if k != peak.station}
         return [peak] + [
-            replace(
-                peak, T_map_odom=pose_from(np.eye(3), np.array([0.0, 0.0, rise])) @ peak.T_map_odom, station=k
-            )
+            replace(peak, T_map_odom=pose_from(np.eye(3), np.array([0.0, 0.0, rise])) @ peak.T_map_odom, station=k)
             for k, rise in rises.items()
         ]
 

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from coview_stream.descriptors.feature_map import (
-    TILE,
-    FeatureMap,
-    quantized,
-    quantized_sigma,
-    weights_sha256,
-)
+from coview_stream.descriptors.feature_map import TILE, FeatureMap, quantized, quantized_sigma, weights_sha256
 from coview_stream.descriptors.network import Features
 from coview_stream.localization.search.learned.matcher import QueryFeatures
 
@@ -82,6 +76,4 @@ class Planted:
         place = np.repeat(self.place[nearest][:, None], 256, axis=1).reshape(-1, 16, 16)
         inside = np.hypot(u, v) <= 30.0
         weight = np.where(inside, 1.0 / sigma, 0.0).astype(np.float32)
-        return QueryFeatures(
-            Features(local.astype(np.float32), sigma, place.astype(np.float32)), weight, centre
-        )
+        return QueryFeatures(Features(local.astype(np.float32), sigma, place.astype(np.float32)), weight, centre)

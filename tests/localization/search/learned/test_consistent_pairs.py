@@ -9,11 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coview_stream.localization.search.learned.consistent_pairs import (
-    largest_clique,
-    maximum_clique,
-    relaxed_clique,
-)
+from coview_stream.localization.search.learned.consistent_pairs import largest_clique, maximum_clique, relaxed_clique
 
 
 def random_graph(nodes, share, seed):
@@ -59,10 +55,7 @@ def clique_number(weights):
 def test_clique_search_equals_brute_force(nodes, share, seed):
     weights = random_graph(nodes, share, seed)
     expected = clique_number(weights)
-    for found in (
-        maximum_clique(weights, 100_000),
-        largest_clique(weights > 0, np.empty(0, dtype=np.int64), 100_000),
-    ):
+    for found in (maximum_clique(weights, 100_000), largest_clique(weights > 0, np.empty(0, dtype=np.int64), 100_000)):
         assert found.exact
         assert is_clique(weights, found.members)
         assert len(found) == expected

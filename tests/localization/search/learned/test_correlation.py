@@ -24,9 +24,7 @@ def seen_at(known, row, col, yaw, size):
     y, x = np.meshgrid(at, at, indexing="ij")
     c, s = np.cos(yaw), np.sin(yaw)
     where = [row + s * x + c * y, col + c * x - s * y]
-    return np.stack([ndimage.map_coordinates(channel, where, order=1) for channel in known]).astype(
-        np.float32
-    )
+    return np.stack([ndimage.map_coordinates(channel, where, order=1) for channel in known]).astype(np.float32)
 
 
 def disk(size):
@@ -127,8 +125,7 @@ def test_map_edge_does_not_bias_scores():
     weight = disk(32)
     coarse = FeatureIndex(known, (0, 0))
     inside, edge = (
-        correlate(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col]
-        for col in (50, 5)
+        correlate(seen_at(known, 50, col, 0.0, 32) * weight, weight, coarse, [0.0])[0, 50, col] for col in (50, 5)
     )
     assert edge == pytest.approx(inside, rel=0.05)
     query = seen_at(known, 50, 5, 0.0, 32) * weight

@@ -8,10 +8,7 @@ import pytest
 from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.geometry.transforms import wrap_angle
 from coview_stream.localization.search.learned.consistent_pairs import consistency_graph, maximum_clique
-from coview_stream.localization.search.learned.keypoint_registration import (
-    fit_rigid_2d,
-    refine_by_keypoints,
-)
+from coview_stream.localization.search.learned.keypoint_registration import fit_rigid_2d, refine_by_keypoints
 from coview_stream.localization.search.learned.keypoints import Keypoints
 
 CONFIG = LearnedMatchConfig()

@@ -7,12 +7,7 @@ import pytest
 
 from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.errors import ConfigError
-from coview_stream.localization.search.learned.keypoints import (
-    Keypoints,
-    keypoints,
-    local_minima,
-    nearest_pairs,
-)
+from coview_stream.localization.search.learned.keypoints import Keypoints, keypoints, local_minima, nearest_pairs
 
 
 def test_local_minima_match_definition_and_are_not_adjacent():
@@ -66,9 +61,7 @@ def test_mismatched_shapes_are_refused():
     with pytest.raises(ValueError, match="different numbers"):
         Keypoints(np.zeros((3, 2)), np.zeros((2, 4), np.float32), np.ones(3, np.float32))
     with pytest.raises(ValueError, match="mask is"):
-        keypoints(
-            np.zeros((2, 4, 4), np.float32), np.ones((4, 4), np.float32), (0, 0), mask=np.ones((3, 4), bool)
-        )
+        keypoints(np.zeros((2, 4, 4), np.float32), np.ones((4, 4), np.float32), (0, 0), mask=np.ones((3, 4), bool))
     with pytest.raises(ValueError, match="do not compare"):
         nearest_pairs(np.zeros((3, 4), np.float32), np.zeros((3, 5), np.float32))
 

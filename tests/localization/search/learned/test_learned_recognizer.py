@@ -29,9 +29,7 @@ def named(heights, peaks=5):
         distances=lambda view, suggested: np.tile(flat, (len(heights), 1)),
         refine=lambda hypotheses, view: hypotheses,
     )
-    source = LearnedRecognizer(
-        SimpleNamespace(stations=stations, config=SimpleNamespace(block=2.0)), config, learned
-    )
+    source = LearnedRecognizer(SimpleNamespace(stations=stations, config=SimpleNamespace(block=2.0)), config, learned)
     ground = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32) * (1, 1, 0)
     body = np.eye(4)
     body[2, 3] = 1.5

@@ -108,9 +108,7 @@ def at(xy, yaw, centre, z=0.0):
 def test_keypoints_refine_a_hypothesis(planted, known):
     xy, yaw, centre = np.array([13.4, 27.8]), 0.83, np.array([40.0, -3.0, 1.5])
     view = planted.seen(xy, yaw, centre, noise=0.2)
-    rough = Hypothesis(
-        at(xy + np.array([1.5, -2.0]), yaw + np.radians(5), centre, 2.5), 17, 4, -3.0, learned=True
-    )
+    rough = Hypothesis(at(xy + np.array([1.5, -2.0]), yaw + np.radians(5), centre, 2.5), 17, 4, -3.0, learned=True)
     (exact,) = known.refine([rough], view)
     there = transform(exact.T_map_odom, centre[None])[0]
     assert np.hypot(*(there[:2] - xy)) < 0.4
