@@ -9,6 +9,7 @@ import ast
 import textwrap
 from collections import defaultdict
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,6 +54,7 @@ def modules() -> dict[str, Path]:
     }
 
 
+@cache
 def imports() -> dict[str, set[str]]:
     """Return which modules each module imports, at any level of its code."""
     known = modules()

@@ -106,6 +106,7 @@ def test_what_cannot_be_run_is_refused_in_one_line(planted, capfd, arguments, wo
     assert all(word in err for word in words)
 
 
+@pytest.mark.slow
 def test_a_benchmark_that_fails_is_a_row(capfd):
     (row,) = run("peers", ["--trial", "nobody", "map", "places"], None)
     assert (row.name, row.holds) == ("peers: ended with exit code 1", False)

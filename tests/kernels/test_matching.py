@@ -107,6 +107,7 @@ KINDS = (
 SPREAD = 1200  # stations; a thread takes 512 at least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["serial", pytest.param("parallel", marks=NATIVE), "float32"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_top_k_equals_exhaustive_search(kind, way, monkeypatch):
@@ -185,6 +186,7 @@ def test_index_takes_less_than_1300_bytes_a_station_and_keeps_a_memory_map(tmp_p
     assert index.descriptors is file
 
 
+@pytest.mark.slow
 def test_queries_and_frames_from_many_threads_during_a_shutdown():
     rng = np.random.default_rng(9)
     desc, _ = scene(rng, "random", 200, (6, 20))

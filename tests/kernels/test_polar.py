@@ -132,6 +132,7 @@ def test_empty_cloud_and_cloud_in_one_bin():
     assert grid.max_height.min() == -2.0
 
 
+@pytest.mark.slow
 def test_polar_bin_of_two_million_points():
     points = np.random.default_rng(2).normal(0, 20, (2_000_000, 3)).astype(np.float32)
     points[::500, 1] = np.inf

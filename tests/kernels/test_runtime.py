@@ -49,6 +49,7 @@ def test_public_names():
         assert getattr(reference, name) is not getattr(coview_kernels, name, None)
 
 
+@pytest.mark.slow
 @needs_library
 @pytest.mark.skipif(os.name != "posix", reason="HOME is POSIX")
 @pytest.mark.parametrize("known", [True, False])
@@ -72,6 +73,7 @@ def test_only_runtime_imports_taichi():
             assert not any(f"import {name}" in text or f"from {name}" in text for name in ("taichi", "quadrants"))
 
 
+@pytest.mark.slow
 def test_import_loads_no_backend_and_kernels_print_nothing():
     code = "import sys\nassert not {'taichi', 'quadrants', 'scipy'} & set(sys.modules)\n"
     code += "use()\nprint(ck.backend())"
@@ -80,12 +82,14 @@ def test_import_loads_no_backend_and_kernels_print_nothing():
     assert succeeds(code) == (LIBRARIES[0] if LIBRARIES else "numpy") + "\n"
 
 
+@pytest.mark.slow
 def test_unknown_backend_raises():
     done = run_python("import coview_kernels as ck; ck.backend()", COVIEW_KERNELS="cuda")
     assert done.returncode == 1
     assert "COVIEW_KERNELS is 'cuda'" in done.stderr
 
 
+@pytest.mark.slow
 def test_numpy_is_used_where_taichi_is_missing():
     blocked = "import sys\nsys.modules['taichi'] = sys.modules['quadrants'] = None\nuse()\nprint(ck.backend())"
     assert succeeds(blocked) == "numpy\n"
@@ -117,6 +121,7 @@ def test_many_threads_submit_at_once():
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 def test_first_use_from_many_threads_starts_one_backend():
     code = (
         "from concurrent.futures import ThreadPoolExecutor\nimport threading\n"
@@ -146,6 +151,7 @@ def test_shutdown_while_other_threads_compute_loses_no_call():
         assert all(call.result(timeout=60)[0].count.sum() == 100 for call in calls)
 
 
+@pytest.mark.slow
 @needs_library
 @pytest.mark.parametrize("name", LIBRARIES)
 @pytest.mark.parametrize("launched", [True, False])
@@ -162,6 +168,7 @@ def test_host_that_initialised_taichi_before_us_keeps_it(name, launched):
     assert done.stdout.endswith("fine\n")
 
 
+@pytest.mark.slow
 @needs_library
 @pytest.mark.parametrize("name", LIBRARIES)
 def test_host_that_initialises_taichi_after_us_keeps_it(name):
@@ -175,6 +182,7 @@ def test_host_that_initialises_taichi_after_us_keeps_it(name):
     assert done.stdout.endswith("fine\n")
 
 
+@pytest.mark.slow
 def test_forked_child_computes_in_numpy():
     code = (
         "import os, warnings\nwarnings.simplefilter('ignore')\nuse()\nchild = os.fork()\n"
@@ -184,6 +192,7 @@ def test_forked_child_computes_in_numpy():
     assert succeeds(code) == ""
 
 
+@pytest.mark.slow
 def test_interpreter_exits_while_another_thread_computes():
     code = (
         "import threading\nuse()\n"

@@ -63,6 +63,7 @@ def test_voxel_indices_beyond_64_bits():
     np.testing.assert_array_equal(moved, points[[0, 2]])
 
 
+@pytest.mark.slow
 def test_transform_unique_of_two_million_points():
     points = np.random.default_rng(1).normal(0, 40, (2_000_000, 3)).astype(np.float32)
     points[::1000] = np.nan

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from fake_robot import KEYS, Robot, cloud, ends, search_request, search_result, tracking, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -140,6 +142,7 @@ frame = st.permutations(["odometry", "cloud", "odometry", "take", "done"]).map(
 usual = st.lists(frame, max_size=3).map(lambda frames: [event for events in frames for event in events])
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.lists(st.one_of(usual, usual, st.lists(st.one_of(*quiet), max_size=4)), max_size=12))
 def test_random_events_of_a_mostly_working_robot_keep_invariants(chapters):
