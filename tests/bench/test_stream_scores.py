@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from bench.stream import scores as stream_scores
+from bench.stream.drive import EPOCH_NS
 from bench.stream.scores import Posed, Told
-from bench.stream.wire import EPOCH_NS
 from coview_stream.geometry.transforms import pose_from, rot_z
 
 SECOND = 10**9
 
 
-def posed(arrival, stamp_ns=0, T=None, age=None):
+def posed(arrival, stamp_ns=0, T=None, age=np.nan):
     return Posed(arrival, stamp_ns, np.eye(4) if T is None else T, age)
 
 

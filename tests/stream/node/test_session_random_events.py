@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
 from fake_robot import KEYS, Robot, cloud, ends, search_request, search_result, tracking, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
