@@ -1,4 +1,4 @@
-"""How a recorded stream of poses and statuses is scored: pure functions of what arrived when.
+"""Scores of a recorded stream of poses and statuses: pure functions of what arrived when.
 
 Arrivals are seconds of a monotonic clock of the machine; stamps are nanoseconds of the robot's sensor clock.
 """
@@ -8,30 +8,34 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coview_stream.geometry.arrays import Floats
 
 FALSE_METRES, FALSE_DEGREES = 2.0, 5.0  # a pose further from the truth than either is a false one
-MOST_MISMATCH_NS = 2_000_000
+MAX_MISMATCH_NS = 2_000_000
 """A frame is recognised by its stamp; ages come as decimal seconds, so that stamps made of them are rounded."""
 
+FATES = (
+    "processed", "rejected", "dropped", "late", "out_of_order", "duplicate", "no_odometry", "malformed", "oversized",
+    "unknown_encoding", "engine_errors",
+)  # fmt: skip
+"""What may become of a received frame."""
 
-@dataclass(frozen=True)
-class Posed:
-    """One pose as it arrived: (4, 4) map <- body, and the seconds since the frame that corrected it, if told."""
+
+class Posed(NamedTuple):
+    """One pose as it arrived: (4, 4) map <- body, and the seconds since the frame that corrected it, NaN if untold."""
 
     arrival: float
     stamp_ns: int
     T_map_body: Floats
-    age: float | None = None
+    age: float = math.nan
 
 
-@dataclass(frozen=True)
-class Told:
+class Told(NamedTuple):
     """One status as it arrived."""
 
     arrival: float
@@ -45,12 +49,12 @@ class Told:
 
 def errors(poses: Sequence[Posed], truth: Callable[[int], Floats]) -> tuple[Floats, Floats]:
     """Metres and degrees between each pose and the truth at its stamp."""
-    metres, degrees = np.zeros(len(poses)), np.zeros(len(poses))
-    for k, pose in enumerate(poses):
-        apart = np.linalg.inv(truth(pose.stamp_ns)) @ pose.T_map_body
-        metres[k] = np.linalg.norm(apart[:3, 3])
-        degrees[k] = math.degrees(math.acos(min(1.0, max(-1.0, (np.trace(apart[:3, :3]) - 1) / 2))))
-    return metres, degrees
+    if not poses:
+        return np.zeros(0), np.zeros(0)
+    true, told = np.stack([truth(pose.stamp_ns) for pose in poses]), np.stack([pose.T_map_body for pose in poses])
+    apart = np.linalg.inv(true) @ told
+    turned = Rotation.from_matrix(apart[:, :3, :3]).magnitude()
+    return np.linalg.norm(apart[:, :3, 3], axis=1), np.degrees(turned)
 
 
 def false_poses(metres: Floats, degrees: Floats) -> int:
@@ -66,12 +70,13 @@ def tracking_intervals(
     ``without`` are periods (begin, end) that are left out, such as the absence of the router: an interval that
     touches one does not count. Any other silence does, however long: that is the point of measuring.
     """
-    untracked = np.array([status.arrival for status in told if status.state != "TRACKING"])
-    counted = []
-    for begin, end in itertools.pairwise(arrivals):
-        silent = np.any((untracked > begin) & (untracked < end))
-        if not silent and not any(begin < last and first < end for first, last in without):
-            counted.append(end - begin)
+    untracked = [status.arrival for status in told if status.state != "TRACKING"]
+    counted = [
+        end - begin
+        for begin, end in itertools.pairwise(arrivals)
+        if not any(begin < at < end for at in untracked)
+        and not any(begin < last and first < end for first, last in without)
+    ]
     return np.array(counted)
 
 
@@ -80,12 +85,14 @@ def rate_hz(intervals: Floats) -> float | None:
     return float(len(intervals) / intervals.sum()) if len(intervals) and intervals.sum() > 0 else None
 
 
-def jitter_ms(intervals: Floats, period: float = 0.1) -> tuple[float, float] | None:
+def jitter_ms(intervals: Floats, period: float = 0.1) -> tuple[float, ...] | None:
     """p50 and p99 of how far the intervals are from ``period`` seconds, in milliseconds; None without any."""
-    if not len(intervals):
-        return None
-    p50, p99 = np.percentile(np.abs(intervals - period) * 1e3, [50, 99])
-    return float(p50), float(p99)
+    return percentiles_ms(np.abs(intervals - period), 50, 99)
+
+
+def percentiles_ms(seconds: Floats, *percents: float) -> tuple[float, ...] | None:
+    """Percentiles in milliseconds; None without any."""
+    return tuple(np.percentile(seconds * 1e3, percents).tolist()) if len(seconds) else None
 
 
 def steps_back(stamps_ns: Sequence[int]) -> int:
@@ -113,25 +120,21 @@ def jain(shares: Sequence[float]) -> float:
 
 
 def put_time(puts: Floats, stamp_ns: float) -> float | None:
-    """When the frame with that stamp was put; ``puts`` (N, 2) are stamps and times in order; None if unknown."""
+    """When the frame with that stamp was put; ``puts`` (N, 2) are stamps and times; None if unknown."""
     if not len(puts):
         return None
-    k = int(np.clip(np.searchsorted(puts[:, 0], stamp_ns), 1, max(1, len(puts) - 1)))
-    near = min((row for row in puts[k - 1 : k + 1]), key=lambda row: abs(row[0] - stamp_ns))
-    return float(near[1]) if abs(near[0] - stamp_ns) <= MOST_MISMATCH_NS else None
+    stamp, put = puts[np.abs(puts[:, 0] - stamp_ns).argmin()]
+    return float(put) if abs(stamp - stamp_ns) <= MAX_MISMATCH_NS else None
 
 
 def reaction(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
     """Seconds from the put of a frame until something first told of it; ``seen`` are (arrival, stamp) in order."""
-    newest, found = -math.inf, []
+    newest, first = -math.inf, []
     for arrival, stamp_ns in seen:
-        if stamp_ns <= newest + MOST_MISMATCH_NS:
-            continue
-        newest = stamp_ns
-        put = put_time(puts, stamp_ns)
-        if put is not None:
-            found.append(arrival - put)
-    return np.array(found)
+        if stamp_ns > newest + MAX_MISMATCH_NS:
+            newest = stamp_ns
+            first.append((arrival, stamp_ns))
+    return staleness(puts, first)
 
 
 def staleness(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
@@ -140,30 +143,15 @@ def staleness(puts: Floats, seen: Sequence[tuple[float, float]]) -> Floats:
     return np.array([arrival - put for arrival, put in known if put is not None])
 
 
-def percentiles_ms(seconds: Floats) -> tuple[float, float, float] | None:
-    """p50, p95, p99 in milliseconds; None without any."""
-    if not len(seconds):
-        return None
-    p50, p95, p99 = np.percentile(seconds * 1e3, [50, 95, 99])
-    return float(p50), float(p95), float(p99)
-
-
 def corrected(poses: Sequence[Posed]) -> list[tuple[float, float]]:
     """(arrival, stamp of the frame that last corrected it) of each pose that tells its age."""
-    return [(pose.arrival, pose.stamp_ns - pose.age * 1e9) for pose in poses if pose.age is not None]
+    return [(pose.arrival, pose.stamp_ns - pose.age * 1e9) for pose in poses if math.isfinite(pose.age)]
 
 
 def processed(told: Sequence[Told]) -> list[tuple[float, float]]:
     """(arrival, stamp of the newest processed frame) of each status that tells it."""
     seen = ((status.arrival, status.fields.get("last_frame_ns")) for status in told)
     return [(arrival, float(stamp)) for arrival, stamp in seen if isinstance(stamp, int) and stamp > 0]
-
-
-FATES = (
-    "processed", "rejected", "dropped", "late", "out_of_order", "duplicate", "no_odometry", "malformed", "oversized",
-    "unknown_encoding", "engine_errors",
-)  # fmt: skip
-"""What may become of a received frame."""
 
 
 def unaccounted(counters: dict[str, Any] | None) -> int | None:
@@ -173,8 +161,5 @@ def unaccounted(counters: dict[str, Any] | None) -> int | None:
 
 def counter(told: Sequence[Told], name: str) -> int | None:
     """Newest value of a counter; None if no status has it."""
-    for status in reversed(told):
-        counters = status.fields.get("counters")
-        if isinstance(counters, dict) and isinstance(counters.get(name), (int, float)):
-            return int(counters[name])
-    return None
+    values = ((status.fields.get("counters") or {}).get(name) for status in reversed(told))
+    return next((int(value) for value in values if isinstance(value, (int, float))), None)

@@ -1,0 +1,272 @@
+"""The processes around the node: a router with a metronome, senders, a rogue; and the recorder, in this process.
+
+They use raw zenoh and the documented keys. The metronome ticks at 10 Hz through the same router: what the recorder sees
+of its jitter is the machine's own, to be compared with that of the poses.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import random
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.stream.drive import EPOCH_NS, Drive, RobotPlan, schedule, stamp_of
+from bench.stream.scores import Posed, Told
+from coview_stream.errors import MessageError
+from coview_stream.geometry.arrays import Floats
+from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_pose, encode_cloud, encode_odometry
+from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, Sample
+
+METRONOME = "bench/metronome"
+TICK = 0.1
+_KEYS = {"cloud": "cloud", "odometry": "odom"}
+_AHEAD = 0.5  # seconds between the order to start and the first message
+
+_SPAWN = multiprocessing.get_context("spawn")  # a fork of a process with an open session hangs
+
+
+def free_port() -> int:
+    """Return a loopback port that is not in use."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def open_session(mode: str, connect: Sequence[str] = (), listen: Sequence[str] = ()) -> Any:
+    """Open zenoh without discovery, and quick to reconnect: the node is what is measured."""
+    import zenoh
+
+    config = zenoh.Config()
+    for key, value in {
+        "mode": mode,
+        "connect/endpoints": list(connect),
+        "listen/endpoints": list(listen),
+        "scouting/multicast/enabled": False,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 1.5},
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+class Helper:
+    """A process that says when it is ready, waits for ``begin``, works, and sends back its result."""
+
+    def __init__(self, work: Callable[..., None], *args: Any) -> None:
+        self._ours, theirs = _SPAWN.Pipe()
+        self.process = _SPAWN.Process(target=work, args=(theirs, *args), daemon=True)
+        self.process.start()
+        theirs.close()
+        self.result(120.0)
+
+    def begin(self, at: float | None = None) -> float:
+        """Let it start at that monotonic time; returns it."""
+        at = time.monotonic() + _AHEAD if at is None else at
+        self._ours.send(at)
+        return at
+
+    def stop(self) -> None:
+        """End the work early; it still sends its result."""
+        self._ours.send("stop")
+
+    def result(self, timeout: float = 300.0) -> Any:
+        """Wait for what it says next."""
+        if not self._ours.poll(timeout):
+            raise TimeoutError(f"a helper process of the benchmark said nothing for {timeout} s")
+        return self._ours.recv()
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self.process.kill()
+        self.process.join(10)
+
+
+def route(conn: Connection, port: int) -> None:
+    """Be a router until told to stop; tick all the while."""
+    with open_session("router", listen=[f"tcp/127.0.0.1:{port}"]) as session:
+        publisher = session.declare_publisher(METRONOME, express=True)
+        conn.send("ready")
+        tick = time.monotonic()
+        while not conn.poll(max(0.0, tick - time.monotonic())):
+            publisher.put(b"\0" * 400)
+            tick += TICK
+
+
+class Sent(NamedTuple):
+    """What a sender did: per robot (N, 2) stamps and times of its cloud puts; its longest delay, s."""
+
+    puts: dict[str, Floats]
+    longest_lag: float
+
+
+def send(conn: Connection, endpoint: str, world: Path, plans: Sequence[RobotPlan]) -> None:
+    """Stream the plans' robots through one session, on time; every cloud is loaded before."""
+    import zenoh
+
+    drives = {plan.robot: Drive(world, plan) for plan in plans}
+    todo = sorted(((due, plan) for plan in plans for due in schedule(plan)), key=lambda item: item[0][0])
+    for (_, kind, content, _), plan in todo:
+        if kind == "cloud":
+            drives[plan.robot].cloud(content)
+    controls = {"cloud": zenoh.CongestionControl.DROP, "odometry": zenoh.CongestionControl.BLOCK}
+    puts: dict[str, list[tuple[int, float]]] = {plan.robot: [] for plan in plans}
+    lag = 0.0
+    with open_session("client", connect=[endpoint]) as session:
+        conn.send("ready")
+        start = float(conn.recv())
+        for (due, kind, content, claimed), plan in todo:
+            while (wait := start + due - time.monotonic()) > 0:
+                time.sleep(wait)
+            if conn.poll():
+                break
+            drive, stamp, key = drives[plan.robot], stamp_of(claimed), f"coview/{plan.robot}/in/"
+            if kind == "cloud":
+                message = encode_cloud(CloudMessage(stamp, drive.cloud(content)), plan.cloud)
+                puts[plan.robot].append((stamp, time.monotonic()))
+            else:
+                message = encode_odometry(OdometryMessage(stamp, drive.T_odom_body(content)), plan.odometry)
+            session.put(
+                key + _KEYS[kind], message.payload, encoding=message.encoding, attachment=message.attachment,
+                congestion_control=controls[kind],
+            )  # fmt: skip
+            lag = max(lag, -wait)
+    conn.send(Sent({robot: np.array(rows, np.float64).reshape(-1, 2) for robot, rows in puts.items()}, lag))
+
+
+def vandalise(conn: Connection, endpoint: str, robot: str, rate: float) -> None:
+    """Send rubbish to a robot's inputs, ``rate`` messages a second, until told to stop; sends back how many."""
+    source = rubbish(7)
+    with open_session("client", connect=[endpoint]) as session:
+        conn.send("ready")
+        due, count = float(conn.recv()), 0
+        while not conn.poll(max(0.0, due - time.monotonic())):
+            message, key = next(source), f"coview/{robot}/in/{list(_KEYS.values())[count % 2]}"
+            session.put(key, message.payload, encoding=message.encoding or None, attachment=message.attachment)
+            count += 1
+            due = max(due + 1.0 / rate, time.monotonic() - 0.5)
+    conn.send(count)
+
+
+_RUBBISH = (
+    b"", b"{}", b"null", b"[" * 5000, b'{"stamp_ns": 1e400}', b"\xff\xfe",
+    b'{"stamp_ns": 1, "position": [0, 0], "orientation": [0, 0, 0, 1]}',
+    b'{"stamp_ns": 1, "position": [NaN, 0, 0], "orientation": [0, 0, 0, 1]}',
+    b'{"stamp_ns": 1, "position": [0, 0, 0], "orientation": [0, 0, 0, 0]}',
+    b'{"stamp_ns": "x", "position": "y", "orientation": null}',
+    b'{"stamp_ns": ' + b"9" * 5000 + b', "position": [0,0,0], "orientation": [0,0,0,1]}',
+    b"\0\1\0\0" + b"\xff" * 400, b"\0\0\0\0" + b"\0" * 60,
+)  # fmt: skip
+_STRANGE = ("", "text/plain", "application/x-unheard-of", "application/cdr;some_msgs/msg/Other", "a;b;c;d", "image/png")
+
+
+def rubbish(seed: int) -> Iterator[Encoded]:
+    """Endless: random bytes, fixed nasties, and valid messages with flipped bytes or a missing end."""
+    rng = random.Random(seed)
+    cloud, odometry = CloudMessage(EPOCH_NS, np.zeros((300, 3), np.float32)), OdometryMessage(EPOCH_NS, np.eye(4))
+    valid = [encode_cloud(cloud, name) for name in CLOUD_CODECS]
+    valid += [encode_odometry(odometry, name) for name in ODOMETRY_CODECS]
+    encodings = (*(message.encoding for message in valid), *_STRANGE)
+    while True:
+        draw = rng.random()
+        encoding = rng.choice((*encodings, f"x{rng.randrange(10**6)}/y"))
+        attachment = rng.choice((None, b"", rng.randbytes(8), rng.randbytes(33), EPOCH_NS.to_bytes(8, "little")))
+        if draw < 0.5:
+            yield Encoded(rng.randbytes(rng.randrange(5001)), encoding, attachment)
+        elif draw < 0.52:
+            yield Encoded(rng.randbytes(1 << 20), encoding, attachment)
+        elif draw < 0.65:
+            yield Encoded(rng.choice(_RUBBISH), encoding, attachment)
+        else:
+            whole = rng.choice(valid)
+            end = rng.randrange(len(whole.payload)) if rng.random() < 0.5 else None
+            broken = bytearray(whole.payload[:end])
+            for _ in range(rng.randrange(1, 9) if broken else 0):
+                broken[rng.randrange(len(broken))] = rng.randrange(256)
+            beside = rng.choice((whole.attachment, whole.attachment, None, rng.randbytes(8)))
+            yield Encoded(bytes(broken), whole.encoding, beside)
+
+
+@dataclass
+class Recorder:
+    """Everything the robots' outputs said, with the time of its arrival; costs microseconds per message."""
+
+    endpoint: str
+    arrived: list[tuple[float, str, bytes, str]] = field(default_factory=list)
+    tokens: list[tuple[float, str, bool]] = field(default_factory=list)
+    unreadable: int = 0
+
+    def __enter__(self) -> Recorder:
+        import zenoh
+
+        self.session = open_session("client", connect=[self.endpoint])
+        direct = zenoh.handlers.Callback(self._record, indirect=False)
+        self._held = [self.session.declare_subscriber(key, direct) for key in ("coview/*/out/*", METRONOME)]
+        self._held.append(self.session.liveliness().declare_subscriber("coview/*/alive", self._token, history=True))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()
+
+    def _record(self, sample: Any) -> None:
+        at = time.monotonic()
+        self.arrived.append((at, str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
+
+    def _token(self, sample: Any) -> None:
+        import zenoh
+
+        self.tokens.append((time.monotonic(), str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+
+    def _of(self, key: str, begin: float, end: float) -> list[tuple[float, str, bytes, str]]:
+        return [row for row in list(self.arrived) if row[1] == key and begin <= row[0] < end]
+
+    def poses(self, robot: str, begin: float = 0.0, end: float = float("inf")) -> list[Posed]:
+        """Poses of a robot that arrived within a period; unreadable ones are counted instead."""
+        found = []
+        for at, key, payload, encoding in self._of(f"coview/{robot}/out/pose", begin, end):
+            try:
+                pose = decode_pose(Sample(key, payload, encoding))
+                found.append(Posed(at, pose.stamp_ns, pose.T_map_body, pose.age))
+            except MessageError as error:
+                self.unreadable += 1
+                print(f"unreadable pose, {encoding}: {error!r}")
+        return found
+
+    def told(self, robot: str, begin: float = 0.0, end: float = float("inf")) -> list[Told]:
+        """Statuses of a robot that arrived within a period."""
+        rows = self._of(f"coview/{robot}/out/status", begin, end)
+        return [Told(at, json.loads(payload)) for at, _, payload, _ in rows]
+
+    def ticks(self, begin: float = 0.0, end: float = float("inf")) -> list[float]:
+        """Arrivals of the metronome."""
+        return [at for at, *_ in self._of(METRONOME, begin, end)]
+
+    def alive(self, robot: str) -> bool:
+        """Whether the robot's token is there."""
+        known = [put for _, key, put in list(self.tokens) if key == f"coview/{robot}/alive"]
+        return bool(known and known[-1])
+
+    def query(self, robot: str, name: str, payload: bytes | None = None, parameters: str = "") -> list[str]:
+        """Ask one of the node's procedures; every reply as text, errors with their mark."""
+        selector = f"coview/{robot}/rpc/{name}" + (f"?{parameters}" if parameters else "")
+        return [
+            reply.ok.payload.to_string() if reply.ok else "error: " + reply.err.payload.to_string()
+            for reply in self.session.get(selector, payload=payload, timeout=3.0)
+        ]
+
+
+def wait_until(true: Callable[[], bool], seconds: float, every: float = 0.05) -> bool:
+    """Wait for a condition; returns whether it came."""
+    deadline = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(every)
+    return True
