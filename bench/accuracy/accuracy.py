@@ -100,8 +100,9 @@ def run_one(folder: Path, run: SimulationConfig, site: SimulationConfig, call: C
     name = world_name(run) if run == site else f"{world_name(run)}-on-{site.seed}"
 
     def make() -> Run:
-        seconds = [call(prepare, folder, config) for config in dict.fromkeys((run, site))]
-        return {**seconds[0], **call(measure, folder, run, site)}
+        for config in dict.fromkeys((run, site)):
+            call(prepare, folder, config)
+        return dict(call(measure, folder, run, site))
 
     try:
         spec = {"run": run.to_dict(), "map": site.to_dict(), **code}

@@ -15,15 +15,16 @@ import numpy as np
 from bench.harness.files import fingerprint, remembered_seconds
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
-from coview_stream.config import DescriptorConfig, KeyframeConfig, MapConfig
+from coview_stream.config import KeyframeConfig, MapConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
+from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rotation_angle, to_local
+from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
 from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
 from coview_stream.report.evaluation import driven
-from coview_stream.sim import SimulationConfig
+from coview_stream.sim import SimulationConfig, simulate
 
 TUNED_SEEDS = frozenset(range(1, 21))
 """Seeds of ``coview_stream.sim`` that defaults were chosen on; those of the unit tests are among them."""
@@ -49,29 +50,19 @@ def world_name(config: SimulationConfig) -> str:
     return f"{config.scene}-{config.sensor}-{config.seed}"
 
 
-def prepare(folder: Path, config: SimulationConfig) -> dict[str, float]:
-    """Simulate a world into ``folder`` and build its map beside it, unless both are there already.
-
-    Returns the seconds that each took when it was made.
-    """
-    from coview_stream.sim import simulate
-
-    out = folder / world_name(config)
-    world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
-    made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
-    return {
-        "simulate_s": remembered_seconds(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True)),
-        "build_s": remembered_seconds(out / "built.json", made, lambda: _build(out)),
-    }
-
-
 def map_of(folder: Path, config: SimulationConfig) -> Path:
     """Return where :func:`prepare` puts a world's map."""
     return folder / world_name(config) / "site.coview"
 
 
-def _build(out: Path) -> None:
-    BaseMap.build(out / "base.laz").save(out / "site.coview")
+def prepare(folder: Path, config: SimulationConfig) -> Path:
+    """Return a world's directory; simulate it and build its map there unless that is done."""
+    out, site = folder / world_name(config), map_of(folder, config)
+    world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
+    made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
+    remembered_seconds(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
+    remembered_seconds(out / "built.json", made, lambda: BaseMap.build(out / "base.laz").save(site))
+    return out
 
 
 KEYFRAMES = 5  # keyframes of a query: a drive of eight metres
@@ -101,8 +92,7 @@ class Place:
     def errors(self, T_map_submap: Pose) -> tuple[float, float]:
         """Distance (metres) and angle (degrees) of an answer from the truth."""
         off = inverse(self.T_map_submap) @ T_map_submap
-        cosine = np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
-        return float(np.linalg.norm(off[:3, 3])), float(np.degrees(np.arccos(cosine)))
+        return float(np.linalg.norm(off[:3, 3])), float(np.degrees(rotation_angle(off)))
 
     @property
     def T_odom_submap(self) -> Pose:
@@ -112,8 +102,7 @@ class Place:
 
 def world(folder: Path, scene: str) -> Path:
     """Simulate a world and build its map unless that is done; return its directory."""
-    prepare(folder, WORLDS[scene])
-    return folder / world_name(WORLDS[scene])
+    return prepare(folder, WORLDS[scene])
 
 
 def base_map(folder: Path, scene: str) -> BaseMap:
@@ -125,29 +114,22 @@ def places(folder: Path, scene: str, count: int) -> list[Place]:
     """``count`` places, evenly along the run of a world that is there."""
     there, site = folder / world_name(WORLDS[scene]), base_map(folder, scene)
     run, (_, truth) = open_run(there / "run"), read_tum(there / "truth.tum")
-    settings = KeyframeConfig()
     way = driven(run.poses)
-    last = way[-1] - KEYFRAMES * settings.distance
-    starts = np.searchsorted(way, np.linspace(0.0, last, count))
-    return [_place(run, truth, int(start), site.origin, settings, site.descriptor_config) for start in starts]
+    last = way[-1] - KEYFRAMES * KeyframeConfig().distance
+    return [_place(run, truth, int(k), site) for k in np.searchsorted(way, np.linspace(0.0, last, count))]
 
 
-def _place(
-    run: Run, truth: Floats, start: int, origin: Floats, settings: KeyframeConfig, descriptor: DescriptorConfig
-) -> Place:
-    buffer, queries = KeyframeBuffer(settings), []
+def _place(run: Run, truth: Floats, start: int, site: BaseMap) -> Place:
+    buffer, queries = KeyframeBuffer(KeyframeConfig()), []
     for index in range(start, len(run)):
         frame = run.read(index)
-        T_odom_body = frame.T_odom_body.copy()
-        T_odom_body[:3, 3] -= run.poses[start][:3, 3]
-        keyframe = buffer.add(frame.points, T_odom_body, frame.stamp)
+        T_odom_body = to_local(frame.T_odom_body, run.poses[start][:3, 3])
+        keyframe = buffer.add(voxelized(frame.points, T_odom_body, buffer.config), T_odom_body, frame.stamp)
         if keyframe is not None:
-            queries.append(SearchRequest.of(buffer, keyframe, frame.points, RequestSpec(descriptor)))
+            queries.append(SearchRequest.of(buffer, keyframe, frame.points, RequestSpec(site.descriptor_config)))
         if len(queries) == KEYFRAMES:
             break
     position = queries[-1].position
     submap = (buffer.recent(KEYFRAMES) - position.astype(np.float32)).astype(np.float32)
-    T_map_body = truth[index].copy()
-    T_map_body[:3, 3] -= origin
     T_submap_body = pose_from(T_odom_body[:3, :3], np.zeros(3))
-    return Place(queries, submap, T_map_body @ inverse(T_submap_body))
+    return Place(queries, submap, to_local(truth[index], site.origin) @ inverse(T_submap_body))

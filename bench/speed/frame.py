@@ -12,16 +12,23 @@ co-visibility serves us too, since one grid takes it less than a launch.
 
 from __future__ import annotations
 
+import tracemalloc
 from argparse import Namespace
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from bench.harness.rows import REPEAT, Row, against, bounded, medians
+from coview_kernels import VoxelFilter, polar_bin, reference
+from coview_stream.config import DescriptorConfig
+from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.geometry.transforms import pose_from
 
-_LEAST = 4.0
-LIMITS = 0.3, 0.5, 80.0
+LIMITS = 0.3, 0.5, 80.0  # voxel, least and greatest range, metres
+STANDING = pose_from([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], [100.3, -20.2, 1.7])  # the robot's pose
+_SCAN = 131_072
 
 
 def frame(seed: int = 0) -> Floats32:
@@ -42,16 +49,8 @@ def frame(seed: int = 0) -> Floats32:
     return np.asarray(beams * noisy[:, None], dtype=np.float32)
 
 
-def pose() -> Floats:
-    """Return where the robot stands, (4, 4)."""
-    T = np.eye(4)
-    T[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
-    T[:3, 3] = 100.3, -20.2, 1.7
-    return T
-
-
 def best_numpy(points: Floats32, T: Floats) -> Floats32:
-    """Return the same points; presumes finite ones near the sensor."""
+    """Return the same points as the kernel; presumes finite ones near the sensor."""
     voxel, r_min, r_max = LIMITS
     x, y, z = points.T.astype(np.float64)
     r2 = x * x + y * y + z * z
@@ -74,58 +73,29 @@ def best_numpy(points: Floats32, T: Floats) -> Floats32:
     return np.asarray(moved[first])
 
 
-def _taken(repeat: int) -> list[float]:
-    """Milliseconds of ours, of the reference and of the best NumPy; all must agree."""
-    from coview_kernels import VoxelFilter, reference
-
-    points, T = frame(), pose()
-    ours = VoxelFilter(*LIMITS)
-
-    def plain() -> Floats32:
-        return reference.transform_unique(points, T, *LIMITS)[0]
-
-    found, _ = ours(points, T)
-    for other in (plain(), best_numpy(points, T)):
-        if not np.array_equal(found, other):
-            raise AssertionError("ours and NumPy disagree")
-    return medians(lambda: ours(points, T), plain, lambda: best_numpy(points, T), repeat=repeat)
-
-
-def allocated(frames: int = 100) -> float:
-    """Kilobytes that Python and NumPy had allocated at most at a time during ``frames`` frames, warmed up."""
-    import tracemalloc
-
-    from coview_kernels import VoxelFilter
-
-    points, T = frame(), pose()
-    take = VoxelFilter(*LIMITS)
-    take(points, T)
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        for _ in range(frames):
-            take(points, T)
-        return (tracemalloc.get_traced_memory()[1] - before) / 1e3
-    finally:
-        tracemalloc.stop()
-
-
-def _intake(asked: Namespace) -> Iterator[Row]:
+def _intake(repeat: int) -> Iterator[Row]:
     """Ratios, and what a frame allocates (its points have 786 kB)."""
-    ours, plain, best = _taken(9 if asked.quick else REPEAT)
-    yield against("intake, 64k points, beside the best NumPy", ours, best, "ms", _LEAST)
-    yield against("intake, 64k points, beside the reference", ours, plain, "ms", None)
-    yield bounded("intake, memory allocated in 100 frames, at most", allocated(), "kB", 16.0)
+    points, ours = frame(), VoxelFilter(*LIMITS)
+    plain = partial(reference.transform_unique, points, STANDING, *LIMITS)
+    found = ours(points, STANDING)[0]
+    if not (np.array_equal(found, plain()[0]) and np.array_equal(found, best_numpy(points, STANDING))):
+        raise AssertionError("ours and NumPy disagree")
+    taken, slow, best = medians(
+        partial(ours, points, STANDING), plain, partial(best_numpy, points, STANDING), repeat=repeat
+    )
+    yield against("intake, 64k points, beside the best NumPy", taken, best, "ms", 4.0)
+    yield against("intake, 64k points, beside the reference", taken, slow, "ms", None)
+    tracemalloc.start()
+    before, _ = tracemalloc.get_traced_memory()
+    for _ in range(100):
+        ours(points, STANDING)
+    most = (tracemalloc.get_traced_memory()[1] - before) / 1e3
+    tracemalloc.stop()
+    yield bounded("intake, memory allocated in 100 frames, at most", most, "kB", 16.0)
 
 
-_SCAN = 131_072
-_DESCRIBE = 10.0
-
-
-def virtual_scan() -> Floats32:
+def _virtual_scan() -> Floats32:
     """Points (131072, 3) of 20 keyframes 2 m apart; heights are spread, since one street has too few voxels."""
-    from coview_kernels import reference
-
     rng = np.random.default_rng(1)
     parts = []
     for k in range(20):
@@ -138,40 +108,30 @@ def virtual_scan() -> Floats32:
     return np.ascontiguousarray(unique[chosen])
 
 
-def _described(repeat: int) -> list[float]:
-    """Milliseconds of ours and the reference, then of binning alone, ours first."""
-    import coview_kernels as kernels
-    from coview_kernels import reference
-    from coview_stream.config import DescriptorConfig
-    from coview_stream.descriptors.coview import describe
-
-    points, centre, config = virtual_scan(), np.array([0.1, -0.2, -1.8]), DescriptorConfig()
-    size = config.rings, config.sectors, config.radius
+def _describe(repeat: int) -> Iterator[Row]:
+    """Ratios of the whole and of binning alone."""
+    points, centre, config = _virtual_scan(), np.array([0.1, -0.2, -1.8]), DescriptorConfig()
+    binned = points, centre, config.rings, config.sectors, config.radius
 
     def plain() -> list[Floats32]:
-        grid, _ = reference.polar_bin(points, centre, *size)
+        grid, _ = reference.polar_bin(*binned)
         highest = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
         return [highest, reference.coview(*grid)]
 
     if not all(map(np.array_equal, describe(points, centre, config).values(), plain())):
         raise AssertionError("ours and NumPy disagree")
-    return medians(
-        lambda: describe(points, centre, config),
+    ours, numpy, bins, numpy_bins = medians(
+        partial(describe, points, centre, config),
         plain,
-        lambda: kernels.polar_bin(points, centre, *size),
-        lambda: reference.polar_bin(points, centre, *size),
+        partial(polar_bin, *binned),
+        partial(reference.polar_bin, *binned),
         repeat=repeat,
     )
-
-
-def _describe(asked: Namespace) -> Iterator[Row]:
-    """Ratios of the whole and of its parts."""
-    found = _described(5 if asked.quick else REPEAT)
-    for what, least, k in (("", _DESCRIBE, 0), (", bins alone", None, 2)):
-        yield against(f"describe, {_SCAN} points{what}", found[k], found[k + 1], "ms", least)
+    yield against(f"describe, {_SCAN} points", ours, numpy, "ms", 10.0)
+    yield against(f"describe, {_SCAN} points, bins alone", bins, numpy_bins, "ms", None)
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Take in a frame, then describe a keyframe."""
-    yield from _intake(asked)
-    yield from _describe(asked)
+    yield from _intake(9 if asked.quick else REPEAT)
+    yield from _describe(5 if asked.quick else REPEAT)

@@ -2,8 +2,8 @@
 
 A row per kernel at the sizes of a localizer step and of a map build; a kernel that does not win here is deleted.
 The twins are plain and vectorised; the targets that count are those of the benchmarks of the whole step (``match``,
-``intake``, ``describe``, ``map_build``, ``registration``), which compare with the best formulation known. Run it on
-idle cores: a busy neighbour slows the kernels, which use all threads, more than NumPy.
+``frame``, ``map_build``, ``registration``), which compare with the best formulation known. Run it on idle cores: a
+busy neighbour slows the kernels, which use all threads, more than NumPy.
 """
 
 from __future__ import annotations
@@ -11,64 +11,54 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 import coview_kernels as ck
 from bench.harness.rows import REPEAT, Row, against, medians
 from coview_kernels import reference
+from coview_stream.geometry.transforms import pose_from
 
-Case = tuple[str, Callable[[], object], Callable[[], object]]
 
-
-def cases() -> Iterator[Case]:
-    """Name, our call and NumPy's call, at the sizes of a localizer step and of a map build."""
+def cases() -> Iterator[tuple[str, Callable[..., Any], Callable[..., Any], tuple[Any, ...]]]:
+    """Name, our kernel, its twin, and what both are called with."""
     rng = np.random.default_rng(0)
     cloud = rng.normal(0.0, 20.0, (131_072, 3)).astype(np.float32)
-    T = np.eye(4)
-    T[:2, :2], T[:3, 3] = [[0.6, -0.8], [0.8, 0.6]], [1.0, 2.0, 3.0]
-    origin = np.zeros(3)
+    T = pose_from([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]], [1.0, 2.0, 3.0])
     for n in (20_000, 131_072):
         move = (cloud[:n], T, 0.3, 1.0, 80.0)
-        yield _both(f"transform_unique {n}", ck.transform_unique, reference.transform_unique, *move)
-        polar = (cloud[:n], origin, 20, 60, 50.0)
-        yield _both(f"polar_bin {n}", ck.polar_bin, reference.polar_bin, *polar)
-    yield from _stations(rng)
-    yield from _neighbours(rng)
-    desc = rng.normal(2.0, 1.0, (9_527, 20, 60)).astype(np.float32)
-    spectra = ck.column_spectra(desc)
-    for q in (1, 8):  # BLAS beside einsum
-        name = f"all_shift_distance {q} x 9527"
-        yield _both(name, ck.all_shift_distance, _einsum_distance, desc[:q], spectra, 60)
-
-
-def _both(name: str, ours: Callable[..., object], numpy: Callable[..., object], *arguments: object) -> Case:
-    return name, partial(ours, *arguments), partial(numpy, *arguments)
-
-
-def _stations(rng: np.random.Generator) -> Iterator[Case]:
+        yield f"transform_unique {n}", ck.transform_unique, reference.transform_unique, move
+        yield f"polar_bin {n}", ck.polar_bin, reference.polar_bin, (cloud[:n], np.zeros(3), 20, 60, 50.0)
     top = rng.normal(5.0, 2.0, (600, 600)).astype(np.float32)
     count = rng.integers(0, 3, top.shape).astype(np.int32)
     at = rng.integers(0, 600, (2, 300)).astype(np.int32)
     raster = (top, count, 0.5, *at, rng.normal(size=300).astype(np.float32), 20, 60, 50.0)
-    yield _both("station_bins 300", ck.station_bins, reference.station_bins, *raster)
-    grids = reference.station_bins(*raster)
-    yield _both("coview 300", ck.coview, reference.coview, *grids)
-
-
-def _neighbours(rng: np.random.Generator) -> Iterator[Case]:
-    """Walk a street: ground, two walls, a point every quarter metre; the twin is SciPy's k-d tree, queries alone."""
-    along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))
-    flat = np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])
-    walls = [np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)]
-    street = np.concatenate([flat, *walls]).astype(np.float32)
-    street += rng.normal(0, 0.02, street.shape).astype(np.float32)
+    yield "station_bins 300", ck.station_bins, reference.station_bins, raster
+    yield "coview 300", ck.coview, reference.coview, reference.station_bins(*raster)
+    street = _street(rng)
     grid = ck.PointGrid(street)
     scan = street[rng.permutation(len(street))[:5_000]]
     scan += rng.normal(0, 0.1, scan.shape).astype(np.float32)
     for radius in (0.4, 3.0):
-        name = f"nearest 5000, {radius} m"
-        yield (name, partial(ck.nearest, grid, scan, radius), partial(reference.nearest, grid.tree, scan, radius))
+        yield f"nearest 5000, {radius} m", ck.nearest, _nearest_in_tree, (grid, scan, radius)
+    desc = rng.normal(2.0, 1.0, (9_527, 20, 60)).astype(np.float32)
+    spectra = ck.column_spectra(desc)
+    for q in (1, 8):  # BLAS beside einsum
+        yield f"all_shift_distance {q} x 9527", ck.all_shift_distance, _einsum_distance, (desc[:q], spectra, 60)
+
+
+def _street(rng: np.random.Generator) -> np.ndarray:
+    """Points (N, 3) of the ground and two walls of a street, one every quarter metre."""
+    along, side = np.meshgrid(np.arange(-60, 60, 0.25), np.arange(-15, 15, 0.25))
+    flat = np.column_stack([along.ravel(), side.ravel(), np.zeros(along.size)])
+    walls = [np.column_stack([along.ravel(), np.full(along.size, y), side.ravel() + 15]) for y in (-15.0, 15.0)]
+    street = np.concatenate([flat, *walls]).astype(np.float32)
+    return street + rng.normal(0, 0.02, street.shape).astype(np.float32)
+
+
+def _nearest_in_tree(grid: ck.PointGrid, scan: np.ndarray, radius: float) -> object:
+    return reference.nearest(grid.tree, scan, radius)  # SciPy's k-d tree, queries alone
 
 
 def _einsum_distance(query: np.ndarray, spectra: np.ndarray, sectors: int) -> np.ndarray:
@@ -80,6 +70,6 @@ def _einsum_distance(query: np.ndarray, spectra: np.ndarray, sectors: int) -> np
 def rows(asked: Namespace) -> Iterator[Row]:
     """Compare every kernel with its twin."""
     ck.warm_up()
-    for name, ours, numpy in cases():
-        times = medians(ours, numpy, repeat=5 if asked.quick else REPEAT)
-        yield against(f"kernels/{name}", *times, "ms", 1.0)
+    for name, ours, numpy, arguments in cases():
+        sides = partial(ours, *arguments), partial(numpy, *arguments)
+        yield against(f"kernels/{name}", *medians(*sides, repeat=5 if asked.quick else REPEAT), "ms", 1.0)

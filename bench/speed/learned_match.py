@@ -19,9 +19,21 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy import fft
+from scipy.signal import fftconvolve
 
 from bench.harness.rows import Row, against, bounded, informs, medians
+from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.geometry.arrays import Bools, Floats, Floats32
+from coview_stream.geometry.transforms import rot_z
+from coview_stream.localization.search.learned.consistent_pairs import (
+    consistency_graph,
+    largest_clique,
+    maximum_clique,
+    relaxed_clique,
+)
+from coview_stream.localization.search.learned.correlation import correlate, rotate_images
+from coview_stream.localization.search.learned.feature_index import FeatureIndex
 
 CHANNELS, HEADINGS, QUERY = 32, 36, 32
 SIDES = {"0.1 km2": (158, 250.0), "1 km2": (500, 1500.0)}  # cells on a side and the milliseconds allowed
@@ -32,71 +44,56 @@ class OneFft:
     """Baseline: per channel over the whole map, its spectra kept."""
 
     def __init__(self, features: Floats32) -> None:
-        from scipy import fft
-
         self._shape = features.shape[1:]
         self._size = tuple(fft.next_fast_len(side + QUERY, real=True) for side in self._shape)
         self._spectra = fft.rfft2(features, self._size)
 
     def __call__(self, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
         """Return sums (K, H, W) over all weights."""
-        from scipy import fft
-
         half, (height, width) = QUERY // 2, self._shape
         out = np.empty((len(yaws), height, width), dtype=np.float32)
         for k, grid in enumerate(_turned(query, weight, yaws)):
             product = (np.conj(fft.rfft2(grid, self._size)) * self._spectra).sum(axis=0)
-            whole = np.roll(fft.irfft2(product, self._size), (half, half), axis=(0, 1))
-            out[k] = whole[:height, :width]
+            out[k] = np.roll(fft.irfft2(product, self._size), (half, half), axis=(0, 1))[:height, :width]
         return out
 
 
-def convolved(features: Floats32, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
+def _convolved(features: Floats32, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
     """Baseline: ``scipy.signal.fftconvolve`` along the map's axes, then the sum over dimensions (K, H, W)."""
-    from scipy.signal import fftconvolve
-
     grids = _turned(query, weight, yaws)[..., ::-1, ::-1]
     return np.stack([fftconvolve(features, grid, mode="same", axes=(1, 2)).sum(axis=0) for grid in grids])
 
 
 def _turned(query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
     """Turn a query (K, C, h + 1, h + 1), over the sum of its weights."""
-    from coview_stream.localization.search.learned.correlation import rotate_images
-
     images = rotate_images(np.concatenate([query, weight[None]]), yaws).transpose(2, 3, 0, 1)
     return np.ascontiguousarray(images[:, :-1] / images[:, -1:].sum(axis=(2, 3), keepdims=True))
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Rows of the suite."""
+    """Dense correlation, then cliques."""
     yield from _dense(asked.quick)
     yield from _cliques(5 if asked.quick else 15)
 
 
 def _dense(quick: bool) -> Iterator[Row]:
-    from coview_stream.localization.search.learned.correlation import correlate
-    from coview_stream.localization.search.learned.feature_index import FeatureIndex
-
     rng = np.random.default_rng(0)
-    query, weight = _unit(rng, QUERY, QUERY), np.ones((QUERY, QUERY), dtype=np.float32)
+    query, weight = _unit(rng, QUERY), np.ones((QUERY, QUERY), dtype=np.float32)
     yaws = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
-    for label, (side, most) in SIDES.items():
-        if quick and side > 200:
-            continue
-        features = _unit(rng, side, side)
+    for label, (side, most) in list(SIDES.items())[: 1 if quick else None]:
+        features = _unit(rng, side)
         known, one = FeatureIndex(features, (0.0, 0.0)), OneFft(features)
         near = known.blocks_near([known.corner + (side // 2 + 0.5) * known.cell], 50.0)
         plain = partial(correlate, query, weight, known, yaws, min_coverage=None)
         _same(plain(), one(query, weight, yaws))
-        _same(plain()[:1], convolved(features, query, weight, yaws[:1]))
-        repeat = 3 if quick or side > 200 else 7
+        _same(plain()[:1], _convolved(features, query, weight, yaws[:1]))
         mean, ours, restricted, whole, single = medians(
             partial(correlate, query, weight, known, yaws),
             plain,
             partial(correlate, query, weight, known, yaws, near),
             partial(one, query, weight, yaws),
-            partial(convolved, features, query, weight, yaws[:1]),
-            repeat=repeat,
+            partial(_convolved, features, query, weight, yaws[:1]),
+            repeat=3 if quick or side > 200 else 7,
             warm_up=0,  # they have just run
         )
         yield bounded(f"learned_match/dense correlation, {label}, 36 headings", mean, "ms", most)
@@ -107,14 +104,6 @@ def _dense(quick: bool) -> Iterator[Row]:
 
 
 def _cliques(repeat: int) -> Iterator[Row]:
-    from coview_stream.config.search import LearnedMatchConfig
-    from coview_stream.localization.search.learned.consistent_pairs import (
-        consistency_graph,
-        largest_clique,
-        maximum_clique,
-        relaxed_clique,
-    )
-
     config = LearnedMatchConfig()
     for label, share in (("1 in 10 right", 0.1), ("none right", 0.0)):
         here, there = _pairs(np.random.default_rng(1), share)
@@ -159,18 +148,16 @@ def enumerated(adjacent: Bools) -> int:
     return most
 
 
-def _unit(rng: np.random.Generator, height: int, width: int) -> Floats32:
-    values = rng.standard_normal((CHANNELS, height, width), dtype=np.float32)
-    values /= np.linalg.norm(values, axis=0)
-    return values
+def _unit(rng: np.random.Generator, side: int) -> Floats32:
+    values = rng.standard_normal((CHANNELS, side, side), dtype=np.float32)
+    return np.asarray(values / np.linalg.norm(values, axis=0))
 
 
 def _pairs(rng: np.random.Generator, share: float) -> tuple[Floats, ...]:
     """Points of pairs in a disk's square, ``share`` of them the same from either side but for the heading."""
     here, there = rng.uniform(-30.0, 30.0, (2, PAIRS, 2))
     right = round(share * PAIRS)
-    c, s = np.cos(0.7), np.sin(0.7)
-    there[:right] = here[:right] @ np.array([[c, s], [-s, c]]) + rng.normal(0.0, 0.3, (right, 2))
+    there[:right] = here[:right] @ rot_z(0.7)[:2, :2].T + rng.normal(0.0, 0.3, (right, 2))
     return here, there
 
 

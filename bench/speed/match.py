@@ -29,27 +29,27 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import fft
 
+import coview_kernels as kernels
 from bench.harness.files import folder
 from bench.harness.rows import REPEAT, Row, against, bounded, informs, medians
 from bench.harness.worlds import base_map, places, world
+from coview_kernels.runtime import workers
+from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats32
 
 STATIONS, MANY = 9_527, 100_000
 BEST = 10
-KILOBYTES = 3.0
-LOOP = 150.0  # times as fast as the plain C++ loop, one thread each
-BUILD_MS = 300.0
 
 F16 = npt.NDArray[np.float16]
+Found = tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]  # stations, shifts and distances of the nearest
 
 
 class Spectral:
     """Baseline: the product of the spectra, frequency by frequency, then all shifts by one real product."""
 
     def __init__(self, stations: F16) -> None:
-        import coview_kernels as kernels
-
         spectra = kernels.column_spectra(stations.astype(np.float32))
         self._spectra = np.ascontiguousarray(spectra.transpose(0, 2, 1))  # BLAS reads along the stations
         sectors = stations.shape[2]
@@ -58,12 +58,8 @@ class Spectral:
         angle = 2.0 * np.pi / sectors * np.outer(n, f)
         self._turn = np.hstack([np.cos(angle) * weight, -np.sin(angle) * weight]).astype(np.float32)
 
-    def __call__(self, query: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
-        """Return stations, shifts and distances of the ``k`` nearest."""
-        from scipy import fft
-
-        import coview_kernels as kernels
-
+    def __call__(self, query: Floats32, k: int) -> Found:
+        """Return the ``k`` nearest."""
         wave = fft.rfft(kernels.unit_columns(query), axis=-1).T.conj()
         product = np.matmul(wave[:, None], self._spectra)[:, 0]  # conjugate, for the want of a copy
         return _best(self._turn @ np.concatenate([product.real, -product.imag]), k)
@@ -73,23 +69,17 @@ class Turned:
     """Baseline: 60 turned queries times all unit columns."""
 
     def __init__(self, stations: F16) -> None:
-        import coview_kernels as kernels
+        self._columns = np.ascontiguousarray(kernels.unit_columns(stations).reshape(len(stations), -1).T)
 
-        unit = kernels.unit_columns(stations).reshape(len(stations), -1)
-        self._columns = np.ascontiguousarray(unit.T)
-
-    def __call__(self, query: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
-        """Return stations, shifts and distances of the ``k`` nearest."""
-        import coview_kernels as kernels
-
-        unit = kernels.unit_columns(query) / np.float32(query.shape[1])
-        twice = np.concatenate([unit, unit], axis=1)
-        windows = np.lib.stride_tricks.sliding_window_view(twice, query.shape[1], axis=1)
-        turned = windows[:, : query.shape[1]].transpose(1, 0, 2).reshape(query.shape[1], -1)
-        return _best(turned @ self._columns, k)
+    def __call__(self, query: Floats32, k: int) -> Found:
+        """Return the ``k`` nearest."""
+        sectors = query.shape[1]
+        unit = kernels.unit_columns(query) / np.float32(sectors)
+        windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([unit, unit], axis=1), sectors, axis=1)
+        return _best(windows[:, :sectors].transpose(1, 0, 2).reshape(sectors, -1) @ self._columns, k)
 
 
-def _best(correlation: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
+def _best(correlation: Floats32, k: int) -> Found:
     top = correlation.max(axis=0)
     chosen = np.argpartition(top, -k)[-k:]
     chosen = chosen[np.argsort(-top[chosen], kind="stable")]
@@ -98,54 +88,48 @@ def _best(correlation: Floats32, k: int) -> tuple[npt.NDArray[Any], ...]:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Top-K beside the best of NumPy, then sizes and limits."""
-    import coview_kernels as kernels
-
     repeat = 5 if asked.quick else REPEAT
     known, queries = town()
-    bandwidth = gigabytes_per_second()
+    array = np.ones(64_000_000, dtype=np.float32)  # 256 MB
+    read = min(medians(array.sum, array.view(np.int8).max, repeat=7))
+    bandwidth = array.nbytes / read / 1e6
     yield informs("match/memory bandwidth, a large array summed by one thread", bandwidth, "GB/s")
     for name, stations in known.items():
-        query = queries[name]
-        some = stations[:STATIONS]
+        query, some = queries[name], stations[:STATIONS]
         start = time.perf_counter()
         index = kernels.MatchIndex(some)
         build = (time.perf_counter() - start) * 1e3
         spectral, turned = Spectral(some), Turned(some)
         for k in (BEST, 1, 100):
-            _agree(index.top_k(query, k), spectral(query, k), turned(query, k))
-            ours, *others = medians(
-                partial(index.top_k, query, k), partial(spectral, query, k), partial(turned, query, k), repeat=repeat
-            )
-            label = f"match/top {k} of {len(some)} stations, {name}"
-            yield against(label, ours, min(others), "ms", 3.0 if k == BEST else None)
-        yield bounded(f"match/making the index, {name}", build, "ms", BUILD_MS)
-    yield from _limits(index, query, bandwidth, repeat)
-    yield from _hard(query, repeat)
-    yield from _growth(stations, query, repeat)
-    yield _against_loop(index, some, query, repeat)
-
-
-def _limits(index: Any, query: Floats32, bandwidth: float, repeat: int) -> Iterator[Row]:
+            for other in (spectral, turned):
+                np.testing.assert_allclose(index.top_k(query, k).distance, other(query, k)[2], atol=2e-5)
+            sides = (partial(side, query, k) for side in (index.top_k, spectral, turned))
+            ours, *others = medians(*sides, repeat=repeat)
+            target = 3.0 if k == BEST else None
+            yield against(f"match/top {k} of {len(some)} stations, {name}", ours, min(others), "ms", target)
+        yield bounded(f"match/making the index, {name}", build, "ms", 300.0)
     kilobytes = index.nbytes / len(index) / 1e3
-    yield bounded("match/memory of the index per station", kilobytes, "kB", KILOBYTES)
+    yield bounded("match/memory of the index per station", kilobytes, "kB", 3.0)
     whole = kilobytes + index.descriptors.nbytes / len(index) / 1e3
     yield informs("match/the same with the map's own descriptors, float16", whole, "kB")
     (ours,) = medians(partial(index.top_k, query, BEST), repeat=repeat)
     floor = index.nbytes / bandwidth / 1e6
     yield against("match/top 10 beside one reading of the index from memory", ours, floor, "ms", None)
+    yield from _hard(query, repeat)
+    few, many = (kernels.MatchIndex(multiplied(stations, count)) for count in (STATIONS, MANY))
+    short, long = medians(partial(few.top_k, query, BEST), partial(many.top_k, query, BEST), repeat=repeat)
+    yield informs(f"match/top 10 of {MANY} stations", long, "ms")
+    yield bounded("match/time per station, many over few", (long / MANY) / (short / STATIONS), "x", 1.0)
+    yield _against_loop(index, some, query, repeat)
 
 
 def _hard(query: Floats32, repeat: int) -> Iterator[Row]:
     """Stations that bounds cannot tell apart, with the spectra at hand for the exhaustive way out."""
-    import coview_kernels as kernels
-
     rng = np.random.default_rng(0)
     noise = rng.standard_normal((STATIONS, *query.shape)).astype(np.float16)
     alike = (rng.uniform(1, 9, query.shape) * (1 + 1e-3 * noise)).astype(np.float16)
-    for name, stations, asked in (
-        ("noise", noise, rng.standard_normal(query.shape).astype(np.float32)),
-        ("all alike", alike, query),
-    ):
+    another = rng.standard_normal(query.shape).astype(np.float32)
+    for name, stations, asked in (("noise", noise, another), ("all alike", alike, query)):
         index, spectral = kernels.MatchIndex(stations), Spectral(stations)
         spectra = kernels.column_spectra(stations.astype(np.float32))
         ours, base = medians(
@@ -156,58 +140,32 @@ def _hard(query: Floats32, repeat: int) -> Iterator[Row]:
         yield against(f"match/top 10, {name}, without", alone, base, "ms", None)
 
 
-def _growth(stations: F16, query: Floats32, repeat: int) -> Iterator[Row]:
-    """Time per station with many against that with few, interleaved."""
-    import coview_kernels as kernels
-
-    few, many = (kernels.MatchIndex(multiplied(stations, count)) for count in (STATIONS, MANY))
-    short, long = medians(partial(few.top_k, query, BEST), partial(many.top_k, query, BEST), repeat=repeat)
-    yield informs(f"match/top 10 of {MANY} stations", long, "ms")
-    yield bounded("match/time per station, many over few", (long / MANY) / (short / STATIONS), "x", 1.0)
-
-
 def _against_loop(index: Any, stations: F16, query: Floats32, repeat: int) -> Row:
-    from coview_kernels.runtime import workers
-
+    """``peers/plain_loop.cpp`` on the same stations; it prints milliseconds, station, shift and distance."""
     name = "match/top 10 against a plain C++ loop, all shifts"
-    taken = plain_loop(stations, query)
     (ours,) = medians(partial(index.top_k, query, BEST), repeat=repeat)
-    if taken is None:
-        return informs(f"{name}: no C++ compiler here", ours, "ms")
-    milliseconds, station, _, distance = taken
-    nearest = index.top_k(query, 1)
-    assert abs(nearest.distance[0] - distance) < 1e-5, (nearest, station, distance)
-    return against(name, ours, milliseconds, "ms", LOOP if workers() == 1 else None)
-
-
-def plain_loop(stations: F16, query: Floats32) -> tuple[float, int, int, float] | None:
-    """Milliseconds of ``peers/plain_loop.cpp``, its station, shift and distance; None without a compiler."""
     compiler = shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
     if compiler is None:
-        return None
+        return informs(f"{name}: no C++ compiler here", ours, "ms")
     source = Path(__file__).parents[1] / "peers" / "plain_loop.cpp"
-    with tempfile.TemporaryDirectory() as name:
-        there = Path(name)
-        program = there / "plain_loop"
-        subprocess.run([compiler, "-O3", "-o", str(program), str(source)], check=True)
-        stations.astype(np.float32).tofile(there / "stations")
-        query.astype(np.float32).tofile(there / "query")
-        sizes = map(str, (*query.shape, len(stations)))
-        command = [str(program), str(there / "stations"), str(there / "query"), *sizes]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-    milliseconds, station, shift, distance = done.stdout.split()
-    return float(milliseconds), int(station), int(shift), float(distance)
+    with tempfile.TemporaryDirectory() as scratch:
+        program, kept, asked = (str(Path(scratch) / part) for part in ("plain_loop", "stations", "query"))
+        subprocess.run([compiler, "-O3", "-o", program, str(source)], check=True)
+        stations.astype(np.float32).tofile(kept)
+        query.astype(np.float32).tofile(asked)
+        command = [program, kept, asked, *map(str, (*query.shape, len(stations)))]
+        said = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    if not abs(index.top_k(query, 1).distance[0] - float(said[3])) < 1e-5:
+        raise AssertionError(f"the loop found {said}, ours {index.top_k(query, 1)}")
+    return against(name, ours, float(said[0]), "ms", 150.0 if workers() == 1 else None)
 
 
 def town() -> tuple[dict[str, F16], dict[str, Floats32]]:
     """Descriptors (M, R, S) and a keyframe's (R, S), by channel, of a simulated town."""
-    from coview_stream.descriptors.coview import describe, ground_below
-
     world(folder(), "town")
     site = base_map(folder(), "town")
     newest = places(folder(), "town", 2)[1].queries[-1]
-    centre = newest.position.copy()
-    centre[2] = ground_below(newest.scan, newest.position)
+    centre = np.array([*newest.position[:2], ground_below(newest.scan, newest.position)])
     queries = describe(newest.scan, centre, site.descriptor_config)
     order = np.random.default_rng(0).permutation(len(site))
     return {name: np.array(site.descriptors(name))[order] for name in queries}, queries
@@ -223,16 +181,3 @@ def multiplied(stations: F16, count: int) -> F16:
         made[:, :, :half] = other[:, :, :half]
         parts.append(made)
     return np.concatenate(parts)[:count]
-
-
-def gigabytes_per_second() -> float:
-    """Memory bandwidth of one thread, read: the better of a sum and a maximum over 256 MB."""
-    array = np.ones(64_000_000, dtype=np.float32)
-    taken = min(medians(lambda: array.sum(), lambda: array.view(np.int8).max(), repeat=7))
-    return array.nbytes / taken / 1e6
-
-
-def _agree(ours: Any, *others: tuple[npt.NDArray[Any], ...]) -> None:
-    """All sides name the same distances."""
-    for other in others:
-        np.testing.assert_allclose(ours.distance, other[2], atol=2e-5)

@@ -12,36 +12,41 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
+import coview_kernels as kernels
 from bench.harness.files import folder
 from bench.harness.rows import Row, informs, medians
 from bench.harness.worlds import base_map, world
-from bench.speed.engine import frames_of
+from bench.speed.engine import there_and_back
+from bench.speed.frame import LIMITS, STANDING, best_numpy, frame
 from bench.speed.match import Spectral, Turned, multiplied, town
+from coview_kernels import runtime
+from coview_stream import Localizer, LocalizerConfig
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.recordings.open_run import open_run
+from coview_stream.report.style import TRUTH, figure
 
 OUT = Path("docs/images")
 PERIOD_MS = 100.0  # between the frames of a robot, at 10 Hz
 BEST = 20  # stations that matching has to name
 
-_COLOURS = ("#0072B2", "#D55E00", "#999999", "#009E73")
+_COLOURS = ("#0072B2", "#D55E00", "#999999")
 _SEARCH_FRAMES = 400  # at most, until a robot is tracked
-_ROUNDS = 61
 
 
-@dataclass
-class Curves:
-    """Milliseconds by name, at each ``x``; ``limit`` is a line that says how much is allowed."""
+class Curves(NamedTuple):
+    """Milliseconds at each ``x`` of each of the ``names``; ``limit`` is a line that says how much is allowed."""
 
     title: str
     axis: str
     x: Sequence[int]
-    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+    names: tuple[str, ...]
+    milliseconds: list[list[float]]
     limit: tuple[float, str] | None = None
 
 
@@ -50,84 +55,70 @@ def candidates(quick: bool) -> Curves:
 
     Index, spectra and transposed descriptors are made beforehand.
     """
-    import coview_kernels as kernels
-
     sizes = [1_000, 3_000] if quick else [1_000, 3_000, 10_000, 30_000, 100_000]
-    out = Curves("Matching one query at all shifts", "stations", sizes)
     known, queries = town()
     channel = next(iter(known))
     stations, query, found = multiplied(known[channel], max(sizes)), queries[channel], []
     for size in sizes:
-        sides = [made(stations[:size]) for made in (kernels.MatchIndex, Spectral, Turned)]
-        asked = [sides[0].top_k, *sides[1:]]
-        found.append(medians(*(partial(side, query, BEST) for side in asked)))
+        some = stations[:size]
+        sides = kernels.MatchIndex(some).top_k, Spectral(some), Turned(some)
+        found.append(medians(*(partial(side, query, BEST) for side in sides)))
     names = ("coview_stream, pruned", "spectra, BLAS", "one product of turned queries, BLAS")
-    out.milliseconds = dict(zip(names, map(list, zip(*found, strict=True)), strict=True))
-    return out
+    return Curves("Matching one query at all shifts", "stations", sizes, names, found)
 
 
 def points(quick: bool) -> Curves:
     """Frames of 4,096 to 131,072 points: transform, range filter, voxels."""
-    from bench.speed.frame import LIMITS, best_numpy, frame, pose
-    from coview_kernels import VoxelFilter
-
     sizes = [4_096, 16_384] if quick else [4_096, 8_192, 16_384, 32_768, 65_536, 131_072]
-    out = Curves("Taking in a frame", "points of the frame", sizes)
-    both, T, order = np.concatenate([frame(0), frame(1)]), pose(), np.random.default_rng(0)
-    found = []
+    both, order, found = np.concatenate([frame(0), frame(1)]), np.random.default_rng(0), []
     for size in sizes:
         part = both[np.sort(order.choice(len(both), size, replace=False))]
-        found.append(medians(partial(VoxelFilter(*LIMITS), part, T), partial(best_numpy, part, T)))
-    ours, numpy = zip(*found, strict=True)
-    out.milliseconds = {"coview_stream": list(ours), "NumPy, one sort": list(numpy)}
-    return out
+        sides = kernels.VoxelFilter(*LIMITS), best_numpy
+        found.append(medians(*(partial(side, part, STANDING) for side in sides)))
+    return Curves("Taking in a frame", "points of the frame", sizes, ("coview_stream", "NumPy, one sort"), found)
 
 
 def robots(quick: bool) -> Curves:
     """One round of frames, one of each robot in turn, of robots that share a map and its crops in one process."""
     counts = (1, 2) if quick else (1, 2, 4, 8, 16)
-    out = Curves("Tracking several robots on one map", "robots in one process", counts)
-    out.limit = (PERIOD_MS, "period of 10 Hz")
-    fleet, median, worst = _fleet(world(folder(), "town"), max(counts)), [], []
+    fleet, found = _fleet(max(counts)), []
     for count in counts:
-        steps = [robot.step for robot in fleet[:count]]
-        rounds = [medians(lambda: [step() for step in steps], repeat=1, warm_up=0)[0]  # noqa: B023
-                  for _ in range(11 if quick else _ROUNDS)]  # fmt: skip
-        median.append(float(np.median(rounds)))
-        worst.append(float(np.percentile(rounds, 95)))
-    out.milliseconds = {"a round of frames, median": median, "95th percentile": worst}
-    return out
+
+        def turn(few: Sequence[Callable[[], bool]] = fleet[:count]) -> None:
+            for step in few:
+                step()
+
+        rounds = [medians(turn, repeat=1, warm_up=0)[0] for _ in range(11 if quick else 61)]
+        found.append(np.percentile(rounds, [50, 95]).tolist())
+    title, axis = "Tracking several robots on one map", "robots in one process"
+    names = ("a round of frames, median", "95th percentile")
+    return Curves(title, axis, counts, names, found, (PERIOD_MS, "period of 10 Hz"))
 
 
-class _Robot:
-    """A tracked robot, which drives a run to and fro."""
+def _fleet(count: int) -> list[Callable[[], bool]]:
+    """Robots that have found their places along one run, far from each other, and drive it to and fro.
 
-    def __init__(self, localizer: Any, frames: list[Any], start: int) -> None:
-        self._localizer, self._frames, self._tick = localizer, frames, start
-        self._order = [index for index, _ in frames_of(frames, 2 * len(frames) - 2)]
-
-    def step(self) -> bool:
-        """Take in the next frame; tell whether the robot is tracked."""
-        frame = self._frames[self._order[self._tick % len(self._order)]]
-        self._tick += 1
-        fix = self._localizer.step(frame.points, frame.T_odom_body, self._tick * PERIOD_MS / 1e3)
-        return fix.T_map_body is not None
-
-
-def _fleet(there: Path, count: int) -> list[_Robot]:
-    """Robots that have found their places along one run, far from each other."""
-    from coview_stream import Localizer, LocalizerConfig
-    from coview_stream.localization.registration.local_map import LocalMaps
-    from coview_stream.recordings.open_run import open_run
-
-    site, run = base_map(folder(), "town"), open_run(there / "run")
-    frames = [run.read(index) for index in range(len(run))]
-    config = LocalizerConfig()
+    A call takes in a robot's next frame and tells whether it is tracked.
+    """
+    run = open_run(world(folder(), "town") / "run")
+    site, config, frames = base_map(folder(), "town"), LocalizerConfig(), [run.read(k) for k in range(len(run))]
     crops = LocalMaps(site, config.registration.source_range)
-    fleet = [_Robot(Localizer(site, config, crops), frames, k * len(frames) // count) for k in range(count)]
-    for robot in fleet:
-        if not any(robot.step() for _ in range(_SEARCH_FRAMES)):
-            raise RuntimeError("a robot has not found its place; the plot would show searches")
+
+    def robot(start: int) -> Callable[[], bool]:
+        localizer, ticks = Localizer(site, config, crops), enumerate(there_and_back(frames))
+        for _ in range(start):
+            next(ticks)
+
+        def step() -> bool:
+            tick, index = next(ticks)
+            T_odom_body = frames[index].T_odom_body
+            return localizer.step(frames[index].points, T_odom_body, tick * PERIOD_MS / 1e3).T_map_body is not None
+
+        return step
+
+    fleet = [robot(k * len(frames) // count) for k in range(count)]
+    if not all(any(step() for _ in range(_SEARCH_FRAMES)) for step in fleet):
+        raise RuntimeError("a robot has not found its place; the plot would show searches")
     return fleet
 
 
@@ -140,12 +131,10 @@ def draw(shown: Curves, command: str, path: Path) -> None:
     Raises:
         InputError: the picture cannot be written.
     """
-    from coview_kernels import runtime
-    from coview_stream.report.style import TRUTH, figure
-
     with figure(path, figsize=(7.2, 4.6)) as (drawing, axes):
-        for colour, (name, milliseconds) in zip(_COLOURS, shown.milliseconds.items(), strict=False):
-            axes.plot(shown.x, milliseconds, "o-", color=colour, label=name, linewidth=1.8, markersize=5)
+        for k, name in enumerate(shown.names):
+            curve = [found[k] for found in shown.milliseconds]
+            axes.plot(shown.x, curve, "o-", color=_COLOURS[k], label=name, linewidth=1.8, markersize=5)
         if shown.limit:
             value, label = shown.limit
             axes.axhline(value, color=TRUTH, linestyle="--", linewidth=1.0, label=label)
@@ -173,6 +162,6 @@ def rows(asked: Namespace) -> Iterator[Row]:
         shown = PLOTS[name](asked.quick)
         command = f"python -m bench plots {name}{' --quick' * asked.quick}"
         draw(shown, command, asked.out / f"performance_{name}.png")
-        for curve, milliseconds in shown.milliseconds.items():
-            for x, value in zip(shown.x, milliseconds, strict=True):
-                yield informs(f"plots/{name}: {curve}, {x} {shown.axis}", value, "ms")
+        for k, curve in enumerate(shown.names):
+            for x, found in zip(shown.x, shown.milliseconds, strict=True):
+                yield informs(f"plots/{name}: {curve}, {x} {shown.axis}", found[k], "ms")

@@ -1,6 +1,6 @@
-"""Registration beside small_gicp: of a simulated town, or ``python -m bench registration SITE RUN TRUTH``.
+"""Registration beside small_gicp: 10,000 points against a tile of the map.
 
-Places along a drive with a simulated 64-beam lidar in an airborne town map (or a map, run and truth of one's own).
+Places along a drive with a simulated 64-beam lidar in an airborne town map.
 Every way gets the same 10,000 points of the last five metres' frames (thinned to 0.25 m within 50 m), the same tile
 of the map and the same starts: up to 0.5 m off in each direction and 3 degrees of heading ("search"), or a tenth of
 that ("tracking").
@@ -25,24 +25,32 @@ The time is taken with the threads that COVIEW_THREADS grants.
 from __future__ import annotations
 
 import time
-from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator, Sequence
+from argparse import Namespace
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.harness.files import folder
 from bench.harness.rows import Row, against, informs
-from bench.harness.tables import number, table
-from bench.harness.worlds import map_of, prepare, world_name
+from bench.harness.worlds import map_of, prepare
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Pose, inverse, norms, pose_from, rot_z, rotation_angle, transform
+from coview_stream.geometry.transforms import (
+    Pose,
+    inverse,
+    norms,
+    pose_from,
+    rot_z,
+    rotation_angle,
+    to_local,
+    transform,
+)
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
@@ -68,68 +76,48 @@ class Place(NamedTuple):
     target: LocalMap
 
 
-class Trials(NamedTuple):
-    """Milliseconds, metres and degrees (n,) of one way from all starts."""
-
-    ms: Floats
-    metres: Floats
-    degrees: Floats
-
-    def rms(self) -> Floats:
-        """Root mean squares (2,) of both errors, metres and degrees."""
-        return np.asarray(np.sqrt(np.mean(np.square(self[1:]), axis=1)))
-
-    def no_worse_than(self, other: Trials) -> bool:
-        """Whether both errors' root mean squares equal the other's within 5 % or are smaller."""
-        return bool((self.rms() <= EQUAL * other.rms()).all())
-
-    def details(self) -> dict[str, list[float]]:
-        """Root mean square, median and 95th percentile of each, and the share that is right, %."""
-        right = 100 * float(((self.metres < 0.1) & (self.degrees < 0.5)).mean())
-        metres, degrees = self.rms().tolist()
-        cm, deg, ms = (np.percentile(v, [50, 95]).tolist() for v in (self.metres * 100, self.degrees, self.ms))
-        return {"cm": [100 * metres, *cm], "deg": [degrees, *deg], "right": [right], "ms": ms}
-
-
-def options(parser: ArgumentParser) -> None:
-    """Add data of one's own."""
-    parser.add_argument("data", type=Path, nargs="*", help="map, run and truth: SITE.coview RUN TRUTH.tum")
-    parser.add_argument("--places", type=int, default=31, help="along the run (31)")
-
-
 def rows(asked: Namespace) -> Iterator[Row]:
     """Compare with each of small_gicp's ways, from each kind of start."""
-    if asked.data:
-        site, run, truth = asked.data
-    else:
-        config = SimulationConfig("town", "os64", seed=4005, size=200.0, length=60.0)
-        prepare(folder(), config)
-        world = folder() / world_name(config)
-        site, run, truth = map_of(folder(), config), world / "run", world / "truth.tum"
-    yield from compare(list(places(site, run, truth, 11 if asked.quick else asked.places)))
+    found = list(places(11 if asked.quick else 31))
+    warm_up()
+    peers = {id(target): SmallGicp(target) for target in {id(p.target): p.target for p in found}.values()}
+    for place in found:
+        nearest(place.target.grid, place.target.points[:1], 1.0)  # sorts the tile
+    for kind in STARTS:
+        results = _trials(found, kind, peers)
+        took, *error = results["ours"]
+        for way in WAYS:
+            name, (took_them, *error_them) = f"registration/{kind}: {way}", results[way]
+            row = against(name, took, took_them, "ms", LEAST)
+            holds = bool(row.holds) and all(a <= EQUAL * b for a, b in zip(error, error_them, strict=True))
+            yield replace(row, target=f">= {LEAST:g} at equal error", holds=holds)
+            yield against(f"{name}, align only", took, results[f"{way}, align only"][0], "ms", None)
+        for name in ("ours", *WAYS):
+            _, metres, degrees = results[name]
+            yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm")
+            yield informs(f"registration/{kind}: {name}, rms of the rotation's error", degrees, "deg")
 
 
-def places(site: Path, run: Path, truth: Path, count: int) -> Iterator[Place]:
-    """Spread ``count`` places over a run."""
-    base_map = BaseMap.load(site)
+def places(count: int) -> Iterator[Place]:
+    """Spread ``count`` places over a run through a simulated town."""
+    config = SimulationConfig("town", "os64", seed=4005, size=200.0, length=60.0)
+    world = prepare(folder(), config)
+    base_map = BaseMap.load(map_of(folder(), config))
     maps = LocalMaps(base_map, 60.0, crops=1000)
-    stamps, poses = read_tum(truth)
-    frames = list(open_run(run))
+    stamps, poses = read_tum(world / "truth.tum")
+    frames = list(open_run(world / "run"))
     wanted = set(np.linspace(0, len(frames) - 1, count + 1).astype(int)[1:].tolist())
     recent: list[tuple[Floats, Floats32]] = []
-    anchor = frames[0].T_odom_body[:3, 3]  # odometry may begin anywhere; float32 should not
     for index, frame in enumerate(frames):
-        T = pose_from(frame.T_odom_body[:3, :3], frame.T_odom_body[:3, 3] - anchor)
+        T = to_local(frame.T_odom_body, frames[0].T_odom_body[:3, 3])
         recent.append((T[:3, 3], transform(T, frame.points)))
         recent = [r for r in recent if np.linalg.norm(r[0] - T[:3, 3]) < WINDOW]
-        if index not in wanted:
-            continue
-        k = int(np.argmin(np.abs(stamps - frame.stamp)))
-        T_map_body = pose_from(poses[k][:3, :3], poses[k][:3, 3] - base_map.origin)
-        target = maps.around(T_map_body[:3, 3])
-        source = _source(np.concatenate([points for _, points in recent]), T[:3, 3])
-        if target is not None and len(source.points) >= POINTS // 2:
-            yield Place(source, T[:3, 3], T_map_body @ inverse(T), target)
+        if index in wanted:
+            T_map_body = to_local(poses[np.abs(stamps - frame.stamp).argmin()], base_map.origin)
+            target = maps.around(T_map_body[:3, 3])
+            source = _source(np.concatenate([points for _, points in recent]), T[:3, 3])
+            if target is not None and len(source.points) >= POINTS // 2:
+                yield Place(source, T[:3, 3], T_map_body @ inverse(T), target)
 
 
 def _source(points: Floats32, position: Floats) -> RegistrationCloud:
@@ -140,18 +128,17 @@ def _source(points: Floats32, position: Floats) -> RegistrationCloud:
     return RegistrationCloud(thin[some], height[some] > _CLEAR, height[some])
 
 
-def start(place: Place, kind: str, seed: int) -> Pose:
+def _start(place: Place, kind: str, seed: int) -> Pose:
     """Return the truth, moved and turned about the robot."""
     metres, radians = STARTS[kind]
     rng = np.random.default_rng([seed, len(kind)])
     about = transform(place.truth, place.position[None])[0]
     turn = rot_z(radians * rng.choice([-1, 1]) * rng.uniform(0.3, 1))
     shift = metres * rng.uniform(-1, 1, 3) * [1, 1, 0.4]
-    there = pose_from(np.eye(3), about + shift)
-    return there @ pose_from(turn, np.zeros(3)) @ pose_from(np.eye(3), -about) @ place.truth
+    return pose_from(turn, about + shift) @ pose_from(np.eye(3), -about) @ place.truth
 
 
-def error(place: Place, T: Pose | None) -> tuple[float, float]:
+def _error(place: Place, T: Pose | None) -> tuple[float, float]:
     """Metres at the robot and degrees; a failure counts as far off."""
     if T is None:
         return 99.0, 180.0
@@ -159,103 +146,67 @@ def error(place: Place, T: Pose | None) -> tuple[float, float]:
     return float(np.linalg.norm(off)), float(np.degrees(rotation_angle(inverse(place.truth) @ T)))
 
 
-def compare(found: list[Place]) -> Iterator[Row]:
-    """Yield the rows of all places."""
-    warm_up()
-    threads = runtime.workers()
-    peers = [SmallGicp(place.target, threads) for place in {id(p.target): p for p in found}.values()]
-    for peer in peers:
-        nearest(peer.target.grid, peer.target.points[:1], 1.0)  # sorts the tile
-    for kind in STARTS:
-        results = _trials(found, kind, _sides(kind, {id(peer.target): peer for peer in peers}))
-        ours = results["ours"]
-        for way in WAYS:
-            for name, least in ((way, LEAST), (f"{way}, align only", None)):
-                took, took_them = (float(np.median(trials.ms)) for trials in (ours, results[name]))
-                row = against(f"registration/{kind}: {name}", took, took_them, "ms", least)
-                if least is not None:
-                    holds = bool(row.holds) and ours.no_worse_than(results[name])
-                    row = replace(row, target=f">= {LEAST:g} at equal error", holds=holds)
-                yield row
-        for name in ("ours", *WAYS):
-            metres, degrees = results[name].rms()
-            about = {"way": f"{kind}, {name}", "trials": results[name].details()}
-            yield informs(f"registration/{kind}: {name}, rms of the position's error", 100 * metres, "cm", about)
-            yield informs(f"registration/{kind}: {name}, rms of the rotation's error", degrees, "deg")
-
-
-def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Errors and times of all ways: root mean square, median, 95th percentile."""
-    head = ("way", "cm rms", "p50", "p95", "deg rms", "p50", "p95", "right %", "ms p50", "p95")
-    lines = []
-    for each in (row.details for row in rows if row.details):
-        cm, deg, right, ms = (each["trials"][key] for key in ("cm", "deg", "right", "ms"))
-        texts = [(cm, 2), (deg, 3), (right, 0), (ms, 1)]
-        lines.append([each["way"], *(number(value, digits) for part, digits in texts for value in part)])
-    return {"errors": table(head, lines)} if lines else {}
-
-
 Way = Callable[[Place, Pose], tuple[float, Pose | None]]
 
 
-def _sides(kind: str, peers: dict[int, SmallGicp]) -> dict[str, Way]:
-    def ours(place: Place, begin: Pose) -> tuple[float, Pose | None]:
-        clock, config = time.perf_counter(), RegistrationConfig()
-        about, target = place.position, place.target
-        answer = register(place.source.every(NTH), begin, target, config, COARSE[kind], centre=about)
-        if answer is not None:
-            answer = register(place.source, answer.T_map_source, target, config, FINE, centre=about)
-        return time.perf_counter() - clock, None if answer is None else answer.T_map_source
+def _trials(found: list[Place], kind: str, peers: dict[int, SmallGicp]) -> dict[str, tuple[float, float, float]]:
+    """Median milliseconds and root mean squares of metres and degrees of every way, two starts at each place."""
 
-    def theirs(way: str, whole: bool) -> Way:
-        return lambda place, begin: peers[id(place.target)].align(way, place.source.points, begin, whole)
+    def theirs(way: str, whole: bool, place: Place, begin: Pose) -> tuple[float, Pose]:
+        return peers[id(place.target)].align(way, place.source.points, begin, whole)
 
-    sides: dict[str, Way] = {"ours": ours}
+    sides: dict[str, Way] = {"ours": partial(_ours, kind)}
     for way in WAYS:
-        sides |= {way: theirs(way, True), f"{way}, align only": theirs(way, False)}
-    return sides
-
-
-def _trials(found: list[Place], kind: str, sides: dict[str, Way]) -> dict[str, Trials]:
+        sides |= {way: partial(theirs, way, True), f"{way}, align only": partial(theirs, way, False)}
     values: dict[str, list[tuple[float, float, float]]] = {name: [] for name in sides}
     order = list(sides)
     for name in order:
-        sides[name](found[0], start(found[0], kind, 0))
-    for seed, place in enumerate(found):
-        for again in range(2):
-            begin = start(place, kind, 2 * seed + again)
-            for name in order:
-                seconds, T = sides[name](place, begin)
-                values[name].append((1e3 * seconds, *error(place, T)))
-            order.reverse()
-    return {name: Trials(*np.array(v).T) for name, v in values.items()}
+        sides[name](found[0], _start(found[0], kind, 0))
+    for seed in range(2 * len(found)):
+        place = found[seed // 2]
+        begin = _start(place, kind, seed)
+        for name in order:
+            seconds, T = sides[name](place, begin)
+            values[name].append((1e3 * seconds, *_error(place, T)))
+        order.reverse()
+    ms = {name: float(np.median([each[0] for each in v])) for name, v in values.items()}
+    rms = {name: np.sqrt(np.mean(np.square(v), axis=0)).tolist()[1:] for name, v in values.items()}
+    return {name: (ms[name], *rms[name]) for name in sides}
+
+
+def _ours(kind: str, place: Place, begin: Pose) -> tuple[float, Pose | None]:
+    clock, config = time.perf_counter(), RegistrationConfig()
+    align = partial(register, target=place.target, config=config, centre=place.position)
+    answer = align(place.source.every(NTH), begin, scales=COARSE[kind])
+    if answer is not None:
+        answer = align(place.source, answer.T_map_source, scales=FINE)
+    return time.perf_counter() - clock, None if answer is None else answer.T_map_source
 
 
 class SmallGicp:
     """small_gicp with a tile prepared."""
 
-    def __init__(self, target: LocalMap, threads: int) -> None:
-        import small_gicp
+    def __init__(self, target: LocalMap) -> None:
+        import small_gicp  # of the extra peers
 
-        self.target, self._threads = target, threads
         self._library: Any = small_gicp
-        self._map, self._tree = small_gicp.preprocess_points(
-            target.points.astype(np.float64), downsampling_resolution=0.05, num_threads=threads
-        )
+        self._threads = {"num_threads": runtime.workers()}
+        points = target.points.astype(np.float64)
+        self._map, self._tree = small_gicp.preprocess_points(points, downsampling_resolution=0.05, **self._threads)
         self._voxels = small_gicp.GaussianVoxelMap(1.0)
         self._voxels.insert(self._map)
 
-    def align(self, way: str, points: Floats32, begin: Pose, whole: bool) -> tuple[float, Pose | None]:
+    def align(self, way: str, points: Floats32, begin: Pose, whole: bool) -> tuple[float, Pose]:
         """Seconds, with the source's covariances or without, and the pose."""
         cloud = points.astype(np.float64)
         clock = time.perf_counter()
-        source, _ = self._library.preprocess_points(cloud, downsampling_resolution=0.5, num_threads=self._threads)
+        source, _ = self._library.preprocess_points(cloud, downsampling_resolution=0.5, **self._threads)
         if not whole:
             clock = time.perf_counter()
-        within = 2.0 if way == "VGICP" else 1.0
-        about = {"num_threads": self._threads, "max_correspondence_distance": within}
         if way == "VGICP":
-            answer = self._library.align(self._voxels, source, begin, about)
+            answer = self._library.align(self._voxels, source, begin, max_correspondence_distance=2.0, **self._threads)
         else:
-            answer = self._library.align(self._map, source, self._tree, begin, about)
+            answer = self._library.align(
+                self._map, source, self._tree, begin, max_correspondence_distance=1.0, **self._threads
+            )
         return time.perf_counter() - clock, np.array(answer.T_target_source)

@@ -7,92 +7,58 @@ that are part of another are indented below it. The clocks cost some microsecond
 
 from __future__ import annotations
 
-import functools
-import time
 from argparse import ArgumentParser, Namespace
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
+from bench.harness.clock import Clock
 from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
 from bench.speed.engine import drive, opened
+from coview_stream import Localizer
+from coview_stream.localization import localizer
+from coview_stream.localization.registration import local_map, verification
+from coview_stream.localization.registration import register as registration
+from coview_stream.localization.tracking import tracker
 
 FRAMES = 1500
 _SETTLED = 300  # frames before the numbers count
 
-Times = dict[str, float]
+STAGES = (
+    ("step", Localizer, "step"),
+    ("take the frame in, check it", localizer, "validate_cloud"),
+    ("one point per voxel", localizer.kernels.VoxelFilter, "__call__"),
+    ("match to map", localizer.Tracker, "match_to_map"),
+    ("  crop of the map", local_map.LocalMaps, "around"),
+    ("  points to register", tracker, "prepare_scan"),
+    ("  registration", registration, "register"),
+    ("  rays of the newest frame", registration.RangeImage, "of"),
+    ("  verification", registration, "verify"),
+    ("    nearest map points", verification.kernels, "nearest"),
+    ("    rays against the map", verification, "free_space"),
+)
+"""Name in the table, and where the function is looked up."""
 
 
-def stages() -> list[tuple[str, Any, str]]:
-    """Return what is timed: name in the table, and where the function is looked up."""
-    from coview_stream.localization import localizer
-    from coview_stream.localization.registration import local_map, verification
-    from coview_stream.localization.registration import register as registration
-    from coview_stream.localization.tracking import tracker
-
-    return [
-        ("take the frame in, check it", localizer, "validate_cloud"),
-        ("remember its points, thinned", localizer.KeyframeBuffer, "voxelize"),
-        ("match to map", localizer.Tracker, "match_to_map"),
-        ("  crop of the map", local_map.LocalMaps, "around"),
-        ("  points to register", tracker, "prepare_scan"),
-        ("  registration", registration, "register"),
-        ("  rays of the newest frame", registration.RangeImage, "of"),
-        ("  verification", registration, "verify"),
-        ("    nearest map points", verification.kernels, "nearest"),
-        ("    rays against the map", verification, "free_space"),
-    ]
-
-
-@contextmanager
-def clocks(known: Sequence[tuple[str, Any, str]]) -> Iterator[Times]:
-    """Add up the seconds that each stage takes, until the block ends; the dictionary may be cleared at any time."""
-    spent: Times = defaultdict(float)
-    before = [vars(owner)[name] for _, owner, name in known]
-    try:
-        for label, owner, name in known:
-            timed = _timed(getattr(owner, name), label, spent)
-            fixed = isinstance(vars(owner)[name], classmethod)
-            setattr(owner, name, staticmethod(timed) if fixed else timed)
-        yield spent
-    finally:
-        for (_, owner, name), original in zip(known, before, strict=True):
-            setattr(owner, name, original)
-
-
-def _timed(stage: Callable[..., Any], label: str, spent: Times) -> Callable[..., Any]:
-    @functools.wraps(stage)
-    def run(*arguments: Any, **options: Any) -> Any:
-        begin = time.perf_counter()
-        try:
-            return stage(*arguments, **options)
-        finally:
-            spent[label] += time.perf_counter() - begin
-
-    return run
-
-
-def measured(frames: int) -> list[Times]:
-    """Seconds of every stage and of the ``step``, frame by frame."""
-    from coview_stream import Localizer
-
+def measured(frames: int) -> list[dict[str, float]]:
+    """Seconds of every stage, frame by frame."""
     base_map, run, truth = opened(36.0)
-    out: list[Times] = []
-    with clocks([*stages(), ("step", Localizer, "step")]) as spent:
+    clock, out = Clock(), []
+    with clock.around(STAGES):
         timed = Localizer.step
 
         def noted(*arguments: Any) -> Any:
-            spent.clear()
+            clock.seconds.clear()
             fix = timed(*arguments)
-            out.append(dict(spent))
+            out.append(dict(clock.seconds))
             return fix
 
-        Localizer.step = noted  # type: ignore[method-assign]  # clocks put the original back
-        drive(base_map, run, truth, frames)
+        with patch.object(Localizer, "step", noted):
+            drive(base_map, run, truth, frames)
     return out[_SETTLED:]
 
 
@@ -104,11 +70,9 @@ def options(parser: ArgumentParser) -> None:
 def rows(asked: Namespace) -> Iterator[Row]:
     """Medians of the stages, of both kinds of frames."""
     frames = measured(600 if asked.quick else max(asked.frames, _SETTLED + 1))
-    for title, chosen in (
-        ("frames that register", [each for each in frames if "match to map" in each]),
-        ("all others", [each for each in frames if "match to map" not in each]),
-    ):
-        for label in ["step", *(label for label, _, _ in stages())]:
+    for title, registers in (("frames that register", True), ("all others", False)):
+        chosen = [frame for frame in frames if ("match to map" in frame) is registers]
+        for label, _, _ in STAGES:
             values = 1e3 * np.array([frame.get(label, 0.0) for frame in chosen])
             if values.any():
                 p50, p95 = np.percentile(values, [50, 95])
