@@ -1,4 +1,4 @@
-"""How a tracked drive is scored: pure functions of what was said frame by frame and of the truth."""
+"""Scores of a tracked drive: pure functions of what was said frame by frame and of the truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FALSE_METRES, FALSE_DEGREES = 1.0, 5.0  # a pose further from the truth than eit
 DOUBTFUL_METRES = 0.5
 """One further than this is counted beside them."""
 
-MOST_HELD = 0.5  # seconds that a false pose counts at most: until the next frame, or so long
+MAX_HELD = 0.5  # seconds that a false pose counts at most: until the next frame, or so long
 
 
 @dataclass(frozen=True)
@@ -79,19 +79,18 @@ def errors(told: Told, truth: Floats) -> Errors:
 
 
 def held(stamps: Floats) -> Floats:
-    """(N,) seconds for which each frame's answer counts: until the next frame, at most :data:`MOST_HELD`."""
+    """(N,) seconds for which each frame's answer counts: until the next frame, at most :data:`MAX_HELD`."""
     if len(stamps) < 2:
         return np.zeros(len(stamps))
     gaps = np.diff(stamps)
-    return np.asarray(np.minimum(np.r_[gaps, np.median(gaps)], MOST_HELD))
+    return np.asarray(np.minimum(np.r_[gaps, np.median(gaps)], MAX_HELD))
 
 
 def recovery(right: Bools, stamps: Floats, driven: Floats, end: int) -> tuple[float, float] | None:
     """Seconds and metres driven from the frame ``end`` to the first right pose; None if there is none."""
-    again = np.flatnonzero(right[end:])
-    if not len(again):
+    if not right[end:].any():
         return None
-    k = end + int(again[0])
+    k = end + int(right[end:].argmax())
     return float(stamps[k] - stamps[end]), float(driven[k] - driven[end])
 
 
@@ -101,17 +100,8 @@ def losses(states: Sequence[str], reasons: Sequence[str]) -> list[str]:
     return [reason for before, state, reason in pairs if state == "LOST" != before]
 
 
-def transitions(told: Told) -> list[tuple[float, str, str]]:
-    """(seconds since the first frame, new state, reason) of every change of state."""
-    out = []
-    for k, state in enumerate(told.states):
-        if not k or state != told.states[k - 1]:
-            out.append((round(float(told.stamps[k] - told.stamps[0]), 2), state, told.reasons[k]))
-    return out
-
-
 def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str, int, int]]) -> dict[str, Any]:
-    """All figures of one drive but coverage; metres, degrees, seconds, milliseconds.
+    """All figures of one drive but coverage; metres, degrees, seconds, milliseconds; None where there is no pose.
 
     Args:
         told: what was said.
@@ -122,55 +112,38 @@ def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str,
     error, known = errors(told, truth), told.tracking
     right, hold = error.right, held(told.stamps)
     false = known & ~right
-    first = int(np.argmax(known)) if known.any() else None
     before = np.r_[False, known[:-1]]  # stepping from a pose searches no map
-    lost = losses(told.states, told.reasons)
+    reasons = losses(told.states, told.reasons)
+    happened = []
+    for what, begin, end in events:
+        back = recovery(right, told.stamps, driven, end)
+        until = len(right) if back is None else end + int(right[end:].argmax()) + 1
+        during = float(hold[begin:until][false[begin:until]].sum())
+        seconds, metres = back or (None, None)
+        happened.append({"what": what, "recovery_s": seconds, "recovery_m": metres, "false_s": during})
+    steps = np.percentile(told.seconds[before] * 1e3, [50, 99]) if before.any() else (None, None)
     return {
-        "frames": len(known),
         "driven_m": float(driven[-1]),
-        "share_right": float(right.mean()),
-        "share_right_after_first": None if first is None else float(right[first:].mean()),
-        "first_fix_m": None if first is None else float(driven[first]),
-        "metres": _summary(error.metres[known]),
-        "degrees": _summary(error.degrees[known]),
+        "right_percent": 100 * float(right.mean()),
+        "first_fix_m": float(driven[known.argmax()]) if known.any() else None,
+        "rmse_m": _rms(error.metres[known]),
+        "max_m": _max(error.metres[known]),
+        "rmse_deg": _rms(error.degrees[known]),
+        "max_deg": _max(error.degrees[known]),
         "false_frames": int(false.sum()),
         "false_s": float(hold[false].sum()),
         "doubtful_frames": int((error.metres[known] > DOUBTFUL_METRES).sum()),
-        "losses": len(lost),
-        "reasons": lost,
-        "transitions": transitions(told),
-        "events": [_event(what, begin, end, right, false, told.stamps, driven, hold) for what, begin, end in events],
-        "step_ms": _percentiles(told.seconds * 1e3),
-        "tracking_step_ms": _percentiles(told.seconds[before] * 1e3),
-        "skipped": sum(state == "SKIPPED" for state in told.states),
+        "losses": len(reasons),
+        "reasons": reasons,
+        "events": happened,
+        "p50_ms": steps[0],
+        "p99_ms": steps[1],
     }
 
 
-def _event(
-    what: str, begin: int, end: int, right: Bools, false: Bools, stamps: Floats, driven: Floats, hold: Floats
-) -> dict[str, Any]:
-    back = recovery(right, stamps, driven, end)
-    until = len(right) if back is None else end + int(np.argmax(right[end:])) + 1
-    during = slice(begin, until)
-    return {
-        "what": what,
-        "begin_m": float(driven[begin]),
-        "recovery_s": None if back is None else back[0],
-        "recovery_m": None if back is None else back[1],
-        "false_s": float(hold[during][false[during]].sum()),
-    }
+def _rms(values: Floats) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
-def _summary(values: Floats) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    p50, p95, p99 = np.percentile(values, [50, 95, 99])
-    rmse = float(np.sqrt(np.mean(values**2)))
-    return {"rmse": rmse, "p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
-
-
-def _percentiles(values: Floats) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    p50, p99 = np.percentile(values, [50, 99])
-    return {"p50": float(p50), "p99": float(p99)}
+def _max(values: Floats) -> float | None:
+    return float(values.max()) if len(values) else None

@@ -6,7 +6,8 @@ scale or stands still while the robot is carried.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,19 +16,20 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z, yaw_of
 from coview_stream.report.evaluation import driven
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
+from coview_stream.sim.sensors import FRAME_PERIOD
 
-PERIOD = 0.1
 SEGMENT = 100.0  # metres over which drift is measured
+EVENT_AT = 90.0  # metres
 CLEAR, CLOTH, DUST = 0, 1, 2
 """What lies over the sensor: nothing; a cloth at 0.5 to 0.9 m; so much that only 20 returns of a frame are left."""
 
 _DUST_POINTS = 20
-_LEAST_GAP = 20.0  # metres in the gap that count as an event
+_MIN_GAP = 20.0  # metres in the gap that count as an event
+_COVERED_S = 30.0
 _FIRST_STAMP = 1000.0
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """What happened, from the frame ``begin`` on; at the frame ``end`` it is over, and recovery begins."""
 
     what: str
@@ -55,7 +57,7 @@ class Drive:
     odometry: Floats
     driven: Floats
     cover: Ints
-    events: tuple[Event, ...] = field(default=())
+    events: tuple[Event, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -66,15 +68,22 @@ class Drive:
 
     def until(self, metres: float) -> Drive:
         """Return the drive's first ``metres``."""
-        k = self.at(metres) + 1
-        parts = (self.stamps[:k], self.truth[:k], self.odometry[:k], self.driven[:k], self.cover[:k])
-        return Drive(self.frames[:k], *parts, events=self.events)
+        return self.picked(np.arange(self.at(metres) + 1))
+
+    def picked(self, rows: Ints) -> Drive:
+        """Return some of the frames, in the time that as many take."""
+        arrays = {name: value[rows] for name, value in vars(self).items() if name != "events"}
+        return replace(self, **arrays | {"stamps": self.stamps[: len(rows)]})
+
+    def after(self, what: str, begin: int, end: int, **changes: Floats | Ints) -> Drive:
+        """Return the drive on which that happened, with the arrays that it changed."""
+        return replace(self, **changes, events=(*self.events, Event(what, begin, end)))
 
 
 def start(truth: Floats, drift: float, seed: int) -> Drive:
     """Drive as recorded: (N, 4, 4) map <- body, with odometry that drifts by that share of the distance."""
     count = len(truth)
-    stamps = _FIRST_STAMP + PERIOD * np.arange(count, dtype=np.float64)
+    stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(count, dtype=np.float64)
     odometry = drifting(truth, drift, seed)
     return Drive(np.arange(count), stamps, truth, odometry, driven(truth), np.zeros(count, dtype=np.int64))
 
@@ -102,10 +111,8 @@ def drifting(truth: Floats, share: float, seed: int) -> Floats:
     """
     usual, factor = OdometryConfig(), share / 0.015
     for _ in range(5):
-        config = replace(
-            usual, yaw_walk=usual.yaw_walk * factor, scale_error=0.0, position_walk=usual.position_walk * factor
-        )
-        walked = drifting_odometry(truth, config, np.random.default_rng([seed, 41]))
+        walks = {"yaw_walk": usual.yaw_walk * factor, "position_walk": usual.position_walk * factor}
+        walked = drifting_odometry(truth, replace(usual, scale_error=0.0, **walks), np.random.default_rng([seed, 41]))
         odometry = rescaled(walked, 1.0 + (-1) ** seed * usual.scale_error * factor)
         factor *= share / drift_share(truth, odometry)
     return odometry
@@ -126,20 +133,20 @@ def rejoined(odometry: Floats, at: int, T_odom_body: Pose) -> Floats:
     return np.concatenate([odometry[:at], joint @ odometry[at:]])
 
 
-def kidnapped(drive: Drive, at: int, to: int) -> Drive:
-    """From the frame ``at`` on the robot is where it was at ``to``; by its odometry it stood still meanwhile."""
-    pick = np.r_[0:at, to : len(drive)]
-    odometry = rejoined(drive.odometry[pick], at, drive.odometry[at - 1])
-    way = np.concatenate([drive.driven[:at], drive.driven[to:] - drive.driven[to] + drive.driven[at - 1]])
-    count = len(pick)
-    return Drive(
-        drive.frames[pick], drive.stamps[:count], drive.truth[pick], odometry, way, drive.cover[pick],
-        (*drive.events, Event("kidnapped", at, at)),
-    )  # fmt: skip
+def kidnapped(drive: Drive, to: float = 250.0, until: float = 370.0) -> Drive:
+    """Put the robot down where it is after ``to`` metres; by its odometry it stood still meanwhile."""
+    drive = drive.until(until)
+    at, there = drive.at(EVENT_AT), drive.at(to)
+    rows = np.r_[0:at, there : len(drive)]
+    way = np.r_[drive.driven[:at], drive.driven[there:] - drive.driven[there] + drive.driven[at - 1]]
+    odometry = rejoined(drive.odometry[rows], at, drive.odometry[at - 1])
+    return drive.picked(rows).after("kidnapped", at, at, odometry=odometry, driven=way)
 
 
-def carried(drive: Drive, at: int, to: int) -> Drive:
-    """From ``at`` to ``to`` the robot is carried with open eyes: odometry stands still, only its tilt goes on."""
+def carried(drive: Drive) -> Drive:
+    """Carry the robot 40 m with open eyes: odometry stands still, only its tilt goes on."""
+    drive = drive.until(EVENT_AT + 160.0)
+    at, to = drive.at(EVENT_AT), drive.at(EVENT_AT + 40.0)
     odometry = rejoined(drive.odometry, to, drive.odometry[at - 1])
     for k in range(at, to):
         level = rot_z(yaw_of(odometry[at - 1]) - yaw_of(drive.odometry[k]))
@@ -147,44 +154,47 @@ def carried(drive: Drive, at: int, to: int) -> Drive:
     way = drive.driven.copy()
     way[at:to] = way[at - 1]
     way[to:] -= drive.driven[to] - way[at - 1]
-    return replace(drive, odometry=odometry, driven=way, events=(*drive.events, Event("carried", at, to)))
+    return drive.after("carried", at, to, odometry=odometry, driven=way)
 
 
-def covered(drive: Drive, begin: int, end: int, cover: int) -> Drive:
-    """Something lies over the sensor from ``begin`` to ``end``; the robot drives on."""
+def covered(drive: Drive, cover: int) -> Drive:
+    """Lay something over the sensor for half a minute; the robot drives on."""
+    begin = drive.at(EVENT_AT)
+    end = min(begin + round(_COVERED_S / FRAME_PERIOD), len(drive) - 1)
     over = drive.cover.copy()
     over[begin:end] = cover
-    return replace(drive, cover=over, events=(*drive.events, Event("covered", begin, end)))
+    return drive.after("covered", begin, end, cover=over).until(float(drive.driven[end]) + 100.0)
 
 
-def jumped(drive: Drive, at: int, metres: tuple[float, float], degrees: float) -> Drive:
-    """Odometry jumps between two frames: ``metres`` forward and to the left, and a turn."""
-    step = pose_from(rot_z(np.radians(degrees)), [*metres, 0.0])
+def jumped(drive: Drive) -> Drive:
+    """Let odometry jump between two frames: 3 m forward, 1 m to the left, and a turn of 15 degrees."""
+    drive = drive.until(EVENT_AT + 120.0)
+    at, step = drive.at(EVENT_AT), pose_from(rot_z(np.radians(15.0)), [3.0, 1.0, 0.0])
     odometry = rejoined(drive.odometry, at, drive.odometry[at] @ step)
-    return replace(drive, odometry=odometry, events=(*drive.events, Event("odometry jump", at, at)))
+    return drive.after("odometry jump", at, at, odometry=odometry)
 
 
-def restarted(drive: Drive, at: int) -> Drive:
-    """Odometry starts again at its zero."""
-    odometry = rejoined(drive.odometry, at, np.eye(4))
-    return replace(drive, odometry=odometry, events=(*drive.events, Event("odometry reset", at, at)))
+def restarted(drive: Drive) -> Drive:
+    """Let odometry start again at its zero."""
+    drive = drive.until(EVENT_AT + 120.0)
+    at = drive.at(EVENT_AT)
+    return drive.after("odometry reset", at, at, odometry=rejoined(drive.odometry, at, np.eye(4)))
 
 
-def scaled(drive: Drive, factor: float) -> Drive:
-    """Odometry drives ``factor`` times as far as the robot."""
-    return replace(drive, odometry=rescaled(drive.odometry, factor))
+def scaled(drive: Drive) -> Drive:
+    """Let odometry drive 5 % too far."""
+    drive = drive.until(300.0)
+    return replace(drive, odometry=rescaled(drive.odometry, 1.05))
 
 
 def over_the_gap(drive: Drive) -> Drive:
     """Mark where the drive leads through the gap of the map (see :func:`bench.tracking.worlds.in_gap`)."""
     inside = np.r_[False, in_gap(drive.truth, drive.truth[:, :3, 3]), False].astype(int)
-    begins, ends = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1)
-    events = [
-        Event("map gap", int(begin), int(end))
-        for begin, end in zip(begins, ends, strict=True)
-        if end < len(drive) and drive.driven[end] - drive.driven[begin] >= _LEAST_GAP
-    ]
-    return replace(drive, events=(*drive.events, *events))
+    marked = drive
+    for begin, end in zip(np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1), strict=True):
+        if end < len(drive) and drive.driven[end] - drive.driven[begin] >= _MIN_GAP:
+            marked = marked.after("map gap", int(begin), int(end))
+    return marked.until(340.0)
 
 
 def seen(points: Points, cover: int, frame: int) -> Points:

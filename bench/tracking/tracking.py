@@ -25,22 +25,26 @@ from bench.harness.files import code_line, fingerprint, folder, remembered
 from bench.harness.rows import Row, informs, judged
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Told, errors, score
-from bench.tracking.coverage import WITHIN, coverage_table, draw, honest, pooled, shares, spread
+from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, draw, honest, pooled, shares, spread
 from bench.tracking.drives import Drive, drift_share, seen
 from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
 from bench.tracking.worlds import Recorded, map_of, open_world
 from coview_stream.errors import InputError
 
-MOST_METRES, MOST_DEGREES, MOST_RECOVERY = 0.12, 0.35, 20.0
+MAX_METRES, MAX_DEGREES, MAX_RECOVERY = 0.12, 0.35, 20.0
 """The targets: root mean squares over the plain drives, and metres driven after an event."""
 
 _JUDGED = ("x", "y", "z", "yaw", "x,y", "x,y,z")
 """What the coverage target is about; roll, pitch and the whole pose are told."""
 
-_HEAD = (
-    "scenario", "drift %", "driven m", "right %", "first m", "rmse m", "max m", "rmse deg", "max deg", "false",
-    "false s", "> 0.5 m", "lost", "back m", "back s", "p50 ms", "p99 ms",
-)  # fmt: skip
+_COLUMNS = {
+    "drift %": ("drift_percent", 1), "driven m": ("driven_m", 0), "right %": ("right_percent", 1),
+    "first m": ("first_fix_m", 1), "rmse m": ("rmse_m", 3), "max m": ("max_m", 2), "rmse deg": ("rmse_deg", 2),
+    "max deg": ("max_deg", 1), "false": ("false_frames", 0), "false s": ("false_s", 1),
+    "> 0.5 m": ("doubtful_frames", 0), "lost": ("losses", 0), "back m": ("recovery_m", 1), "back s": ("recovery_s", 1),
+    "p50 ms": ("p50_ms", 1), "p99 ms": ("p99_ms", 0),
+}  # fmt: skip
+"""Of the table: a drive's figure, or one of its worst event, and its decimals."""
 
 Figures = dict[str, Any]
 
@@ -63,7 +67,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
         figures, squared = measure(folder(), scenario)
         drives.append(figures)
         parts.append(squared)
-        yield informs(f"tracking/{scenario.name}", _of(figures, "metres", "rmse"), "m", figures)
+        yield informs(
+            f"tracking/{scenario.name}", np.nan if figures["rmse_m"] is None else figures["rmse_m"], "m", figures
+        )
     together = pooled(parts)
     found = shares(together)
     yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
@@ -75,20 +81,22 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """Drives, coverage, and what was lost and found again."""
-    drives = [row.details for row in rows if "metres" in row.details]
+    drives = [row.details for row in rows if "rmse_m" in row.details]
     found = next(row.details["coverage"] for row in rows if list(row.details) == ["coverage"])
-    shown = {"": table(_HEAD, [cells(figures) for figures in drives]), "coverage": coverage_table(found)}
+    shown = {
+        "": table(("scenario", *_COLUMNS), [cells(figures) for figures in drives]),
+        "coverage": coverage_table(found),
+    }
     return shown | {"events": "\n".join([*_events(drives), code_line()])}
 
 
-def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Any]:
+def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
     """Return the figures of a scenario, and the squared distances that its coverage is made of."""
     told, drive = told_of(folder, scenario)
-    figures = score(told, drive.truth, drive.driven, [(e.what, e.begin, e.end) for e in drive.events])
+    figures = score(told, drive.truth, drive.driven, drive.events)
     parts = spread(told, errors(told, drive.truth))
     drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
-    about = {"name": scenario.name, "plain": scenario.plain, "drift": drift}
-    return figures | about | {"coverage": shares(pooled([parts]))}, parts
+    return {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift} | figures, parts
 
 
 def told_of(folder: Path, scenario: Scenario) -> tuple[Told, Drive]:
@@ -99,7 +107,7 @@ def told_of(folder: Path, scenario: Scenario) -> tuple[Told, Drive]:
     recorded = open_world(folder, scenario.world)
     drive = scenario.drive(recorded.truth)
     site = map_of(folder, scenario.world, scenario.variant)
-    out = folder / "tracking-results" / scenario.name.replace("/", "-")
+    out = folder / "tracking-results" / f"{scenario.name.replace('/', '-')}.json"
     arrays = out.with_suffix(".npz")
     spec = {"code": fingerprint(), "bench": fingerprint("bench/tracking"), "scenario": repr(scenario.world)}
 
@@ -109,7 +117,7 @@ def told_of(folder: Path, scenario: Scenario) -> tuple[Told, Drive]:
         np.savez_compressed(arrays, **vars(told))
         return {"frames": len(drive)}
 
-    remembered(out.with_suffix(".json"), spec, work)
+    remembered(out, spec, work)
     with np.load(arrays) as kept:
         fields = dict(kept)
     texts = {name: fields.pop(name).tolist() for name in ("states", "reasons")}
@@ -144,26 +152,16 @@ def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
     return Told(drive.stamps, states, reasons, poses, covariances, seconds)
 
 
-def _of(figures: Figures, *keys: str) -> float:
-    """One figure below another; NaN where there is none."""
-    for key in keys:
-        figures = (figures or {}).get(key)  # type: ignore[assignment]
-    return np.nan if figures is None else float(figures)  # type: ignore[arg-type]
-
-
 def cells(figures: Figures) -> list[str]:
     """One line of the table; of several events the worst."""
-    back = [[event[key] for event in figures["events"]] for key in ("recovery_m", "recovery_s")]
-    first = figures["first_fix_m"]
-    return [
-        figures["name"], number(100 * figures["drift"], 1), f"{figures['driven_m']:.0f}",
-        number(100 * figures["share_right"], 1), number(first, 1), number(_of(figures, "metres", "rmse"), 3),
-        number(_of(figures, "metres", "max"), 2), number(_of(figures, "degrees", "rmse"), 2),
-        number(_of(figures, "degrees", "max"), 1), str(figures["false_frames"]), number(figures["false_s"], 1),
-        str(figures["doubtful_frames"]), str(figures["losses"]),
-        *("" if not part else "never" if None in part else f"{max(part):.1f}" for part in back),
-        number(_of(figures, "tracking_step_ms", "p50"), 1), number(_of(figures, "tracking_step_ms", "p99"), 0),
-    ]  # fmt: skip
+    line = [figures["name"]]
+    for key, digits in _COLUMNS.values():
+        if key in figures:
+            line.append(number(figures[key], digits))
+        else:
+            back = [event[key] for event in figures["events"]]
+            line.append("" if not back else "never" if None in back else number(max(back), digits))
+    return line
 
 
 def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick: bool = False) -> Iterator[Row]:
@@ -172,9 +170,9 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
     ``quick`` drives are too short to be found again on, and too few for a coverage.
     """
     plain = [figures for figures in drives if figures["plain"]]
-    for unit, key, most in (("m", "metres", MOST_METRES), ("deg", "degrees", MOST_DEGREES)):
+    for unit, key, most in (("m", "rmse_m", MAX_METRES), ("deg", "rmse_deg", MAX_DEGREES)):
         if plain:
-            each = np.nan_to_num([_of(figures, key, "rmse") for figures in plain], nan=np.inf)
+            each = [np.inf if figures[key] is None else figures[key] for figures in plain]
             mean = float(np.sqrt(np.mean(np.square(each))))
             said = f"{mean:.3f} (worst drive {max(each):.3f})"
             yield judged(f"tracking/rmse of plain drives, {unit}", said, f"<= {most}", mean <= most, mean)
@@ -184,10 +182,10 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
         return
     if events := [event for figures in drives for event in figures["events"]]:
         metres = [np.inf if e["recovery_m"] is None else e["recovery_m"] for e in events]
-        late = sum(m > MOST_RECOVERY for m in metres)
+        late = sum(m > MAX_RECOVERY for m in metres)
         said = f"{np.median(metres):.1f} median, {max(metres):.1f} worst; {late} of {len(metres)} later"
-        yield judged("tracking/recovery, m driven", said, f"<= {MOST_RECOVERY:.0f}", not late, max(metres))
-    for part in ("first minute", "later"):
+        yield judged("tracking/recovery, m driven", said, f"<= {MAX_RECOVERY:.0f}", not late, max(metres))
+    for part in PARTS:
         if found[part]["yaw"]["frames"]:
             wrong = [name for name in _JUDGED if not honest(found[part][name])]
             said = f"out of it: {'; '.join(wrong)}" if wrong else "all within"
@@ -196,14 +194,12 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
 
 def _events(drives: Sequence[Figures]) -> list[str]:
     """List the losses by reason, and what each event came to."""
-    lines = [
-        f"- {figures['name']}: lost {n} x, {reason}"
-        for figures in drives
-        for reason, n in Counter(figures["reasons"]).most_common()
-    ]
+    lines, ends = [], []
     for figures in drives:
+        name = figures["name"]
+        lines += [f"- {name}: lost {n} x, {reason}" for reason, n in Counter(figures["reasons"]).most_common()]
         for event in figures["events"]:
             m, s = event["recovery_m"], event["recovery_s"]
             back = "never right again" if m is None else f"right after {m:.1f} m, {s:.1f} s"
-            lines.append(f"- {figures['name']}: {event['what']}: {event['false_s']:.1f} s false, {back}")
-    return lines
+            ends.append(f"- {name}: {event['what']}: {event['false_s']:.1f} s false, {back}")
+    return lines + ends

@@ -6,11 +6,11 @@ in a scenario is made of those frames. Frames are kept as int16 steps of 4 mm, a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 from unittest.mock import patch
 
 import numpy as np
@@ -18,6 +18,8 @@ import numpy.typing as npt
 
 from bench.harness.files import fingerprint, remembered_seconds
 from bench.harness.worlds import MAPPER, SIMULATOR
+from coview_stream import BaseMap
+from coview_stream.clouds import write_cloud
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.config import MapConfig
 from coview_stream.geometry.arrays import Bools, Floats, Indices, Ints
@@ -37,8 +39,7 @@ _TREES, _UNDERGROWTH = 0.012, 0.008  # per square metre, of a sparse forest
 _SELF = "bench/tracking/worlds.py"
 
 
-@dataclass(frozen=True)
-class World:
+class World(NamedTuple):
     """A place and a drive of ``length`` metres at ``speed`` m/s, and how far the odometry of its plain run drifts.
 
     Attributes:
@@ -73,51 +74,64 @@ class World:
             return build_scene(config.scene, config.seed, config.size, changed)
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """The drive through a world, frame by frame.
-
-    Attributes:
-        truth: (N, 4, 4) map <- body.
-    """
+class Recorded(NamedTuple):
+    """The drive through a world, frame by frame: true poses (N, 4, 4) map <- body, and all points of all frames."""
 
     truth: Floats
-    _counts: Ints
-    _rows: npt.NDArray[np.int16]
-
-    def __len__(self) -> int:
-        return len(self.truth)
+    ends: Ints
+    rows: npt.NDArray[np.int16]
 
     def read(self, index: int) -> Points:
         """Frame (K, 3) float32 metres, body frame."""
-        end = int(self._counts[: index + 1].sum())
-        rows = self._rows[end - int(self._counts[index]) : end]
+        rows = self.rows[self.ends[index - 1] if index else 0 : self.ends[index]]
         return np.asarray(rows.astype(np.float32) * np.float32(STEP))
 
 
 def open_world(folder: Path, world: World) -> Recorded:
     """Open the drive of a world, simulated now unless it is there."""
     out = folder / world.name
-    wanted = {"world": asdict(world) | {"drift": 0}, "code": fingerprint(*SIMULATOR, _SELF)}
+    wanted = {"world": world._replace(drift=0.0)._asdict(), "code": fingerprint(*SIMULATOR, _SELF)}
     remembered_seconds(out / "simulated.json", wanted, lambda: _simulate(out, world))
     rows = np.memmap(out / "frames.i16", np.int16, "r").reshape(-1, 3)
-    return Recorded(np.load(out / "truth.npy"), np.load(out / "counts.npy"), rows)
+    return Recorded(np.load(out / "truth.npy"), np.load(out / "ends.npy"), rows)
+
+
+def _simulate(out: Path, world: World) -> None:
+    from coview_stream.sim.simulate import base_map, frames, trajectories
+
+    scene, counts = world.scene(), []
+    truth = trajectories(scene, world.config)[1]
+    out.mkdir(parents=True, exist_ok=True)
+    np.save(out / "base.npy", base_map(scene, world.config).astype(np.float32))
+    np.save(out / "truth.npy", truth)
+    with atomic_path(out / "frames.i16") as part, part.open("wb") as stream:
+        for points in frames(scene, world.config, truth):
+            stream.write(np.round(points / STEP).astype(np.int16).tobytes())
+            counts.append(len(points))
+    np.save(out / "ends.npy", np.cumsum(counts))
 
 
 def map_of(folder: Path, world: World, variant: str = "plain") -> Path:
     """Return a map of a world, built now unless it is there: ``plain``, ``gap`` or ``changed``."""
-    drive = open_world(folder, world)
-    out = folder / world.name
+    drive, out = open_world(folder, world), folder / world.name
     file = out / f"{variant}.coview"
     wanted = {
-        "world": asdict(world) | {"drift": 0}, "map": asdict(MapConfig()), "code": fingerprint(*MAPPER, _SELF),
+        "world": world._replace(drift=0.0)._asdict(), "map": asdict(MapConfig()), "code": fingerprint(*MAPPER, _SELF),
     }  # fmt: skip
-    makers: dict[str, Callable[[], Floats]] = {
-        "plain": lambda: np.load(out / "base.npy").astype(np.float64),
-        "gap": lambda: _with_gap(np.load(out / "base.npy").astype(np.float64), drive.truth),
-        "changed": lambda: _scanned(earlier(world.scene(CHANGED), world.seed, CHANGED), world),
-    }
-    remembered_seconds(out / f"{variant}.json", wanted, lambda: _build(file, makers[variant]()))
+
+    def build() -> None:
+        from coview_stream.sim.simulate import base_map
+
+        points = np.load(out / "base.npy").astype(np.float64)
+        if variant == "gap":
+            points = points[~in_gap(drive.truth, points)]
+        if variant == "changed":
+            points = base_map(earlier(world.scene(CHANGED), world.seed, CHANGED), world.config)
+        with TemporaryDirectory() as scratch:
+            write_cloud(Path(scratch) / "base.laz", points)
+            BaseMap.build(Path(scratch) / "base.laz").save(file)
+
+    remembered_seconds(out / f"{variant}.json", wanted, build)
     return file
 
 
@@ -189,43 +203,3 @@ def _owners(scene: Scene, margin: float = 2.0) -> Indices:
         nearer = (out < best) & (size < 1000)  # the ground is one piece
         best[nearer], owner[nearer] = out[nearer], k
     return np.asarray(owner[piece])
-
-
-def _simulate(out: Path, world: World) -> None:
-    from coview_stream.sim.simulate import frames, trajectories
-
-    scene = world.scene()
-    _, truth, _ = trajectories(scene, world.config)
-    out.mkdir(parents=True, exist_ok=True)
-    np.save(out / "base.npy", _scanned(scene, world).astype(np.float32))
-    np.save(out / "truth.npy", truth)
-    with atomic_path(out / "frames.i16") as part, part.open("wb") as stream:
-        counts = [_write(stream, points) for points in frames(scene, world.config, truth)]
-    np.save(out / "counts.npy", np.array(counts, dtype=np.int64))
-
-
-def _write(stream: Any, points: Points) -> int:
-    stream.write(np.round(points / STEP).astype(np.int16).tobytes())
-    return len(points)
-
-
-def _scanned(scene: Scene, world: World) -> Floats:
-    from coview_stream.sim.simulate import base_map
-
-    return base_map(scene, world.config)
-
-
-def _with_gap(points: Floats, truth: Floats) -> Floats:
-    return points[~in_gap(truth, points)]
-
-
-def _build(file: Path, points: Floats) -> None:
-    from coview_stream import BaseMap
-    from coview_stream.clouds import write_cloud
-
-    source = file.with_suffix(".laz")
-    try:
-        write_cloud(source, points)
-        BaseMap.build(source).save(file)
-    finally:
-        source.unlink(missing_ok=True)
