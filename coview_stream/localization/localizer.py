@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
@@ -70,13 +71,14 @@ class Localizer:
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
         self._search = GlobalSearch(base_map, self.config, self._local_maps, index)
-        self._epoch: Epoch = (0, 0)
+        self._voxel_filter = kernels.VoxelFilter(self.config.keyframe.voxel, self.config.keyframe.range_min)
+        self._epoch = Epoch()
         self.reset()
 
     def reset(self, epoch: int = 0) -> None:
         """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
         self.state = State.SEARCHING
-        self._epoch = (epoch, self._epoch[1] + 1)
+        self._epoch = Epoch(epoch, self._epoch.restart + 1)
         self._buffer = KeyframeBuffer(self.config.keyframe)
         self._search.reset()
         self._tracker = Tracker(self.base_map, self.config, self._local_maps)
@@ -122,7 +124,7 @@ class Localizer:
         elif (request := self._search_request(frame)) is not None:
             match = self._begin_tracking(self._search.update(request))  # eqs 1-13, over the whole map
         if match is not None:
-            event = self._verify(match)  # evidence as usual here, agreement with odometry
+            event = self._verify(match)  # what its verdict and those before mean for the place
             self._update(match, event)  # the graph of poses and the state
         return self.fix()
 
@@ -211,11 +213,9 @@ class Localizer:
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
         T = to_local(T, self._anchor)
-        if self.state.has_place:  # keyframes are for searching: a loss starts from nothing
-            keyframe, voxels = None, self._buffer.voxelize(cloud, T)
-        else:
-            keyframe = self._buffer.add(cloud, T, stamp)
-            voxels = self._buffer.newest
+        voxels = self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
+        # keyframes are for searching: a loss starts from nothing
+        keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp)
         self._tracker.add_scan(voxels, T)
         self._newest = _Frame(cloud, T, stamp, voxels, keyframe)
         return self._newest
@@ -262,24 +262,29 @@ class Localizer:
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 
-    def _verify(self, match: MapMatch) -> Event:
-        """Return what a registration means for the place; its evidence is the next fix's, where it adds any."""
+    def _verify(self, match: MapMatch) -> Event | None:
+        """Return what a registration's verdict means for the place, after those before it; None if nothing yet.
+
+        Its evidence is the next fix's, where it adds any.
+        """
         assert self._newest is not None  # it is of the newest frame
         stamp, verdict = self._newest.stamp, match.verdict
         event, reason = self._monitor.verify(verdict, stamp, self._tracker.travelled)
         self._registered_at = stamp
+        after = self.state if event is None else next_state(self.state, event)
         if not (match.confirms_search and verdict.verified):
             self._evidence = KeyframeEvidence(
-                stamp, next_state(self.state, event), reason, verdict.score, 0.0, verdict.evidence,
+                stamp, after, reason, verdict.score, 0.0, verdict.evidence,
                 cause=verdict.cause, innovation=verdict.innovation,
             )  # fmt: skip
         return event
 
-    def _update(self, match: MapMatch, event: Event) -> None:
+    def _update(self, match: MapMatch, event: Event | None) -> None:
         """Correct the pose by a registration that is believed, and move on to the state that follows."""
         assert self._newest is not None  # as in _verify
         self._tracker.update(match, self._newest.T_odom_body)
-        self._handle(event)
+        if event is not None:
+            self._handle(event)
 
     # ---- states
 
@@ -313,4 +318,4 @@ class Localizer:
 
     def _next_epoch(self) -> None:
         """Begin another epoch: requests on their way belong to what has been forgotten."""
-        self._epoch = (self._epoch[0], self._epoch[1] + 1)
+        self._epoch = self._epoch._replace(restart=self._epoch.restart + 1)

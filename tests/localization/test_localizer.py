@@ -8,13 +8,13 @@ import small_world
 from small_world import pose_error
 from trackers import garbage
 
+import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import RegistrationConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.prepare_scan import voxelized
-from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.state import State
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -306,8 +306,8 @@ def test_search_result_waits_for_required_verification(world_map, world_drive, r
 
 def test_frame_is_voxelized_once_and_copied(world_map, world_drive, monkeypatch):
     """A driver may reuse its array for the next frame; a search result applied later still registers this one."""
-    whole, calls = KeyframeBuffer.voxelize, []
-    monkeypatch.setattr(KeyframeBuffer, "voxelize", lambda *given: calls.append(1) or whole(*given))
+    whole, calls = kernels.VoxelFilter.__call__, []
+    monkeypatch.setattr(kernels.VoxelFilter, "__call__", lambda *given: calls.append(1) or whole(*given))
     localizer = Localizer(world_map)
     array = world_drive.clouds[0].copy()
     localizer.add_frame(array, world_drive.T_odom_body[0], 0.0)

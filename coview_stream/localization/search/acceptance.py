@@ -1,4 +1,4 @@
-"""The decision on a search: a place is accepted once it has stood alone, often and clearly enough."""
+"""The decision on a search: a place is accepted once it has led all rivals, often and clearly enough."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.refinement import Candidate
-from coview_stream.localization.search.request import Epoch, SearchRequest, same_place
+from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest, same_place
 from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"
@@ -18,7 +18,7 @@ BY_FEATURES = " (by learned features)"
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What one keyframe's search came to.
+    """Result of one keyframe's search.
 
     Attributes:
         accepted: the place, once there is one.
@@ -30,7 +30,7 @@ class SearchResult:
     accepted: Candidate | None
     evidence: KeyframeEvidence
     travelled: float = 0.0
-    epoch: Epoch = (0, 0)
+    epoch: Epoch = FIRST_EPOCH
 
 
 class AcceptanceTest:
@@ -99,7 +99,7 @@ class AcceptanceTest:
         return State.AMBIGUOUS, ""
 
     def _has_rivals(self, best: Candidate, candidates: list[Candidate], request: SearchRequest, votes: int) -> bool:
-        """Whether enough keyframes have voted for what else it might be; a place found by votes needs no more."""
+        """Tell whether enough keyframes have voted for rivals of the best; a place found by votes needs no more."""
         voted = any(
             c.hypothesis.station is not None and same_place(c.T_map_odom, best.T_map_odom, request) for c in candidates
         )
@@ -117,9 +117,10 @@ class AcceptanceTest:
     def _confirmation(self) -> tuple[State, str]:
         rule = self.config.acceptance
         if self.config.stationary:
-            return State.TRACKING, "one scan, and it stands alone"
+            return State.TRACKING, "one scan, no rival within the required lead"
         total = f"{self._evidence_sum:.2f} of {rule.evidence_sum:.2f}"
-        reason = f"confirmed by {self._confirmed} keyframes, proof {total}"
+        keyframes = "1 keyframe" if self._confirmed == 1 else f"{self._confirmed} keyframes"
+        reason = f"confirmed by {keyframes}, evidence {total}"
         enough = self._confirmed >= rule.confirmations and self._evidence_sum >= rule.evidence_sum
         return State.TRACKING if enough else State.AMBIGUOUS, reason
 

@@ -17,7 +17,7 @@ from coview_stream.localization.search.recognizers import CoViewRecognizer, Plac
 from coview_stream.localization.search.refinement import Candidate, Refinement
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
 
-_REMEMBERED = 2  # best candidates that the next keyframe tries again
+_REMEMBERED = 2  # best candidates that the next keyframe tries again; set by hand
 
 
 class GlobalSearch:
@@ -40,7 +40,7 @@ class GlobalSearch:
         self._recognizers = [each for each in (self.coview, self.learned) if each is not None]
         self._refinement = Refinement(base_map, self.config, local_maps)
         self._acceptance = AcceptanceTest(self.config)
-        self._epoch: Epoch = (0, 0)
+        self._epoch = Epoch()
         self.clear()
 
     @property
@@ -50,7 +50,7 @@ class GlobalSearch:
 
     @property
     def spec(self) -> RequestSpec:
-        """What its requests have to bring."""
+        """Data that its requests have to bring."""
         return RequestSpec(
             None if self.coview is None else self.base_map.descriptor_config,
             None if self.learned is None else self.config.learned.reach,
@@ -120,17 +120,17 @@ class GlobalSearch:
 
     def _remember(self, candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest) -> None:
         """Keep what the next keyframe tries again: the best candidates, and hints that were not refuted."""
-        least = self.config.acceptance.score
+        min_score = self.config.acceptance.score
         if hints:
             best = max((c.evidence.score for c in candidates if c.hypothesis.station is None), default=0.0)
             positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
             # where the map knows nothing, a keyframe does not speak against a hint
             surveyed = all(self.base_map.surveyed(position).all() for position in positions)
-            self._hints.tried(refuted=surveyed and best < least)
+            self._hints.tried(refuted=surveyed and best < min_score)
         self._remembered = [
             replace(c.hypothesis, T_map_odom=c.T_map_odom, lead=0.0)
             for c in candidates[:_REMEMBERED]
-            if c.evidence.score >= least
+            if c.evidence.score >= min_score
         ]
 
     def _decide(self, candidates: list[Candidate], request: SearchRequest, votes: int) -> SearchResult:

@@ -51,34 +51,25 @@ class KeyframeBuffer:
 
     Attributes:
         keyframes: the newest ones, oldest first.
-        newest: (N, 3) float32 points of the newest frame, one per voxel.
-        travelled: metres between keyframes.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self.config = config
         self.keyframes: deque[Keyframe] = deque(maxlen=config.capacity)
-        self.travelled = 0.0
-        self.newest: Points = np.empty((0, 3), dtype=np.float32)
         self._pending: list[Points] = []
-        self._filter = kernels.VoxelFilter(config.voxel, config.range_min)
 
-    def voxelize(self, cloud: Points, T_odom_body: Pose) -> Points:
-        """Reduce one frame (N, 3), body frame, to :attr:`newest`, without adding it to a keyframe."""
-        self.newest = self._filter(cloud, T_odom_body)[0].copy()  # the next frame overwrites the filter's array
-        return self.newest
+    def add(self, points: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
+        """Add a frame's points (N, 3), odometry frame, which are kept; return the keyframe that it completes, if any.
 
-    def add(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
-        """Add one frame (N, 3), body frame; return the keyframe that it completes, if any."""
-        self.voxelize(cloud, T_odom_body)
-        self._pending.append(self.newest)
+        :func:`~coview_stream.localization.registration.prepare_scan.voxelized` makes the points of a cloud.
+        """
+        self._pending.append(points)
         if sum(map(len, self._pending)) > _PENDING_POINTS:
             self._pending = [self._unique(np.concatenate(self._pending))]
         if self.keyframes:
             moved = float(np.linalg.norm(T_odom_body[:3, 3] - self.keyframes[-1].position))
             if moved < self.config.distance:
                 return None
-            self.travelled += moved
         keyframe = Keyframe(stamp, T_odom_body, self._unique(np.concatenate(self._pending)))
         self.keyframes.append(keyframe)
         self._pending = []

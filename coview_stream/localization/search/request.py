@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +16,20 @@ _SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more ar
 _SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
 _SAME_ANGLE = np.radians(5.0)  # likewise
 
-Epoch = tuple[int, int]
-"""What belongs together in time: the number of the odometry frame, and how often the localizer has begun anew."""
+
+class Epoch(NamedTuple):
+    """Number of what belongs together in time: scans and poses of one odometry frame, between two losses.
+
+    Attributes:
+        odometry: number of the odometry frame, as the caller counts them.
+        restart: how often the localizer has begun anew.
+    """
+
+    odometry: int = 0
+    restart: int = 0
+
+
+FIRST_EPOCH = Epoch()
 
 
 def _no_points() -> Points:
@@ -59,7 +72,7 @@ class SearchRequest:
     submap: Points
     cloud: Points
     travelled: float = 0.0
-    epoch: Epoch = (0, 0)
+    epoch: Epoch = FIRST_EPOCH
     hints: tuple[Pose, ...] = ()
     surroundings: Points = field(default_factory=_no_points)
 
@@ -76,7 +89,7 @@ class SearchRequest:
         cloud: Points,
         spec: RequestSpec,
         travelled: float = 0.0,
-        epoch: Epoch = (0, 0),
+        epoch: Epoch = FIRST_EPOCH,
         hints: tuple[Pose, ...] = (),
     ) -> SearchRequest:
         """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is its newest frame, body frame."""

@@ -144,8 +144,8 @@ class LossMonitor:
         self._confirmed_at = (0.0, 0.0)  # metres driven and stamp of the newest confirmation that counts
         self._lasted = 0.0  # seconds from the first rejection to the first confirmation
 
-    def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> tuple[Event, str]:
-        """Return what a registration, ``travelled`` metres into the drive, means for the place, and one clause."""
+    def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> tuple[Event | None, str]:
+        """Return what a registration at ``travelled`` metres means for the place (None: nothing), and one clause."""
         if verdict.verified:
             return self._verified(verdict, stamp, travelled)
         self._confirmations = 0
@@ -170,7 +170,7 @@ class LossMonitor:
             self._rejections += 1
             self._rejected_at = travelled
 
-    def _verified(self, verdict: MatchVerdict, stamp: float, travelled: float) -> tuple[Event, str]:
+    def _verified(self, verdict: MatchVerdict, stamp: float, travelled: float) -> tuple[Event | None, str]:
         """Clear the doubt; after a long one, only once several registrations have."""
         if not self._confirmations:
             self._lasted = 0.0 if self._since is None else stamp - self._since
@@ -183,6 +183,6 @@ class LossMonitor:
             needed = self._rule.confirmations
             if self._confirmations < needed:
                 after = f"after {self._lasted:.0f} s of doubt"
-                return (Event.VERIFICATION_REQUIRED, f"verified {self._confirmations} of {needed} times {after}")
+                return None, f"verified {self._confirmations} of {needed} times {after}"
         self.clear()
         return Event.MATCH_VERIFIED, verdict.reason

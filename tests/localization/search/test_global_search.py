@@ -21,6 +21,7 @@ from coview_stream.config import (
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, tilt_of
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
@@ -129,11 +130,11 @@ ACCEPTED = {
 @pytest.mark.parametrize("case", ACCEPTED)
 def test_good_candidate_is_accepted_after_enough_evidence(search, case):
     best = ACCEPTED[case][0]
-    proof = int(np.ceil(RULE.evidence_sum / (best.evidence.score - RULE.evidence_floor)))
-    accepted = [result.accepted for result in judged(search, *[ACCEPTED[case]] * (max(proof, RULE.confirmations) + 1))]
+    needed = int(np.ceil(RULE.evidence_sum / (best.evidence.score - RULE.evidence_floor)))
+    accepted = [result.accepted for result in judged(search, *[ACCEPTED[case]] * (max(needed, RULE.confirmations) + 1))]
     assert accepted[-1] is best
     # no sooner either: weak evidence needs more driving
-    assert accepted[: max(proof, RULE.confirmations) - 1] == [None] * (max(proof, RULE.confirmations) - 1)
+    assert accepted[: max(needed, RULE.confirmations) - 1] == [None] * (max(needed, RULE.confirmations) - 1)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +146,7 @@ def test_disagreeing_keyframes_give_no_confirmation(search, other):
     for result in judged(search, *[[candidate(0.7, T)] for T in [HERE, other] * RULE.confirmations]):
         assert result.accepted is None
         assert result.evidence.state is State.AMBIGUOUS
-        assert "confirmed by 1 keyframes" in result.evidence.reason
+        assert "confirmed by 1 keyframe," in result.evidence.reason
 
 
 def test_agreement_is_measured_at_the_robot_not_at_the_odometry_origin(search):
@@ -240,7 +241,9 @@ def run_of(world_drive, frames, T_map_odom=T_MAP_ODOM):
     for k in range(frames):
         T = inverse(T_map_odom) @ world_drive.T_map_body[k]
         cloud = world_drive.clouds[k]
-        yield SearchRequest.of(buffer, buffer.add(cloud, T, 0.5 * k), cloud, RequestSpec(descriptor))
+        yield SearchRequest.of(
+            buffer, buffer.add(voxelized(cloud, T, buffer.config), T, 0.5 * k), cloud, RequestSpec(descriptor)
+        )
 
 
 def test_good_candidate_is_tried_again_without_votes(search, world_drive, monkeypatch):

@@ -143,7 +143,7 @@ def test_scan_of_another_world_is_detected_as_displaced(world_map, world_drive, 
 
 
 def test_displacement_check_samples_a_bounded_number_of_points(target, monkeypatch):
-    """It has half a millisecond at every frame, whatever the lidar."""
+    """It has half a millisecond at every frame, with any lidar."""
     asked = []
     inner = module.kernels.nearest
     monkeypatch.setattr(

@@ -89,7 +89,7 @@ def blinded(monitor, seconds):
 
 def verified(count, seconds=31):
     """One of several verifications that a long doubt takes."""
-    return Event.VERIFICATION_REQUIRED, f"verified {count} of 3 times after {seconds} s of doubt"
+    return None, f"verified {count} of 3 times after {seconds} s of doubt"
 
 
 def test_long_doubt_needs_several_verifications(monitor):

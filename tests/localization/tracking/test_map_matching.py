@@ -121,7 +121,7 @@ def test_singular_registration_information_is_rejected(world_map, world_drive, s
 
 def assert_no_hold(found, truth):
     assert found.verdict.cause is RejectionReason.FITNESS
-    assert found.verdict.reason.startswith("no hold: ")
+    assert found.verdict.reason.startswith("registration failed: ")
     assert found.verdict.innovation is None
     np.testing.assert_array_equal(found.T_map_body, truth)
 

@@ -62,7 +62,7 @@ def test_correction_fuses_as_two_gaussians(graph):
 
 
 def test_huber_kernel_bounds_the_pull_of_an_outlier(graph):
-    """Alone along x, the pull of k sigmas moves the mean by k P / sigma whatever the outlier's size."""
+    """Alone along x, the pull of k sigmas moves the mean by k P / sigma for any size of the outlier."""
     P, R = 0.01 * np.eye(6), 1e-4 * np.eye(6)
     moved = []
     for far in (10.0, 50.0):

@@ -1,4 +1,4 @@
-"""Learned re-localization with planted features: the right place and heading win, whatever the weights are worth."""
+"""Learned re-localization with planted features: the right place and heading win with any weights."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_clouds_to_pose_end_to_end(map_points, monkeypatch, xy, degrees):
 
 
 def test_query_features_of_a_cloud(known):
-    """By the network of the package, whatever it is worth: shapes, norms, and where it counts."""
+    """By the network of the package, with any weights: shapes, norms, and where it counts."""
     rng = np.random.default_rng(0)
     cloud = rng.uniform([-23, -28, 0], [37, 32, 5], (20_000, 3)).astype(np.float32)
     view = known.encode(cloud, np.array([7.0, 2.0, 0.0]))
