@@ -12,14 +12,17 @@ from __future__ import annotations
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from bench.forest.methods import Methods
 from bench.forest.tables import EXACT_DEGREES, EXACT_METRES, success
 from bench.forest.tables import tables as tables_of
-from bench.forest.worlds import code, noted, on_disk, place, say, weights
+from bench.forest.worlds import Place, code, drawn, noted, on_disk, place, recorded, say, weights
 from bench.harness.files import remembered
 from bench.harness.rows import Row, failed, informs
+from coview_stream import BaseMap
 
 FIRST_SEED = 20_000  # nobody trains or tunes on the seeds from here on
 RADIUS = 30.0
@@ -36,7 +39,7 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--world", type=Path, nargs="+", default=[], metavar="DIR", help="worlds on disk as well")
 
 
-def answers(folder: Path, name: str, opened: Callable[[], Any], about: dict[str, Any]) -> list[dict[str, Any]]:
+def answers(name: str, opened: Callable[[], Place], about: dict[str, Any]) -> list[dict[str, Any]]:
     """Answers to all queries of a place (a function that opens it), now or when the same was asked before.
 
     ``about`` says what else they depend on: what lies in a folder, say.
@@ -44,44 +47,37 @@ def answers(folder: Path, name: str, opened: Callable[[], Any], about: dict[str,
     spec = {"name": name, "weights": weights(), "code": code(), "radius": RADIUS, **about}
 
     def work() -> dict[str, Any]:
-        from bench.forest.methods import Methods
-        from coview_stream import BaseMap
-
         begin, there = time.perf_counter(), opened()
         methods = Methods(BaseMap.build(there.base, radius=RADIUS, learned=True))
-        say(f"{name}: {there.kind}, {len(methods.base_map)} stations, {time.perf_counter() - begin:.0f} s")
         told = {"world": there.name, "kind": there.kind}
         found = [{**told, "first": not k, **methods.ask(drive)} for k, drive in enumerate(there.drives)]
-        return {"answers": found, "seconds": round(time.perf_counter() - begin, 1)}
+        say(f"{name}: {there.kind}, {len(found)} queries, {time.perf_counter() - begin:.0f} s")
+        return {"answers": found}
 
-    result = remembered(folder / "answers" / f"{name}.json", spec, work)
-    say(f"{name}: {len(result['answers'])} queries, {result['seconds']:.0f} s")
-    return list(result["answers"])
+    return list(remembered(place() / "answers" / f"{name}.json", spec, work)["answers"])
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Ask all methods in all worlds; a row per world, with every answer."""
-    from bench.forest.worlds import drawn, recorded
-
-    folder = place()
     if asked.quick:
         asked.worlds, asked.queries = min(asked.worlds, _QUICK), min(asked.queries, _QUICK)
-    jobs: list[tuple[str, Callable[[], Any], dict[str, Any]]] = [
-        (f"drawn-{seed}-{asked.queries}", lambda seed=seed: drawn(folder, seed, asked.queries), {})
+    jobs: list[tuple[str, Callable[[], Place], dict[str, Any]]] = [
+        (f"drawn-{seed}-{asked.queries}", partial(drawn, place(), seed, asked.queries), {})
         for seed in range(asked.seeds, asked.seeds + asked.worlds)
     ]
     for path in asked.world:
         # the name of a folder alone is not unique
         key = f"disk-{path.resolve().parent.name}-{path.name}-{asked.queries}"
-        jobs.append((key, lambda path=path: recorded(path, asked.queries), on_disk(path)))
-    for name, opened, about in jobs:
+        jobs.append((key, partial(recorded, path, asked.queries), on_disk(path)))
+    for job in jobs:
+        name = f"forest/{job[0]}"
         try:
-            found = answers(folder, name, opened, about)
+            found = answers(*job)
         except Exception as error:  # the other worlds are still worth having; the exit code tells
-            yield failed(f"forest/{name}", f"{type(error).__name__}: {error}")
+            yield failed(name, f"{type(error).__name__}: {error}")
             continue
         share = 100 * success(found, "after", EXACT_METRES, EXACT_DEGREES)
-        yield informs(f"forest/{name}: within 0.3 m and 1 deg", share, "%", {"answers": found})
+        yield informs(f"{name}: within 0.3 m and 1 deg", share, "%", {"answers": found})
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy import fft
 
-from bench.forest.query import APART, Chain, distinct, errors, local, of_places, of_volume, query_of
+from bench.forest.query import APART, Chain, distinct, errors, of_places, of_volume, query_of
 from bench.forest.worlds import Drive
+from bench.harness.clock import Clock
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.birds_eye_view import CELL, SLABS, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.geometry.transforms import Points, Pose, transform
+from coview_stream.geometry.transforms import Points, Pose, rot_z, to_local, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, robust_zscore
-from coview_stream.localization.search.learned.matcher import QueryFeatures
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
 
@@ -28,8 +25,6 @@ METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "keyp
 """In the tables' order."""
 
 BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
-
-Named = dict[str, list[Hypothesis]]
 
 
 class Methods:
@@ -41,69 +36,71 @@ class Methods:
         Raises:
             MapError: the map has no learned features, or some of other weights.
         """
-        usual = LocalizerConfig(reloc="auto")
-        self.config = usual
-        self.base_map = base_map
-        known = SearchIndex.of(base_map, replace(usual, reloc="learned"))
-        retrieval = SearchIndex.of(base_map, replace(usual, reloc="coview")).retrieval
-        if known.learned is None or retrieval is None:
-            raise ValueError("the map has no learned features")
-        self._learned, self._retrieval = known.learned, retrieval
+        self.config, self.base_map = LocalizerConfig(reloc="auto"), base_map
+        learned = SearchIndex.of(base_map, replace(self.config, reloc="learned")).learned
+        retrieval = SearchIndex.of(base_map, replace(self.config, reloc="coview")).retrieval
+        assert learned is not None
+        assert retrieval is not None
+        self._learned, self._retrieval = learned, retrieval
         self._learned.prepare()
         self._retrieval.prepare()
         self._canopy = Canopy(base_map.points)
-        self._chain = Chain(base_map, usual)
-
-    @property
-    def chance(self) -> float:
-        """Share of the places that the map knows from which 10 m reach the right one, if one of them is drawn."""
-        area = len(self.base_map.stations) * self.base_map.config.block**2
-        return float(min(1.0, np.pi * APART**2 / area))
+        self._chain = Chain(base_map, self.config)
+        area = len(base_map.stations) * base_map.config.block**2
+        # share of the places that the map knows from which 10 m reach the right one, if one of them is drawn
+        self._chance = float(min(1.0, np.pi * APART**2 / area))
 
     def ask(self, drive: Drive) -> dict[str, Any]:
         """Ask all methods; distances (metres), errors, and milliseconds, all plain values."""
         query, truth = query_of(drive, self.config)
-        truth = local(truth, self.base_map.origin)
+        truth = to_local(truth, self.base_map.origin)
         robot = (truth @ query.T_odom_body)[:2, 3]
-        clock = _Clock()
-        named = {**self._by_descriptors(query, clock), "canopy": self._by_canopy(query, clock)}
-        found = {name: _in_turn(hypotheses, query) for name, hypotheses in named.items()}
-        answer: dict[str, Any] = {"sensor": drive.sensor, "travelled": drive.travelled, "chance": self.chance}
-        more, metric = self._by_features(query, truth, clock)
-        apart = {name: np.hypot(*(at - robot).T) for name, at in (found | more).items()}
-        answer["off"] = {name: np.round(values, 2).tolist() for name, values in apart.items()}
-        scan = self._chain.scan(query)
-        answer["chains"] = {name: self._chain.ask(named[name], scan, truth, query) for name in BASELINES}
-        return answer | metric | {"ms": {name: round(1e3 * s, 1) for name, s in clock.seconds.items()}}
+        clock = Clock()
+        named = self._by_hand(query, clock)
+        places = {name: _in_turn(hypotheses, query) for name, hypotheses in named.items()}
+        metric = self._by_features(query, truth, clock, places)
+        scan, chains = self._chain.scan(query), {}
+        for name in BASELINES:
+            spent = Clock()
+            with spent("ms"):
+                candidates = self._chain.register(named[name], scan)
+            chains[name] = self._chain.metric(named[name], candidates, truth, query) | _milliseconds(spent)
+        apart = {name: np.hypot(*(at - robot).T) for name, at in places.items()}
+        return {
+            "sensor": drive.sensor,
+            "chance": self._chance,
+            "off": {name: np.round(values, 2).tolist() for name, values in apart.items()},
+            "chains": chains,
+            **metric,
+            "ms": _milliseconds(clock),
+        }
 
-    def _by_descriptors(self, query: SearchRequest, clock: _Clock) -> Named:
+    def _by_hand(self, query: SearchRequest, clock: Clock) -> dict[str, list[Hypothesis]]:
+        """Name places by descriptors and by the heights of the canopy."""
+        stations = self.base_map.stations
         with clock("descriptors"):
             centre = _on_ground(query.scan, query)
             volumes = self._retrieval.distances(describe(query.scan, centre, self.base_map.descriptor_config))
             both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
-        named = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
-        return {name: of_volume(volume, self.base_map.stations, centre) for name, volume in named.items()}
-
-    def _by_canopy(self, query: SearchRequest, clock: _Clock) -> list[Hypothesis]:
         with clock("canopy"):
-            xy, top = seen_from(query.surroundings, query.position)
-            score, heading = self._canopy.search(xy, top)
+            score, heading = self._canopy.search(*seen_from(query.surroundings, query.position))
+        by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
+        named = {name: of_volume(volume, stations, centre) for name, volume in by_volume.items()}
         centre = _on_ground(query.surroundings, query)
-        return of_places(self._canopy.places, score.ravel(), heading.ravel(), self.base_map.stations, centre)
+        canopy = of_places(self._canopy.places, score.ravel(), heading.ravel(), stations, centre)
+        return named | {"canopy": canopy}
 
     def _by_features(
-        self, query: SearchRequest, truth: Pose, clock: _Clock
-    ) -> tuple[dict[str, Floats], dict[str, Any]]:
-        centre = _on_ground(query.surroundings, query)
+        self, query: SearchRequest, truth: Pose, clock: Clock, places: dict[str, Floats]
+    ) -> dict[str, Any]:
+        """Add the places by learned features; return the errors of their poses."""
+        centre, stations = _on_ground(query.surroundings, query), self.base_map.stations
         with clock("network"):
             view = self._learned.encode(query.surroundings, centre)
         with clock("correlation"):
             volume = self._learned.distances(view)
-            consensus = Consensus(
-                self.base_map.stations,
-                self.base_map.config.block,
-                replace(self.config.consensus, mode="consensus", peaks=self.config.learned.peaks),
-            )
+            peaks = replace(self.config.consensus, mode="consensus", peaks=self.config.learned.peaks)
+            consensus = Consensus(stations, self.base_map.config.block, peaks)
             consensus.vote(centre, {"learned": volume})
             voted = [replace(each, learned=True) for each in consensus.hypotheses()]
         with clock("keypoints"):
@@ -111,20 +108,17 @@ class Methods:
         with clock("registration"):
             candidates = self._chain.register(sharpened, self._chain.scan(query))
         verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in candidates]
-        places = {
-            "global": self._by_global_descriptor(view),
-            "dense": distinct(self.base_map.stations[:, :2], -volume.min(axis=1)),
-            "keypoints": _in_turn(sharpened, query),
-            "verified": _in_turn(verified, query),
-        }
-        moved = not np.array_equal(sharpened[0].T_map_odom, voted[0].T_map_odom)
-        metric: dict[str, Any] = {"dense": errors(voted[0].T_map_odom, truth, query)[:2], "moved": moved}
-        return places, {**metric, **self._chain.metric(sharpened, candidates, truth, query)}
-
-    def _by_global_descriptor(self, view: QueryFeatures) -> Floats:
         features = self._learned.features
-        likeness = features.place.astype(np.float32) @ view.place
-        return distinct(features.place_at, likeness)
+        places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
+        places["dense"] = distinct(stations[:, :2], -volume.min(axis=1))
+        places["keypoints"], places["verified"] = (_in_turn(each, query) for each in (sharpened, verified))
+        moved = not np.array_equal(sharpened[0].T_map_odom, voted[0].T_map_odom)
+        metric = self._chain.metric(sharpened, candidates, truth, query)
+        return {"dense": errors(voted[0].T_map_odom, truth, query)[:2], "moved": moved, **metric}
+
+
+def _milliseconds(clock: Clock) -> dict[str, float]:
+    return {name: round(1e3 * seconds, 1) for name, seconds in clock.seconds.items()}
 
 
 def _on_ground(points: Points, query: SearchRequest) -> Floats:
@@ -137,19 +131,6 @@ def _in_turn(hypotheses: list[Hypothesis], query: SearchRequest) -> Floats:
     """Places (K, 2) of hypotheses in their order, those left out that are near a better one."""
     at = [transform(each.T_map_odom, query.position[None])[0, :2] for each in hypotheses]
     return distinct(np.array(at).reshape(-1, 2), -np.arange(len(at), dtype=np.float64))
-
-
-class _Clock:
-    """Seconds by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - begin
 
 
 COARSE = 2.0  # edge of a cell, metres
@@ -182,31 +163,16 @@ class Canopy:
             for column in range(0, columns, step):
                 part = _window(points, low + np.array([column, row]) * COARSE, step)
                 here = slice(row, row + step), slice(column, column + step)
-                shape = top[here].shape
-                top[here], seen[here] = part[0][: shape[0], : shape[1]], part[1][: shape[0], : shape[1]]
-        self._prepare(top, seen, low)
-
-    @classmethod
-    def of(cls, top: Floats, seen: Bools, corner: Floats) -> Canopy:
-        """Take heights (H, W) on cells of 2 m as they are; ``corner`` (2,) is that of cell (0, 0), metres."""
-        made = cls.__new__(cls)
-        made._prepare(top, seen, corner)
-        return made
-
-    def _prepare(self, top: Floats, seen: Bools, corner: Floats) -> None:
-        self.shape, self.corner = top.shape, corner
+                fits = tuple(slice(n) for n in top[here].shape)
+                top[here], seen[here] = part[0][fits], part[1][fits]
+        self.shape = top.shape
+        row, column = np.indices(self.shape)
+        # (H * W, 2) middles of the cells, metres
+        self.places = (np.stack([column.ravel(), row.ravel()], axis=1) + 0.5) * COARSE + low
         self._half = round(REACH / COARSE)
         self._size = tuple(fft.next_fast_len(n + 2 * self._half, real=True) for n in self.shape)
         values = np.where(seen, top, 0.0)
-        images = np.stack([seen.astype(np.float64), values, values**2])
-        self._spectra = fft.rfft2(images, self._size)
-
-    @property
-    def places(self) -> Floats:
-        """(H * W, 2) middles of the cells, metres."""
-        row, column = np.indices(self.shape)
-        at = np.stack([column.ravel(), row.ravel()], axis=1)
-        return np.asarray((at + 0.5) * COARSE + self.corner)
+        self._spectra = fft.rfft2(np.stack([seen.astype(np.float64), values, values**2]), self._size)
 
     def search(self, xy: Floats, top: Floats) -> tuple[Floats, Floats]:
         """Correlate heights ``top`` (N,) seen at ``xy`` (N, 2), metres from the robot, axes of the odometry.
@@ -224,9 +190,8 @@ class Canopy:
 
     def _turned(self, xy: Floats, top: Floats, yaw: float) -> tuple[Floats, Floats]:
         """Greatest heights (2h + 1, 2h + 1) of the query's cells about its middle, and which were seen."""
-        c, s = np.cos(yaw), np.sin(yaw)
         side = 2 * self._half + 1
-        cell = np.rint(xy @ np.array([[c, s], [-s, c]]) / COARSE).astype(np.int64) + self._half
+        cell = np.rint(xy @ rot_z(yaw)[:2, :2].T / COARSE).astype(np.int64) + self._half
         inside = ((cell >= 0) & (cell < side)).all(axis=1)
         flat = cell[inside, 1] * side + cell[inside, 0]
         seen, image = np.zeros(side * side), np.zeros(side * side)

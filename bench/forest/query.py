@@ -5,7 +5,6 @@ What the ring buffer would hold, in the odometry's frame; then the product's own
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,7 @@ from bench.forest.worlds import Drive, in_odometry
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Reals
-from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from, rot_z
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, rotation_angle, yaw_of
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import ScanInput
@@ -24,7 +23,9 @@ from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.refinement import Candidate, Refinement
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.report.evaluation import driven
 
+BEST, APART = 5, 10.0  # places that each method names, and metres between two of them
 _SUBMAP = 8.0  # metres driven that are registered: four keyframes, as in the search
 
 
@@ -39,52 +40,28 @@ def query_of(drive: Drive, config: LocalizerConfig) -> tuple[SearchRequest, Pose
         voxelized(cloud, T, keyframe) if len(cloud) else np.empty((0, 3), dtype=np.float32)
         for cloud, T in zip(drive.clouds, told, strict=True)
     ]
-    steps = np.linalg.norm(np.diff(told[:, :3, 3], axis=0), axis=1)
-    left = np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])  # metres still to drive from each frame on
+    left = driven(told[::-1])[::-1]  # metres still to drive from each frame on
     recent = [part for part, metres in zip(parts, left, strict=True) if metres < _SUBMAP]
-    around = _once(parts, keyframe.voxel)
+    submap, around = (
+        kernels.transform_unique(np.concatenate(some), np.eye(4), keyframe.voxel)[0] for some in (recent, parts)
+    )
     around = around[np.hypot(around[:, 0], around[:, 1]) < config.learned.reach]
     query = SearchRequest(
-        stamp=0.0,
-        T_odom_body=told[-1],
-        scan=around,
-        submap=_once(recent, keyframe.voxel),
-        cloud=drive.clouds[-1],
-        travelled=drive.travelled,
-        surroundings=around,
-    )
+        stamp=0.0, T_odom_body=told[-1], scan=around, submap=submap, cloud=drive.clouds[-1],
+        travelled=drive.travelled, surroundings=around,
+    )  # fmt: skip
     return query, truth
-
-
-def local(truth: Pose, origin: Floats) -> Pose:
-    """Return a pose (4, 4) of the map's source relative to the map's ``origin`` (3,)."""
-    moved: Pose = truth.copy()
-    moved[:3, 3] -= origin
-    return moved
 
 
 def errors(T: Pose, truth: Pose, query: SearchRequest) -> tuple[float, float, float, float]:
     """How far a ``T_map_odom`` puts the robot off: metres in the plane, degrees of heading, metres, degrees."""
-    apart = T @ query.T_odom_body @ inverse(truth @ query.T_odom_body)
-    shift = (T @ query.T_odom_body)[:3, 3] - (truth @ query.T_odom_body)[:3, 3]
-    heading = abs(float(np.degrees(np.arctan2(apart[1, 0], apart[0, 0]))))
-    cosine = np.clip(0.5 * (np.trace(apart[:3, :3]) - 1.0), -1.0, 1.0)
-    return (
-        float(np.hypot(shift[0], shift[1])), heading, float(np.linalg.norm(shift)),
-        float(np.degrees(np.arccos(cosine))),
-    )  # fmt: skip
+    found, true = T @ query.T_odom_body, truth @ query.T_odom_body
+    apart, shift = found @ inverse(true), found[:3, 3] - true[:3, 3]
+    metres = float(np.hypot(shift[0], shift[1])), float(np.linalg.norm(shift))
+    return metres[0], abs(float(np.degrees(yaw_of(apart)))), metres[1], float(np.degrees(rotation_angle(apart)))
 
 
-def _once(parts: list[Points], voxel: float) -> Points:
-    points: Points = kernels.transform_unique(np.concatenate(parts), np.eye(4), voxel)[0]
-    return points
-
-
-BEST = 5  # places that each method names
-APART = 10.0  # metres between two of them
-
-
-def chosen(xy: Reals, score: Reals, count: int = BEST) -> list[int]:
+def best_places(xy: Reals, score: Reals, count: int = BEST) -> list[int]:
     """Which of the places (N, 2) are best, higher scores (N,) being better, 10 m or more apart, best first."""
     at, left = np.asarray(xy, dtype=np.float64), np.array(score, dtype=np.float64)
     found: list[int] = []
@@ -96,14 +73,14 @@ def chosen(xy: Reals, score: Reals, count: int = BEST) -> list[int]:
 
 
 def distinct(xy: Reals, score: Reals, count: int = BEST) -> Floats:
-    """Return the best places (K, 2) themselves, see :func:`chosen`."""
-    return np.asarray(xy, dtype=np.float64)[chosen(xy, score, count)].reshape(-1, 2)
+    """Return the best places (K, 2) themselves, see :func:`best_places`."""
+    return np.asarray(xy, dtype=np.float64)[best_places(xy, score, count)].reshape(-1, 2)
 
 
 def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypothesis]:
     """Best stations (M, 3) of distances (M, S), each at its best shift; ``centre`` (3,) in the odometry frame."""
     found = []
-    for k in chosen(stations[:, :2], -volume.min(axis=1)):
+    for k in best_places(stations[:, :2], -volume.min(axis=1)):
         shift = int(volume[k].argmin())
         yaw = float(yaw_of_shift(shift, volume.shape[1]))
         found.append(Hypothesis(_pose(stations[k], yaw, centre), k, shift, float(volume[k, shift])))
@@ -113,7 +90,7 @@ def of_volume(volume: Floats32, stations: Floats32, centre: Floats) -> list[Hypo
 def of_places(xy: Floats, score: Floats, heading: Floats, stations: Floats32, centre: Floats) -> list[Hypothesis]:
     """Hypotheses of the best places (N, 2) at their headings (N,), as high as the station next to each."""
     found = []
-    for k in chosen(xy, score):
+    for k in best_places(xy, score):
         nearest = int(np.hypot(*(stations[:, :2] - xy[k]).T).argmin())
         at = np.array([*xy[k], stations[nearest, 2]])
         found.append(Hypothesis(_pose(at, float(heading[k]), centre), nearest, 0, -float(score[k])))
@@ -121,7 +98,7 @@ def of_places(xy: Floats, score: Floats, heading: Floats, stations: Floats32, ce
 
 
 def _pose(at: Reals, yaw: float, centre: Floats) -> Pose:
-    return pose_from(rot_z(yaw), at.astype(np.float64)) @ pose_from(np.eye(3), -centre)
+    return pose_from(rot_z(yaw), at) @ pose_from(np.eye(3), -centre)
 
 
 class Chain:
@@ -153,14 +130,6 @@ class Chain:
         return {
             "before": errors(named[0].T_map_odom, truth, query)[:2] if named else None,
             "after": errors(candidates[0].T_map_odom, truth, query)[2:] if candidates else None,
-            "score": score,
             "passes": bool(candidates) and score >= self.config.acceptance.score,
             "accepted": self._acceptance.decide(candidates, query, 1).accepted is not None,
         }
-
-    def ask(self, named: list[Hypothesis], scan: ScanInput, truth: Pose, query: SearchRequest) -> dict[str, Any]:
-        """Register what a method names: what :meth:`metric` says, and the milliseconds."""
-        begin = time.perf_counter()
-        candidates = self.register(named, scan)
-        spent = round(1e3 * (time.perf_counter() - begin), 1)
-        return self.metric(named, candidates, truth, query) | {"ms": spent}

@@ -38,7 +38,7 @@ SIDES = (10, 32)  # tiles of 32 m along the edge: 0.10 and 1.05 km2
 LIMITS = {10: 0.4, 32: 3.0}  # seconds a query that issue 6 allows
 CUT = 4  # tiles along the edge of what is repeated
 _SEED, _QUERIES, _REPEAT = 20_001, 4, 3
-_PARTS = ("view", "correlation", "consensus", "sharpening", "registration")
+_PARTS = ("view", "correlation", "consensus", "keypoint refinement", "registration")
 
 
 def repeated(tiles: Ints, low: Ints, side: int, cut: int = CUT) -> tuple[Ints, Ints]:

@@ -10,27 +10,26 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.harness.files import fingerprint, folder, remembered
+from coview_stream.clouds import read_tum
+from coview_stream.descriptors.network import weights_directory, weights_name
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, pose_from
-from coview_stream.report.evaluation import driven
+from coview_stream.recordings.open_run import open_run
+from coview_stream.report.evaluation import MAX_STAMP_GAP, driven
 from coview_stream.training.recipe import Recipe
+from coview_stream.training.worlds import base_scan, draw_world, drives
 
-BEHIND = 12.0  # metres of a recorded run that a query is made of, and ...
-EVERY = 10.0
-"""... and between two queries of it."""
-
+BEHIND, EVERY = 12.0, 10.0  # metres of a recorded run that a query is made of, and between two queries
 _SPACING = 0.25  # metres between the frames of a recorded run that are read
 _LEANING = 3  # random stream
-
 
 WORLDS = (*(f"coview_stream/{part}" for part in ("geometry", "clouds", "sim", "training")), "bench/forest/worlds.py")
 """What makes worlds, and the runs and queries in them."""
@@ -58,8 +57,6 @@ def say(text: str) -> None:
 
 def weights() -> str:
     """Say which weights the package has, by both networks' hashes."""
-    from coview_stream.descriptors.network import weights_directory, weights_name
-
     total = hashlib.sha256()
     for view in ("aerial", "ground"):
         file = weights_directory() / weights_name(view)
@@ -109,14 +106,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Place:
-    """A map's cloud and the drives through the place.
-
-    Attributes:
-        name: of the world.
-        kind: what it is, in words.
-        base: file of the map's cloud.
-        drives: each a query.
-    """
+    """A world's name, its kind in words, the file of its map's cloud, and the drives through it: each a query."""
 
     name: str
     kind: str
@@ -124,63 +114,36 @@ class Place:
     drives: list[Drive]
 
 
-def drawn(folder: Path, seed: int, queries: int, recipe: Recipe | None = None) -> Place:
+def drawn(folder: Path, seed: int, queries: int) -> Place:
     """Return the world of a seed, simulated now unless ``folder`` has it.
 
     Raises:
         DependencyError: Open3D cannot be loaded.
     """
-    recipe = replace(recipe or Recipe(), submaps=queries)
-    out = folder / f"drawn-{seed}-{queries}"
+    recipe, out = Recipe(submaps=queries), folder / f"drawn-{seed}-{queries}"
     spec = {"seed": seed, "recipe": recipe.to_dict(), "code": fingerprint(*WORLDS)}
     kind = str(remembered(out / "drawn.json", spec, lambda: _simulate(out, seed, recipe))["kind"])
-    return Place(f"seed {seed}", kind, out / "base.npy", _read(out / "drives.npz"))
+    return Place(f"seed {seed}", kind, out / "base.npy", [_read(out / f"drive-{k}.npz") for k in range(queries)])
 
 
 def _simulate(out: Path, seed: int, recipe: Recipe) -> dict[str, Any]:
-    from coview_stream.training.worlds import base_scan, draw_world
-
     out.mkdir(parents=True, exist_ok=True)
-    world = draw_world(seed, recipe)
+    world, rng = draw_world(seed, recipe), np.random.default_rng([seed, _LEANING])
     np.save(out / "base.npy", base_scan(world, seed, recipe)[0])
-    _write(out / "drives.npz", list(_drives(world, seed, recipe)))
+    for k, (sensor, frames) in enumerate(drives(world, seed, recipe)):
+        lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
+        leaning = pose_from(exp_so3(np.array([*lean, 0.0])), np.zeros(3))
+        clouds = [cloud.astype(np.float32) for cloud in frames.clouds]
+        about = {"sensor": sensor, "travelled": frames.travelled, "truth": frames.truth[-1]}
+        np.savez(out / f"drive-{k}.npz", *clouds, odometry=leaning @ frames.odometry, **about)
     return {"kind": world.kind}
 
 
-def _drives(world: Any, seed: int, recipe: Recipe) -> Iterator[Drive]:
-    from coview_stream.training.worlds import drives
-
-    rng = np.random.default_rng([seed, _LEANING])
-    for sensor, frames in drives(world, seed, recipe):
-        lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
-        leaning = pose_from(exp_so3(np.array([*lean, 0.0])), np.zeros(3))
-        yield Drive(sensor, frames.travelled, leaning @ frames.odometry, frames.clouds, frames.truth[-1])
-
-
-def _write(file: Path, drives: list[Drive]) -> None:
-    clouds = [cloud for drive in drives for cloud in drive.clouds]
-    np.savez(
-        file,
-        sensor=np.array([drive.sensor for drive in drives]),
-        travelled=np.array([drive.travelled for drive in drives]),
-        truth=np.array([drive.truth for drive in drives]),
-        frames=np.array([len(drive.clouds) for drive in drives]),
-        odometry=np.concatenate([drive.odometry for drive in drives]),
-        counts=np.array([len(cloud) for cloud in clouds]),
-        points=np.concatenate(clouds).astype(np.float32),
-    )
-
-
-def _read(file: Path) -> list[Drive]:
-    with np.load(file, allow_pickle=False) as kept:
-        of = dict(kept)
-    clouds = np.split(of["points"], np.cumsum(of["counts"])[:-1])
-    ends = np.cumsum(of["frames"])
-    return [
-        Drive(str(of["sensor"][k]), float(of["travelled"][k]), of["odometry"][end - count : end],
-              tuple(clouds[end - count : end]), of["truth"][k])
-        for k, (end, count) in enumerate(zip(ends, of["frames"], strict=True))
-    ]  # fmt: skip
+def _read(file: Path) -> Drive:
+    with np.load(file, allow_pickle=False) as of:
+        odometry = of["odometry"]
+        clouds = tuple(of[f"arr_{k}"] for k in range(len(odometry)))
+        return Drive(str(of["sensor"]), float(of["travelled"]), odometry, clouds, of["truth"])
 
 
 def base_of(directory: Path) -> Path:
@@ -195,41 +158,39 @@ def base_of(directory: Path) -> Path:
     raise InputError(f"{directory}: no base.laz or base.las; name a folder as 'coview-stream simulate' makes it")
 
 
-def recorded(directory: Path, most: int | None = None) -> Place:
+def recorded(directory: Path, most: int) -> Place:
     """Read a world on disk (base, run/frames, run/odometry.tum, truth.tum); at most ``most`` queries, spread over it.
 
     Raises:
         InputError, RunError, CloudError: a part is missing or cannot be read.
     """
-    from coview_stream.clouds import read_tum
-    from coview_stream.recordings.open_run import open_run
-
     run = open_run(directory / "run")
     stamps, poses = read_tum(directory / "truth.tum")
-    told = run.poses
-    way = driven(told)
-    drives = []
-    for end in ends_of(way, most):
+    way = driven(run.poses)
+    about = directory / "world.json"
+    sensor = json.loads(about.read_text()).get("sensor", "unknown") if about.is_file() else "unknown"
+    found = []
+    for end in _ends(way, most):
         nearest = int(np.abs(stamps - run.stamps[end]).argmin())
-        if abs(stamps[nearest] - run.stamps[end]) > 0.051:
-            continue
-        chosen = frames_behind(way, end)
-        clouds = tuple(run.read(k).points for k in chosen)
-        drives.append(Drive(_sensor(directory), float(way[end] - way[chosen[0]]), told[chosen], clouds, poses[nearest]))
-    return Place(directory.name, "on disk", base_of(directory), drives)
+        if abs(stamps[nearest] - run.stamps[end]) < MAX_STAMP_GAP:
+            chosen = _frames_behind(way, end)
+            clouds = tuple(run.read(k).points for k in chosen)
+            travelled = float(way[end] - way[chosen[0]])
+            found.append(Drive(str(sensor), travelled, run.poses[chosen], clouds, poses[nearest]))
+    return Place(directory.name, "on disk", base_of(directory), found)
 
 
-def ends_of(way: Floats, most: int | None) -> list[int]:
+def _ends(way: Floats, most: int) -> list[int]:
     """Frames at which queries end: every ten of the metres (N,) that were driven, the first after twelve."""
     marks = np.arange(min(BEHIND, way[-1]), way[-1] + 1e-6, EVERY)
     ends = np.unique(np.minimum(np.searchsorted(way, marks - 1e-6), len(way) - 1))
-    if most is not None and len(ends) > most:
+    if len(ends) > most:
         ends = ends[np.unique(np.linspace(0, len(ends) - 1, most).round().astype(int))]
     return [int(end) for end in ends]
 
 
-def frames_behind(way: Floats, end: int) -> list[int]:
-    """Return frames of the last twelve metres, a quarter of a metre apart or more; the last one is ``end``."""
+def _frames_behind(way: Floats, end: int) -> list[int]:
+    """Frames of the last twelve metres, a quarter of a metre apart or more; the last one is ``end``."""
     chosen = [end]
     for k in range(end - 1, -1, -1):
         if way[end] - way[k] > BEHIND + 1e-3:
@@ -237,11 +198,6 @@ def frames_behind(way: Floats, end: int) -> list[int]:
         if way[chosen[-1]] - way[k] >= _SPACING:
             chosen.append(k)
     return chosen[::-1]
-
-
-def _sensor(directory: Path) -> str:
-    file = directory / "world.json"
-    return str(json.loads(file.read_text()).get("sensor", "unknown")) if file.is_file() else "unknown"
 
 
 def in_odometry(drive: Drive) -> tuple[Floats, Pose]:
