@@ -23,7 +23,8 @@ _KEYS = (
     "**/@v0/*/pubsub/point_cloud/**",
     "**/@v0/*/pubsub/frame_transform/odometry/**",
 )
-_MAX_SUGGESTED = 3  # candidates in one line, set by hand
+_LISTEN = 2.0  # seconds, set by hand: clouds come at 5 Hz or more
+_MAX_LISTED = 3  # candidates in one line, set by hand
 _MAX_CANDIDATES = 200  # set by hand; a large site has more than anyone reads
 
 
@@ -42,12 +43,10 @@ class Candidate:
     options: str
 
 
-def discover(
-    transport: Transport, seconds: float = 2.0, wait: Callable[[float], object] = time.sleep
-) -> list[Candidate]:
+def discover(transport: Transport, wait: Callable[[float], object] = time.sleep) -> list[Candidate]:
     """Return the clouds and odometry on the network, sorted.
 
-    Listens for ``seconds`` to the keys of all robots, whose clouds all come here meanwhile, then asks for tokens.
+    Listens for two seconds to the keys of all robots, whose clouds all come here meanwhile, then asks for tokens.
     """
     found: set[Candidate] = set()
 
@@ -57,21 +56,21 @@ def discover(
 
     for key in _KEYS:
         transport.subscribe(key, lambda sample: add(from_key(sample.key)), "newest")
-    wait(seconds)
+    wait(_LISTEN)
     for expression in _TOKENS:
         for token in transport.tokens(expression):
             add(from_token(token))
     return sorted(found)
 
 
-def suggestion(candidates: Iterable[Candidate], channel: str) -> str:
+def candidates_text(candidates: Iterable[Candidate], channel: str) -> str:
     """Name the candidates of a channel, with the options that subscribe to them; empty if there are none."""
     fitting = [candidate for candidate in candidates if candidate.channel == channel]
     if not fitting:
         return ""
     what = "clouds come" if channel == "cloud" else "odometry comes"
-    listed = "; ".join(f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_SUGGESTED])
-    more = f"; and {len(fitting) - _MAX_SUGGESTED} more" if len(fitting) > _MAX_SUGGESTED else ""
+    listed = "; ".join(f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_LISTED])
+    more = f"; and {len(fitting) - _MAX_LISTED} more" if len(fitting) > _MAX_LISTED else ""
     return f"{what} {listed}{more}"
 
 

@@ -48,10 +48,10 @@ class Finding:
         }
 
 
-def from_error(what: str, error: Exception | str, robot: str | None = None) -> Finding:
+def from_error(what: str, error: Exception | str) -> Finding:
     """Return a FAIL with an error's message; this package's messages end with the remedy, after a semicolon."""
     found, _, remedy = " ".join(str(error).split()).partition("; ")
-    return Finding("FAIL", what, found, remedy, robot)
+    return Finding("FAIL", what, found, remedy)
 
 
 def failed(findings: Iterable[Finding]) -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from coview_stream.doctor.capture import Codecs, RobotCapture, Wait, capture_robots
 from coview_stream.doctor.channel_checks import cloud_findings, odometry_findings
 from coview_stream.doctor.cross_checks import cross_findings, node_finding
-from coview_stream.doctor.discovery import Candidate, discover, suggestion
+from coview_stream.doctor.discovery import Candidate, candidates_text, discover
 from coview_stream.doctor.finding import Finding
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import Connection, Transport
@@ -75,8 +75,8 @@ def _counts(connection: Connection) -> str:
 
 def robot_findings(capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None) -> Iterator[Finding]:
     """Judge all of one robot; ``candidates`` are what else is on the network, ``sha256`` the map's if one is known."""
-    yield from cloud_findings(capture, suggestion(candidates, "cloud"))
-    yield from odometry_findings(capture, suggestion(candidates, "odometry"))
+    yield from cloud_findings(capture, candidates_text(candidates, "cloud"))
+    yield from odometry_findings(capture, candidates_text(candidates, "odometry"))
     yield from cross_findings(capture)
     yield node_finding(capture, sha256)
 
@@ -102,7 +102,7 @@ def robots_findings(
 
 def candidates_finding(candidates: Sequence[Candidate]) -> Finding:
     """Name the clouds and odometry there are, for a user who has named no robot."""
-    texts = [text for channel in ("cloud", "odometry") if (text := suggestion(candidates, channel))]
+    texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(candidates, channel))]
     if texts:
         return Finding("ok", "robots", "; ".join(texts))
     return Finding("warn", "robots", "nothing that looks like clouds or odometry", "name one: --robot NAME")

@@ -27,7 +27,7 @@ _CODECS = {
 }
 
 
-def probe(name: str, timeout: float = _TIMEOUT) -> dict[str, Any]:
+def probe(name: str) -> dict[str, Any]:
     """Run one of :data:`PROBES` in a process of its own; ``{"error": ...}`` if it fails, crashes or hangs."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     try:
@@ -38,11 +38,11 @@ def probe(name: str, timeout: float = _TIMEOUT) -> dict[str, Any]:
             text=True,
             errors="replace",
             env=environment,
-            timeout=timeout,
+            timeout=_TIMEOUT,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return {"error": f"no answer within {timeout:g} s"}
+        return {"error": f"no answer within {_TIMEOUT:g} s"}
     return _answer(done.returncode, done.stdout, done.stderr)
 
 

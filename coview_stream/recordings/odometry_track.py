@@ -24,9 +24,9 @@ class Track:
         poses: (K, 4, 4) odometry <- body, metres.
     """
 
-    def __init__(self, stamps: Ints, poses: Poses, config: NodeConfig | None = None) -> None:
+    def __init__(self, stamps: Ints, poses: Poses) -> None:
         """Sort the samples; of equal stamps the first counts. At least one sample."""
-        config = config or NodeConfig()
+        config = NodeConfig()
         self.stamps, first = np.unique(stamps, return_index=True)
         self.poses = poses[first]
         seconds = _NS * np.diff(self.stamps)

@@ -50,12 +50,7 @@ def plot_map(base: Reals, stations: Reals, path: Path, title: str = "Base map") 
 
 
 def plot_trajectory(
-    base: Reals,
-    positions: Reals,
-    states: Sequence[str],
-    path: Path,
-    truth: Reals | None = None,
-    title: str = "Trajectory",
+    base: Reals, positions: Reals, states: Sequence[str], path: Path, truth: Reals | None = None
 ) -> None:
     """Draw a trajectory over the grey base map, coloured by state.
 
@@ -66,7 +61,6 @@ def plot_trajectory(
         states: K states, SEARCHING, AMBIGUOUS, TRACKING or LOST.
         path: picture to write.
         truth: (T, 3) true positions, if known.
-        title: heading.
 
     Raises:
         InputError: as many states as positions are needed; or the picture cannot be written.
@@ -83,7 +77,7 @@ def plot_trajectory(
         _draw_states(axes, positions - shift, drawn, np.asarray(states, dtype=object))
         if not drawn.any():
             draw_notice(axes, "not localised: no frame has a pose")
-        axes.set_title(title)
+        axes.set_title("Trajectory")
         legend_below(drawing, axes)
 
 
@@ -103,9 +97,7 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
         axes.scatter(x, y, s=90, marker="o", facecolors="none", edgecolors=TRUTH, label="first pose", zorder=4)
 
 
-def plot_errors(
-    distance: Reals, e_t: Reals, e_r: Reals, path: Path, title: str = "Errors over the distance driven"
-) -> None:
+def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: Path) -> None:
     """Draw translation errors (N,) in metres and rotation errors (N,) in radians over (N,) metres driven.
 
     Raises:
@@ -130,7 +122,7 @@ def plot_errors(
             axes.scatter(distance[~wrong], values[~wrong], s=7, color=colour, linewidths=0, label=named)
             _draw_false(axes, distance[wrong], values[wrong], limit)
             legend_above(axes)
-        panels[0].set_title(title)
+        panels[0].set_title("Errors over the distance driven")
         panels[1].set_xlabel("distance driven [m]")
 
 

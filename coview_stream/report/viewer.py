@@ -21,12 +21,12 @@ class PoseViewer:
         DependencyError: rerun is not installed.
     """
 
-    def __init__(self, application: str = "coview_stream") -> None:
+    def __init__(self) -> None:
         self._rerun = require_library("rerun", "rerun-sdk>=0.20", "--rerun")
         self._origin: np.ndarray | None = None
         self._strips: dict[str, list[np.ndarray]] = {}
         self._pieces: dict[str, int] = {}
-        self._rerun.init(application, spawn=True)
+        self._rerun.init("coview_stream", spawn=True)
 
     def show(self, pose: PoseMessage) -> None:
         """Draw one pose and the path to it."""

@@ -24,18 +24,15 @@ from coview_stream.training.training_config import TrainingConfig
 _WARM_UP = 0.03  # share of the steps over which the learning rate rises
 _FINAL_RATE = 0.01  # share of the learning rate at the end
 _MAX_GRADIENT = 5.0  # norm
+_CHECKPOINT_STEPS = 100  # from one checkpoint to the next
 
 Report = Callable[[int, Losses], None]
 
 
 def train(
-    worlds: Sequence[WorldViews],
-    config: TrainingConfig,
-    report: Report | None = None,
-    checkpoint: Path | None = None,
-    every: int = 100,
+    worlds: Sequence[WorldViews], config: TrainingConfig, report: Report | None = None, checkpoint: Path | None = None
 ) -> PlaceNet:
-    """Train from scratch, or go on from the file ``checkpoint`` if it exists; it is written every ``every`` steps.
+    """Train from scratch, or go on from the file ``checkpoint`` if it exists; it is written every 100 steps.
 
     Raises:
         InputError: the loss is not finite, or the checkpoint cannot be read or is of another configuration.
@@ -59,7 +56,7 @@ def train(
         optimiser.step()
         if report is not None:
             report(step, found)
-        if checkpoint is not None and (step + 1) % every == 0:
+        if checkpoint is not None and (step + 1) % _CHECKPOINT_STEPS == 0:
             _keep(checkpoint, net, optimiser, step + 1, config)
     net.eval()
     return net

@@ -14,13 +14,16 @@ from coview_stream.localization.search.learned.correlation import correlate, dow
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.training.dataset import WorldViews
 
+# all set by hand
+
 HEADINGS = 36
 """Headings that the dense search tries."""
 
 _CELL = 2.0  # metres of the dense search
 _BEST = 5  # places kept
-_DISTINCT = 10.0  # metres between two places that are counted as two; set by hand
-_RADIUS = 29.0  # metres of a query that are compared; set by hand
+_DISTINCT = 10.0  # metres between two places that are counted as two
+_MAX_ERROR = 10.0  # metres from the truth at which a place still counts as found
+_RADIUS = 29.0  # metres of a query that are compared
 
 Encoder = Callable[[Image], Features]
 
@@ -45,10 +48,10 @@ class SearchedQuery:
     pose: Floats
     scores: Floats
 
-    def found_among(self, best: int = 1, within: float = 10.0) -> bool:
-        """Tell whether one of the ``best`` places lies ``within`` metres of the truth."""
+    def found_among(self, best: int = 1) -> bool:
+        """Tell whether one of the ``best`` places lies within 10 m of the truth."""
         apart = np.linalg.norm(self.found[:best, :2] - self.pose[:2], axis=1)
-        return bool((apart < within).any())
+        return bool((apart < _MAX_ERROR).any())
 
 
 def search_queries(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coview_stream.doctor.discovery import Candidate, discover, from_key, from_token, suggestion
+from coview_stream.doctor.discovery import Candidate, candidates_text, discover, from_key, from_token
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
@@ -94,12 +94,12 @@ def test_discovery_uses_keys_and_tokens():
         "hq/@v0/ship/pubsub/point_cloud/os",
         "/r3/odom",
     ]
-    assert suggestion(candidates, "odometry") == "odometry comes on /r3/odom: try --preset rmw_zenoh --robot r3"
-    assert suggestion(candidates, "cloud").count(": try ") == 3
+    assert candidates_text(candidates, "odometry") == "odometry comes on /r3/odom: try --preset rmw_zenoh --robot r3"
+    assert candidates_text(candidates, "cloud").count(": try ") == 3
     assert net.raised == []
 
 
 def test_suggested_options_stay_short():
     candidates = [Candidate("cloud", f"k{n}", f"--robot r{n}") for n in range(9)]
-    assert suggestion(candidates, "cloud").endswith("; and 6 more")
-    assert suggestion(candidates, "odometry") == ""
+    assert candidates_text(candidates, "cloud").endswith("; and 6 more")
+    assert candidates_text(candidates, "odometry") == ""
