@@ -15,7 +15,7 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.errors import EncodingError, MessageError
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry, prepare
-from coview_stream.messages.choose import Channel, codec_for
+from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.stream.node.counters import counter_of
@@ -177,7 +177,7 @@ def capture_odometry(
 
 
 def _capture(
-    channel: Channel,
+    channel: MessageKind,
     codecs: Mapping[str, Any],
     decode: Callable[..., Any],
     sample: Sample,

@@ -1,4 +1,4 @@
-"""Messages from bytes and back: one table of codecs for each channel.
+"""Messages from bytes and back: one table of codecs for each kind of message.
 
 ============  ===========================================  ===================================================
 codec         in                                           out
@@ -14,8 +14,8 @@ codec         in                                           out
 
 Stamps are nanoseconds of the sensor's clock, lengths metres; poses are 4x4 and map the body into odometry or map.
 For any bytes, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too
-large, :class:`EncodingError` if no codec knows the encoding or it cannot carry what the channel needs). An ``option``
-or ``hint`` that names no codec of the channel is a :class:`ConfigError`.
+large, :class:`EncodingError` if no codec knows the encoding or it cannot carry what the message needs). An ``option``
+or ``hint`` that names no codec of that kind of message is a :class:`ConfigError`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Generic, TypeVar
 
 from coview_stream.errors import ConfigError, MessageError
 from coview_stream.messages import foxglove, json_messages, keelson, raw, ros2
-from coview_stream.messages.choose import Channel, codec_for
+from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import MAX_PAYLOAD, MAX_POINTS, OversizedError, check_size, read_attachment
 
@@ -51,7 +51,12 @@ M = TypeVar("M")
 
 @dataclass(frozen=True)
 class Codec(Generic[M]):
-    """One encoding on one channel, in both directions."""
+    """One encoding of one kind of message, in both directions.
+
+    Attributes:
+        decode: read a sample.
+        encode: write a message.
+    """
 
     decode: Callable[[Sample], M]
     encode: Callable[[M], Encoded]
@@ -125,14 +130,14 @@ def prepare(*names: str) -> None:
         _PREPARE.get(name, lambda: None)()
 
 
-def _named(channel: Channel, codecs: Mapping[str, Codec[M]], name: str) -> Codec[M]:
+def _named(kind: MessageKind, codecs: Mapping[str, Codec[M]], name: str) -> Codec[M]:
     if name not in codecs:
-        raise ConfigError(f"encoding {name!r} for {channel}; it must be one of {', '.join(codecs)}")
+        raise ConfigError(f"encoding {name!r} for {kind}; it must be one of {', '.join(codecs)}")
     return codecs[name]
 
 
 def _decode(
-    channel: Channel,
+    kind: MessageKind,
     codecs: Mapping[str, Codec[M]],
     sample: Sample,
     option: str | None,
@@ -143,7 +148,7 @@ def _decode(
         check_size(sample.payload, max_payload, sample.size)
     except OversizedError as error:
         raise OversizedError(f"{sample.key}: {error}") from error
-    name = codec_for(channel, codecs, sample, option, hint)
+    name = codec_for(kind, codecs, sample, option, hint)
     try:
         return codecs[name].decode(sample)
     except MessageError as error:

@@ -10,7 +10,7 @@ from typing import Literal
 from coview_stream.errors import ConfigError, EncodingError
 from coview_stream.messages.types import Sample
 
-Channel = Literal["cloud", "odometry", "pose"]
+MessageKind = Literal["cloud", "odometry", "pose"]
 
 # the codecs that a MIME type may stand for; the first if no schema is named
 _MIMES: dict[str, tuple[str, ...]] = {
@@ -26,7 +26,7 @@ _MIMES: dict[str, tuple[str, ...]] = {
 }
 _MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # without a schema they say nothing
 _WITHOUT_SCHEMA = ("application/json", "text/json")  # what follows is a charset or the like
-_SCHEMAS: dict[str, tuple[str, tuple[Channel, ...]]] = {
+_SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "xyz": ("xyz", ("cloud",)),
     "xyzi": ("xyzi", ("cloud",)),
     "sensor_msgs.pointcloud2": ("cdr", ("cloud",)),
@@ -37,32 +37,32 @@ _SCHEMAS: dict[str, tuple[str, tuple[Channel, ...]]] = {
     "foxglove.frametransform": ("foxglove", ("odometry", "pose")),
     "core.envelope": ("keelson", ("cloud", "odometry", "pose")),
 }
-_KEELSON: dict[str, tuple[Channel, ...]] = {"point_cloud": ("cloud",), "frame_transform": ("odometry", "pose")}
+_KEELSON: dict[str, tuple[MessageKind, ...]] = {"point_cloud": ("cloud",), "frame_transform": ("odometry", "pose")}
 _MAGIC = ((b"\0\0\0\0", "cdr"), (b"\0\1\0\0", "cdr"), (b"{", "json"))
 _RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
 _KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
 _MAX_ENCODING = 256  # characters
 
 
-def codec_for(channel: Channel, names: Collection[str], sample: Sample, option: str | None, hint: str | None) -> str:
+def codec_for(kind: MessageKind, names: Collection[str], sample: Sample, option: str | None, hint: str | None) -> str:
     """Choose one of the codecs ``names``; ConfigError for a wrong option or hint, EncodingError if none fits."""
     for setting, name in (("option", option), ("hint", hint)):
         if name is not None and name not in names:
-            raise ConfigError(f"encoding {setting} {name!r} for {channel}; it must be one of {', '.join(names)}")
+            raise ConfigError(f"encoding {setting} {name!r} for {kind}; it must be one of {', '.join(names)}")
     if option is not None:
         return option
-    allowed, by_key = _claims(channel, sample.encoding[: _MAX_ENCODING + 1], sample.key)
+    allowed, by_key = _claims(kind, sample.encoding[: _MAX_ENCODING + 1], sample.key)
     if allowed:
         name = next((name for name in (by_key, hint) if name in allowed), allowed[0])
     else:
         name = by_key or hint or _by_magic(sample)
     if name not in names:
-        raise EncodingError(f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {channel}")
+        raise EncodingError(f"{sample.key}: {name} (encoding {sample.encoding[:80]!r}) cannot carry {kind}")
     return name
 
 
 @lru_cache(maxsize=256)
-def _claims(channel: Channel, encoding: str, key: str) -> tuple[tuple[str, ...], str]:
+def _claims(kind: MessageKind, encoding: str, key: str) -> tuple[tuple[str, ...], str]:
     """Return the codecs that the encoding allows, best first (none: it says nothing), and the one of the key or ''."""
     mime, _, parameters = encoding.partition(";")
     mime = mime.strip().lower()
@@ -70,11 +70,11 @@ def _claims(channel: Channel, encoding: str, key: str) -> tuple[tuple[str, ...],
         raise EncodingError(f"{key}: unknown encoding {encoding[:80]!r}; see the table of encodings")
     schema = _schema(parameters)
     if schema and mime not in _WITHOUT_SCHEMA:
-        codec = _of_schema(channel, schema, f"{key}: encoding {encoding[:80]!r}")
+        codec = _of_schema(kind, schema, f"{key}: encoding {encoding[:80]!r}")
         if codec not in _MIMES[mime]:
             raise EncodingError(f"{key}: encoding {encoding[:80]!r} contradicts itself")
         return (codec,), ""
-    return (() if mime in _MUTE else _MIMES[mime]), _by_key(channel, key)
+    return (() if mime in _MUTE else _MIMES[mime]), _by_key(kind, key)
 
 
 def _schema(parameters: str) -> str:
@@ -84,21 +84,21 @@ def _schema(parameters: str) -> str:
     return ".".join(part for part in parts if part not in ("msg", "dds", ""))
 
 
-def _of_schema(channel: Channel, schema: str, source: str) -> str:
-    codec, channels = _SCHEMAS.get(schema, ("", ()))
+def _of_schema(kind: MessageKind, schema: str, source: str) -> str:
+    codec, kinds = _SCHEMAS.get(schema, ("", ()))
     if not codec:
         raise EncodingError(f"{source}: no codec knows {schema!r}")
-    if channel not in channels:
-        raise EncodingError(f"{source}: {schema!r} cannot carry {channel}")
+    if kind not in kinds:
+        raise EncodingError(f"{source}: {schema!r} cannot carry {kind}")
     return codec
 
 
-def _by_key(channel: Channel, key: str) -> str:
+def _by_key(kind: MessageKind, key: str) -> str:
     if rmw := _RMW_KEY.search(key):
-        return _of_schema(channel, _schema(rmw[1]), f"{key}: key")
+        return _of_schema(kind, _schema(rmw[1]), f"{key}: key")
     if keelson := _KEELSON_KEY.search(key):
-        if channel not in _KEELSON.get(keelson[1], (channel,)):
-            raise EncodingError(f"{key}: subject {keelson[1]!r} cannot carry {channel}")
+        if kind not in _KEELSON.get(keelson[1], (kind,)):
+            raise EncodingError(f"{key}: subject {keelson[1]!r} cannot carry {kind}")
         return "keelson"
     return ""
 

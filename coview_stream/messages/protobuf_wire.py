@@ -16,11 +16,19 @@ _LENGTH = 2
 
 @dataclass(frozen=True)
 class Entry:
-    """One field on the wire; offsets in bytes from the start of the message."""
+    """One field on the wire; offsets in bytes from the start of the message.
+
+    Attributes:
+        number: of the field.
+        sized: whether it has a length.
+        start: offset of its tag.
+        value: offset of its value, after the length.
+        end: offset of what follows.
+    """
 
     number: int
-    sized: bool  # it has a length
-    start: int  # of its tag
+    sized: bool
+    start: int
     value: int
     end: int
 

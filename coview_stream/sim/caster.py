@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_stream.clouds.open3d_loader import open3d
 from coview_stream.geometry.arrays import Bools, Floats32, Indices
-from coview_stream.sim.scenes import Epoch
+from coview_stream.sim.scenes import SceneState
 
 BLOCK = 200_000
 """Rays cast at a time, set by hand: bounds the memory to about 30 MB."""
@@ -32,7 +32,7 @@ class Hits(NamedTuple):
 
 
 class Caster:
-    """Ray caster for one epoch of a scene, on ``threads`` cores.
+    """Ray caster for one state of a scene, on ``threads`` cores.
 
     Leaves are hit ``leaf_depth`` metres on average below the surface of their foliage.
 
@@ -40,13 +40,13 @@ class Caster:
         DependencyError: Open3D cannot be loaded.
     """
 
-    def __init__(self, epoch: Epoch, threads: int = _THREADS, leaf_depth: float = _LEAF_DEPTH) -> None:
+    def __init__(self, scene: SceneState, threads: int = _THREADS, leaf_depth: float = _LEAF_DEPTH) -> None:
         self._o3d: Any = open3d()
         self._threads, self._leaf_depth = threads, leaf_depth
         self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=threads)
         self._foliage = -1
         for name in ("solid", "foliage"):
-            mesh = getattr(epoch, name)
+            mesh = getattr(scene, name)
             if len(mesh.triangles):
                 vertices = self._o3d.core.Tensor(mesh.vertices.astype(np.float32))
                 triangles = self._o3d.core.Tensor(mesh.triangles.astype(np.uint32))

@@ -12,7 +12,7 @@ import numpy as np
 
 from coview_stream.sim import buildings
 from coview_stream.sim.layout import Layout, grid_layout, loop_layout
-from coview_stream.sim.vegetation import Species
+from coview_stream.sim.vegetation import TreeMix
 
 Range = tuple[float, float]
 
@@ -66,7 +66,7 @@ class Kind(NamedTuple):
     vacant: float
     infill: float
     trees: float
-    species: Species
+    species: TreeMix
     undergrowth: float = 0.0
     rocks: float = 0.0
     logs: float = 0.0
@@ -90,7 +90,7 @@ KINDS: dict[str, Kind] = {
         vacant=0.12,
         infill=0.0004,
         trees=0.0035,
-        species=Species((4.0, 12.0)),
+        species=TreeMix((4.0, 12.0)),
         undergrowth=0.004,
         cars=0.45,
         pole_spacing=26.0,
@@ -107,7 +107,7 @@ KINDS: dict[str, Kind] = {
         vacant=0.3,
         infill=0.0004,
         trees=0.0045,
-        species=Species((5.0, 15.0), conifers=0.2),
+        species=TreeMix((5.0, 15.0), conifers=0.2),
         undergrowth=0.002,
         cars=0.2,
         pole_spacing=30.0,
@@ -124,7 +124,7 @@ KINDS: dict[str, Kind] = {
         vacant=0.25,
         infill=0.0002,
         trees=0.006,
-        species=Species((3.5, 13.0), conifers=0.2),
+        species=TreeMix((3.5, 13.0), conifers=0.2),
         undergrowth=0.006,
         cars=0.15,
         pole_spacing=38.0,
@@ -145,7 +145,7 @@ KINDS: dict[str, Kind] = {
         vacant=0.2,
         infill=0.0002,
         trees=0.001,
-        species=Species((4.0, 10.0)),
+        species=TreeMix((4.0, 10.0)),
         undergrowth=0.001,
         cars=0.3,
         pole_spacing=32.0,
@@ -162,7 +162,7 @@ KINDS: dict[str, Kind] = {
         vacant=0.6,
         infill=0.0,
         trees=0.036,
-        species=Species((7.0, 26.0), spread=(0.12, 0.2), conifers=0.5),
+        species=TreeMix((7.0, 26.0), spread=(0.12, 0.2), conifers=0.5),
         undergrowth=0.02,
         rocks=0.0012,
         logs=0.0012,

@@ -1,6 +1,6 @@
-"""Seeded scenes in two epochs: when the map was made, and now.
+"""Seeded scenes in two states: when the map was made, and now.
 
-Frame: the scene's own, z up, metres, origin in the middle. Trees, cars and poles may change between the two epochs;
+Frame: the scene's own, z up, metres, origin in the middle. Trees, cars and poles may change between the two;
 ground, buildings and hedges stay.
 """
 
@@ -51,7 +51,7 @@ class Footprint:
 
 
 @dataclass(frozen=True)
-class Epoch:
+class SceneState:
     """Scene at one time.
 
     Attributes:
@@ -65,7 +65,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene in both epochs.
+    """Scene in both states.
 
     Attributes:
         kind: one of ``KINDS``.
@@ -79,8 +79,8 @@ class Scene:
 
     kind: str
     size: float
-    mapped: Epoch
-    now: Epoch
+    mapped: SceneState
+    now: SceneState
     site: Site
     route: Floats
     footprints: tuple[Footprint, ...]
@@ -88,7 +88,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class _Movable:
-    """Objects of one sort that may change between the epochs.
+    """Objects of one sort that may change between the two states.
 
     Attributes:
         rows: one per object when the map was made.
@@ -124,15 +124,15 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     cars, poles = _street_furniture(rng[_STREET], site, spec)
     trees = _trees(rng[_GREEN], rng[_SPARE], site, spec, changed)
 
-    def epoch(pick: Callable[[_Movable], Floats]) -> Epoch:
+    def state(pick: Callable[[_Movable], Floats]) -> SceneState:
         rows = pick(trees)
         ground = site.z(rows[:, 0], rows[:, 1])
         street = [furniture.cars(pick(cars), site), furniture.poles(pick(poles), site)]
         solid = join([site.mesh(), *built, *fixed, *street, vegetation.trunks(rows, ground)])
-        return Epoch(solid, join([*bushes, vegetation.crowns(rows, ground)]))
+        return SceneState(solid, join([*bushes, vegetation.crowns(rows, ground)]))
 
-    mapped = epoch(lambda movable: movable.rows)
-    now = epoch(lambda movable: movable.now(rng[_SPARE], changed)) if changed else mapped
+    mapped = state(lambda movable: movable.rows)
+    now = state(lambda movable: movable.now(rng[_SPARE], changed)) if changed else mapped
     return Scene(kind, size, mapped, now, site, layout.route, tuple(footprints))
 
 
@@ -208,7 +208,7 @@ def _draw_plot(rng: np.random.Generator, spec: Kind) -> tuple[Plot, float, float
 
 
 def _greenery(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Mesh], list[Mesh]]:
-    """Return the meshes that stay in both epochs: solid rocks and logs, leafy bushes."""
+    """Return the meshes that stay in both states: solid rocks and logs, leafy bushes."""
     area, extent = (2 * site.half) ** 2, site.half - 2.0
     solid = [
         vegetation.rocks(rng, site, int(spec.rocks * area), extent),

@@ -18,7 +18,7 @@ _BUSH = ellipsoid(4, 6)
 TREE_COLUMNS = ("x", "y", "height", "spread", "conifer", "lean_x", "lean_y", "seed")
 
 
-class Species(NamedTuple):
+class TreeMix(NamedTuple):
     """Sizes and shapes of a scene's trees.
 
     Attributes:
@@ -32,7 +32,7 @@ class Species(NamedTuple):
     conifers: float = 0.0
 
 
-def draw_tree(rng: np.random.Generator, x: float, y: float, species: Species) -> Floats:
+def draw_tree(rng: np.random.Generator, x: float, y: float, species: TreeMix) -> Floats:
     """Draw one tree as a row of ``TREE_COLUMNS``."""
     height = rng.uniform(*species.height)
     conifer = float(rng.random() < species.conifers)

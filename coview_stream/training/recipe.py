@@ -64,20 +64,20 @@ class Recipe:
         kinds: scenes of the worlds with buildings.
         size: side of the square map, metres.
         submaps: queries of a world, evenly of ``sensors``.
-        changed: share of trees, cars and poles that differ between the epochs, in worlds with buildings.
+        changed: share of trees, cars and poles that differ between map and drive, in worlds with buildings.
         stems: trees per hectare.
         tree_height: metres.
         crown_width: diameter, in shares of the tree's height.
         crown_base: height of the lowest leaves, in shares of the tree's height.
         crown_offset: metres between a crown's middle and its stem's foot.
         stem_radius: metres.
-        mortality: share of trees that stand, or have leaves, at one of the two epochs only.
+        mortality: share of trees that stand, or have leaves, at one of the two times only.
         dead: share of bare trees.
-        leaf_off: probability that an epoch lies in winter.
+        leaf_off: probability that one of the two times lies in winter.
         understory: bushes and saplings per square metre.
         slope: steepest slopes of a world, degrees.
         roughness: of the ground, metres.
-        wind: shift of each crown between the epochs, metres, 1 sigma.
+        wind: shift of each crown between the two times, metres, 1 sigma.
         aerial_porosity: probability that an airborne pulse passes a surface of leaves.
         ground_porosity: probability that a robot's beam does.
         leaf_depth: mean depth below a crown's surface at which leaves are hit, metres.

@@ -1,4 +1,4 @@
-"""Forest stands at two epochs: when the map is flown, and when the robot drives."""
+"""Forest stands at two times: when the map is flown, and when the robot drives."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.sim.mesh import Mesh, join
-from coview_stream.sim.scenes import Epoch
+from coview_stream.sim.scenes import SceneState
 from coview_stream.training import tree_meshes
 from coview_stream.training.mesh_copies import MeshCopies, join_standing
 from coview_stream.training.recipe import Recipe
@@ -25,13 +25,13 @@ class Stand(NamedTuple):
         mapped: geometry when the map is flown.
         now: geometry when the robot drives.
         terrain: the ground.
-        trees: all trees of either epoch.
+        trees: all trees of either time.
         obstacles: (N, 3) x, y and radius of what blocks the robot, metres.
         drawn: values that were drawn for the stand, for JSON.
     """
 
-    mapped: Epoch
-    now: Epoch
+    mapped: SceneState
+    now: SceneState
     terrain: Terrain
     trees: Trees
     obstacles: Floats
@@ -59,8 +59,8 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     woody = [tree_meshes.stems(trees), tree_meshes.branches(rng, trees, _branch_counts(rng, trees, any(winters)))]
     there, leafed = _fates(rng, len(xy), mortality)
     shifts = (None, rng.normal(0, wind, (len(xy), 2)))
-    epochs = [
-        _epoch(rng, solid, woody, leaves, bushes, there[k], leafed[k] & tree_meshes.leafy(trees, winters[k]), shifts[k])
+    states = [
+        _state(rng, solid, woody, leaves, bushes, there[k], leafed[k] & tree_meshes.leafy(trees, winters[k]), shifts[k])
         for k in range(2)
     ]
     drawn = {
@@ -74,7 +74,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
         "understory": understory,
         "wind": wind,
     }
-    return Stand(epochs[0], epochs[1], terrain, trees, _obstacles(trees, there[1]), drawn)
+    return Stand(states[0], states[1], terrain, trees, _obstacles(trees, there[1]), drawn)
 
 
 def tags(drawn: dict[str, Any]) -> str:
@@ -87,13 +87,13 @@ def tags(drawn: dict[str, Any]) -> str:
 
 
 def _winters(rng: np.random.Generator, recipe: Recipe) -> tuple[bool, bool]:
-    """Draw whether it is winter at the two epochs: the same season in half of the cases."""
+    """Draw whether it is winter at the two times: the same season in half of the cases."""
     first, second = (bool(each) for each in rng.random(2) < recipe.leaf_off)
     return (first, first) if rng.random() < 0.5 else (first, second)
 
 
 def _fates(rng: np.random.Generator, count: int, mortality: float) -> tuple[tuple[Bools, Bools], tuple[Bools, Bools]]:
-    """Draw masks of the trees that stand and of those with leaves, at each epoch; a share of ``mortality`` differs."""
+    """Draw masks of the trees that stand and of those with leaves, at each time; a share of ``mortality`` differs."""
     fate = np.where(rng.random(count) < mortality, rng.integers(1, 4, count), 0)
     everyone = np.ones(count, dtype=bool)
     return (fate != 2, fate != 1), (everyone, fate != 3)
@@ -114,7 +114,7 @@ def _litter(rng: np.random.Generator, terrain: Terrain) -> list[Mesh]:
     return [join_standing([logs, rocks], everything)]
 
 
-def _epoch(
+def _state(
     rng: np.random.Generator,
     solid: list[Mesh],
     woody: list[MeshCopies],
@@ -123,10 +123,10 @@ def _epoch(
     there: Bools,
     leafed: Bools,
     shift: Floats | None,
-) -> Epoch:
+) -> SceneState:
     grown = rng.random(len(bushes.owner)) < 0.85  # the understory changes most
     foliage = [join_standing(leaves, there & leafed, shift), join_standing([bushes], grown)]
-    return Epoch(join([*solid, join_standing(woody, there)]), join(foliage))
+    return SceneState(join([*solid, join_standing(woody, there)]), join(foliage))
 
 
 def _obstacles(trees: Trees, there: Bools) -> Floats:

@@ -1,4 +1,4 @@
-"""Training worlds: a place at two epochs, the map's scan of it, and the robot's submaps."""
+"""Training worlds: a place at two times, the map's scan of it, and the robot's submaps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 from coview_stream.sim.airborne import Flight, airborne_scan
 from coview_stream.sim.caster import Caster
-from coview_stream.sim.scenes import Epoch, build_scene
+from coview_stream.sim.scenes import SceneState, build_scene
 from coview_stream.training.paths import along_streets, between_trees
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.stands import draw_stand, tags
@@ -41,8 +41,8 @@ class World:
 
     size: float
     kind: str
-    mapped: Epoch
-    now: Epoch
+    mapped: SceneState
+    now: SceneState
     ground: Callable[[Floats, Floats], Floats]
     span: tuple[float, float]
     path: Callable[[np.random.Generator, float, float], Floats]

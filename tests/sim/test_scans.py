@@ -7,7 +7,7 @@ import pytest
 
 from coview_stream.sim.caster import Caster
 from coview_stream.sim.mesh import EMPTY, Mesh, box, join, placed
-from coview_stream.sim.scenes import Epoch
+from coview_stream.sim.scenes import SceneState
 from coview_stream.sim.sensors import SENSORS
 
 RNG = np.random.default_rng(0)
@@ -88,24 +88,24 @@ def test_beam_directions_are_unit_vectors_and_repeat_as_specified(name):
     assert rows is None or len(np.unique(elevation.round(6))) == rows
 
 
-def cast_down(epoch, porosity, count=4000):
+def cast_down(scene, porosity, count=4000):
     rays = np.tile(np.array([[0, 0, -1]], np.float32), (count, 1))
     origins = np.column_stack([RNG.uniform(-3, 3, (count, 2)), np.full(count, 20.0)]).astype(np.float32)
-    return Caster(epoch).cast(origins, rays, np.random.default_rng(1), porosity)
+    return Caster(scene).cast(origins, rays, np.random.default_rng(1), porosity)
 
 
 def test_foliage_transmits_configured_share_of_rays():
     ground, leaves = box(20, 20, 1), placed(box(10, 10, 1), 0, 0, 8.0)
-    upper = cast_down(Epoch(ground, leaves), 0.5).distance < 13
+    upper = cast_down(SceneState(ground, leaves), 0.5).distance < 13
     assert upper.mean() == pytest.approx(0.75, abs=0.03)  # two surfaces, each stops half of what comes
-    assert (cast_down(Epoch(ground, leaves), 0.0).distance < 13).all()
-    solid = cast_down(Epoch(join([ground, leaves]), EMPTY), 0.5)
+    assert (cast_down(SceneState(ground, leaves), 0.0).distance < 13).all()
+    solid = cast_down(SceneState(join([ground, leaves]), EMPTY), 0.5)
     np.testing.assert_allclose(solid.distance, 11.0, atol=1e-4)
     np.testing.assert_allclose(solid.incidence, 1.0, atol=1e-4)
 
 
 def test_rays_into_the_sky_return_nothing():
-    hits = Caster(Epoch(box(2, 2, 1), EMPTY)).cast(
+    hits = Caster(SceneState(box(2, 2, 1), EMPTY)).cast(
         np.array([[0, 0, 5]], np.float32), np.array([[0, 0, 1]], np.float32), RNG, 0.0
     )
     assert np.isinf(hits.distance).all()
@@ -115,7 +115,7 @@ def test_far_wall_at_grazing_angle_returns_fewer_points():
     corners = np.array([[10.0, -500, -50], [10, 500, -50], [10, 500, 50], [10, -500, 50]])
     wall = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     sensor = SENSORS["vlp16"]()
-    points = sensor.scan(Caster(Epoch(wall, EMPTY)), np.eye(4), 0, np.random.default_rng(0))
+    points = sensor.scan(Caster(SceneState(wall, EMPTY)), np.eye(4), 0, np.random.default_rng(0))
     assert np.abs(points[:, 0] - 10.0).max() < 0.15
     returned = np.linalg.norm(points, axis=1)
     ahead = sensor.beams(0)[:, 0]
