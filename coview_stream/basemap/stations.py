@@ -22,12 +22,12 @@ Described = dict[Channel, npt.NDArray[np.float16]]
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
-RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
-_PORTION = 512  # stations at a time: 7 MB of bins
+RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth; set by hand
+_PORTION = 512  # stations at a time: 7 MB of bins; set by hand
 _FLOORS = LevelConfig(area=25.0)  # square metres: smaller floors are overhangs more often than not; set by hand
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together; set by hand
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey; set by hand
-_CEILING = 6.0  # metres: as LevelConfig.cover
+_CEILING = 6.0  # metres: as LevelConfig.cover; set by hand
 
 
 def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:

@@ -24,6 +24,7 @@ _YEAR = 3.2e7  # seconds
 _MIN_PAIRED = 0.9  # share of the clouds that find odometry, set by hand
 _MAX_STATUS_AGE = 5.0  # seconds, set by hand; a node publishes one every second
 _LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
+_LEAP_TOLERANCE = 0.4  # seconds off a whole number of leap seconds, set by hand
 _DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 
 
@@ -53,7 +54,7 @@ def clock_finding(clouds: list[CapturedMessage], odometry: list[CapturedMessage]
     remedy = "put both on one clock"
     if size > _YEAR:
         remedy += "; one counts from 1970, the other from when it was switched on"
-    elif (leap := _LEAP_SECONDS.get(round(size))) and abs(size - round(size)) < 0.4:
+    elif (leap := _LEAP_SECONDS.get(round(size))) and abs(size - round(size)) < _LEAP_TOLERANCE:
         remedy += f"; this looks like {leap}"
     return Finding("FAIL", "one clock", found, remedy, robot)
 

@@ -22,6 +22,7 @@ _SLACK = 0.5  # metres that a sample may always be off: corrections by a lidar o
 _SLACK_SPEED = 3.0  # metres per second by which any robot may have sped up meanwhile
 _SPEED_FACTOR = 3.0  # times its speed of the last seconds
 _SPEED_WINDOW_NS = 2 * _NS
+_MIN_SPEED_SPAN = 0.2  # seconds of samples: fewer give no speed
 _JUMP_ANGLE = np.radians(20.0)
 
 
@@ -43,6 +44,8 @@ class SampleKind(StrEnum):
 
 @dataclass(frozen=True)
 class _Entry:
+    """A sample, and the way to it."""
+
     sample: OdometryMessage
     travelled: float  # metres since the first sample
     turned: float  # radians since the first sample
@@ -136,7 +139,7 @@ class OdometryBuffer:
         return SampleKind.GAP if seconds > self.config.odometry_timeout else SampleKind.CONTINUES
 
     def _is_new_sequence(self, stamp_ns: int, now: float) -> bool:
-        """Whether the samples that do not continue the buffer have continued each other for long enough."""
+        """Tell whether the samples that do not continue the buffer have continued each other for long enough."""
         if self._discontinuous and stamp_ns <= self._discontinuous[-1]:
             self._discontinuous.clear()
         if not self._discontinuous:
@@ -157,7 +160,7 @@ class OdometryBuffer:
         newest = self._samples[-1]
         past = next(s for s in self._samples if s.stamp_ns >= newest.stamp_ns - _SPEED_WINDOW_NS)
         seconds = (newest.stamp_ns - past.stamp_ns) / _NS
-        if seconds < 0.2:
+        if seconds < _MIN_SPEED_SPAN:
             return float("inf")
         return _SLACK_SPEED + _SPEED_FACTOR * (newest.travelled - past.travelled) / seconds
 

@@ -8,7 +8,8 @@ from coview_stream.descriptors.birds_eye_view import CELL, LAYERS, Image
 
 _HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
 _TOP, _SEEN, _RELIEF = LAYERS - 3, LAYERS - 2, LAYERS - 1
-_CHANCE = 0.5  # of each change; this and the numbers below are set by hand
+# set by hand, as the ranges drawn from below
+_CHANCE = 0.5  # of each change
 _MAX_FALLEN = 0.004  # disks per square metre: 40 a hectare
 _RADII = (1.0, 2.5)  # metres
 

@@ -22,7 +22,7 @@ _NARROWED = 0.4  # share of the queries that are cut at a random radius
 _SECTOR_LOST = 0.25  # share that lose a sector
 _FROM_MAP = 0.1  # share that are cut from the map: driving all around a tree shows its whole crown, too
 _RADIUS = 30.0  # metres, of a query
-_TRIES = 50
+_TRIES = 50  # middles of a piece drawn until there are enough queries near it
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,17 @@ from torch.nn import functional
 
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL
 
-_COARSE = 2  # local cells to a coarse one: the dense search runs on 2 m
 # set by hand
+_COARSE = 2  # local cells to a coarse one: the dense search runs on 2 m
 _RADIUS = 29.0  # metres about a query's middle whose cells count
 _DENSE_SCALE = 20.0  # on scores in [-1, 1] before the softmax of the dense search
-_LOCAL_TEMPERATURE = 0.07
-_PLACE_TEMPERATURE = 0.08
+_LOCAL_TEMPERATURE = 0.07  # of the softmax over local descriptors
+_PLACE_TEMPERATURE = 0.08  # of the softmax over global ones
 _SAMPLES = 128  # corresponding points of a query and its map
 _IGNORED_RADIUS = 2.5  # metres: other points within are neither right nor wrong
 _SAME_PLACE = 12.0  # metres: likewise for global descriptors
-_MIN_SIGMA = 0.05
+_MIN_SIGMA = 0.05  # uncertainties below are taken for it
+_LOCAL_WEIGHT, _PLACE_WEIGHT = 0.5, 0.5  # beside the dense loss
 _EXCLUDED = -1e4  # logit of what does not compete
 
 
@@ -35,7 +36,7 @@ class Losses:
     @property
     def total(self) -> Tensor:
         """The loss that is minimised."""
-        return self.dense + 0.5 * self.local + 0.5 * self.place
+        return self.dense + _LOCAL_WEIGHT * self.local + _PLACE_WEIGHT * self.place
 
 
 Encoded = tuple[Tensor, Tensor, Tensor]

@@ -47,6 +47,8 @@ class _Conv(nn.Module):
 
 
 class _Residual(nn.Module):
+    """Two convolutions whose result is added to their input."""
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.first, self.second = _Conv(channels, channels), _Conv(channels, channels)

@@ -8,13 +8,14 @@ from scipy.spatial import cKDTree
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.sim.layout import Layout, arc_lengths, directions
 
+# all set by hand
+
 CLEARANCE = 0.6
 """Metres between the robot's middle and a stem."""
 
 STEP = 0.1
 """Metres between the points of a path."""
 
-# set by hand
 _CANDIDATES = 150  # random paths of which the longest free one is taken
 _COARSE = 5  # steps between the points that are tested
 _LANE = 0.7  # metres to either side of a street's middle

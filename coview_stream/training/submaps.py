@@ -19,13 +19,14 @@ from coview_stream.training.paths import STEP
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import trained_sensor
 
+# all set by hand
+
 RADIUS = 30.0
 """Metres about the newest position within which points are kept."""
 
 VOXEL = 0.25
 """Metres: one point is kept per voxel, as in the map."""
 
-# set by hand
 _SPEED = 1.2  # metres per second
 _WHEELBASE = 1.0  # metres
 _PAUSE = 3  # frames between two that are kept while the robot stands

@@ -44,6 +44,7 @@ _PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is 
 
 # free space
 _FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
+_MIN_RANGE = 1.0  # metres: nearer returns are the robot's own
 _FREE_EVERY = 3  # of the map's points: a share needs no more
 _FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
 _BEAM = np.radians(2.0)  # cell of the range image
@@ -53,6 +54,9 @@ _BEAM_HITS = 2  # returns in a cell: fewer say nothing
 _MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
 _SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
 _SLACK_SLOPE = 0.03
+_FLOOR_RADIUS = 10.0  # metres around the sensor in which its ground is looked for
+_FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the ground
+_MIN_FLOOR_POINTS = 20  # fewer do not show the ground
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,7 @@ class RangeImage:
         """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
         cloud = cloud[:: max(1, -(-len(cloud) // _MAX_RAYS))]
         ranges = norms(cloud)
-        usable = ranges > 1.0
+        usable = ranges > _MIN_RANGE
         ranges = ranges[usable]
         cell = _beam_cells(cloud.compress(usable, axis=0), ranges)
         nearest = np.full(_CELLS, np.inf, dtype=np.float32)
@@ -156,7 +160,7 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
     wanted = (dx * dx + dy * dy < _FREE_RANGE**2) & (points[:, 2] > position[2] + seen.floor + _FREE_HEIGHT)
     body = transform(inverse(T_map_body), points.compress(wanted, axis=0).astype(np.float64))
     distance = norms(body)
-    off = distance > 1.0
+    off = distance > _MIN_RANGE
     body, distance = body.compress(off, axis=0), distance[off]
     cell = _beam_cells(body, distance)
     looked = seen.hits[cell] >= _BEAM_HITS
@@ -184,6 +188,6 @@ def _beam_cells(points: Reals, ranges: Reals) -> Ints:
 
 
 def _floor_below(cloud: Points) -> float:
-    """Height of the ground relative to the sensor: a low percentile of the points within 10 m, never above it."""
-    near = cloud[:, 2][np.hypot(cloud[:, 0], cloud[:, 1]) < 10.0]
-    return min(0.0, float(np.percentile(near, 5))) if len(near) >= 20 else 0.0
+    """Height of the ground relative to the sensor: a low percentile of the points near it, never above it."""
+    near = cloud[:, 2][np.hypot(cloud[:, 0], cloud[:, 1]) < _FLOOR_RADIUS]
+    return min(0.0, float(np.percentile(near, _FLOOR_PERCENTILE))) if len(near) >= _MIN_FLOOR_POINTS else 0.0

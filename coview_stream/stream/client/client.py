@@ -30,6 +30,7 @@ _log = logging.getLogger(__name__)
 
 _Item = TypeVar("_Item")
 
+# set by hand
 MAX_UNREAD_POSES = 100  # ten seconds of them
 _MAX_UNREAD_STATUSES = 100
 
@@ -209,7 +210,7 @@ class RobotClient:
             raise TransportError(f"the client of robot {self.robot!r} is closed: open another one")
 
     def _tracking(self) -> bool:
-        """Whether poses are valid; True without a status, which access rules may withhold."""
+        """Tell whether poses are valid; True without a status, which access rules may withhold."""
         status = self._latest_status
         return status is None or status.get("state", "TRACKING") == "TRACKING"
 
