@@ -114,7 +114,7 @@ class BaseMap:
 
     @property
     def descriptor_config(self) -> DescriptorConfig:
-        """How the descriptors were made; queries must be made the same way."""
+        """Settings that the descriptors were made with; queries need the same."""
         return self.config.descriptor
 
     @cached_property

@@ -27,7 +27,7 @@ _FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
 
 @dataclass(frozen=True)
 class GroundConfig:
-    """How ground is separated from the rest; ``python -m bench ground`` scores the defaults on labelled scans.
+    """Separation of the ground from the rest; ``python -m bench ground`` scores the defaults on labelled scans.
 
     Attributes:
         method: ``auto`` takes the cloth where its wheel is installed, else the morphological filter

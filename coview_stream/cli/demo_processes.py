@@ -29,7 +29,7 @@ _IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
 
 @dataclass
 class Recording:
-    """What the watcher received, in order.
+    """Messages that the watcher received, in order.
 
     Attributes:
         poses: as published, JSON.

@@ -50,7 +50,7 @@ _LAS_SCALE = 0.001  # metres
 
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
-    """Whether the suffix is one that ``read_cloud`` accepts (hidden files are not clouds)."""
+    """Tell whether the suffix is one that ``read_cloud`` accepts (hidden files are not clouds)."""
     name = Path(path).name
     return Path(name).suffix.lower() in CLOUD_SUFFIXES and not name.startswith(".")
 

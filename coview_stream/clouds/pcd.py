@@ -23,6 +23,8 @@ _MAX_HEADER = 64 * 1024  # bytes
 
 @dataclass(frozen=True)
 class _Header:
+    """Header of a PCD file: fields with their types and counts, points, encoding and where the data start."""
+
     fields: tuple[str, ...]
     types: tuple[np.dtype[np.generic], ...]
     counts: tuple[int, ...]

@@ -26,6 +26,8 @@ _MAX_HEADER = 64 * 1024  # bytes
 
 @dataclass
 class _Element:
+    """An element that the header declares: its name, how many rows follow, and their properties."""
+
     name: str
     count: int
     # (name, type) of a scalar; (name, type of the length, type of the items) of a list

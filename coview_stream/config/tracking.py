@@ -12,17 +12,17 @@ from coview_stream.config.checks import all_positive, counts, positive, require
 class TrackingConfig:
     """Registrations while tracking: when, with which frames; and the drift that odometry is believed to have.
 
-    A registration is due after ``distance``, ``turn`` or ``seconds``, the last whatever odometry says, for wheels slip,
-    drivers hang and robots are carried; and sooner where odometry is so bad that the pose has become uncertain.
+    A registration is due after ``distance``, ``turn`` or ``seconds``. ``seconds`` counts regardless of odometry, for
+    wheels slip, drivers hang and robots are carried. Where odometry is so bad that the pose has become uncertain, it is
+    due sooner.
 
-    Registered is the newest frame, and as many before it as it takes to ``min_points``. Older frames are smeared by the
-    drift: with odometry that drifts by 3 % the heading came out nearly ten times as well from one frame as from those
-        of
-    the last two metres (seen once on worlds 5103 and 5106, no command prints it).
+    Registered are the newest frame and as many before it as it takes to reach ``min_points``. Drift smears older
+    frames: with odometry that drifts by 3 % the heading came out nearly ten times as well from one frame as from those
+    of the last two metres (seen once on worlds 5103 and 5106, no command prints it).
 
     Drifts are sigmas of a random walk per square root of a metre driven, with which
-    :class:`coview_stream.localization.tracking.motion.DriftEstimator` begins before it measures them. All are
-    set by hand.
+    :class:`coview_stream.localization.tracking.motion.DriftEstimator` begins before it measures them. All are set by
+    hand.
 
     Attributes:
         distance: metres driven.

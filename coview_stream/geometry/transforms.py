@@ -179,7 +179,7 @@ def orthonormal(T: Pose) -> Pose:
 
 
 def is_pose(T: Reals) -> bool:
-    """Whether ``T`` is a finite 4x4 rigid transform (rotation orthonormal to 1e-3)."""
+    """Tell whether ``T`` is a finite 4x4 rigid transform (rotation orthonormal to 1e-3)."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[:3, :3]

@@ -35,14 +35,15 @@ TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 
 @dataclass
 class RunResult:
-    """What localizing a run gave.
+    """Result of localizing a run.
 
     Attributes:
+        frames: number of frames in the run.
         fixes: one per frame that could be used, in order.
         keyframes: evidence of every keyframe.
         skipped: file and reason of every frame that could not be used.
         seconds: time each step took; empty if that is not known.
-        sources: who named places to look at: "coview", "learned"; empty if that is not known.
+        sources: recognizers that named places: "coview", "learned"; empty if that is not known.
         query: descriptors of the keyframe that won the first fix, if there was one.
         winner: its evidence: station and shift.
     """

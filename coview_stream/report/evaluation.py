@@ -55,7 +55,14 @@ class FrameErrors:
 
 @dataclass(frozen=True)
 class ErrorStats:
-    """Mean, root mean square, median and maximum of an error; metres or degrees."""
+    """Statistics of an error, metres or degrees.
+
+    Attributes:
+        mean: of all values.
+        rmse: root mean square.
+        median: of all values.
+        max: greatest value.
+    """
 
     mean: float
     rmse: float

@@ -228,23 +228,23 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
             span, unit, rest = found[0], found[1], found[2]
             for i in range(k):
                 top[i] = -3.0
-            least = ti.cast(-3.0, f64)
+            min_bound = ti.cast(-3.0, f64)
             worth = -100000  # in whole units: spares most stations the look at what they miss
             for m in range(best.shape[0]):
                 if best[m] > worth:
                     bound = best[m] * unit - (ti.cast(residual[m], f64) * span + rest)
-                    if bound > least:
+                    if bound > min_bound:
                         insert(top, k, bound)
-                        least = top[k - 1]
-                        worth = ti.max(worth, ti.cast((least + rest) / unit, i32) - 1)
-            least -= _ROUNDING
-            worth = ti.max(-100000, ti.cast((least - rest - (max_norm - 1.0) * span) / unit, i32) - 2)
+                        min_bound = top[k - 1]
+                        worth = ti.max(worth, ti.cast((min_bound + rest) / unit, i32) - 1)
+            min_bound -= _ROUNDING
+            worth = ti.max(-100000, ti.cast((min_bound - rest - (max_norm - 1.0) * span) / unit, i32) - 2)
             count = 0
             for m in range(best.shape[0]):
                 if best[m] < worth:
                     continue
                 bound = best[m] * unit + (ti.cast(residual[m], f64) * span + rest)
-                if bound >= least:
+                if bound >= min_bound:
                     if count < listed.shape[0]:
                         listed[count] = m
                         upper[count] = bound
@@ -257,8 +257,8 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
                 i = 0
                 for j in range(count):
                     i = j if upper[j] > upper[i] else i
-                least = ti.max(least, top[k - 1] - _ROUNDING)
-                if upper[i] < least:
+                min_bound = ti.max(min_bound, top[k - 1] - _ROUNDING)
+                if upper[i] < min_bound:
                     break
                 upper[i] = -9.0
                 m = listed[i]
@@ -274,7 +274,7 @@ def _match(rings: int, sectors: int, blocks: int, lanes: int, shifts: int, seria
                     for n in range(wide):
                         guess[n] += p * rotations[b * wide + n] + q * rotations[row + n]
                 error = ti.cast(residual[m], f64) * span + rest
-                floor = least - error
+                floor = min_bound - error
                 for n in range(sectors):
                     floor = ti.max(floor, guess[n] - 2.0 * error)
                 inverse = ti.Vector.zero(f64, sectors)

@@ -46,7 +46,7 @@ class Launch:
             _set_argument(self._context, index, value)
 
     def ready(self) -> bool:
-        """Whether the kernel has run before in the program that runs now: from then on any thread may call it."""
+        """Tell whether the kernel has run before in the program that runs now: from then on any thread may call it."""
         return self._program is not None and self._program is runtime.program()
 
     def __call__(self) -> None:

@@ -130,13 +130,13 @@ class MatchIndex:
         low, high = bounds.estimate - bounds.error, bounds.estimate + bounds.error
         station = np.argpartition(low, -k)[-k:]
         shift, found = self._scores(station, shifted)
-        least = float(found.min()) - _ROUNDING
-        left = high >= least
+        min_correlation = float(found.min()) - _ROUNDING
+        left = high >= min_correlation
         left[station] = False
         rest = np.flatnonzero(left)
         if spectra is not None and len(rest) > _BATCH:
             alike = 1.0 - all_shift_distance(query, spectra, query.shape[1]).min(axis=1)
-            rest = rest[alike[rest] >= least - _FLOAT32_ERROR]
+            rest = rest[alike[rest] >= min_correlation - _FLOAT32_ERROR]
             high = np.minimum(high, alike + _FLOAT32_ERROR)
         rest = rest[np.argsort(-high[rest], kind="stable")]
         for start in range(0, len(rest), _BATCH):
@@ -203,7 +203,7 @@ class MatchKernel:
         self._k = 0
 
     def ready(self) -> bool:
-        """Whether :meth:`candidates` may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
+        """Tell whether :meth:`candidates` may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
         return self._launch.ready()
 
     def candidates(self, query: F32, k: int) -> tuple[I64, I64, F64] | None:

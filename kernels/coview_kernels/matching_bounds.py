@@ -112,8 +112,8 @@ class QuantizedStations:
         """(R, 2, L) what one unit of int8 stands for; what exceeds the range is clipped, and counts as rounding."""
         numbers = self._spectra(sample).astype(np.float64)
         square = (numbers * numbers).mean(axis=0) if len(sample) else np.zeros(numbers.shape[1:])
-        least = 1e-3 * square.max(initial=0.0) + 1e-12  # rows that are empty in the sample
-        return np.asarray(np.sqrt(np.maximum(square, least)) * (_INT8_RANGE / 127.0), dtype=np.float32)
+        min_square = 1e-3 * square.max(initial=0.0) + 1e-12  # rows that are empty in the sample
+        return np.asarray(np.sqrt(np.maximum(square, min_square)) * (_INT8_RANGE / 127.0), dtype=np.float32)
 
     def max_query_norm(self) -> F64:
         """(L,) greatest norm of a query's int16 with which no sum of upper halves leaves int16.

@@ -64,7 +64,7 @@ def polar_bin(
 
 
 def _fits_kernel(rings: int, sectors: int) -> bool:
-    """Whether the kernel can bin into so many rings and sectors."""
+    """Tell whether the kernel can bin into so many rings and sectors."""
     return max(rings, sectors) <= _MAX_SIDE and rings * sectors <= _MAX_BINS
 
 

@@ -182,7 +182,7 @@ def _forget_kernels(library: Any) -> None:
 
 
 def _usable(name: str) -> bool:
-    """Whether the library can be imported and has no program of the host's."""
+    """Tell whether the library can be imported and has no program of the host's."""
     if importlib.util.find_spec(name) is None:
         return False
     try:

@@ -18,8 +18,8 @@ from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
 
 _COARSE_SCALES = 2  # of the registration's scales that every hypothesis goes through; set by hand
-_COARSE_EVERY = 3  # the coarse scales register every third point
-_COARSE_ITERATIONS = 8
+_COARSE_EVERY = 3  # the coarse scales register every third point; set by hand
+_COARSE_ITERATIONS = 8  # of each coarse scale; set by hand
 _MIN_SHARE = 0.5  # of the best (or needed) score: with less than that a candidate stays coarse; set by hand
 
 
@@ -52,7 +52,7 @@ class Refinement:
         self.local_maps = local_maps
 
     def coarse(self, hypotheses: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
-        """Return what the coarse scales make of every hypothesis, best first; without those that find no hold."""
+        """Register every hypothesis at the coarse scales; return those that have pairs enough, best first."""
         scales = self.config.registration.search[:_COARSE_SCALES]
         thinned = scan.cloud.every(_COARSE_EVERY)
         found = [self._candidate(each, scan, scales, thinned) for each in hypotheses]

@@ -44,7 +44,7 @@ class MapMatch:
 
     @classmethod
     def without_registration(cls, verdict: MatchVerdict, belief: Estimate) -> MapMatch:
-        """Return the match of a scan that finds no hold: the belief stays."""
+        """Return the match of a scan whose registration failed: the belief stays."""
         return cls(verdict, belief.T_map_body, belief.covariance)
 
 
@@ -65,7 +65,7 @@ class MapMatcher:
     def match(
         self, scan: ScanInput, belief: Estimate, target: LocalMap, scales: tuple[float, ...], graph: PoseGraph
     ) -> MapMatch:
-        """Register (eq. 13), verify and judge; where the numbers leave nothing to hold on to, the belief stays.
+        """Register (eq. 13), verify and judge; where registration fails, the belief stays.
 
         Args:
             scan: what to register.
@@ -78,13 +78,13 @@ class MapMatcher:
         T_start = belief.T_map_body @ inverse(scan.T_odom_body)
         information = _inverted(belief.covariance)
         if information is None:
-            return _no_hold(belief, "what is believed so far has a covariance without an inverse")
+            return _failed(belief, "what is believed so far has a covariance without an inverse")
         prior = Prior(T_start, information)
         found = register_and_verify(self.base_map, scan, T_start, target, settings, scales, prior)
         cause, reason = self.baseline.judge(found.evidence, acceptance)
         if found.registration is None:
             if cause is RejectionReason.VERIFIED:
-                return _no_hold(belief, "too few points have a partner in the map", found.evidence)
+                return _failed(belief, "too few points have a partner in the map", found.evidence)
             return MapMatch.without_registration(MatchVerdict(cause, reason, found.evidence), belief)
         tilt = tilt_of(found.T_map_odom)
         if tilt > acceptance.max_tilt:
@@ -95,13 +95,13 @@ class MapMatcher:
             covariance = registration_covariance(own.information, settings)
             innovation = graph.innovation(own.T_map_body, covariance)
         except InputError as error:
-            return _no_hold(belief, str(error), found.evidence)
+            return _failed(belief, str(error), found.evidence)
         verdict = MatchVerdict(cause, reason, found.evidence, innovation)
         return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target)
 
 
-def _no_hold(belief: Estimate, reason: str, evidence: Evidence | None = None) -> MapMatch:
-    verdict = MatchVerdict(RejectionReason.FITNESS, f"no hold: {reason}", evidence)
+def _failed(belief: Estimate, reason: str, evidence: Evidence | None = None) -> MapMatch:
+    verdict = MatchVerdict(RejectionReason.FITNESS, f"registration failed: {reason}", evidence)
     return MapMatch.without_registration(verdict, belief)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 
 def is_panic(error: BaseException) -> bool:
-    """Whether a Rust library panicked: pyo3's PanicException is no Exception, and nothing exports it to import."""
+    """Tell whether a Rust library panicked: pyo3's PanicException is no Exception, and nothing exports it to import."""
     return type(error).__name__ == "PanicException"
 
 

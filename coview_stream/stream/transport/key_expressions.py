@@ -78,7 +78,7 @@ def check_expression(text: str, option: str, wildcards: bool = True) -> str:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Whether two valid key expressions have a key in common: of a plain ``key``, whether ``expression`` holds it."""
+    """Tell whether two valid key expressions have a key in common; a plain ``key``: whether ``expression`` holds it."""
     import zenoh
 
     return bool(zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)))

@@ -101,7 +101,7 @@ class FeatureMatcher:
 
     @property
     def dense(self) -> bool:
-        """Whether the map is small enough to be searched all over."""
+        """True if the map is small enough to be searched all over."""
         return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
