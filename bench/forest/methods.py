@@ -79,14 +79,14 @@ class Methods:
         """Name places by descriptors and by the heights of the canopy."""
         stations = self.base_map.stations
         with clock("descriptors"):
-            centre = _on_ground(query.scan, query)
+            centre = on_ground(query.scan, query)
             volumes = self._retrieval.distances(describe(query.scan, centre, self.base_map.descriptor_config))
             both = robust_zscore(volumes["scan_context"]) + robust_zscore(volumes["coview"])
         with clock("canopy"):
             score, heading = self._canopy.search(*seen_from(query.surroundings, query.position))
         by_volume = {"scan context": volumes["scan_context"], "co-view": volumes["coview"], "both": both}
         named = {name: of_volume(volume, stations, centre) for name, volume in by_volume.items()}
-        centre = _on_ground(query.surroundings, query)
+        centre = on_ground(query.surroundings, query)
         canopy = of_places(self._canopy.places, score.ravel(), heading.ravel(), stations, centre)
         return named | {"canopy": canopy}
 
@@ -94,7 +94,7 @@ class Methods:
         self, query: SearchRequest, truth: Pose, clock: Clock, places: dict[str, Floats]
     ) -> dict[str, Any]:
         """Add the places by learned features; return the errors of their poses."""
-        centre, stations = _on_ground(query.surroundings, query), self.base_map.stations
+        centre, stations = on_ground(query.surroundings, query), self.base_map.stations
         with clock("network"):
             view = self._learned.encode(query.surroundings, centre)
         with clock("correlation"):
@@ -121,7 +121,7 @@ def _milliseconds(clock: Clock) -> dict[str, float]:
     return {name: round(1e3 * seconds, 1) for name, seconds in clock.seconds.items()}
 
 
-def _on_ground(points: Points, query: SearchRequest) -> Floats:
+def on_ground(points: Points, query: SearchRequest) -> Floats:
     """Return the robot's position (3,), but on the ground that the points (N, 3) show below it; odometry frame."""
     x, y, _ = query.position
     return np.array([x, y, ground_below(points, query.position)])

@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 
 from bench.forest.methods import METHODS, Methods
-from bench.forest.tables import EXACT_DEGREES, EXACT_METRES, recall, success
+from bench.forest.tables import EXACT_DEGREES, EXACT_METRES, medians, recall_cell, success
 from bench.forest.worlds import Drive, noted
 from bench.harness.rows import Row, informs
-from bench.harness.tables import number, table
+from bench.harness.tables import table
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds import read_cloud
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, inverse, pose_from, rot_z, transform
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
 
 TILES = ("bcts_2.laz", "bcts_3.laz")
 HEADINGS = 4
@@ -53,41 +54,37 @@ def measured(data: Path, name: str) -> list[dict[str, Any]]:
 
 def pasted(tile: Floats, plot: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Put a plot (N, 3) into the middle of a tile (M, 3): the points of both, and the shift (3,) of the plot."""
-    middle = 0.5 * (tile[:, :2].min(axis=0) + tile[:, :2].max(axis=0))
-    low, high = plot[:, :2].min(axis=0), plot[:, :2].max(axis=0)
-    half = 0.5 * (high - low)
-    hole = (np.abs(tile[:, :2] - middle) <= half).all(axis=1)
-    lift = lowest(tile[hole]) - lowest(plot)
-    shift = np.array([*(middle - 0.5 * (low + high)), lift])
-    share = min(1.0, hole.sum() / len(plot))
-    thin = plot[rng.random(len(plot)) < share]
+    hole = (np.abs(tile[:, :2] - _middle(tile)) <= 0.5 * np.ptp(plot[:, :2], axis=0)).all(axis=1)
+    shift = np.array([*(_middle(tile) - _middle(plot)), lowest(tile[hole]) - lowest(plot)])
+    thin = plot[rng.random(len(plot)) < min(1.0, hole.sum() / len(plot))]
     return np.concatenate([tile[~hole], thin + shift]), shift
+
+
+def _middle(points: Floats) -> Floats:
+    return np.asarray(0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)))
 
 
 def lowest(points: Floats) -> float:
     """Typical height of the ground in a cloud (N, 3): the median of the lowest points of cells of 4 m."""
-    cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / 4.0).astype(np.int64)
-    least: dict[tuple[int, int], float] = {}
-    for (i, j), z in zip(cell.tolist(), points[:, 2].tolist(), strict=True):
-        least[i, j] = min(z, least.get((i, j), np.inf))
-    return float(np.median(list(least.values())))
+    cells = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / 4.0).astype(np.int64)
+    found, cell = np.unique(cells, axis=0, return_inverse=True)
+    least = np.full(len(found), np.inf)
+    np.minimum.at(least, cell.ravel(), points[:, 2])
+    return float(np.median(least))
 
 
 def standing(points: Floats, heading: float) -> Drive:
     """Return what a robot in the middle of a scan (N, 3) would have seen, if it saw all; its odometry is turned."""
-    middle = 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
+    middle = _middle(points)
     near = np.hypot(*(points[:, :2] - middle).T) < 3.0
     truth = pose_from(rot_z(heading), np.array([*middle, lowest(points[near]) + _EYE]))
     seen = transform(inverse(truth), points)
     cells = np.floor(seen / _VOXEL).astype(np.int64)
     kept = seen[np.unique(cells, axis=0, return_index=True)[1]]
-    cloud: Points = kept.astype(np.float32)
-    return Drive("mls", 0.0, np.eye(4)[None], (cloud,), truth)
+    return Drive("mls", 0.0, np.eye(4)[None], (kept.astype(np.float32),), truth)
 
 
 def _metres(file: Path) -> Floats:
-    from coview_stream.clouds import read_cloud
-
     cloud = read_cloud(file)
     return np.asarray(cloud.points.astype(np.float64) + cloud.origin)
 
@@ -108,15 +105,12 @@ def rows(asked: Namespace) -> Iterator[Row]:
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """AR@1 / AR@5 by method over all tiles and headings, and how exactly the plot was registered."""
     answers = [answer for row in rows for answer in row.details["answers"]]
-    shown = [
-        [method, f"{100 * recall(answers, method, 1):.0f} / {100 * recall(answers, method, 5):.0f}"]
-        for method in METHODS
-    ]
-    poses = [answer["after"] for answer in answers if answer["after"] is not None]
-    metres = float(np.median([pose[0] for pose in poses])) if poses else None
+    shown = [[method, recall_cell(answers, method)] for method in METHODS]
     share = success(answers, "after", EXACT_METRES, EXACT_DEGREES)
     shown.append(["registered within 0.3 m and 1 deg, %", f"{100 * share:.0f}"])
-    shown.append(["registered: median metres off, wrong places included", number(metres, 2)])
-    chance = 100 * float(np.mean([answer["chance"] for answer in answers]))
-    head = (f"AR@1 / AR@5, %, {len(answers)} queries, chance {chance:.1f}", "")
+    shown.append(["registered: median metres off, wrong places included", medians(answers, "after", (2, 2))[0]])
+    head = (
+        f"AR@1 / AR@5, %, {len(answers)} queries, chance {100 * np.mean([answer['chance'] for answer in answers]):.1f}",
+        "",
+    )
     return {"": noted(table(head, shown), "forest_plot DATA")}

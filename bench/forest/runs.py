@@ -11,8 +11,9 @@ from __future__ import annotations
 import json
 import time
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +25,25 @@ from bench.harness.files import fingerprint, remembered
 from bench.harness.rows import Row, failed, informs
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Told, errors
+from coview_stream import BaseMap
+from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.config import LocalizerConfig, Reloc
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
+from coview_stream.localization.offline import locate
+from coview_stream.recordings.open_run import open_run
 from coview_stream.report.evaluation import driven
-from coview_stream.sim import SimulationConfig
+from coview_stream.sim import SimulationConfig, simulate
+from coview_stream.sim.caster import Caster
+from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
+from coview_stream.sim.sensors import FRAME_PERIOD
 from coview_stream.training.recipe import Recipe
+from coview_stream.training.sensors import trained_sensor
+from coview_stream.training.worlds import base_scan, draw_world
 
 Run = dict[str, Any]
 
 MODES: tuple[Reloc, ...] = ("coview", "learned", "auto")
-_HEAD = (
-    "run", "reloc", "driven m", "first fix m", "posed %", "after first %", "RMSE m", "RMSE deg", "false",
-    "searching ms",
-)  # fmt: skip
-
 
 _STAND = Recipe(built=0.0, size=(200.0, 200.0), slope=(0.0, 15.0), stems=(200.0, 600.0))
 _SPEED, _EVERY = 1.2, 2  # metres per second; of the sensor's frames
@@ -73,107 +78,85 @@ RUNS = (
 """The usual ones."""
 
 
-def world_of(folder: Path, run: Through) -> Path:
+def world_of(run: Through) -> Path:
     """Return the directory of a run's world, simulated now unless it is there.
 
     Raises:
         DependencyError: Open3D cannot be loaded.
     """
-    out = folder / run.name
-    spec = {"run": asdict(run), "code": fingerprint(*WORLDS, "bench/forest/runs.py")}
+    out = place() / run.name
 
     def make() -> dict[str, Any]:
-        from coview_stream.sim import simulate
-
         if run.drawn:
-            return drawn_run(out, run)
-        size = 240.0 if run.length <= 150.0 else 320.0
-        config = SimulationConfig("forest", run.sensor, run.seed, size, run.length, changed=0.1, speed=2.0)
-        return {"driven": simulate(out, config, overwrite=True).distance}
+            _drive_stand(out, run)
+        else:
+            size = 240.0 if run.length <= 150.0 else 320.0
+            config = SimulationConfig("forest", run.sensor, run.seed, size, run.length, changed=0.1, speed=2.0)
+            simulate(out, config, overwrite=True)
+        return {}
 
-    remembered(folder / f"{run.name}.json", spec, make)
+    spec = {"run": asdict(run), "code": fingerprint(*WORLDS, "bench/forest/runs.py")}
+    remembered(place() / f"{run.name}.json", spec, make)
     return out
 
 
-def drawn_run(out: Path, run: Through) -> dict[str, Any]:
+def _drive_stand(out: Path, run: Through) -> None:
     """Write a drive through a drawn stand; the way is shorter than asked where the trees leave none."""
-    from coview_stream.clouds import write_cloud, write_tum
-    from coview_stream.sim.caster import Caster
-    from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
-    from coview_stream.sim.sensors import FRAME_PERIOD
-    from coview_stream.training.sensors import trained_sensor
-    from coview_stream.training.worlds import base_scan, draw_world
-
     world, rng = draw_world(run.seed, run.recipe), np.random.default_rng([run.seed, _PATH])
-    (out / "run" / "frames").mkdir(parents=True, exist_ok=True)
-    for old in (out / "run" / "frames").iterdir():
+    frames = out / "run" / "frames"
+    frames.mkdir(parents=True, exist_ok=True)
+    for old in frames.iterdir():
         old.unlink()
     write_cloud(out / "base.laz", base_scan(world, run.seed, run.recipe)[0].astype(np.float64))
     ways: list[Floats] = [world.path(rng, world.size / 2 - 30.0, run.length) for _ in range(8)]
-    path = max(ways, key=len)
-    step = _SPEED * FRAME_PERIOD * _EVERY
-    truth = poses(path, step, world.ground, rng)
+    truth = _poses(max(ways, key=len), _SPEED * FRAME_PERIOD * _EVERY, world.ground, rng)
     caster, sensor = Caster(world.now, threads=1, leaf_depth=0.3), trained_sensor(run.sensor)
     for k, T in enumerate(truth):
-        write_cloud(out / "run" / "frames" / f"{k:06d}.pcd", sensor.scan(caster, T, _EVERY * k, rng))
+        write_cloud(frames / f"{k:06d}.pcd", sensor.scan(caster, T, _EVERY * k, rng))
     stamps: Floats = 1000.0 + FRAME_PERIOD * _EVERY * np.arange(len(truth), dtype=np.float64)
     write_tum(out / "run" / "odometry.tum", stamps, drifting_odometry(truth, OdometryConfig(), rng))
     write_tum(out / "truth.tum", stamps, truth)
     (out / "world.json").write_text(json.dumps({"scene": world.kind, "sensor": run.sensor, "seed": run.seed}))
-    return {"driven": step * (len(truth) - 1), "kind": world.kind}
 
 
-def poses(path: Floats, step: float, ground: Any, rng: np.random.Generator, height: float = 1.5) -> Floats:
-    """Poses (K, 4, 4) along a path (N, 2), ``step`` metres apart, ``height`` above the ground, swaying a little."""
+def _poses(path: Floats, step: float, ground: Any, rng: np.random.Generator) -> Floats:
+    """Poses (K, 4, 4) along a path (N, 2), ``step`` metres apart, 1.5 m above the ground, swaying a little."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at = np.arange(0.0, way[-1], step)
     x, y = (np.interp(at, way, path[:, k]) for k in range(2))
     heading = np.arctan2(np.gradient(y), np.gradient(x))
-    z = ground(x, y) + height
-    sway = rng.normal(0.0, np.radians(0.5), (len(at), 2))
-    slope = np.gradient(z) / step
-    made = []
-    for k in range(len(at)):
-        lean = exp_so3(np.array([sway[k, 0], sway[k, 1] - np.arctan(slope[k]), 0.0]))
-        made.append(pose_from(rot_z(float(heading[k])) @ lean, np.array([x[k], y[k], z[k]])))
-    return np.array(made)
+    z = ground(x, y) + 1.5
+    roll, pitch = rng.normal(0.0, np.radians(0.5), (len(at), 2)).T
+    lean = exp_so3(np.column_stack([roll, pitch - np.arctan(np.gradient(z) / step), np.zeros(len(at))]))
+    return np.array([pose_from(rot_z(h) @ R, p) for h, R, p in zip(heading, lean, np.stack([x, y, z], 1), strict=True)])
 
 
-def map_of(world: Path) -> Path:
-    """Return the map of a world on disk with learned features, built now unless it is there."""
-    from coview_stream import BaseMap
-
-    out = world.with_name(f"{world.name}.coview")
-    base = base_of(world)
-    spec = {"code": code(), "weights": weights(), **on_disk(world)}
+def _map_of(world: Path) -> Path:
+    """Return the map of a world with learned features, built now unless it is there, in the benchmark's folder."""
+    own = world.parent.resolve() == place().resolve()
+    name = world.name if own else f"{world.resolve().parent.name}-{world.name}"
+    out = place() / f"{name}.coview"
 
     def make() -> dict[str, Any]:
-        BaseMap.build(base, learned=True).save(out)
+        BaseMap.build(base_of(world), learned=True).save(out)
         return {}
 
-    remembered(out.with_suffix(".built.json"), spec, make)
+    remembered(out.with_suffix(".built.json"), {"code": code(), "weights": weights(), **on_disk(world)}, make)
     return out
 
 
 def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Told, Floats]:
     """Localize the run of a world on a map: what was said of each frame, and the true poses (N, 4, 4)."""
-    from coview_stream import BaseMap
-    from coview_stream.clouds import read_tum
-    from coview_stream.localization.offline import locate
-    from coview_stream.recordings.open_run import open_run
-
-    run = open_run(world / "run")
     stamps, truth = read_tum(world / "truth.tum")
-    located = locate(BaseMap.load(site), run, LocalizerConfig(reloc=reloc))
-    said = np.array([fix.stamp for fix in located.fixes])
+    located = locate(BaseMap.load(site), open_run(world / "run"), LocalizerConfig(reloc=reloc))
+    fixes = located.fixes
+    said = np.array([fix.stamp for fix in fixes])
     nearest = np.abs(stamps[:, None] - said[None]).argmin(axis=0)
-    known = np.full((len(said), 4, 4), np.nan)
-    for k, fix in enumerate(located.fixes):
-        if fix.T_map_body is not None:
-            known[k] = fix.T_map_body
-    states = [fix.state.reported for fix in located.fixes]
-    reasons = [fix.evidence.reason if fix.evidence else "" for fix in located.fixes]
-    told = Told(said, states, reasons, known, np.full((len(said), 6, 6), np.nan), np.array(located.seconds))
+    nowhere = np.full((4, 4), np.nan)
+    poses = np.array([nowhere if fix.T_map_body is None else fix.T_map_body for fix in fixes])
+    states = [fix.state.reported for fix in fixes]
+    reasons = [fix.evidence.reason if fix.evidence else "" for fix in fixes]
+    told = Told(said, states, reasons, poses, np.full((len(said), 6, 6), np.nan), np.array(located.seconds))
     return told, truth[nearest]
 
 
@@ -183,8 +166,7 @@ def scored(told: Told, truth: Floats, outside: bool) -> Run:
     known = told.tracking
     way = driven(truth)
     wrong = known & ((error.metres > NEAR_METRES) | (error.degrees > NEAR_DEGREES) | outside)
-    first = int(np.argmax(known)) if known.any() else None
-    right = known & ~wrong
+    right, first = known & ~wrong, int(np.argmax(known)) if known.any() else None
     searching = told.seconds[~np.r_[False, known[:-1]]]
     return {
         "driven_m": float(way[-1]),
@@ -195,7 +177,6 @@ def scored(told: Told, truth: Floats, outside: bool) -> Run:
         "rmse_deg": _rms(error.degrees[right]),
         "false": int(wrong.sum()),
         "searching_ms": float(1e3 * np.percentile(searching, 95)) if len(searching) else None,
-        "reason": told.reasons[-1] if told.reasons else "",
     }
 
 
@@ -208,20 +189,22 @@ def options(parser: ArgumentParser) -> None:
     parser.add_argument("--world", type=Path, nargs="+", default=[], metavar="DIR", help="instead of the usual runs")
 
 
+Job = tuple[str, Callable[[], Path], Any]  # name, what opens the world, and what else its results depend on
+
+
 def rows(asked: Namespace) -> Iterator[Row]:
     """Localize all runs in all modes, each also on the map of the next if there is one."""
-    folder = place()
-    folder.mkdir(parents=True, exist_ok=True)
-    few = [replace(run, length=min(run.length, 40.0)) for run in RUNS[1:4:2]] if asked.quick else list(RUNS)
-    jobs: list[tuple[str, Any, Any]] = [(path.name, lambda path=path: path, on_disk(path)) for path in asked.world]
-    jobs = jobs or [(run.name, lambda run=run: world_of(folder, run), asdict(run)) for run in few]
-    for k, (name, _, _) in enumerate(jobs):
+    place().mkdir(parents=True, exist_ok=True)
+    few = [replace(run, length=min(run.length, 40.0)) for run in RUNS[1:4:2]] if asked.quick else RUNS
+    jobs: list[Job] = [(path.name, partial(Path, path), on_disk(path)) for path in asked.world]
+    jobs = jobs or [(run.name, partial(world_of, run), asdict(run)) for run in few]
+    for k, job in enumerate(jobs):
         for site in dict.fromkeys((k, (k + 1) % len(jobs))):
-            label = name if site == k else f"{name} on {jobs[site][0]}"
+            label = job[0] if site == k else f"{job[0]} on {jobs[site][0]}"
             for reloc in MODES:
                 begin = time.perf_counter()
                 try:
-                    run = _run(folder, label, reloc, jobs[k], jobs[site])
+                    run = _run(label, reloc, job, jobs[site])
                 except Exception as error:  # the other runs are still worth having; the exit code tells
                     yield failed(f"forest_runs/{label}, {reloc}", f"{type(error).__name__}: {error}")
                     continue
@@ -229,11 +212,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 yield informs(f"forest_runs/{label}, {reloc}: false", run["false"], "", run)
 
 
-def _run(folder: Path, label: str, reloc: Reloc, world: tuple[str, Any, Any], site: tuple[str, Any, Any]) -> Run:
-    outside = world is not site
-
+def _run(label: str, reloc: Reloc, world: Job, site: Job) -> Run:
     def make() -> Run:
-        return scored(*followed(world[1](), map_of(_kept(folder, site[1]())), reloc), outside)
+        return scored(*followed(world[1](), _map_of(site[1]()), reloc), outside=world is not site)
 
     wanted = {
         "runs": [world[2], site[2]],
@@ -242,33 +223,21 @@ def _run(folder: Path, label: str, reloc: Reloc, world: tuple[str, Any, Any], si
         "code": fingerprint(),
         "bench": fingerprint(*WORLDS, "bench/forest/runs.py", "bench/harness/trajectory_scores.py"),
     }
-    kept = folder / "runs" / f"{label.replace(' ', '-')}-{reloc}.json"
-    return {"run": label, "reloc": reloc, "outside": outside, **remembered(kept, wanted, make)}
-
-
-def _kept(folder: Path, world: Path) -> Path:
-    """Give a world on disk a place in ``folder`` beside which its map may be written."""
-    if world.parent.resolve() == folder.resolve():
-        return world
-    link = folder / f"{world.resolve().parent.name}-{world.name}"
-    if not link.is_symlink():
-        link.symlink_to(world.resolve(), target_is_directory=True)
-    return link
+    kept = place() / "runs" / f"{label.replace(' ', '-')}-{reloc}.json"
+    return {"run": label, "reloc": reloc, **remembered(kept, wanted, make)}
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per run, map and mode."""
+    columns = {
+        "driven m": ("driven_m", 1, 0), "first fix m": ("first_fix_m", 1, 1), "posed %": ("posed", 100, 0),
+        "after first %": ("posed_after", 100, 0), "RMSE m": ("rmse_m", 1, 3), "RMSE deg": ("rmse_deg", 1, 2),
+        "false": ("false", 1, 0), "searching ms": ("searching_ms", 1, 0),
+    }  # fmt: skip
     shown = [
-        [
-            run["run"], run["reloc"], number(run["driven_m"], 0), number(run["first_fix_m"], 1),
-            number(100 * run["posed"], 0), number(_percent(run["posed_after"]), 0), number(run["rmse_m"], 3),
-            number(run["rmse_deg"], 2), str(run["false"]), number(run["searching_ms"], 0),
-        ]
+        [run["run"], run["reloc"], *(number(None if run[key] is None else scale * run[key], digits)
+                                     for key, scale, digits in columns.values())]
         for run in (row.details for row in rows if row.details)
     ]  # fmt: skip
     about = " --quick" * asked.quick + " --world" * bool(asked.world) + " DIR" * len(asked.world)
-    return {"": noted(table(_HEAD, shown), f"forest_runs{about}")}
-
-
-def _percent(value: float | None) -> float | None:
-    return None if value is None else 100 * value
+    return {"": noted(table(("run", "reloc", *columns), shown), f"forest_runs{about}")}

@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.forest.methods import on_ground
 from bench.forest.query import Chain, query_of
 from bench.forest.worlds import drawn, noted, place
+from bench.harness.clock import Clock
 from bench.harness.rows import Row, bounded
 from bench.harness.tables import number, table
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.descriptors.coview import ground_below
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.geometry.arrays import Bools, Floats32, Ints
 from coview_stream.geometry.transforms import pose_from, transform
@@ -34,69 +35,56 @@ from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
 
-SIDES = (10, 32)  # tiles of 32 m along the edge: 0.10 and 1.05 km2
-LIMITS = {10: 0.4, 32: 3.0}  # seconds a query that issue 6 allows
+LIMITS = {10: 0.4, 32: 3.0}  # seconds allowed to a query, by tiles of 32 m along the edge: 0.10 and 1.05 km2
 CUT = 4  # tiles along the edge of what is repeated
 _SEED, _QUERIES, _REPEAT = 20_001, 4, 3
-_PARTS = ("view", "correlation", "consensus", "keypoint refinement", "registration")
+_PARTS = ("view", "correlation", "consensus", "sharpening", "registration")
 
 
-def repeated(tiles: Ints, low: Ints, side: int, cut: int = CUT) -> tuple[Ints, Ints]:
-    """Lay the tiles (T, 2) within ``cut`` of ``low`` (2,) side by side, ``side`` along the edge.
+class Enlarged(BaseMap):
+    """The middle of a map side by side, ``side`` tiles along the edge: features, stations (M, 3), lowest tile (2,)."""
 
-    Returns:
-        (N,) which tile stands at each place, and (N, 2) the places, from ``low`` on.
+    def __init__(self, original: BaseMap, side: int) -> None:
+        self.__dict__.update(original.__dict__)
+        features, edge = original.learned, float(TILE)
+        assert features is not None
+        tiles = features.index.tiles.astype(np.int64)
+        self.low: Ints = np.floor(tiles.mean(axis=0) + 0.5).astype(np.int64) - CUT // 2
+        low, high = self.low * edge, (self.low + side) * edge
+        copies = np.stack(np.meshgrid(*[np.arange(-(-side // CUT))] * 2), axis=-1).reshape(-1, 2) * CUT * edge
 
-    Raises:
-        ValueError: the map has nothing in one of them.
-    """
-    number = {tuple(tile): k for k, tile in enumerate(tiles.tolist())}
-    row, column = np.indices((side, side)).reshape(2, -1)
-    places = np.stack([column, row], axis=1)
-    originals = (places % cut + low).tolist()
-    if missing := [tile for tile in map(tuple, originals) if tile not in number]:
-        raise ValueError(f"the map has nothing in tile {missing[0]}")
-    return np.array([number[tuple(tile)] for tile in originals]), places + low
+        def repeated(at: Floats32, others: npt.NDArray[Any]) -> tuple[Floats32, npt.NDArray[Any]]:
+            """Places and what belongs to them, of the middle, in all copies."""
+            inner = _within(at, low, low + CUT * edge)
+            there = (at[inner, :2] + copies[:, None]).reshape(-1, 2)
+            kept = _within(there, low, high)
+            return there[kept].astype(np.float32), np.tile(others[inner], (len(copies), 1))[kept]
 
+        number_of = {tuple(tile): k for k, tile in enumerate(tiles.tolist())}
+        places = np.stack(np.indices((side, side)).reshape(2, -1)[::-1], axis=1)
+        which = [number_of[tuple(tile)] for tile in (places % CUT + self.low).tolist()]
+        place_at, place = repeated(features.place_at, features.place)
+        arrays = {
+            "learned.local": features._local[which],
+            "learned.sigma": features._sigma[which],
+            "learned.tiles": (places + self.low).astype(np.int32),
+            "learned.place": place,
+            "learned.place_at": place_at,
+        }
+        stations = np.hstack(repeated(original.stations, original.stations[:, 2:])).astype(np.float32)
+        learned = FeatureMap(arrays, {"weights": features.weights, "cell": 1.0})
+        self.__dict__ |= {"learned": learned, "stations": stations}
 
-def enlarged(base_map: BaseMap, side: int) -> tuple[FeatureMap, Floats32, Ints]:
-    """Features and stations (M, 3) of the repeated middle of a map, and its lowest tile (2,)."""
-    features = base_map.learned
-    assert features is not None
-    tiles = features.index.tiles.astype(np.int64)
-    low = np.floor(tiles.mean(axis=0) + 0.5).astype(np.int64) - CUT // 2
-    which, places = repeated(tiles, low, side)
-    edge = float(TILE)
-    copies = np.stack(np.meshgrid(*[np.arange(-(-side // CUT))] * 2), axis=-1).reshape(-1, 2) * CUT * edge
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "learned.local": features._local[which],
-        "learned.sigma": features._sigma[which],
-        "learned.tiles": places.astype(np.int32),
-    }
-    high = (low + side) * edge
-    inner = _within(features.place_at, low * edge, (low + CUT) * edge)
-    at = (features.place_at[inner] + copies[:, None]).reshape(-1, 2)
-    kept = _within(at, low * edge, high)
-    arrays["learned.place"] = np.tile(features.place[inner], (len(copies), 1))[kept]
-    arrays["learned.place_at"] = at[kept].astype(np.float32)
-    own = base_map.stations[_within(base_map.stations, low * edge, (low + CUT) * edge)]
-    stations = np.tile(own, (len(copies), 1))
-    stations[:, :2] = (own[:, :2] + copies[:, None]).reshape(-1, 2)
-    stations = stations[_within(stations, low * edge, high)]
-    large = FeatureMap(arrays, {"weights": features.weights, "cell": 1.0})
-    return large, stations.astype(np.float32), low
+    def home(self, hypothesis: Hypothesis, query: SearchRequest) -> Hypothesis:
+        """Move a hypothesis to its likeness in the original."""
+        at = transform(hypothesis.T_map_odom, query.position[None])[0, :2]
+        edge = CUT * float(TILE)
+        shift = np.floor((at - self.low * float(TILE)) / edge) * -edge
+        return replace(hypothesis, T_map_odom=pose_from(np.eye(3), [*shift, 0.0]) @ hypothesis.T_map_odom)
 
 
 def _within(at: npt.NDArray[Any], low: npt.NDArray[Any], high: npt.NDArray[Any]) -> Bools:
     return np.asarray(((at[:, :2] >= low) & (at[:, :2] < high)).all(axis=1))
-
-
-def home(hypothesis: Hypothesis, query: SearchRequest, low: Ints) -> Hypothesis:
-    """Move a hypothesis to its likeness in the original."""
-    at = transform(hypothesis.T_map_odom, query.position[None])[0, :2]
-    edge = CUT * float(TILE)
-    shift = np.floor((at - low * float(TILE)) / edge) * -edge
-    return replace(hypothesis, T_map_odom=pose_from(np.eye(3), np.array([*shift, 0.0])) @ hypothesis.T_map_odom)
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -106,63 +94,47 @@ def rows(asked: Namespace) -> Iterator[Row]:
     base_map = BaseMap.build(there.base, radius=30.0, learned=True)
     queries = [query_of(drive, config)[0] for drive in there.drives]
     chain = Chain(base_map, config)
-    for side in SIDES[:1] if asked.quick else SIDES:
-        features, stations, low = enlarged(base_map, side)
+    for side, limit in list(LIMITS.items())[: 1 if asked.quick else None]:
+        large = Enlarged(base_map, side)
         begin = time.perf_counter()
-        whole = _LargeMap(base_map, features, stations)
-        learned = SearchIndex.of(whole, config).learned
+        learned = SearchIndex.of(large, config).learned
         assert learned is not None
         learned.prepare()
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
-        consensus = Consensus(stations, base_map.config.block, peaks)
+        consensus = Consensus(large.stations, base_map.config.block, peaks)
         prepared = time.perf_counter() - begin
         spent: list[list[float]] = []
         for query in [queries[0], *queries * _REPEAT]:
             consensus.clear()
-            ticks = [time.perf_counter()]
-            centre = np.array([*query.position[:2], ground_below(query.surroundings, query.position)])
-            view = learned.encode(query.surroundings, centre)
-            ticks.append(time.perf_counter())
-            volume = learned.distances(view)
-            ticks.append(time.perf_counter())
-            consensus.vote(centre, {"learned": volume})
-            named = consensus.hypotheses()
-            ticks.append(time.perf_counter())
-            named = learned.refine(named, view)
-            ticks.append(time.perf_counter())
-            chain.register([home(each, query, low) for each in named], chain.scan(query))
-            ticks.append(time.perf_counter())
-            spent.append(np.diff(ticks).tolist())
-        medians = np.median(np.array(spent[1:]), axis=0).tolist()  # the first one waits for memory and crops
-        total = float(np.median(np.array(spent[1:]).sum(axis=1)))
-        parts = dict(zip(_PARTS, medians, strict=True)) | {"prepare": prepared, "total": total, "limit": LIMITS[side]}
-        about = {"km2": features.tile_area / 1e6, "stations": len(stations), "threads": _threads(), **parts}
-        yield replace(bounded(f"forest_scale/{about['km2']:.2f} km2", total, "s", LIMITS[side]), details=about)
-
-
-class _LargeMap(BaseMap):
-    """A map with other features and stations than the original's."""
-
-    def __init__(self, original: BaseMap, features: FeatureMap, stations: Floats32) -> None:
-        self.__dict__.update(original.__dict__)
-        self.__dict__ |= {"learned": features, "stations": stations}
-
-
-def _threads() -> str:
-    names = ("OPENBLAS_NUM_THREADS", "COVIEW_THREADS")
-    return ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in names)
+            clock = Clock()
+            with clock("view"):
+                centre = on_ground(query.surroundings, query)
+                view = learned.encode(query.surroundings, centre)
+            with clock("correlation"):
+                volume = learned.distances(view)
+            with clock("consensus"):
+                consensus.vote(centre, {"learned": volume})
+                named = consensus.hypotheses()
+            with clock("sharpening"):
+                named = learned.refine(named, view)
+            with clock("registration"):
+                chain.register([large.home(each, query) for each in named], chain.scan(query))
+            spent.append([clock.seconds[part] for part in _PARTS])
+        warm = np.array(spent[1:])  # the first one waits for memory and crops
+        total, km2 = float(np.median(warm.sum(axis=1))), large.learned.tile_area / 1e6
+        about = {
+            "km2": km2, "stations": len(large.stations), "prepare": prepared,
+            **dict(zip(_PARTS, np.median(warm, axis=0).tolist(), strict=True)), "total": total, "limit": limit,
+            "threads": f"OPENBLAS_NUM_THREADS={os.environ.get('OPENBLAS_NUM_THREADS', 'unset')}, "
+                       f"COVIEW_THREADS={os.environ.get('COVIEW_THREADS', 'unset')}",
+        }  # fmt: skip
+        yield replace(bounded(f"forest_scale/{km2:.2f} km2", total, "s", limit), details=about)
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """One line per size of the map, seconds."""
     head = ("map, km2", "stations", "prepared once, s", *(f"{part}, s" for part in _PARTS), "query, s", "limit, s")
-    sizes = [row.details for row in rows]
-    shown = [
-        [
-            number(size["km2"], 2), str(size["stations"]), number(size["prepare"], 2),
-            *(number(size[part], 3) for part in _PARTS), number(size["total"], 2), number(size["limit"], 1),
-        ]
-        for size in sizes
-    ]  # fmt: skip
-    text = f"{table(head, shown)}\n\n{sizes[0]['threads']}; {os.cpu_count()} cores."
+    digits = {"km2": 2, "stations": 0, "prepare": 2, **dict.fromkeys(_PARTS, 3), "total": 2, "limit": 1}
+    shown = [[number(row.details[key], places) for key, places in digits.items()] for row in rows]
+    text = f"{table(head, shown)}\n\n{rows[0].details['threads']}; {os.cpu_count()} cores."
     return {"": noted(text, "forest_scale")}

@@ -37,6 +37,11 @@ def recall(answers: Sequence[Answer], method: str, best: int) -> float:
     return float(np.mean([min(answer["off"][method][:best], default=RIGHT) < RIGHT for answer in answers]))
 
 
+def recall_cell(answers: Sequence[Answer], method: str) -> str:
+    """AR@1 and AR@5 in per cent."""
+    return " / ".join(_percent(recall(answers, method, best)) for best in (1, 5))
+
+
 def success(answers: Sequence[Answer], stage: str, metres: float, degrees: float) -> float:
     """Share of queries whose pose at a stage is within both; no pose is no success."""
     return float(np.mean([_within(answer[stage], metres, degrees) for answer in answers]))
@@ -74,7 +79,7 @@ def recall_table(answers: Sequence[Answer]) -> str:
     """AR@1 / AR@5 in per cent, by method; chance is that of one place drawn from all the map knows."""
     rows = []
     for name, some in groups(answers):
-        shown = [" / ".join(_percent(recall(some, method, best)) for best in (1, 5)) for method in METHODS]
+        shown = [recall_cell(some, method) for method in METHODS]
         rows.append([name, str(len(some)), f"{100 * np.mean([answer['chance'] for answer in some]):.1f}", *shown])
     return table(("AR@1 / AR@5, %", "n", "chance", *METHODS), rows)
 
@@ -88,8 +93,8 @@ _POSES = (
 def _poses(answers: Sequence[Answer]) -> list[str]:
     """Poses of the best hypothesis before registration, and of the best verified one after it, as ``_POSES`` heads."""
     return [
-        *_medians(answers, "before", (2, 1)), _percent(success(answers, "before", NEAR_METRES, NEAR_DEGREES)),
-        *_medians(answers, "after", (3, 2)), _percent(success(answers, "after", EXACT_METRES, EXACT_DEGREES)),
+        *medians(answers, "before", (2, 1)), _percent(success(answers, "before", NEAR_METRES, NEAR_DEGREES)),
+        *medians(answers, "after", (3, 2)), _percent(success(answers, "after", EXACT_METRES, EXACT_DEGREES)),
         _percent(success(answers, "after", NEAR_METRES, NEAR_DEGREES)),
         str(sum(false(answer, "passes") for answer in answers)),
         str(sum(answer["accepted"] for answer in answers)),
@@ -97,11 +102,11 @@ def _poses(answers: Sequence[Answer]) -> list[str]:
     ]  # fmt: skip
 
 
-def _medians(answers: Sequence[Answer], stage: str, digits: tuple[int, int]) -> list[str]:
+def medians(answers: Sequence[Answer], stage: str, digits: tuple[int, int]) -> list[str]:
     """Median errors, metres and degrees, of the poses that a stage gave."""
     poses = [answer[stage] for answer in answers if answer[stage] is not None]
-    medians = np.median(poses, axis=0).tolist() if poses else (None, None)
-    return [number(value, places) for value, places in zip(medians, digits, strict=True)]
+    found = np.median(poses, axis=0).tolist() if poses else (None, None)
+    return [number(value, places) for value, places in zip(found, digits, strict=True)]
 
 
 def _percent(share: float) -> str:
@@ -111,7 +116,7 @@ def _percent(share: float) -> str:
 def metric_table(answers: Sequence[Answer]) -> str:
     """Poses by learned features: of dense correlation, after keypoints, and after registration."""
     rows = [
-        [name, str(len(some)), *_medians(some, "dense", (2, 1)),
+        [name, str(len(some)), *medians(some, "dense", (2, 1)),
          _percent(float(np.mean([answer["moved"] for answer in some]))), *_poses(some)]
         for name, some in groups(answers)
     ]  # fmt: skip
