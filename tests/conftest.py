@@ -15,7 +15,7 @@ RADIUS = 30.0
 
 @pytest.fixture(scope="session", autouse=True)
 def state_home(tmp_path_factory):
-    """Nodes of tests leave nothing in the state directory of whoever runs them."""
+    """Nodes of tests leave nothing in the user's state directory."""
     folder = tmp_path_factory.mktemp("state")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(folder))
@@ -48,7 +48,7 @@ def world_map(map_cloud_file):
 
 @pytest.fixture(scope="session")
 def learned_map(world_map):
-    """The same with features of the network in the package, whatever they are worth."""
+    """The same with features of the network in the package, untested for accuracy."""
     from coview_stream.descriptors.feature_build import feature_arrays
 
     arrays, parameters = feature_arrays(np.array(world_map.points))

@@ -7,7 +7,7 @@ import time
 
 
 def free_endpoint() -> str:
-    """Return a loopback endpoint that nobody listens on right now."""
+    """Return a loopback endpoint without a listener right now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

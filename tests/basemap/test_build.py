@@ -103,7 +103,7 @@ def test_two_storeys_give_two_stations_in_one_cell(tmp_path):
     inside = (np.abs(both.stations[:, :2] + both.origin[:2]) < 6.0).all(axis=1)
     assert (np.abs(heights[inside] - 0.0) < 0.4).sum() > 20
     assert (np.abs(heights[inside] - 3.5) < 0.4).sum() > 20
-    assert (heights < 5.0).all()  # nobody stands on the roof
+    assert (heights < 5.0).all()  # no station on the roof
     flat = BaseMap.build(tmp_path / "house.npy", levels=False, **SMALL)
     cells = np.floor(flat.stations[:, :2] / 2.0)
     assert len(np.unique(cells, axis=0)) == len(flat)

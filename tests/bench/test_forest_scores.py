@@ -118,7 +118,7 @@ def test_worlds_on_disk_alone_have_tables_of_their_own():
     }  # fmt: skip
 
 
-def test_what_is_believed_and_wrong_is_false():
+def test_wrong_pose_that_passes_is_counted_as_false():
     wrong = [answer([40.0], after=[40.0, 0.1]), answer([1.0], after=[0.1, 6.0], accepted=False)]
     right = [answer([1.0], after=[1.9, 4.9]), answer([40.0], after=[40.0, 90.0], passes=False, accepted=False)]
     assert [false(each, "passes") for each in wrong + right] == [True, True, False, False]

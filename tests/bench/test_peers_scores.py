@@ -9,7 +9,7 @@ from bench.peers.peers import Trial, compared, milliseconds
 
 
 def answer(metres, degrees=0.5, vouched=True, seconds=0.1):
-    return {"seconds": seconds, "vouched": vouched, "score": 1.0, "metres": metres, "degrees": degrees}
+    return {"seconds": seconds, "vouched": vouched, "metres": metres, "degrees": degrees}
 
 
 def tried(name, *answers, scene="town", trouble=""):

@@ -80,7 +80,7 @@ def test_demo_without_fix_exits_with_one_and_removes_old_result(demo, tmp_path, 
     assert "never" in captured.out
     assert "reason" in captured.out
     assert captured.err.count("[4/4]") == 2
-    assert "\r" not in captured.err  # no bars where nobody watches
+    assert "\r" not in captured.err  # no progress bars without a terminal
     assert (out / "trajectory.tum").read_text() == ""
     assert not (out / "descriptors.png").exists()
     assert json.loads((out / "report.json").read_text())["success"] is False

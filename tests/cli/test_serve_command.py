@@ -1,4 +1,4 @@
-"""``coview-stream serve`` ends on a signal, whatever it waits for, and refuses robots that it could not tell apart."""
+"""``coview-stream serve`` ends on a signal, even while it waits, and refuses robots that it could not tell apart."""
 
 from __future__ import annotations
 

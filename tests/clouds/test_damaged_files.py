@@ -1,4 +1,4 @@
-"""Whatever is wrong with a cloud is one CloudError that names the file."""
+"""Every fault of a cloud's file raises one CloudError that names the file."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def test_findings_of_a_robot_and_its_node():
     }
     assert "SEARCHING: too few keyframes" in found[-1].found
     assert net.raised == []
-    assert set(net.subscribed) == {KEYS.cloud, KEYS.odometry, KEYS.status}  # nobody else's are asked for
+    assert set(net.subscribed) == {KEYS.cloud, KEYS.odometry, KEYS.status}  # no other robot's are asked for
 
 
 def test_messages_after_the_capture_are_not_counted():

@@ -48,7 +48,7 @@ def correlations(query, descriptors):
 
 
 def agrees(found, query, descriptors, k):
-    """Distances rank by rank, each station's own distance at its shift, nobody better left out, ties by index."""
+    """Distances rank by rank, each station's own distance at its shift, no better one left out, ties by index."""
     distance = 1.0 - correlations(query, descriptors)
     best = distance.min(axis=1)
     k = min(k, len(best))

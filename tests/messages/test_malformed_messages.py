@@ -1,4 +1,4 @@
-"""Nothing but a message or a MessageError comes out, whatever goes in."""
+"""Nothing but a message or a MessageError comes out of any bytes."""
 
 from __future__ import annotations
 
@@ -249,8 +249,8 @@ def test_huge_field_counts_allocate_no_memory(name):
         tracemalloc.stop()
 
 
-def complaint(decode, sample, **choice):
-    """What the MessageError says; None if a message came out. Anything else that is raised fails the test."""
+def message_error(decode, sample, **choice):
+    """Return the text of the MessageError; None if a message came out. Any other error fails the test."""
     try:
         decode(sample, **choice)
     except MessageError as error:
@@ -262,7 +262,7 @@ def complaint(decode, sample, **choice):
 @given(payload=st.binary(max_size=400), attachment=st.none() | st.binary(max_size=40))
 @pytest.mark.parametrize(("decode", "name"), DECODERS)
 def test_random_bytes_raise_message_error(decode, name, payload, attachment):
-    said = complaint(decode, Sample("some/key", payload, "", attachment), option=name)
+    said = message_error(decode, Sample("some/key", payload, "", attachment), option=name)
     assert said is None or said.startswith("some/key: ")
 
 
@@ -276,7 +276,7 @@ def test_mutated_messages_raise_only_message_error(decode, name, data):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.sampled_from([0, 1, 0x7F, 0x80, 0xFF]))
     cut = data.draw(st.sampled_from([0, 0, 1, 5]))
     sample = Sample("some/key", bytes(payload[: len(payload) - cut]), "", bytes(8))
-    said = complaint(decode, sample, option=name)
+    said = message_error(decode, sample, option=name)
     assert said is None or said.startswith("some/key: ")
 
 
@@ -286,5 +286,5 @@ def test_mutated_messages_raise_only_message_error(decode, name, data):
 @pytest.mark.parametrize("decode", [codecs.decode_cloud, codecs.decode_odometry, codecs.decode_pose])
 def test_random_encodings_and_keys_raise_only_message_error(decode, payload, encoding, key):
     for said in (encoding, "application/cdr;" + encoding, "application/octet-stream;" + encoding):
-        problem = complaint(decode, Sample(key, payload, said))
+        problem = message_error(decode, Sample(key, payload, said))
         assert problem is None or key in problem

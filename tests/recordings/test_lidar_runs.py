@@ -116,7 +116,7 @@ def test_gravity_option_takes_one_value(gravity):
         assert args.gravity == gravity[-1].removeprefix("--gravity=")
 
 
-def complaint(capsys):
+def printed_error(capsys):
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("coview-stream: error: ")
@@ -129,7 +129,7 @@ def test_missing_kiss_icp_is_one_line(world_file, world_run, tmp_path, monkeypat
     monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
     command = ["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), "--odometry", "kiss-icp"]
     assert main(command) == 2
-    assert "pip install 'kiss-icp>=1.2'" in complaint(capsys)
+    assert "pip install 'kiss-icp>=1.2'" in printed_error(capsys)
     assert not (tmp_path / "out").exists()
 
 
@@ -144,4 +144,4 @@ def test_missing_kiss_icp_is_one_line(world_file, world_run, tmp_path, monkeypat
 )
 def test_invalid_gravity_options_are_refused(world_file, world_run, tmp_path, capsys, options, text):
     assert main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), *options]) == 2
-    assert text in complaint(capsys)
+    assert text in printed_error(capsys)

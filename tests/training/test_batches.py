@@ -1,4 +1,4 @@
-"""Batches: whatever is turned and mirrored, the poses still say where the queries stand."""
+"""Batches: the poses say where the queries stand after every rotation and reflection."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def test_router_replaced_between_two_polls_is_a_reconnection(said):
 def test_router_replaced_after_outage_and_additional_router():
     link = ConnectionMonitor()
     assert looks(link, ("A", ""), ("", ""), ("B", "")) == 1
-    assert looks(link, ("BC", "")) == 1  # nobody was missed
+    assert looks(link, ("BC", "")) == 1  # no router was missed
 
 
 def test_losing_one_of_two_routers_is_a_reconnection(said):

@@ -164,7 +164,7 @@ def test_last_pose_is_saved_and_hinted_at_next_start(tmp_path, caplog):
     site, kept = remembering(tmp_path, "r1", "r2")
     kept.hint()
     kept.keep()
-    assert not list(tmp_path.iterdir())  # nobody knows anything yet
+    assert not list(tmp_path.iterdir())  # no pose is known yet
     site.frame("r1", 0.0)
     kept.keep()
     saved = load(tmp_path, "r1", SHA)
@@ -267,7 +267,7 @@ def test_failing_disk_logs_one_warning(tmp_path, caplog, monkeypatch):
 
 def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, caplog):
     def fail():
-        raise RuntimeError("nobody thought of this")
+        raise RuntimeError("unforeseen")
 
     site, kept = remembering(tmp_path, "r1", "r2")
     for name in ("r1", "r2"):
@@ -275,7 +275,7 @@ def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, 
     monkeypatch.setattr(site.sessions["r1"], "last_known_pose", fail)
     kept.keep()
     assert load(tmp_path, "r2", SHA) is not None
-    assert "nobody thought of this" in caplog.text
+    assert "unforeseen" in caplog.text
 
 
 def running(site, kept):

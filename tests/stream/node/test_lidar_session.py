@@ -189,7 +189,7 @@ def test_reset_drops_odometry_and_running_job():
     robot.session.reset()
     robot.session.handle_result(job, OdometryResult(np.eye(4), None, False, 0.0), robot.now)
     assert counted(robot) == {}
-    robot.saw(0.3)  # whatever the stamp
+    robot.saw(0.3)  # with any stamp
     assert robot.session.take_lidar_frame().epoch > job.epoch
 
 

@@ -1,4 +1,4 @@
-"""Turns: nobody is passed over, the urgent come first every second time."""
+"""Turns: no robot is passed over, the urgent come first every second time."""
 
 from __future__ import annotations
 

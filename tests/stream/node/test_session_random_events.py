@@ -1,4 +1,4 @@
-"""Whatever happens in whatever order: nothing raises, every cloud is counted once, no pose without a fix."""
+"""Events in random order: nothing raises, every cloud is counted once, no pose without a fix."""
 
 from __future__ import annotations
 

@@ -217,7 +217,7 @@ def test_unencodable_pose_of_one_robot_does_not_affect_others():
 def test_unexpected_engine_error_does_not_stop_the_node():
     site = Site("r1")
     run = site.track.run
-    errors = [RuntimeError("nobody thought of this")]
+    errors = [RuntimeError("unforeseen")]
     site.track.run = lambda job: run(job) if not errors else (_ for _ in ()).throw(errors.pop())
     site.node.start()
     try:

@@ -74,7 +74,7 @@ def test_rmw_publisher_adds_sequence_and_gid_without_encoding() -> None:
         RmwPublisher(net.publisher(key, "realtime"), token, lambda: 123)
         for key, token in zip(keys, tokens, strict=True)
     )
-    first.put(Encoded(b"x", "application/cdr;whatever"))
+    first.put(Encoded(b"x", "application/cdr;unknown"))
     first.put(Encoded(b"y"))
     second.put(Encoded(b"z"))
     second.close()
