@@ -121,7 +121,7 @@ def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str,
         during = float(hold[begin:until][false[begin:until]].sum())
         seconds, metres = back or (None, None)
         happened.append({"what": what, "recovery_s": seconds, "recovery_m": metres, "false_s": during})
-    steps = np.percentile(told.seconds[before] * 1e3, [50, 99]) if before.any() else (None, None)
+    steps = np.percentile(told.seconds[before] * 1e3, [50, 99]).tolist() if before.any() else (None, None)
     return {
         "driven_m": float(driven[-1]),
         "right_percent": 100 * float(right.mean()),

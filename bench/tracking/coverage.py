@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Errors, Told
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.report.style import TRUTH, draw_notice, figure
 
 FIRST_MINUTE = 60.0  # seconds after a fix in which its covariance is judged apart
@@ -54,7 +54,7 @@ def squares(twist: Floats, covariances: Floats, axes: Sequence[int]) -> Floats:
     """(N,) squared Mahalanobis distances over some axes; infinite where a covariance is none."""
     pick = np.asarray(axes)
     error, cov = twist[:, pick], covariances[:, pick[:, None], pick]
-    sane = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    sane: Bools = np.asarray(np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(error).all(axis=1))
     cov = np.where(sane[:, None, None], cov, np.eye(len(pick)))
     # metres stand beside radians: compare each by its own size
     scale = np.sqrt(np.abs(np.einsum("nii->ni", cov)))

@@ -7,7 +7,7 @@ scale or stands still while the robot is carried.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,10 +72,10 @@ class Drive:
 
     def picked(self, rows: Ints) -> Drive:
         """Return some of the frames, in the time that as many take."""
-        arrays = {name: value[rows] for name, value in vars(self).items() if name != "events"}
+        arrays: dict[str, Any] = {name: each[rows] for name, each in vars(self).items() if name != "events"}
         return replace(self, **arrays | {"stamps": self.stamps[: len(rows)]})
 
-    def after(self, what: str, begin: int, end: int, **changes: Floats | Ints) -> Drive:
+    def after(self, what: str, begin: int, end: int, **changes: Any) -> Drive:
         """Return the drive on which that happened, with the arrays that it changed."""
         return replace(self, **changes, events=(*self.events, Event(what, begin, end)))
 

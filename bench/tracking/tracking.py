@@ -29,7 +29,8 @@ from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, draw
 from bench.tracking.drives import Drive, drift_share, seen
 from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
 from bench.tracking.worlds import Recorded, map_of, open_world
-from coview_stream.errors import InputError
+from coview_stream import BaseMap, Localizer
+from coview_stream.errors import CloudError, InputError, RunError
 
 MAX_METRES, MAX_DEGREES, MAX_RECOVERY = 0.12, 0.35, 20.0
 """The targets: root mean squares over the plain drives, and metres driven after an event."""
@@ -67,9 +68,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
         figures, squared = measure(folder(), scenario)
         drives.append(figures)
         parts.append(squared)
-        yield informs(
-            f"tracking/{scenario.name}", np.nan if figures["rmse_m"] is None else figures["rmse_m"], "m", figures
-        )
+        rmse = np.nan if figures["rmse_m"] is None else figures["rmse_m"]
+        yield informs(f"tracking/{scenario.name}", rmse, "m", figures)
     together = pooled(parts)
     found = shares(together)
     yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
@@ -82,53 +82,39 @@ def rows(asked: Namespace) -> Iterator[Row]:
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """Drives, coverage, and what was lost and found again."""
     drives = [row.details for row in rows if "rmse_m" in row.details]
-    found = next(row.details["coverage"] for row in rows if list(row.details) == ["coverage"])
-    shown = {
+    found = next(row.details["coverage"] for row in rows if "coverage" in row.details)
+    return {
         "": table(("scenario", *_COLUMNS), [cells(figures) for figures in drives]),
         "coverage": coverage_table(found),
+        "events": "\n".join([*_events(drives), code_line()]),
     }
-    return shown | {"events": "\n".join([*_events(drives), code_line()])}
 
 
 def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
-    """Return the figures of a scenario, and the squared distances that its coverage is made of."""
-    told, drive = told_of(folder, scenario)
-    figures = score(told, drive.truth, drive.driven, drive.events)
-    parts = spread(told, errors(told, drive.truth))
-    drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
-    return {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift} | figures, parts
+    """Return the figures of a scenario, and the squared distances that its coverage is made of.
 
-
-def told_of(folder: Path, scenario: Scenario) -> tuple[Told, Drive]:
-    """Return what the localizer said on a scenario's drive, now or when the same code ran before, and the drive.
-
-    Worlds, maps and answers are kept in ``folder``.
+    They are kept in ``folder``, as worlds and maps are, until the code is another one.
     """
-    recorded = open_world(folder, scenario.world)
-    drive = scenario.drive(recorded.truth)
-    site = map_of(folder, scenario.world, scenario.variant)
-    out = folder / "tracking-results" / f"{scenario.name.replace('/', '-')}.json"
-    arrays = out.with_suffix(".npz")
-    spec = {"code": fingerprint(), "bench": fingerprint("bench/tracking"), "scenario": repr(scenario.world)}
+    bench = fingerprint("bench/tracking", "bench/harness/trajectory_scores.py")
+    spec = {"code": fingerprint(), "bench": bench, "scenario": repr(scenario.world)}
 
     def work() -> dict[str, Any]:
-        told = follow(site, recorded, drive)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(arrays, **vars(told))
-        return {"frames": len(drive)}
+        recorded = open_world(folder, scenario.world)
+        drive = scenario.drive(recorded.truth)
+        told = follow(map_of(folder, scenario.world, scenario.variant), recorded, drive)
+        drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
+        about = {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift}
+        parts = spread(told, errors(told, drive.truth))
+        lists = {part: {name: values.tolist() for name, values in axes.items()} for part, axes in parts.items()}
+        return {"figures": about | score(told, drive.truth, drive.driven, drive.events), "squares": lists}
 
-    remembered(out, spec, work)
-    with np.load(arrays) as kept:
-        fields = dict(kept)
-    texts = {name: fields.pop(name).tolist() for name in ("states", "reasons")}
-    return Told(**texts, **fields), drive
+    kept = remembered(folder / "tracking-results" / f"{scenario.name.replace('/', '-')}.json", spec, work)
+    squares = {part: {n: np.array(each, float) for n, each in axes.items()} for part, axes in kept["squares"].items()}
+    return kept["figures"], squares
 
 
 def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
     """Feed a drive to a new localizer, which is told frames and odometry and nothing else; write down what it says."""
-    from coview_stream import BaseMap, Localizer
-    from coview_stream.errors import CloudError, RunError
-
     count = len(drive)
     poses, covariances = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
     seconds, states, reasons = np.zeros(count), [], []
@@ -194,10 +180,12 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
 
 def _events(drives: Sequence[Figures]) -> list[str]:
     """List the losses by reason, and what each event came to."""
-    lines, ends = [], []
+    lines: list[str] = []
+    ends: list[str] = []
     for figures in drives:
         name = figures["name"]
-        lines += [f"- {name}: lost {n} x, {reason}" for reason, n in Counter(figures["reasons"]).most_common()]
+        reasons: Counter[str] = Counter(figures["reasons"])
+        lines += [f"- {name}: lost {n} x, {reason}" for reason, n in reasons.most_common()]
         for event in figures["events"]:
             m, s = event["recovery_m"], event["recovery_s"]
             back = "never right again" if m is None else f"right after {m:.1f} m, {s:.1f} s"
