@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.harness.rows import Row
-from bench.harness.suite import BENCHMARKS, Benchmark, counted, run
+from bench.harness.suite import BENCHMARKS, counted, run
 from bench.harness.tables import HEAD, WIDTHS, cells, filled, line, machine, rule, suite_tables
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import CoViewError, InputError
@@ -50,40 +50,13 @@ def _parser(name: str) -> argparse.ArgumentParser:
     return parser
 
 
-class _Progress:
-    """A line on stderr that says what runs, over itself in a terminal, once a benchmark elsewhere."""
-
-    def __init__(self, label: str) -> None:
-        self._label = label
-        self._live = sys.stderr.isatty()
-        if not self._live:
-            print(f"... {label}", file=sys.stderr, flush=True)
-
-    def __call__(self, seconds: float) -> None:
-        if self._live:
-            print(f"\r... {self._label} {seconds:4.0f} s", end="\r", file=sys.stderr, flush=True)
-
-    def clear(self) -> None:
-        if self._live:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-
 def _apart(name: str, words: Sequence[str], threads: int | None, limit_s: float) -> Iterator[Row]:
-    """Rows of a benchmark in processes of its own, one for each thread count."""
-    for count in _thread_counts(BENCHMARKS[name], threads):
-        progress = _Progress(name if count is None else f"{name}, {counted(count)}")
-        for row in run(name, words, count, limit_s, progress):
-            progress.clear()
-            yield row
-        progress.clear()
-
-
-def _thread_counts(entry: Benchmark, asked: int | None) -> list[int | None]:
-    """Return the counts to run with: the one asked for, else its own as far as the machine has cores."""
-    if asked is not None:
-        return [asked]
+    """Rows of a benchmark in processes of its own: with the thread count asked for, else one for each of its own."""
     cores = os.cpu_count() or 1
-    return [count for count in entry.threads if count is None or count <= cores] or [None]
+    own = [count for count in BENCHMARKS[name].threads if count is None or count <= cores] or [None]
+    for count in own if threads is None else [threads]:
+        print(f"... {name if count is None else f'{name}, {counted(count)}'}", file=sys.stderr, flush=True)
+        yield from run(name, words, count, limit_s)
 
 
 def _measured(name: str, words: Sequence[str], asked: argparse.Namespace) -> Iterator[Row]:

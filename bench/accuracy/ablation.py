@@ -26,12 +26,17 @@ from bench.harness.files import code_line, fingerprint, folder, isolated, rememb
 from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
 from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, map_of, prepare, world_name
+from coview_stream.clouds import read_tum
 from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RetrievalConfig
+from coview_stream.localization.offline import locate
+from coview_stream.recordings.open_run import open_run
+from coview_stream.report.evaluation import evaluate
 from coview_stream.sim import SimulationConfig
 
 SEEDS = tuple(range(2101, 2109))
 """Held out: nobody tunes on them, nor on those of ``python -m bench accuracy``."""
 
+_LENGTH = 24.0  # metres driven in each world
 _RING_KEY = RetrievalConfig(mode="ring_key")
 _SINGLE = ConsensusConfig(mode="single")
 _COC = partial(DescriptorConfig, channels=("coview",))
@@ -59,15 +64,15 @@ _HEAD = (
 )  # fmt: skip
 
 
-def world_of(seed: int, length: float) -> SimulationConfig:
+def world_of(seed: int) -> SimulationConfig:
     """Return the world of a seed: kinds and lidars in turn, odd ones changed since the map was made."""
     size = (240.0, 270.0, 300.0)[seed // 2 % 3]
     changed = 0.25 if seed % 2 else 0.0
-    return SimulationConfig(KINDS[seed % 4], LIDARS[seed % 3], seed, size, length, changed=changed)
+    return SimulationConfig(KINDS[seed % 4], LIDARS[seed % 3], seed, size, _LENGTH, changed=changed)
 
 
 def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Measured:
-    """Measure the named variants in one world."""
+    """Measure the named variants in one world: the search alone, then the whole localizer on the world's run."""
     world, variants = folder / world_name(config), [v for v in VARIANTS if v.name in names]
     bank = Bank(map_of(folder, config))
     found = places(world, variants, bank)
@@ -75,12 +80,6 @@ def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Meas
 
 
 def _localize(world: Path, bank: Bank, variant: Variant) -> dict[str, Any]:
-    """Run the whole localizer on the world's run."""
-    from coview_stream.clouds import read_tum
-    from coview_stream.localization.offline import locate
-    from coview_stream.recordings.open_run import open_run
-    from coview_stream.report.evaluation import evaluate
-
     config = LocalizerConfig(retrieval=variant.retrieval, consensus=variant.consensus)
     posed = locate(bank.map(variant.descriptor), open_run(world / "run"), config).posed
     poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
@@ -92,10 +91,8 @@ def measure(
     folder: Path, config: SimulationConfig, names: Sequence[str], call: Callable[..., Any] = isolated
 ) -> Measured:
     """Measures of the variants in one world, each in a process of its own."""
-    parts = ("bench/accuracy/ablation.py", "bench/accuracy/stages.py")
-    spec = {
-        "world": config.to_dict(), "variants": list(names), "code": fingerprint(), "bench": fingerprint(*parts)
-    }  # fmt: skip
+    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/ablation.py", "bench/accuracy/stages.py")}
+    spec = {"world": config.to_dict(), "variants": list(names), **code}
 
     def make() -> Measured:
         call(prepare, folder, config)
@@ -106,52 +103,46 @@ def measure(
 
 def total(name: str, got: Sequence[dict[str, Any]]) -> Row:
     """Row of a variant over all its worlds; a run without a fix counts as an endless first fix."""
-    sums = {
-        key: sum(each[key] for each in got)
-        for key in ("keyframes", "top1", "windows", "coarse", "success", "false_frames", "posed")
-    }
-    means = {key: [each[key]["mean"] for each in got if each[key]] for key in ("translation", "rotation")}
+
+    def count(key: str) -> int:
+        return sum(each[key] for each in got)
+
+    def error(key: str) -> float:
+        return float(np.mean([each[key]["mean"] for each in got if each[key]] or [np.nan]))
+
+    top1 = count("top1") / count("keyframes") if count("keyframes") else np.nan
+    coarse = count("coarse") / count("windows") if count("windows") else np.nan
     first = float(np.median([np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in got]))
-    top1 = sums["top1"] / sums["keyframes"] if sums["keyframes"] else np.nan
-    coarse = sums["coarse"] / sums["windows"] if sums["windows"] else np.nan
-    errors = {key: float(np.mean(each)) if each else np.nan for key, each in means.items()}
     shown = [
-        number(top1, 2), number(coarse, 2), f"{sums['success']} of {len(got)}",
-        f"{sums['false_frames']} of {sums['posed']}", number(errors["translation"], 3),
-        number(errors["rotation"], 3), number(first if np.isfinite(first) else None, 1),
+        number(top1, 2), number(coarse, 2), f"{count('success')} of {len(got)}",
+        f"{count('false_frames')} of {count('posed')}", number(error("translation"), 3),
+        number(error("rotation"), 3), number(first if np.isfinite(first) else None, 1),
     ]  # fmt: skip
-    details = {"variant": name, "cells": shown, "keyframes": sums["keyframes"], "worlds": got}
+    details = {"variant": name, "cells": shown, "keyframes": count("keyframes"), "worlds": got}
     return informs(f"ablation/{name}: top-1", 100 * top1, "%", details)
 
 
 def options(parser: ArgumentParser) -> None:
     """Add the worlds."""
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, help=f"({SEEDS[0]} to {SEEDS[-1]})")
-    parser.add_argument("--length", type=float, default=24.0, help="metres driven in each world (24)")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Yield a row per variant; seeds that were tuned on are told apart."""
-    names = [variant.name for variant in VARIANTS]
-    measured = {}
+    """Yield a row per variant."""
+    names, measured = [variant.name for variant in VARIANTS], {}
     for seed in dict.fromkeys(asked.seeds[:1] if asked.quick else asked.seeds):
-        begin, config = time.perf_counter(), world_of(seed, asked.length)
+        begin, config = time.perf_counter(), world_of(seed)
         measured[seed] = measure(folder(), config, names)
         print(f"{world_name(config)}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
-    for tuned in (False, True):
-        if worlds := [each for seed, each in measured.items() if (seed in TUNED_SEEDS) is tuned]:
-            for name in names:
-                row = total(name, [world[name] for world in worlds])
-                row.details["tuned"] = tuned
-                yield row
+    for name in names:
+        row = total(name, [world[name] for world in measured.values()])
+        row.details["seeds"] = list(measured)
+        yield row
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Held-out seeds, and in a table apart those that were tuned on."""
-    out = {}
-    for place, tuned in (("", False), ("tuned", True)):
-        if chosen := [row.details for row in rows if row.details["tuned"] is tuned]:
-            shown = table(_HEAD, [[each["variant"], *each["cells"]] for each in chosen])
-            worlds, votes = len(chosen[0]["worlds"]), chosen[0]["keyframes"]
-            out[place] = f"{worlds} worlds, {votes} keyframes vote.\n\n{shown}\n\n{code_line()}"
-    return out
+    """One line per variant; above it, the seeds, and which of them were tuned on."""
+    shown = table(_HEAD, [[row.details["variant"], *row.details["cells"]] for row in rows])
+    seeds, votes = rows[0].details["seeds"], rows[0].details["keyframes"]
+    named = ", ".join(f"{seed} (tuned on)" if seed in TUNED_SEEDS else str(seed) for seed in seeds)
+    return {"": f"Worlds of the seeds {named}; {votes} keyframes vote.\n\n{shown}\n\n{code_line()}"}

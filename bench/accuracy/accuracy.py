@@ -20,6 +20,11 @@ from bench.harness.files import code_line, fingerprint, folder, isolated, peak_m
 from bench.harness.rows import Row, bounded, informs, judged
 from bench.harness.tables import number, table
 from bench.harness.worlds import KINDS, LIDARS, UTM, map_of, prepare, world_name
+from coview_stream import BaseMap
+from coview_stream.clouds import read_tum
+from coview_stream.localization.offline import locate
+from coview_stream.recordings.open_run import open_run
+from coview_stream.report.evaluation import evaluate
 from coview_stream.sim import SimulationConfig
 
 FIRST_SEED = 2001
@@ -46,16 +51,11 @@ def held_out_worlds() -> list[SimulationConfig]:
     """24 worlds: every kind with every lidar, twice; sizes, lengths, changes and offsets in turn."""
     return [
         SimulationConfig(
-            scene=KINDS[k % 4],
-            sensor=LIDARS[k // 4 % 3],
-            seed=FIRST_SEED + k,
-            size=_SIZES[(k + k // 6) % 6],
-            length=_LENGTHS[(k + k // 5) % 5],
-            changed=_CHANGED[k % 5],
-            origin=UTM if k % 3 == 1 else (0.0, 0.0, 0.0),
+            KINDS[k % 4], LIDARS[k // 4 % 3], FIRST_SEED + k, _SIZES[(k + k // 6) % 6], _LENGTHS[(k + k // 5) % 5],
+            changed=_CHANGED[k % 5], origin=UTM if k % 3 == 1 else (0.0, 0.0, 0.0),
         )
         for k in range(24)
-    ]
+    ]  # fmt: skip
 
 
 def pairs(quick: bool = False) -> list[tuple[SimulationConfig, SimulationConfig]]:
@@ -68,12 +68,6 @@ def pairs(quick: bool = False) -> list[tuple[SimulationConfig, SimulationConfig]
 
 def measure(folder: Path, run: SimulationConfig, site: SimulationConfig) -> Run:
     """Localize one world's run on a map; judged against the truth if the map is its own."""
-    from coview_stream import BaseMap
-    from coview_stream.clouds import read_tum
-    from coview_stream.localization.offline import locate
-    from coview_stream.recordings.open_run import open_run
-    from coview_stream.report.evaluation import evaluate
-
     base_map = BaseMap.load(map_of(folder, site))
     begin = time.perf_counter()
     located = locate(base_map, open_run(folder / world_name(run) / "run"))
@@ -133,14 +127,11 @@ def verdicts(runs: Sequence[Run]) -> Iterator[Row]:
     said = f"{succeeded} of {len(inside)}"
     yield judged("accuracy/runs localised", said, "all", succeeded == len(inside), succeeded)
     yield judged("accuracy/false frames", str(false), "0", false == 0, false)
-    for what, key, unit, most in (
-        ("translation", "translation", "m", MOST_TRANSLATION),
-        ("rotation", "rotation", "deg", MOST_ROTATION),
-    ):
+    for key, unit, most in (("translation", "m", MOST_TRANSLATION), ("rotation", "deg", MOST_ROTATION)):
         means = [r[key]["mean"] for r in inside if r.get(key)] or [np.inf]
         mean = float(np.mean(means))
         said = f"{mean:.3f} (worst run {max(means):.3f})"
-        yield judged(f"accuracy/mean {what} error, {unit}", said, f"<= {most}", mean <= most, mean)
+        yield judged(f"accuracy/mean {key} error, {unit}", said, f"<= {most}", mean <= most, mean)
     first = [np.inf if r.get("first_fix_m") is None else r["first_fix_m"] for r in inside]
     yield bounded("accuracy/median first fix", float(np.median(first or [np.inf])), "m", MOST_FIRST_FIX)
     strays, quiet = sum(r["posed"] for r in outside), all(r["success"] for r in outside)

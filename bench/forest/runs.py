@@ -86,14 +86,13 @@ def world_of(run: Through) -> Path:
     """
     out = place() / run.name
 
-    def make() -> dict[str, Any]:
+    def make() -> None:
         if run.drawn:
             _drive_stand(out, run)
         else:
             size = 240.0 if run.length <= 150.0 else 320.0
             config = SimulationConfig("forest", run.sensor, run.seed, size, run.length, changed=0.1, speed=2.0)
             simulate(out, config, overwrite=True)
-        return {}
 
     spec = {"run": asdict(run), "code": fingerprint(*WORLDS, "bench/forest/runs.py")}
     remembered(place() / f"{run.name}.json", spec, make)
@@ -136,12 +135,8 @@ def _map_of(world: Path) -> Path:
     own = world.parent.resolve() == place().resolve()
     name = world.name if own else f"{world.resolve().parent.name}-{world.name}"
     out = place() / f"{name}.coview"
-
-    def make() -> dict[str, Any]:
-        BaseMap.build(base_of(world), learned=True).save(out)
-        return {}
-
-    remembered(out.with_suffix(".built.json"), {"code": code(), "weights": weights(), **on_disk(world)}, make)
+    spec = {"code": code(), "weights": weights(), **on_disk(world)}
+    remembered(out.with_suffix(".built.json"), spec, lambda: BaseMap.build(base_of(world), learned=True).save(out))
     return out
 
 

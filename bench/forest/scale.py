@@ -38,7 +38,7 @@ from coview_stream.localization.search.request import SearchRequest
 LIMITS = {10: 0.4, 32: 3.0}  # seconds allowed to a query, by tiles of 32 m along the edge: 0.10 and 1.05 km2
 CUT = 4  # tiles along the edge of what is repeated
 _SEED, _QUERIES, _REPEAT = 20_001, 4, 3
-_PARTS = ("view", "correlation", "consensus", "sharpening", "registration")
+_PARTS = ("view", "correlation", "consensus", "keypoint refinement", "registration")
 
 
 class Enlarged(BaseMap):
@@ -115,7 +115,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             with clock("consensus"):
                 consensus.vote(centre, {"learned": volume})
                 named = consensus.hypotheses()
-            with clock("sharpening"):
+            with clock("keypoint refinement"):
                 named = learned.refine(named, view)
             with clock("registration"):
                 chain.register([large.home(each, query) for each in named], chain.scan(query))

@@ -32,33 +32,23 @@ def folder() -> Path:
     return Path(os.environ.get("COVIEW_BENCH") or Path(tempfile.gettempdir()) / "coview-bench")
 
 
-def remembered(file: Path, spec: dict[str, Any], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> dict[str, Any]:
     """Return the result in ``file`` if it was made for an equal ``spec``; else make it and keep it there.
 
     This is what lets an interrupted benchmark resume, yet never on the results of other code: ``spec`` holds
-    a :func:`fingerprint`.
+    a :func:`fingerprint`. What ``make`` returns besides a dictionary is not kept: it has written files of its own.
     """
     spec = json.loads(json.dumps(spec))
     if file.is_file():
         known = json.loads(file.read_text())
         if known["spec"] == spec:
             return dict(known["result"])
-    result = make()
+    made = make()
+    result = json.loads(json.dumps(made if isinstance(made, dict) else {}))
     file.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(file) as part:
         part.write_text(json.dumps({"spec": spec, "result": result}, indent=1) + "\n")
-    return dict(json.loads(json.dumps(result)))
-
-
-def remembered_seconds(file: Path, spec: dict[str, Any], make: Callable[[], Any]) -> float:
-    """Seconds that ``make`` took, now or when ``file`` was written for an equal ``spec``."""
-
-    def timed() -> dict[str, Any]:
-        begin = time.perf_counter()
-        make()
-        return {"seconds": round(time.perf_counter() - begin, 2)}
-
-    return float(remembered(file, spec, timed)["seconds"])
+    return dict(result)
 
 
 def fingerprint(*parts: str) -> str:

@@ -7,16 +7,16 @@ import importlib
 import json
 import math
 import os
-import select
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from bench.harness.rows import Row, failed
 
@@ -89,7 +89,6 @@ def counted(threads: int) -> str:
 
 
 ROOT = Path(__file__).parents[2]
-_BEAT_S = 0.2
 
 
 def environment(threads: int | None = None) -> dict[str, str]:
@@ -98,14 +97,8 @@ def environment(threads: int | None = None) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path, **thread_settings(threads)}
 
 
-def run(
-    name: str,
-    words: Sequence[str],
-    threads: int | None,
-    limit_s: float = math.inf,
-    beat: Callable[[float], None] = lambda seconds: None,
-) -> Iterator[Row]:
-    """Yield the rows of ``python -m bench NAME WORDS`` as they come; ``beat`` is told the seconds so far.
+def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = math.inf) -> Iterator[Row]:
+    """Yield the rows of ``python -m bench NAME WORDS`` as they come.
 
     A benchmark that ends in an exception, is killed, runs past its limit or yields nothing adds a row that does
     not hold and says so; what it printed itself is shown on stderr only then.
@@ -113,57 +106,40 @@ def run(
     conditions = (threads and counted(threads), "--quick" in words and "quick")
     label = "".join(f", {said}" for said in conditions if said)
     read, write = os.pipe()
-    with tempfile.TemporaryFile("w+") as said, os.fdopen(read, "rb", buffering=0) as pipe:
+    with tempfile.TemporaryFile("w+") as said, os.fdopen(read) as pipe:
         process = subprocess.Popen(
             [sys.executable, "-m", "bench", name, *words, "--rows-to", str(write)],
             env=environment(threads), pass_fds=(write,), stdin=subprocess.DEVNULL, stdout=said,
             stderr=subprocess.STDOUT, start_new_session=True,  # so that its own children end with it
         )  # fmt: skip
         os.close(write)
-        deadline, count = time.monotonic() + limit_s, 0
+        watch = threading.Timer(min(limit_s, threading.TIMEOUT_MAX), _end, (process,))
+        watch.daemon = True
+        watch.start()
+        begin, count = time.monotonic(), 0
         try:
-            for line in _lines(pipe, process, deadline, beat):
-                count += 1
-                row = Row.from_dict(json.loads(line))
-                yield replace(row, name=f"{row.name}{label}")
-            why = _verdict(process, deadline, count, limit_s)
+            for line in pipe:
+                if line.endswith("\n"):  # not cut off
+                    count += 1
+                    row = Row.from_dict(json.loads(line))
+                    yield replace(row, name=f"{row.name}{label}")
+            code = process.wait()
         finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            watch.cancel()
+            _end(process)
+        if code < 0:
+            late = time.monotonic() - begin >= limit_s
+            why = f"ran past its {limit_s:g} s" if late else f"ended by signal {signal.Signals(-code).name}"
+        else:
+            why = f"ended with exit code {code}" if code else "" if count else "yielded no row"
         if why:
             said.seek(0)
             print("\n".join(said.read().splitlines()[-12:]), file=sys.stderr)
             yield failed(f"{name}{label}", why)
 
 
-def _lines(
-    pipe: IO[bytes], process: subprocess.Popen[bytes], deadline: float, beat: Callable[[float], None]
-) -> Iterator[bytes]:
-    """Whole lines until the process has closed its end, or is gone (its children may hold it), or time is up."""
-    held, begin = b"", time.monotonic()
-    while (left := deadline - time.monotonic()) > 0:
-        beat(time.monotonic() - begin)
-        over = process.poll() is not None
-        if not select.select([pipe], [], [], 0.0 if over else min(_BEAT_S, left))[0]:
-            if over:
-                return
-            continue
-        chunk = os.read(pipe.fileno(), 1 << 16)
-        if not chunk:
-            return
-        *lines, held = (held + chunk).split(b"\n")
-        yield from lines
-
-
-def _verdict(process: subprocess.Popen[bytes], deadline: float, count: int, limit_s: float) -> str:
-    """Say why the benchmark has failed; empty if it has not."""
-    try:
-        code = process.wait(max(1.0, deadline - time.monotonic()))
-    except subprocess.TimeoutExpired:
-        return f"ran past its {limit_s:g} s"
-    if code < 0:
-        return f"ended by signal {signal.Signals(-code).name}"
-    if code:
-        return f"ended with exit code {code}"
-    return "" if count else "yielded no row"
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process with its children."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()

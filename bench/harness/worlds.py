@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.harness.files import fingerprint, remembered_seconds
+from bench.harness.files import fingerprint, remembered
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import KeyframeConfig, MapConfig
@@ -60,8 +60,8 @@ def prepare(folder: Path, config: SimulationConfig) -> Path:
     out, site = folder / world_name(config), map_of(folder, config)
     world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
     made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
-    remembered_seconds(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
-    remembered_seconds(out / "built.json", made, lambda: BaseMap.build(out / "base.laz").save(site))
+    remembered(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
+    remembered(out / "built.json", made, lambda: BaseMap.build(out / "base.laz").save(site))
     return out
 
 

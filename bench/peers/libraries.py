@@ -12,7 +12,7 @@ from bench.peers.methods import Answer, started
 from coview_stream import BaseMap
 from coview_stream.clouds.open3d_loader import open3d
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, inverse, norms, pose_from
+from coview_stream.geometry.transforms import Points, Pose, inverse, norms, pose_from
 
 
 class KissMatcher:
@@ -39,7 +39,7 @@ class KissMatcher:
         found = self._matcher.estimate(place.submap, self._map)
         inliers = int(self._matcher.get_num_final_inliers())
         T = pose_from(np.asarray(found.rotation), np.asarray(found.translation).ravel())
-        return Answer(T, bool(found.valid) and inliers >= self.INLIERS, inliers)
+        return Answer(T, bool(found.valid) and inliers >= self.INLIERS)
 
 
 class MapClosures:
@@ -52,7 +52,6 @@ class MapClosures:
     """
 
     SPACING, REACH, VOXEL = 15.0, 60.0, 0.5
-    _LEAST_POINTS = 1000
     _APART = 10  # between the numbers of queries: neighbours in number are never compared
 
     def __init__(self, site: BaseMap) -> None:
@@ -64,12 +63,10 @@ class MapClosures:
         self._closures: Any = Closures(config)
         stations = site.stations
         low, high = stations.min(axis=0)[:2], stations.max(axis=0)[:2]
-        centres = [
-            np.array([x, y, stations[np.hypot(stations[:, 0] - x, stations[:, 1] - y).argmin(), 2]])
-            for x in np.arange(low[0] + self.SPACING / 2, high[0], self.SPACING)
-            for y in np.arange(low[1] + self.SPACING / 2, high[1], self.SPACING)
-        ]
-        self._tiles = [c for c in centres if len(site.crop(c, self.REACH)[0]) >= self._LEAST_POINTS]
+        xs, ys = (np.arange(a + self.SPACING / 2, b, self.SPACING) for a, b in zip(low, high, strict=True))
+        nearest = {(x, y): np.hypot(stations[:, 0] - x, stations[:, 1] - y).argmin() for x in xs for y in ys}
+        centres = [np.array([*at, stations[k, 2]]) for at, k in nearest.items()]
+        self._tiles = [c for c in centres if len(site.crop(c, self.REACH)[0]) >= 1000]
         # closures are looked for with earlier numbers only: backwards, no tile is compared with another one
         for number in reversed(range(len(self._tiles))):
             points, _ = site.crop(self._tiles[number], self.REACH)
@@ -85,7 +82,7 @@ class MapClosures:
         if best is None:
             return Answer(None, False)
         T = pose_from(np.eye(3), self._tiles[best.source_id]) @ inverse(np.asarray(best.pose))
-        return Answer(T, best.number_of_inliers > self._least, best.number_of_inliers)
+        return Answer(T, best.number_of_inliers > self._least)
 
     def _thinned(self, points: Floats) -> Floats:
         """Thin as its pipeline does before it asks."""
@@ -122,7 +119,7 @@ class Features:
         # FGR reports no fitness of its own for all versions: measured alike for both
         registration = self._o3d.pipelines.registration
         fit = registration.evaluate_registration(cloud, self._map[0], 1.5 * self.VOXEL, T)
-        return Answer(T, fit.fitness >= self.FITNESS, float(fit.fitness))
+        return Answer(T, fit.fitness >= self.FITNESS)
 
     def _described(self, points: Points) -> tuple[Any, Any]:
         o3d, search, voxel = self._o3d, self._o3d.geometry.KDTreeSearchParamHybrid, self.VOXEL
@@ -152,40 +149,50 @@ class Features:
 
 
 class SmallGicp:
-    """small_gicp 1.0 (MIT): GICP and VGICP of the submap to the map, from a pose nearby.
+    """small_gicp 1.0 (MIT): GICP or VGICP (voxels of 1 m, covariances of 10 points) to a prepared cloud."""
 
-    Settings of its documentation: covariances of 10 neighbours, voxels of 1 m for VGICP, correspondences within 1 m.
-    The map is prepared once, at 0.25 m. In its favour, the submap is cut to 50 m and thinned to 0.5 m, as our
-    registration does it: at its default of 0.25 m and without a cut it is as exact and takes two to four times as long
-    (measured). Thinning and covariances of the submap are part of a query, as ours are. All cores. It vouches when it
-    says that it has converged.
-    """
-
-    MAP, SUBMAP, REACH, VOXEL, NEAR = 0.25, 0.5, 50.0, 1.0, 1.0
-
-    def __init__(self, site: BaseMap, way: Literal["GICP", "VGICP"]) -> None:
+    def __init__(self, points: Points, way: Literal["GICP", "VGICP"], voxel: float, near: float, threads: int) -> None:
+        """Prepare the target, thinned to ``voxel`` metres; correspondences count within ``near`` metres."""
         import small_gicp
 
         self._library: Any = small_gicp
-        self._threads = os.cpu_count() or 1
-        self._map, self._tree = self._prepared(np.array(site.points, dtype=np.float64), self.MAP)
-        self._voxels: Any = None
+        self._threads = threads
+        self._target, tree = self.prepared(points, voxel)
+        self._about: dict[str, Any] = {"max_correspondence_distance": near, "num_threads": threads}
         if way == "VGICP":
-            self._voxels = small_gicp.GaussianVoxelMap(self.VOXEL)
-            self._voxels.insert(self._map)
+            voxels = small_gicp.GaussianVoxelMap(1.0)
+            voxels.insert(self._target)
+            self._target = voxels
+        else:
+            self._about["target_tree"] = tree
 
-    def _prepared(self, points: Floats, voxel: float) -> Any:
+    def prepared(self, points: Points, voxel: float) -> Any:
+        """Thin a cloud and estimate its covariances; with its search tree."""
         return self._library.preprocess_points(
-            points, downsampling_resolution=voxel, num_neighbors=10, num_threads=self._threads
+            points.astype(np.float64), downsampling_resolution=voxel, num_neighbors=10, num_threads=self._threads
         )
+
+    def align(self, source: Any, start: Pose) -> Any:
+        """Align a prepared cloud to the target from a pose nearby."""
+        return self._library.align(self._target, source, init_T_target_source=start, **self._about)
+
+
+class NearbyGicp(SmallGicp):
+    """small_gicp: the submap to the map, from a pose nearby.
+
+    Settings of its documentation: correspondences within 1 m. The map is prepared once, at 0.25 m. In its favour, the
+    submap is cut to 50 m and thinned to 0.5 m, as our registration does it: at its default of 0.25 m and without a cut
+    it is as exact and takes two to four times as long (measured). Thinning and covariances of the submap are part of a
+    query, as ours are. All cores. It vouches when it says that it has converged.
+    """
+
+    MAP, SUBMAP, REACH, NEAR = 0.25, 0.5, 50.0, 1.0
+
+    def __init__(self, site: BaseMap, way: Literal["GICP", "VGICP"]) -> None:
+        super().__init__(np.array(site.points), way, self.MAP, self.NEAR, os.cpu_count() or 1)
 
     def answer(self, place: Place) -> Answer:
         """Prepare the submap and align it."""
-        near = place.submap.compress(norms(place.submap) < self.REACH, axis=0).astype(np.float64)
-        source, _ = self._prepared(near, self.SUBMAP)
-        about = {"num_threads": self._threads, "max_correspondence_distance": self.NEAR}
-        if self._voxels is not None:
-            found = self._library.align(self._voxels, source, started(place), **about)
-        else:
-            found = self._library.align(self._map, source, self._tree, started(place), **about)
-        return Answer(np.array(found.T_target_source), bool(found.converged), float(found.num_inliers))
+        source, _ = self.prepared(place.submap.compress(norms(place.submap) < self.REACH, axis=0), self.SUBMAP)
+        found = self.align(source, started(place))
+        return Answer(np.array(found.T_target_source), bool(found.converged))

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+import coview_kernels
 from bench.harness.worlds import Place
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
@@ -31,11 +32,10 @@ OFF, TURNED = 0.5, float(np.radians(3.0))  # how far from the truth tracking sta
 
 @dataclass(frozen=True)
 class Answer:
-    """A pose (4, 4) map <- submap, or None; whether the method itself vouches for it, and its own score."""
+    """A pose (4, 4) map <- submap, or None, and whether the method itself vouches for it."""
 
     T_map_submap: Pose | None
     vouched: bool
-    score: float = 0.0
 
 
 class Method(Protocol):
@@ -76,67 +76,58 @@ class Keyframes:
     """The search over the keyframes of a drive."""
 
     def __init__(self, site: BaseMap, stationary: bool = False) -> None:
-        import coview_kernels
-
         coview_kernels.warm_up()
         config = LocalizerConfig(stationary=stationary)
         self._search = GlobalSearch(site, config, LocalMaps(site, config.registration.source_range))
 
     def answer(self, place: Place) -> Answer:
         """Search until a keyframe's verdict accepts a place."""
-        return self._search_all(place.queries, place)
-
-    def _search_all(self, queries: list[SearchRequest], place: Place) -> Answer:
         self._search.clear()
-        score = 0.0
-        for query in queries:
-            verdict = self._search.update(query)
-            score = verdict.evidence.score
-            if verdict.accepted is not None:
-                return Answer(verdict.accepted.T_map_odom @ place.T_odom_submap, True, score)
-        return Answer(None, False, score)
+        for query in self._queries(place):
+            accepted = self._search.update(query).accepted
+            if accepted is not None:
+                return Answer(accepted.T_map_odom @ place.T_odom_submap, True)
+        return Answer(None, False)
+
+    def _queries(self, place: Place) -> list[SearchRequest]:
+        return place.queries
 
 
 class OneScan(Keyframes):
-    """The search from one submap alone."""
+    """The search from one submap alone: all points of the drive as if they were one scan."""
 
     def __init__(self, site: BaseMap) -> None:
         super().__init__(site, stationary=True)
 
-    def answer(self, place: Place) -> Answer:
-        """Search with all points of the drive as if they were one scan."""
+    def _queries(self, place: Place) -> list[SearchRequest]:
         newest = place.queries[-1]
-        submap = place.submap + newest.position.astype(np.float32)
-        return self._search_all([replace(newest, submap=submap)], place)
+        return [replace(newest, submap=place.submap + newest.position.astype(np.float32))]
 
 
 class Tracking:
     """Registration from a pose nearby, believed if it passes the check that every registration must pass."""
 
     def __init__(self, site: BaseMap) -> None:
-        import coview_kernels
-
         coview_kernels.warm_up()
-        self._site = site
-        self._config = LocalizerConfig().registration
+        self._site, self._config = site, LocalizerConfig().registration
         self._maps = LocalMaps(site, self._config.source_range)
 
     def answer(self, place: Place) -> Answer:
         """Register the submap."""
-        start = started(place)
+        start, newest = started(place), place.queries[-1]
         source = prepare_scan(place.submap, np.zeros(3), self._config)
-        target = self._maps.around(transform(start, np.zeros((1, 3)))[0])
+        target = self._maps.around(start[:3, 3])
         if target is None:
             return Answer(None, False)
         found = register(source, start, target, self._config, self._config.track, centre=np.zeros(3))
         if found is None:
             return Answer(None, False)
-        T, newest = found.T_map_source, place.queries[-1]
+        T = found.T_map_source
         surveyed = self._site.surveyed(transform(T, source.points)[:, :2])
         T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
         evidence = verify(source, T, RangeImage.of(newest.cloud), T_map_body, target, surveyed)
         cause, _ = EvidenceBaseline().judge(evidence, LocalizerConfig().acceptance)
-        return Answer(T, cause is RejectionReason.VERIFIED, evidence.score)
+        return Answer(T, cause is RejectionReason.VERIFIED)
 
 
 def _library(name: str, *options: Any) -> Callable[[BaseMap], Method]:
@@ -161,7 +152,7 @@ PEERS = (
     Peer("Open3D FPFH + RANSAC", _library("Features", "ransac")),
     Peer("Open3D FPFH + FGR", _library("Features", "fgr")),
     Peer(OUR_TRACKING, Tracking, tracking=True),
-    Peer("small_gicp GICP", _library("SmallGicp", "GICP"), "small-gicp", "small_gicp", tracking=True),
-    Peer("small_gicp VGICP", _library("SmallGicp", "VGICP"), "small-gicp", "small_gicp", tracking=True),
+    Peer("small_gicp GICP", _library("NearbyGicp", "GICP"), "small-gicp", "small_gicp", tracking=True),
+    Peer("small_gicp VGICP", _library("NearbyGicp", "VGICP"), "small-gicp", "small_gicp", tracking=True),
 )
 """The first of either kind is coview_stream."""

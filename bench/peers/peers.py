@@ -23,13 +23,14 @@ from typing import Any
 
 import numpy as np
 
+import coview_kernels
 from bench.harness.files import folder, isolated
 from bench.harness.rows import Row, bounded, failed, informs
 from bench.harness.suite import run
 from bench.harness.tables import number, table
 from bench.harness.worlds import WORLDS, map_of, places, world
 from bench.peers.methods import OUR_TRACKING, OURS, PEERS, Peer
-from coview_stream.errors import InputError
+from coview_stream import BaseMap
 
 NEAR, ALIGNED = 3.0, 5.0  # a pose is right within this, metres and degrees (the papers' success)
 
@@ -42,7 +43,7 @@ _HEAD = (
 class Trial:
     """What one peer did on one world's queries, or why it did nothing.
 
-    ``answers`` are of the queries in order: ``seconds``, ``vouched``, ``score``, and ``metres`` and ``degrees`` from
+    ``answers`` are of the queries in order: ``seconds``, ``vouched``, and ``metres`` and ``degrees`` from
     the truth, None without a pose. Queries that it did not come to are missing.
     """
 
@@ -53,38 +54,35 @@ class Trial:
     answers: list[dict[str, Any]] = field(default_factory=list)
     trouble: str = ""
 
-    def _right(self, answer: dict[str, Any], metres: float) -> bool:
-        return bool(
-            answer["vouched"] and answer["metres"] is not None
-            and answer["metres"] < metres and answer["degrees"] < ALIGNED
-        )  # fmt: skip
+    def _near(self, metres: float = NEAR) -> list[dict[str, Any]]:
+        posed = (a for a in self.answers if a["metres"] is not None)
+        return [a for a in posed if a["metres"] < metres and a["degrees"] < ALIGNED]
 
     def succeeded(self, metres: float = NEAR) -> int:
         """Count answers that it vouches for and that are right."""
-        return sum(self._right(a, metres) for a in self.answers)
+        return sum(a["vouched"] for a in self._near(metres))
 
     def false_accepts(self) -> int:
         """Count answers that it vouches for and that are wrong."""
-        return sum(bool(a["vouched"]) and not self._right(a, NEAR) for a in self.answers)
+        return sum(a["vouched"] for a in self.answers) - self.succeeded()
 
     def found(self) -> int:
         """Count right answers, vouched for or not: what a perfect check would make of it."""
-        return sum(self._right(a | {"vouched": True}, NEAR) for a in self.answers)
+        return len(self._near())
 
     def median_error(self) -> tuple[float, float]:
         """Metres and degrees, over the right answers that it vouches for; NaN without one."""
-        right = [(a["metres"], a["degrees"]) for a in self.answers if self._right(a, NEAR)]
+        right = [(a["metres"], a["degrees"]) for a in self._near() if a["vouched"]]
         metres, degrees = np.median(right, axis=0) if right else (np.nan, np.nan)
         return float(metres), float(degrees)
 
     def cells(self) -> list[str]:
         """One line of the table; counts are of the queries that were asked."""
-        counts = (self.succeeded(), self.succeeded(1.0), self.false_accepts(), self.found())
-        right, near, false, found = (f"{count} of {self.asked}" for count in counts)
+        right, near, found = (f"{n} of {self.asked}" for n in (self.succeeded(), self.succeeded(1.0), self.found()))
         metres, degrees = self.median_error()
         return [
-            self.peer, self.scene, right, near, false.split()[0], found, number(metres, 2), number(degrees, 2),
-            number(milliseconds([self]), 0), number(self.prepare_s, 1),
+            self.peer, self.scene, right, near, str(self.false_accepts()), found, number(metres, 2),
+            number(degrees, 2), number(milliseconds([self]), 0), number(self.prepare_s, 1),
         ]  # fmt: skip
 
 
@@ -144,8 +142,6 @@ def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: P
 
 def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
     """Yield the seconds of a peer's preparation, then those of each query with its answer."""
-    from coview_stream import BaseMap
-
     peer = next(peer for peer in PEERS if peer.name == name)
     found = pickle.loads(Path(places_file).read_bytes())
     site = BaseMap.load(Path(map_file))
@@ -158,35 +154,32 @@ def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
         seconds = time.perf_counter() - begin
         T = answer.T_map_submap
         metres, degrees = (None, None) if T is None else place.errors(T)
-        said = {"seconds": seconds, "vouched": answer.vouched, "score": answer.score}
-        yield informs(f"trial/query {k}", seconds, "s", {**said, "metres": metres, "degrees": degrees})
+        said = {"seconds": seconds, "vouched": answer.vouched, "metres": metres, "degrees": degrees}
+        yield informs(f"trial/query {k}", seconds, "s", said)
 
 
-def contest(count: int, limit_s: float, peers: Sequence[Peer] = PEERS) -> Iterator[Trial]:
+def contest(count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
     with tempfile.TemporaryDirectory() as scratch:
         for scene, config in WORLDS.items():
             file = Path(scratch) / scene
             isolated(_keep, folder(), scene, count, file)
-            for peer in peers:
+            for peer in PEERS:
                 print(f"... {peer.name}, {scene}", file=sys.stderr, flush=True)
                 yield run_trial(peer, scene, count, map_of(folder(), config), file, limit_s)
 
 
 def _keep(folder: Path, scene: str, count: int, file: Path) -> None:
-    import coview_kernels
-
     world(folder, scene)
     file.write_bytes(pickle.dumps(places(folder, scene, count), protocol=pickle.HIGHEST_PROTOCOL))
     coview_kernels.shutdown()
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add how many places, how long, and who."""
+    """Add how many places, and how long."""
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
     parser.add_argument("--limit", type=float, default=180.0, metavar="S", help="per world and peer (180 s)")
-    parser.add_argument("--only", nargs="+", metavar="PEER", help="those whose name has this in it, beside ours: kiss")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -194,12 +187,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
     if asked.trial:
         yield from _asked(*asked.trial)
         return
-    words = [word.lower() for word in asked.only or [""]]
-    chosen = [p for p in PEERS if p.name in (OURS, OUR_TRACKING) or any(w in p.name.lower() for w in words)]
-    if unknown := [word for word in words if not any(word in peer.name.lower() for peer in chosen)]:
-        raise InputError(f"no peer {', '.join(unknown)}; there are {'; '.join(p.name for p in PEERS)}")
-    trials = list(contest(4 if asked.quick else asked.places, asked.limit, chosen))
-    for peer in chosen:
+    trials = list(contest(4 if asked.quick else asked.places, asked.limit))
+    for peer in PEERS:
         theirs = [trial for trial in trials if trial.peer == peer.name]
         reference = [trial for trial in trials if trial.peer == (OUR_TRACKING if peer.tracking else OURS)]
         details = {"trials": [asdict(trial) for trial in theirs]}

@@ -29,13 +29,14 @@ from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from bench.harness.files import folder
 from bench.harness.rows import Row, against, informs
 from bench.harness.worlds import map_of, prepare
+from bench.peers.libraries import SmallGicp
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
@@ -63,7 +64,7 @@ EQUAL = 1.05  # errors this far apart are equal: two runs with other noise diffe
 STARTS = {"tracking": (0.05, np.radians(0.3)), "search": (0.5, np.radians(3.0))}
 COARSE = {"tracking": (0.8,), "search": (1.5, 0.8)}
 FINE, NTH = (0.4,), 5
-WAYS = ("GICP", "VGICP")
+WAYS: dict[Literal["GICP", "VGICP"], float] = {"GICP": 1.0, "VGICP": 2.0}  # correspondences within, metres
 _CLEAR = 0.5  # metres above the ground, as the engine's registration has it
 
 
@@ -80,9 +81,10 @@ def rows(asked: Namespace) -> Iterator[Row]:
     """Compare with each of small_gicp's ways, from each kind of start."""
     found = list(places(11 if asked.quick else 31))
     warm_up()
-    peers = {id(target): SmallGicp(target) for target in {id(p.target): p.target for p in found}.values()}
-    for place in found:
-        nearest(place.target.grid, place.target.points[:1], 1.0)  # sorts the tile
+    peers, threads = {}, runtime.workers()
+    for target in {id(place.target): place.target for place in found}.values():
+        peers |= {(w, id(target)): SmallGicp(target.points, w, 0.05, near, threads) for w, near in WAYS.items()}
+        nearest(target.grid, target.points[:1], 1.0)  # sorts the tile
     for kind in STARTS:
         results = _trials(found, kind, peers)
         took, *error = results["ours"]
@@ -147,17 +149,14 @@ def _error(place: Place, T: Pose | None) -> tuple[float, float]:
 
 
 Way = Callable[[Place, Pose], tuple[float, Pose | None]]
+Peers = dict[tuple[str, int], SmallGicp]  # by way and tile
 
 
-def _trials(found: list[Place], kind: str, peers: dict[int, SmallGicp]) -> dict[str, tuple[float, float, float]]:
+def _trials(found: list[Place], kind: str, peers: Peers) -> dict[str, tuple[float, float, float]]:
     """Median milliseconds and root mean squares of metres and degrees of every way, two starts at each place."""
-
-    def theirs(way: str, whole: bool, place: Place, begin: Pose) -> tuple[float, Pose]:
-        return peers[id(place.target)].align(way, place.source.points, begin, whole)
-
     sides: dict[str, Way] = {"ours": partial(_ours, kind)}
     for way in WAYS:
-        sides |= {way: partial(theirs, way, True), f"{way}, align only": partial(theirs, way, False)}
+        sides |= {way: partial(_theirs, peers, way, True), f"{way}, align only": partial(_theirs, peers, way, False)}
     values: dict[str, list[tuple[float, float, float]]] = {name: [] for name in sides}
     order = list(sides)
     for name in order:
@@ -183,30 +182,12 @@ def _ours(kind: str, place: Place, begin: Pose) -> tuple[float, Pose | None]:
     return time.perf_counter() - clock, None if answer is None else answer.T_map_source
 
 
-class SmallGicp:
-    """small_gicp with a tile prepared."""
-
-    def __init__(self, target: LocalMap) -> None:
-        import small_gicp  # of the extra peers
-
-        self._library: Any = small_gicp
-        self._threads = {"num_threads": runtime.workers()}
-        points = target.points.astype(np.float64)
-        self._map, self._tree = small_gicp.preprocess_points(points, downsampling_resolution=0.05, **self._threads)
-        self._voxels = small_gicp.GaussianVoxelMap(1.0)
-        self._voxels.insert(self._map)
-
-    def align(self, way: str, points: Floats32, begin: Pose, whole: bool) -> tuple[float, Pose]:
-        """Seconds, with the source's covariances or without, and the pose."""
-        cloud = points.astype(np.float64)
+def _theirs(peers: Peers, way: str, whole: bool, place: Place, begin: Pose) -> tuple[float, Pose]:
+    """Seconds, with the source's covariances or without, and the pose."""
+    peer = peers[way, id(place.target)]
+    clock = time.perf_counter()
+    source, _ = peer.prepared(place.source.points, 0.5)
+    if not whole:
         clock = time.perf_counter()
-        source, _ = self._library.preprocess_points(cloud, downsampling_resolution=0.5, **self._threads)
-        if not whole:
-            clock = time.perf_counter()
-        if way == "VGICP":
-            answer = self._library.align(self._voxels, source, begin, max_correspondence_distance=2.0, **self._threads)
-        else:
-            answer = self._library.align(
-                self._map, source, self._tree, begin, max_correspondence_distance=1.0, **self._threads
-            )
-        return time.perf_counter() - clock, np.array(answer.T_target_source)
+    T = np.array(peer.align(source, begin).T_target_source)
+    return time.perf_counter() - clock, T

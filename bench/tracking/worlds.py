@@ -16,7 +16,7 @@ from unittest.mock import patch
 import numpy as np
 import numpy.typing as npt
 
-from bench.harness.files import fingerprint, remembered_seconds
+from bench.harness.files import fingerprint, remembered
 from bench.harness.worlds import MAPPER, SIMULATOR
 from coview_stream import BaseMap
 from coview_stream.clouds import write_cloud
@@ -91,7 +91,7 @@ def open_world(folder: Path, world: World) -> Recorded:
     """Open the drive of a world, simulated now unless it is there."""
     out = folder / world.name
     wanted = {"world": world._replace(drift=0.0)._asdict(), "code": fingerprint(*SIMULATOR, _SELF)}
-    remembered_seconds(out / "simulated.json", wanted, lambda: _simulate(out, world))
+    remembered(out / "simulated.json", wanted, lambda: _simulate(out, world))
     rows = np.memmap(out / "frames.i16", np.int16, "r").reshape(-1, 3)
     return Recorded(np.load(out / "truth.npy"), np.load(out / "ends.npy"), rows)
 
@@ -131,7 +131,7 @@ def map_of(folder: Path, world: World, variant: str = "plain") -> Path:
             write_cloud(Path(scratch) / "base.laz", points)
             BaseMap.build(Path(scratch) / "base.laz").save(file)
 
-    remembered_seconds(out / f"{variant}.json", wanted, build)
+    remembered(out / f"{variant}.json", wanted, build)
     return file
 
 
