@@ -97,7 +97,7 @@ class MemoryTransport:
             self.raised.append(error)
             raise TransportError(f"{key}: the node refused: {error}") from error
 
-    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+    def tokens(self, expression: str) -> list[str]:
         """Return those of :attr:`announced` that match, sorted, each once."""
         return sorted({token for token in self.announced if matches(expression, token)})
 

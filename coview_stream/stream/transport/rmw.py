@@ -19,6 +19,7 @@ NO_HASH = "TypeHashNotSupported"
 _GID = 16
 _ATTACHMENT = struct.Struct("<qqB16s")  # sequence, source time in ns, length of the gid, gid
 _QOS = "::,10:,:,:,,"  # empty fields mean rmw_zenoh's defaults: reliable, volatile; keep the last 10
+_NODE_ID = 0  # each of our sessions has one ROS node
 _ROOT = "%"  # a '/' in a name, and so the root enclave and the root namespace
 
 
@@ -47,16 +48,16 @@ def gid_of(token: str) -> bytes:
     return hashlib.blake2b(token.encode(), digest_size=_GID).digest()
 
 
-def node_token(domain: int, zid: str, node: str, node_id: int = 0) -> str:
+def node_token(domain: int, zid: str, node: str) -> str:
     """Return the liveliness token of a ROS 2 node in the root namespace; ``zid`` is our zenoh session's identity."""
-    return f"@ros2_lv/{domain}/{zid}/{node_id}/{node_id}/NN/{_ROOT}/{_ROOT}/{node}"
+    return f"@ros2_lv/{domain}/{zid}/{_NODE_ID}/{_NODE_ID}/NN/{_ROOT}/{_ROOT}/{node}"
 
 
-def publisher_token(key: str, zid: str, node: str, entity_id: int, node_id: int = 0) -> str:
+def publisher_token(key: str, zid: str, node: str, entity_id: int) -> str:
     """Return the token of a publisher on ``key``, ``domain/topic.../type/hash``; ``entity_id`` is its alone."""
     domain, *topic, kind, digest = key.split("/")
     name = _ROOT + _ROOT.join(topic)
-    return f"@ros2_lv/{domain}/{zid}/{node_id}/{entity_id}/MP/{_ROOT}/{_ROOT}/{node}/{name}/{kind}/{digest}/{_QOS}"
+    return f"@ros2_lv/{domain}/{zid}/{_NODE_ID}/{entity_id}/MP/{_ROOT}/{_ROOT}/{node}/{name}/{kind}/{digest}/{_QOS}"
 
 
 class RmwPublisher:

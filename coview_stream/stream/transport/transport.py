@@ -72,7 +72,7 @@ class Transport(Protocol):
         """
         ...
 
-    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+    def tokens(self, expression: str) -> list[str]:
         """List the liveliness tokens that match ``expression`` right now, sorted; none while not connected.
 
         Raises:

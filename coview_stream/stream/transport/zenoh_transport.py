@@ -30,6 +30,7 @@ _RETRY = 0.5  # between two attempts to find the first router
 _OPEN_TIMEOUT = 2.0  # of opening, for the first attempt: a host that is off does not even refuse
 _JOIN_TIMEOUT = 0.4  # for all our threads to end at close; they notice within 0.1
 _EXIT_TIMEOUT = 10.0  # for each thread to end with the process: longer than any attempt to open
+_TOKEN_TIMEOUT = 1.0  # for answers to a question for tokens
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's receiving thread, for all keys
 
 
@@ -140,7 +141,7 @@ class ZenohTransport:
                 return answer
         raise TransportError(f"{key}: no answer within {timeout:g} s; is the node running and connected?")
 
-    def tokens(self, expression: str, timeout: float = 1.0) -> list[str]:
+    def tokens(self, expression: str) -> list[str]:
         """List the liveliness tokens that match ``expression`` right now, sorted; none while there is no session.
 
         Raises:
@@ -150,7 +151,7 @@ class ZenohTransport:
         if session is None:
             return []
         with zenoh_errors(f"tokens {expression!r}"):
-            replies = [reply.ok for reply in session.liveliness().get(expression, timeout=timeout)]
+            replies = [reply.ok for reply in session.liveliness().get(expression, timeout=_TOKEN_TIMEOUT)]
         return sorted({str(sample.key_expr) for sample in replies if sample is not None})
 
     def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
