@@ -10,10 +10,10 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS, Sensor
 
 INCLINATION = float(np.radians(45.0))
-"""Of the sensor's own axis, radians."""
+"""Of the sensor's own axis, radians; set by hand."""
 
 TURNS = 0.5
-"""Turns of the whole sensor about the vertical, per second."""
+"""Turns of the whole sensor about the vertical, per second; set by hand."""
 
 _COLUMNS = 1800
 _ROTATING = "vlp16-inclined"

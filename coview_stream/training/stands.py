@@ -15,7 +15,7 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.terrain import Terrain
 from coview_stream.training.trees import PATTERNS, Trees, draw_species, draw_stems, draw_trees, opened
 
-_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares of the range
+_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares of the range; set by hand
 
 
 class Stand(NamedTuple):

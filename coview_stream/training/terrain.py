@@ -12,7 +12,7 @@ from coview_stream.sim.mesh import Mesh, height_field
 
 Field = Callable[[Floats, Floats], Floats]
 
-_STEP = 1.0  # metres between grid points
+_STEP = 1.0  # metres between grid points; set by hand
 
 
 def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:

@@ -18,6 +18,7 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.training_config import TrainingConfig
 from coview_stream.version import __version__
 
+# set by hand
 _REPORT_STEPS = 20  # from one line of progress to the next
 _HELD_OUT = 19_000  # first seed of the worlds that training never sees
 

@@ -15,7 +15,7 @@ MIN_COVERAGE = 0.6
 """Share of a query's weight that has to lie on surveyed cells; set by hand: at it, scatter has grown by 1.3."""
 
 _BATCH_BYTES = 32 << 20  # of the products that are transformed back together; set by hand
-_EPSILON = 1e-6  # a smaller weight is none
+_EPSILON = 1e-6  # a smaller weight is none; set by hand
 
 
 def correlate(

@@ -27,7 +27,7 @@ _SIZE = 64.0
 """Metres along the edge of a query's image."""
 
 _MAX_SLOPE = 1.0  # metres per metre that the ground rises along a storey; set by hand
-_MAX_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away
+_MAX_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away; set by hand
 _ROUNDING = 1e-6  # cells
 _SAMPLE = 200_000  # scores that a median is taken of; set by hand
 _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # from a tile's middle to beyond its corners, metres
