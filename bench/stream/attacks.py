@@ -27,12 +27,11 @@ def flood(stage: Stage) -> None:
     begin, end, found, recorder = SETTLED, SETTLED + 10.0, stage.found, stage.recorder
     plan = RobotPlan("r1", end + 15.0, phases={"no_cloud": (begin, end)})
     much = RobotPlan("r1", end, begin=begin, cloud_period=0.01, odometry_period=0.0, points=FLOOD_POINTS)
-    flooder, sender = stage.sender(much), stage.sender(plan)
-    start = sender.begin()
-    flooder.begin(start)
+    flooder, stream = stage.sender(much), stage.stream(plan)
+    start = flooder.begin(stream.start)
     until(start + begin - 0.5)
     before = stage.megabytes()
-    stage.ill_treated(plan, sender, start)
+    stage.ill_treated(stream)
     found.most("memory that stays, MB", stage.megabytes() - before, MAX_GROWTH)
     periods = ((0.0, start + begin - 0.5), (start, start + end + 5.0))
     earlier, now = (scores.counter(recorder.told("r1", *period), "dropped") or 0 for period in periods)
@@ -46,8 +45,7 @@ def flood(stage: Stage) -> None:
 
 def random(stage: Stage) -> None:
     """Random bytes on every input key and in queries; then a good stream."""
-    found, plan, long = stage.found, RobotPlan("r1", 25.0), stage.seconds(60.0, 10.0)
-    sender, rogue = stage.sender(plan), stage.helper(vandalise, stage.endpoint, "r1", 200.0)
+    found, long, rogue = stage.found, stage.seconds(60.0, 10.0), stage.helper(vandalise, stage.endpoint, "r1", 200.0)
     end = rogue.begin() + long
     replies = []
     for k in range(20):
@@ -66,8 +64,7 @@ def random(stage: Stage) -> None:
     found.most("longest time without a status, s", silent, 2.5)
     answered = sum(bool(reply) for reply in replies)
     found.judge("queries answered", f"{answered} of 20", "all", answered == 20)
-    start = sender.begin()
-    found.stream(stage.ill_treated(plan, sender, start), "good stream after: ")
+    found.stream(stage.ill_treated(stage.stream(RobotPlan("r1", 25.0))), "good stream after: ")
 
 
 def backwards(stage: Stage) -> None:
@@ -77,9 +74,9 @@ def backwards(stage: Stage) -> None:
         "late": late, "twice": twice, "reversed": reverse, "future": future, "restart": restart,
     }  # fmt: skip
     plan, found = RobotPlan("r1", restart[1], phases=phases), stage.found
-    sender = stage.sender(plan)
-    start = sender.begin()
-    stage.ill_treated(plan, sender, start)
+    stream = stage.stream(plan)
+    start = stream.start
+    stage.ill_treated(stream)
     restarted = start + restart[0]
     told, poses = stage.recorder.told("r1", start), stage.recorder.poses("r1", start)
     for name in ("out_of_order", "duplicate"):
@@ -100,8 +97,8 @@ def backwards(stage: Stage) -> None:
 def router(stage: Stage) -> None:
     """Kill the router, bring it back at the same port after three seconds."""
     plan, found = RobotPlan("r1", SETTLED + 25.0), stage.found
-    sender = stage.sender(plan)
-    start = sender.begin()
+    stream = stage.stream(plan)
+    start = stream.start
     until(start + SETTLED)
     before = stage.recorder.told("r1")[-1].fields
     stage.router.kill()
@@ -109,7 +106,7 @@ def router(stage: Stage) -> None:
     until(gone + 3.0)
     stage.start_router()
     back = time.monotonic()
-    stage.ill_treated(plan, sender, start, without=[(gone - 0.2, back)])
+    stage.ill_treated(stream, without=[(gone - 0.2, back)])
     stage.returned("poses back after the router's return, s", back, BACK_SOON, stamp_of(back - start))
     told = stage.recorder.told("r1", back)
     after = told[-1].fields if told else {}
@@ -127,9 +124,9 @@ def odometry(stage: Stage) -> None:
     """Clouds without odometry for five seconds."""
     begin, end, found = SETTLED, SETTLED + 5.0, stage.found
     plan = RobotPlan("r1", end + 20.0, phases={"no_odometry": (begin, end)})
-    sender = stage.sender(plan)
-    start = sender.begin()
-    stage.ill_treated(plan, sender, start)
+    stream = stage.stream(plan)
+    start = stream.start
+    stage.ill_treated(stream)
     poses = stage.recorder.poses("r1", start, start + end)
     left = poses[-1].arrival - start - begin if poses else None
     soon = left is not None and -0.3 < left <= MAX_LEFT
@@ -141,15 +138,14 @@ def odometry(stage: Stage) -> None:
 
 def sigterm(stage: Stage) -> None:
     """SIGTERM in the middle of a stream."""
-    sender, found = stage.sender(RobotPlan("r1", 40.0)), stage.found
-    start = sender.begin()
-    until(start + 15.0)
+    stream, found = stage.stream(RobotPlan("r1", 40.0)), stage.found
+    until(stream.start + 15.0)
     family, moment = stage.family(), time.monotonic()
     code, seconds = stage.terminate()
     gone = wait_until(lambda: not stage.recorder.alive("r1"), 3.0)
     tokens = [at - moment for at, _, put in stage.recorder.tokens if not put]
     told = stage.recorder.told("r1", moment)
-    sender.stop()
+    stream.sender.stop()
     found.judge("exit code", code, "0", code == 0)
     found.judge("seconds to its end", seconds, f"< {MAX_TERM:.0f}", seconds < MAX_TERM)
     found.judge("statuses after the signal", len(told), ">= 1", len(told) >= 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -85,14 +84,20 @@ def shown(value: Any) -> str:
 
 
 class Setting(NamedTuple):
-    """What all scenarios share: worlds, map, folder of logs, how long, and more arguments for the node."""
+    """What all scenarios share: the world, another one, the first one's map, and how long."""
 
     world: Path
     stranger: Path
     site: Path
-    logs: Path
     quick: bool
-    extra: Sequence[str]
+
+
+class Stream(NamedTuple):
+    """A robot's stream under way, and the monotonic time of its beginning."""
+
+    plan: RobotPlan
+    sender: Helper
+    start: float
 
 
 class Stage:
@@ -102,8 +107,8 @@ class Stage:
         self.setting, self.found, self.robots = setting, found, tuple(robots)
         self.port = free_port()
         self.endpoint = f"tcp/127.0.0.1:{self.port}"
-        self._arguments = ["--robot", *robots, "--connect", self.endpoint, *arguments, *setting.extra]
-        self._log = Path(tempfile.mkstemp(suffix=".log", prefix=f"{found.name}-", dir=setting.logs)[1])
+        self._arguments = ["--robot", *robots, "--connect", self.endpoint, *arguments]
+        self._log = setting.world / f"{found.name}.log"
         self._helpers: list[Helper] = []
 
     def __enter__(self) -> Stage:
@@ -184,6 +189,11 @@ class Stage:
         """Return a sender that waits for its beginning."""
         return self.helper(send, self.endpoint, world or self.setting.world, plans)
 
+    def stream(self, plan: RobotPlan) -> Stream:
+        """Begin the stream of one robot."""
+        sender = self.sender(plan)
+        return Stream(plan, sender, sender.begin())
+
     def sent(self, sender: Helper, label: str = "") -> Sent:
         """Wait for a sender's end, and judge whether the measurement itself can be trusted."""
         sent: Sent = sender.result()
@@ -225,9 +235,9 @@ class Stage:
             "clouds_sent": len(puts),
         }
 
-    def ill_treated(self, plan: RobotPlan, sender: Helper, start: float, **options: Any) -> dict[str, Any]:
+    def ill_treated(self, stream: Stream, **options: Any) -> dict[str, Any]:
         """Measure a stream, and judge what any ill treatment must leave intact."""
-        numbers, found = self.measure(plan, self.sent(sender), start, **options), self.found
+        found, numbers = self.found, self.measure(stream.plan, self.sent(stream.sender), stream.start, **options)
         found.numbers.update(numbers)
         found.judge("node alive", self.running(), "True", self.running())
         found.none("false or unreadable poses", numbers["false"] + numbers["unreadable"], numbers["poses"])

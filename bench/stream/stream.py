@@ -7,12 +7,10 @@ node over raw zenoh, and yields its findings with a verdict per target. Needs th
 from __future__ import annotations
 
 import functools
-import tempfile
 import traceback
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,10 +29,8 @@ FLEET, FLEET_POINTS, MAX_STARVATION, MIN_JAIN = 16, 16_000, 1.0, 0.95
 
 def steady(stage: Stage, label: str = "", full: float = 53.0, quick: float = 25.0, **changes: Any) -> None:
     """Stream one robot that ought to be served well."""
-    plan = RobotPlan("r1", stage.seconds(full, quick), **changes)
-    sender = stage.sender(plan)
-    start = sender.begin()
-    numbers = stage.measure(plan, stage.sent(sender, label), start)
+    stream = stage.stream(RobotPlan("r1", stage.seconds(full, quick), **changes))
+    numbers = stage.measure(stream.plan, stage.sent(stream.sender, label), stream.start)
     stage.found.numbers[label.strip() or "stream"] = numbers
     stage.found.stream(numbers, label)
 
@@ -128,27 +124,21 @@ SCENARIOS: dict[str, tuple[Scenario, ...]] = {
 
 
 def options(parser: ArgumentParser) -> None:
-    """Add which scenarios, and how the node is run."""
+    """Add which scenarios."""
     parser.add_argument("names", nargs="*", metavar="SCENARIO", choices=[[], *SCENARIOS],
                         help=f"of {', '.join(SCENARIOS)} (all)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=3101, help="of the simulated world (3101)")
-    parser.add_argument("--keep", action="store_true", help="keep the node's logs, and say where")
-    parser.add_argument("--serve", default="", metavar="ARGS", help="more arguments for coview-stream serve")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Run the scenarios one after the other, in a simulated world; a stranger drives in another one."""
+    """Run the scenarios one after the other, in a simulated world, where the node's logs stay; see also ``--work``."""
     home, stranger = (SimulationConfig(seed=asked.seed + k, size=220.0, length=80.0 / (1 + k)) for k in (0, 1))
     for config in (home, stranger):
         worlds.prepare(folder(), config)
     main, other = (folder() / worlds.world_name(config) for config in (home, stranger))
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        logs = Path(tempfile.mkdtemp(prefix="bench-stream-")) if asked.keep else Path(scratch)
-        setting = Setting(main, other, worlds.map_of(folder(), home), logs, asked.quick, asked.serve.split())
-        for name in asked.names or SCENARIOS:
-            yield from played(name, setting)
-        if asked.keep:
-            print(f"logs: {logs}")
+    setting = Setting(main, other, worlds.map_of(folder(), home), asked.quick)
+    for name in asked.names or SCENARIOS:
+        yield from played(name, setting)
 
 
 def played(name: str, setting: Setting) -> Iterator[Row]:
