@@ -8,6 +8,7 @@ in ``--work``, so that it can resume.
 from __future__ import annotations
 
 import json
+import sys
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
@@ -103,6 +104,7 @@ def run_one(folder: Path, run: SimulationConfig, site: SimulationConfig, call: C
         found = remembered(folder / "results" / f"{name}.json", spec, make)
     except Exception as error:  # the other runs are still worth having; the verdict counts this one as failed
         found = {"error": f"{type(error).__name__}: {error}", "success": False, "false_frames": 0, "posed": 0}
+        print(f"{name}: {found['error']}", file=sys.stderr)
     return found | {"name": name, "run": run.to_dict(), "outside": run != site}
 
 
@@ -152,12 +154,5 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs; what went wrong in which, and the code that was measured."""
-    runs = [row.details for row in rows if row.details]
-    notes = []
-    for run in runs:
-        if "error" in run:
-            notes.append(f"- {run['name']}: {run['error']}")
-        elif not run["success"]:
-            notes.append(f"- {run['name']}: {run['state']}, {run['posed']} poses; {run['reason']}")
-    return {"": table(_HEAD, [cells(run) for run in runs]), "notes": "\n".join([*notes, code_line()])}
+    """All runs, and the code that was measured."""
+    return {"": f"{table(_HEAD, [cells(row.details) for row in rows if row.details])}\n\n{code_line()}"}

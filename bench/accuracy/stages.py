@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from coview_stream.clouds import read_tum
 from coview_stream.config import Channel, ConsensusConfig, DescriptorConfig, KeyframeConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Points, Pose, inverse, transform, wrap_angle, yaw_of
+from coview_stream.geometry.transforms import Points, Pose, inverse, to_local, transform, wrap_angle, yaw_of
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.keyframes import KeyframeBuffer
@@ -98,9 +99,8 @@ def keyframes_of(world: Path, origin: Floats, descriptor: DescriptorConfig) -> I
     settings = KeyframeConfig()
     buffer = KeyframeBuffer(settings)
     for frame in run:
-        T_odom_body, T_map_body = frame.T_odom_body.copy(), truth[frame.index].copy()
-        T_odom_body[:3, 3] -= run.poses[0][:3, 3]  # near its own origin, as the localizer has it
-        T_map_body[:3, 3] -= origin
+        T_odom_body = to_local(frame.T_odom_body, run.poses[0][:3, 3])  # near its own origin, as the localizer has it
+        T_map_body = to_local(truth[frame.index], origin)
         keyframe = buffer.add(voxelized(frame.points, T_odom_body, settings), T_odom_body, frame.stamp)
         if keyframe is None:
             continue
@@ -114,12 +114,10 @@ class _Search:
     """One variant's votes: of the newest keyframe alone, and of the last few together."""
 
     def __init__(self, variant: Variant, base_map: BaseMap) -> None:
-        self.variant = variant
-        block, stations = base_map.config.block, base_map.stations
-        alone = replace(variant.consensus, window=1, mode="consensus")
-        self._alone = Consensus(stations, block, alone)
-        self._window = Consensus(stations, block, replace(variant.consensus, window=WINDOW))
-        self.places = Places()
+        self.variant, self.places = variant, Places()
+        config = base_map.stations, base_map.config.block
+        self._alone = Consensus(*config, replace(variant.consensus, window=1, mode="consensus"))
+        self._window = Consensus(*config, replace(variant.consensus, window=WINDOW))
 
     def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
         self._alone.vote(centre, volumes)
@@ -134,24 +132,24 @@ class _Search:
 def places(world: Path, variants: list[Variant], bank: Bank) -> dict[str, Places]:
     """How often each variant names the right place along a world's run."""
     searches = [_Search(variant, bank.built) for variant in variants]
-    scorers: dict[tuple[object, ...], Retrieval] = {}
+
+    @cache
+    def retrieval(descriptor: DescriptorConfig, config: RetrievalConfig) -> Retrieval:
+        return Retrieval(bank.map(descriptor), config)
+
     for seen in keyframes_of(world, bank.built.origin, variants[0].descriptor):
-        known: dict[tuple[object, ...], Floats32] = {}
+        known: dict[tuple[DescriptorConfig, RetrievalConfig], Floats32] = {}
         for search in searches:
-            descriptor, volumes = search.variant.descriptor, {}
-            centre = seen.position.copy()
-            if descriptor.ground_zero:
-                centre[2] = seen.ground
+            descriptor, config = search.variant.descriptor, search.variant.retrieval
+            centre = np.array([*seen.position[:2], seen.ground if descriptor.ground_zero else seen.position[2]])
+            volumes = {}
             for name in descriptor.channels:
                 one = replace(descriptor, channels=(name,))
-                # the zero is the keyframe's affair: it does not change the stations
-                key = (replace(one, ground_zero=True), search.variant.retrieval)
-                if key not in scorers:
-                    scorers[key] = Retrieval(bank.map(one), search.variant.retrieval)
-                asked = (*key, one.ground_zero)
-                if asked not in known:
-                    known[asked] = scorers[key].distances(describe(seen.scan, centre, one))[name]
-                volumes[name] = known[asked]
+                if (one, config) not in known:
+                    # the zero is the keyframe's affair: it does not change the stations
+                    stations = retrieval(replace(one, ground_zero=True), config)
+                    known[one, config] = stations.distances(describe(seen.scan, centre, one))[name]
+                volumes[name] = known[one, config]
             search.vote(seen, centre, volumes)
     return {search.variant.name: search.places for search in searches}
 

@@ -107,6 +107,7 @@ class Features:
 
     def __init__(self, site: BaseMap, way: Literal["ransac", "fgr"]) -> None:
         self._o3d: Any = open3d()
+        self._registration = self._o3d.pipelines.registration
         self._o3d.utility.random.seed(1)
         self._way = way
         self._map = self._described(np.array(site.points))
@@ -114,12 +115,20 @@ class Features:
     def answer(self, place: Place) -> Answer:
         """Describe the submap, match and solve."""
         cloud, feature = self._described(place.submap)
-        found = self._ransac(cloud, feature) if self._way == "ransac" else self._fast(cloud, feature)
-        T = np.array(found.transformation)
+        asked, registration, near = (cloud, self._map[0], feature, self._map[1]), self._registration, 1.5 * self.VOXEL
+        if self._way == "ransac":
+            found = registration.registration_ransac_based_on_feature_matching(
+                *asked, False, near, registration.TransformationEstimationPointToPoint(False), 4,
+                [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                 registration.CorrespondenceCheckerBasedOnDistance(near)],
+                registration.RANSACConvergenceCriteria(100_000, 0.999),
+            )  # fmt: skip
+        else:
+            option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * self.VOXEL)
+            found = registration.registration_fgr_based_on_feature_matching(*asked, option)
         # FGR reports no fitness of its own for all versions: measured alike for both
-        registration = self._o3d.pipelines.registration
-        fit = registration.evaluate_registration(cloud, self._map[0], 1.5 * self.VOXEL, T)
-        return Answer(T, fit.fitness >= self.FITNESS)
+        fit = registration.evaluate_registration(cloud, self._map[0], near, found.transformation)
+        return Answer(np.array(found.transformation), fit.fitness >= self.FITNESS)
 
     def _described(self, points: Points) -> tuple[Any, Any]:
         o3d, search, voxel = self._o3d, self._o3d.geometry.KDTreeSearchParamHybrid, self.VOXEL
@@ -127,25 +136,8 @@ class Features:
         cloud = cloud.voxel_down_sample(voxel)
         cloud.estimate_normals(search(radius=2 * voxel, max_nn=30))
         cloud.orient_normals_to_align_with_direction((0.0, 0.0, 1.0))  # a viewpoint is not known for the map
-        feature = o3d.pipelines.registration.compute_fpfh_feature(cloud, search(radius=5 * voxel, max_nn=100))
+        feature = self._registration.compute_fpfh_feature(cloud, search(radius=5 * voxel, max_nn=100))
         return cloud, feature
-
-    def _ransac(self, cloud: Any, feature: Any) -> Any:
-        registration, near = self._o3d.pipelines.registration, 1.5 * self.VOXEL
-        return registration.registration_ransac_based_on_feature_matching(
-            cloud, self._map[0], feature, self._map[1], False, near,
-            registration.TransformationEstimationPointToPoint(False), 4,
-            [registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-             registration.CorrespondenceCheckerBasedOnDistance(near)],
-            registration.RANSACConvergenceCriteria(100_000, 0.999),
-        )  # fmt: skip
-
-    def _fast(self, cloud: Any, feature: Any) -> Any:
-        registration = self._o3d.pipelines.registration
-        option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=0.5 * self.VOXEL)
-        return registration.registration_fgr_based_on_feature_matching(
-            cloud, self._map[0], feature, self._map[1], option
-        )
 
 
 class SmallGicp:

@@ -7,7 +7,7 @@ that are part of another are indented below it. The clocks cost some microsecond
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -25,7 +25,6 @@ from coview_stream.localization.registration import local_map, verification
 from coview_stream.localization.registration import register as registration
 from coview_stream.localization.tracking import tracker
 
-FRAMES = 1500
 _SETTLED = 300  # frames before the numbers count
 
 STAGES = (
@@ -62,14 +61,9 @@ def measured(frames: int) -> list[dict[str, float]]:
     return out[_SETTLED:]
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add how many frames."""
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"({FRAMES}; the first {_SETTLED} do not count)")
-
-
 def rows(asked: Namespace) -> Iterator[Row]:
     """Medians of the stages, of both kinds of frames."""
-    frames = measured(600 if asked.quick else max(asked.frames, _SETTLED + 1))
+    frames = measured(600 if asked.quick else 1500)
     for title, registers in (("frames that register", True), ("all others", False)):
         chosen = [frame for frame in frames if ("match to map" in frame) is registers]
         for label, _, _ in STAGES:
