@@ -48,6 +48,8 @@ _MAGIC = (
 
 _LAS_SCALE = 0.001  # metres
 
+E57_REMEDY = "E57 is not supported yet: convert it to LAZ or PLY"
+
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
     """Tell whether the suffix is one that ``read_cloud`` accepts (hidden files are not clouds)."""
@@ -69,7 +71,7 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     suffix = path.suffix.lower()
     head = _head(path)
     if suffix == ".e57" or head.startswith(b"ASTM-E57"):
-        raise CloudError(f"{path}: E57 is not supported yet: convert it to LAZ or PLY")
+        raise CloudError(f"{path}: {E57_REMEDY}")
     if suffix not in _READERS:
         known = ", ".join(sorted(CLOUD_SUFFIXES))
         raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")

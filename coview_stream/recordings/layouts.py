@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
+from coview_stream.clouds.files import CLOUD_SUFFIXES, E57_REMEDY, is_cloud_name
 from coview_stream.clouds.trajectory import columns_of, read_kitti_poses, read_times, read_tum
 from coview_stream.errors import RunError
 from coview_stream.geometry.arrays import Floats
@@ -48,6 +48,8 @@ def find_layout(path: Path) -> Layout:
         raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
     if path.is_file():
         if not is_cloud_name(path):
+            if path.suffix.lower() == ".e57":
+                raise RunError(f"{path}: {E57_REMEDY}")
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
     for folder in ("frames", "velodyne"):

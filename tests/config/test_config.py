@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import FrozenInstanceError, asdict, fields
 
 import pytest
@@ -134,6 +135,6 @@ def test_config_errors_are_value_errors():
 
 @pytest.mark.parametrize("kind", CONFIGS)
 def test_every_field_is_documented(kind):
-    text = kind.__doc__
-    missing = [item.name for item in fields(kind) if f"\n        {item.name}: " not in text]
+    text = inspect.getdoc(kind)
+    missing = [item.name for item in fields(kind) if f"\n    {item.name}: " not in text]
     assert missing == []

@@ -39,11 +39,12 @@ def test_every_event_changes_some_state():
 def test_tracking_begins_by_an_accepted_place_or_a_verified_one():
     begins = {pair for pair, after in TRANSITIONS.items() if after is State.TRACKING}
     searching = {(state, Event.PLACE_ACCEPTED) for state in State if not state.has_place}
-    assert begins == searching | {(State.DOUBTED, Event.MATCH_VERIFIED)}
+    assert begins == searching | {(state, Event.MATCH_VERIFIED) for state in (State.DOUBTED, State.LOST)}
 
 
-def test_only_an_accepted_place_ends_lost():
-    assert [event for event in Event if next_state(State.LOST, event) is not State.LOST] == [Event.PLACE_ACCEPTED]
+def test_only_an_accepted_or_verified_place_ends_lost():
+    ends = [event for event in Event if next_state(State.LOST, event) is not State.LOST]
+    assert ends == [Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED]
 
 
 def test_only_a_known_place_is_doubted_or_lost():
@@ -125,5 +126,10 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
     assert len(moves) > len(states)
     for before, event, after in moves:
         assert next_state(before, event) is after
+    changes = tuple(event for before, event, after in moves if after is not before)
+    assert localizer.take_events() == changes
+    assert localizer.take_events() == ()
+    localizer.require_verification()
     localizer.reset()
     assert localizer.moves[-1][1:] == (None, State.SEARCHING)
+    assert localizer.take_events() == ()

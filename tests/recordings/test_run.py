@@ -169,6 +169,7 @@ def test_binary_odometry_file_is_refused(run: Path) -> None:
         (lambda d: (d / "a.mcap").touch() or d / "a.mcap", "seems to be empty.*copy or record"),
         (lambda d: (d / "metadata.yaml").touch() or d, r"cannot be read \(Invalid bag metadata.*reindex"),
         (lambda d: (d / "a.txt").touch() or d / "a.txt", "neither a run nor a cloud"),
+        (lambda d: (d / "a.e57").touch() or d / "a.e57", "E57 is not supported yet: convert it"),
     ],
 )
 def test_path_without_a_run_is_refused(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
