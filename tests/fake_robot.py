@@ -12,7 +12,7 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.state import State
+from coview_stream.localization.state import Event, State
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.messages import encode_cloud, encode_odometry
@@ -41,6 +41,14 @@ ENDS = (
     "engine_errors",
 )
 """Counters of which every received cloud ends as one."""
+EVENTS = {
+    State.SEARCHING: (Event.NO_PLACE,),
+    State.AMBIGUOUS: (Event.PLACE_PROPOSED,),
+    State.TRACKING: (Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED),
+    State.DOUBTED: (Event.PLACE_ACCEPTED, Event.MATCH_REJECTED),
+    State.LOST: (Event.PLACE_ACCEPTED, Event.PLACE_GIVEN_UP),
+}
+"""Events that lead to a state, with or without a place before."""
 
 
 def ns(seconds):
@@ -81,20 +89,21 @@ def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT, covariance=None
     stamp = job.stamp_ns * 1e-9
     T = T_map_odom @ job.T_odom_body
     fix = Fix(stamp, State.TRACKING, T, T_map_odom, covariance, 0.8, evidence, drift)
-    return FrameResult(fix, None, 0.01)
+    return FrameResult(fix, None, 0.01, EVENTS[State.TRACKING])
 
 
 def unknown(job, state=State.SEARCHING, reason="no place fits", ask=None):
     """The engine's answer: no idea."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, state, reason)
     request = None if ask is None else replace(ask, epoch=(job.epoch, 1))
-    return FrameResult(Fix(job.stamp_ns * 1e-9, state, evidence=evidence), request, 0.01)
+    return FrameResult(Fix(job.stamp_ns * 1e-9, state, evidence=evidence), request, 0.01, EVENTS[state])
 
 
 def doubted(job, cause=RejectionReason.BLIND, reason="only 0 points to register"):
     """The engine's answer: here you were, but what is seen now does not show it."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.DOUBTED, reason, cause=cause)
-    return FrameResult(Fix(job.stamp_ns * 1e-9, State.DOUBTED, evidence=evidence), None, 0.01)
+    fix = Fix(job.stamp_ns * 1e-9, State.DOUBTED, evidence=evidence)
+    return FrameResult(fix, None, 0.01, EVENTS[State.DOUBTED])
 
 
 class Robot:

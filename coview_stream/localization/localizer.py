@@ -78,6 +78,7 @@ class Localizer:
     def reset(self, epoch: int = 0) -> None:
         """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
         self.state = State.SEARCHING
+        self._events: list[Event] = []  # that have changed the state since take_events
         self._epoch = Epoch(epoch, self._epoch.restart + 1)
         self._buffer = KeyframeBuffer(self.config.keyframe)
         self._search.reset()
@@ -181,6 +182,11 @@ class Localizer:
             evidence,
             self._tracker.drift,
         )
+
+    def take_events(self) -> tuple[Event, ...]:
+        """Return the events that have changed the state since the last call, in order; :meth:`reset` drops them."""
+        events, self._events = tuple(self._events), []
+        return events
 
     # ---- what the caller knows
 
@@ -291,7 +297,10 @@ class Localizer:
     def _handle(self, event: Event) -> None:
         """Move on to the state that an event leads to (docs/tracking.md has the table)."""
         before, self.state = self.state, next_state(self.state, event)
-        if self.state is State.LOST and before is not State.LOST:
+        if self.state is before:
+            return
+        self._events.append(event)
+        if self.state is State.LOST:
             self._forget_place()
 
     def _forget_place(self) -> None:

@@ -17,7 +17,7 @@ class State(StrEnum):
     DOUBTED = "DOUBTED"
     """A place is known, but it has to be verified before there is a pose again."""
     LOST = "LOST"
-    """A place was known; the evidence has gone, and the whole map is searched again."""
+    """A place was known; the evidence has gone and the whole map is searched again, or odometry or frames stay away."""
 
     @property
     def reported(self) -> str:
@@ -64,10 +64,12 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
     (_S.DOUBTED, _E.SILENCE): _S.LOST,
     (_S.DOUBTED, _E.ODOMETRY_RESTARTED): _S.LOST,
     (_S.LOST, _E.PLACE_ACCEPTED): _S.TRACKING,
+    (_S.LOST, _E.MATCH_VERIFIED): _S.TRACKING,  # after silence
 }
 """The state that follows on an event; where a pair is missing, the event changes nothing.
 
-LOST stays LOST while the map is searched again: only an accepted place ends it.
+LOST stays LOST while the map is searched again, and only an accepted place ends it; after SILENCE, which only a node
+knows of, the place is still there, and a registration that verifies it ends LOST too.
 """
 
 

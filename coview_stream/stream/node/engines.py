@@ -82,7 +82,7 @@ class TrackEngine:
             with contextlib.suppress(RunError):  # a hint of no use is no reason to drop the frame
                 localizer.hint_pose(job.hint)
         request = localizer.add_frame(points, job.T_odom_body, job.stamp_ns * 1e-9, job.defer)
-        return FrameResult(localizer.fix(), request, time.perf_counter() - begin)
+        return FrameResult(localizer.fix(), request, time.perf_counter() - begin, localizer.take_events())
 
     def forget(self, robot: str) -> None:
         """Drop a robot's localizer."""

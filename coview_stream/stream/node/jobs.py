@@ -11,6 +11,7 @@ from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.state import Event
 from coview_stream.odometry.buffer import Segment
 
 
@@ -53,11 +54,13 @@ class FrameResult:
         fix: after the frame.
         request: what has to be searched for, None for nothing.
         seconds: that the engine took.
+        events: that have changed the engine's state since its last answer for this robot and epoch, in order.
     """
 
     fix: Fix
     request: SearchRequest | None
     seconds: float
+    events: tuple[Event, ...]
 
 
 @dataclass(frozen=True)

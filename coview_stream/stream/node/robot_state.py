@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,22 +20,17 @@ from coview_stream.stream.node.engine_queue import QueuedFrame
 from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
 
 _NS = 1_000_000_000
-_MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all
+_MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all; set by hand
 
-_EVENT_OF_FIX = {
-    State.SEARCHING: Event.NO_PLACE,
-    State.AMBIGUOUS: Event.PLACE_PROPOSED,
-    State.DOUBTED: Event.MATCH_REJECTED,
-    State.LOST: Event.PLACE_GIVEN_UP,
-}
-"""Event that a fix without a pose stands for."""
+_RESTORING = (Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED)
+"""Events that end DOUBTED and LOST, if the engine has a pose after the frame that brings them and the frame counts."""
 
 
 class RobotState:
     """State and odometry correction of one robot, from one reset of its session to the next; the session locks it.
 
-    The newest fix is what the tracking engine holds in this odometry epoch. The state follows from the fixes and from
-    what only the session sees: odometry that pauses, restarts or stays away.
+    The state follows from the events of the tracking engine and from those that only the session sees: odometry that
+    pauses, restarts or stays away. The newest fix tells what the engine itself holds in this odometry epoch.
 
     Attributes:
         state: of the robot; there is a pose while it is TRACKING.
@@ -83,25 +79,25 @@ class RobotState:
 
     # ---- events
 
-    def add_fix(self, fix: Fix, frame: QueuedFrame) -> None:
-        """Apply the fix after a frame."""
+    def add_fix(self, fix: Fix, frame: QueuedFrame, events: Sequence[Event]) -> None:
+        """Apply the engine's ``events`` up to a frame, in order, and the fix after it."""
         stamp_ns = self.last_frame_ns = frame.job.stamp_ns
-        before, self._fix = self._fix, fix
+        before, lost_before = self.state, self._fix is not None and self._fix.state is State.LOST
+        self._fix = fix
         asked = frame.job.require_verification
         if asked and self._verify_from_ns is not None and stamp_ns >= self._verify_from_ns:
             self._verify_from_ns = None  # from here on a doubt is the engine's own
-        if fix.state is State.TRACKING:
-            if self._verify_from_ns is None:
-                self._correct(OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned))
-            return
-        # an engine that holds no place any more has given it up, even if it says so with another state
-        given_up = fix.state is State.LOST or (self.state.has_place and not fix.state.has_place)
-        if (given_up or fix.state.has_place) and self.state is not State.LOST:
-            self._apply(Event.PLACE_ACCEPTED)  # with this frame, and doubted or given up at once
-        if not given_up:
-            self._apply(_EVENT_OF_FIX[fix.state])
-        elif before is None or before.state is not State.LOST:
-            self._lose(Event.PLACE_GIVEN_UP, fix.evidence.reason if fix.evidence else "evidence gone")
+        verified = fix.state is State.TRACKING and self._verify_from_ns is None
+        for event in events:
+            if event is Event.PLACE_GIVEN_UP:
+                if not lost_before:  # else that place was accepted with this same frame, and is no second loss
+                    self._lose(event, fix.evidence.reason if fix.evidence else "evidence gone")
+            elif verified or event not in _RESTORING or self.state not in (State.DOUBTED, State.LOST):
+                self._apply(event)
+        if verified:
+            self._counters.fixes += before is not State.TRACKING
+            self._correction = OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned)
+            self._hint.update(self._correction.T_map_body)
 
     def restart_search(self, reason: str) -> None:
         """Forget the place: there is another odometry frame."""
@@ -125,12 +121,6 @@ class RobotState:
         """Give a newer reason for a loss, if the place is lost: why it does not come back."""
         if self.state is State.LOST:
             self._loss_reason = reason
-
-    def _correct(self, correction: OdomCorrection) -> None:
-        self._counters.fixes += self.state is not State.TRACKING
-        self._correction = correction
-        self._hint.update(correction.T_map_body)
-        self._apply(Event.MATCH_VERIFIED if self.state.has_place else Event.PLACE_ACCEPTED)
 
     def _lose(self, event: Event, reason: str) -> None:
         """Lose the place for a reason, which replaces that of a loss before; a loss for two reasons counts once."""

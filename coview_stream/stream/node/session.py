@@ -224,7 +224,7 @@ class Session:
                 frame = self.queue.frame_done(job, result, now)
                 if frame is not None:
                     self._hint.delivered(frame.job.hint)
-                    self.robot_state.add_fix(result.fix, frame)
+                    self.robot_state.add_fix(result.fix, frame, result.events)
                     self._record_state()
             elif isinstance(job, SearchJob) and isinstance(result, SearchResult):
                 self.queue.search_done(job, result)

@@ -132,7 +132,7 @@ def test_after_odometry_timeout_a_verified_frame_restores_the_pose(robot):
     robot.saw(0.19, now=silent + 0.02)
     job = robot.session.take_frame()
     assert job.require_verification
-    robot.session.handle_result(job, unknown(job, State.AMBIGUOUS), silent + 0.05)
+    robot.session.handle_result(job, doubted(job), silent + 0.05)
     assert robot.session.pose() is None
     robot.moved(0.3, now=silent + 0.1)
     robot.saw(0.29, now=silent + 0.1)

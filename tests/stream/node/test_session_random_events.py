@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from fake_robot import KEYS, Robot, cloud, ends, search_request, search_result, tracking, unknown
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.localization.state import State
+from coview_stream.localization.state import Event, State, next_state
 from coview_stream.messages.types import Sample
 
+FOUND = (Event.PLACE_ACCEPTED, Event.MATCH_VERIFIED)
 stamps = st.one_of(
     st.just("next"), st.just("next"), st.just("next"), st.floats(-2.0, 2.0), st.floats(-9e8, 9e8), st.just("same")
 )
@@ -22,7 +25,7 @@ quiet = [
     st.tuples(st.just("garbage"), st.binary(max_size=20)),
     st.tuples(st.just("odometry garbage"), st.binary(max_size=20)),
     st.tuples(st.just("take"), st.none()),
-    st.tuples(st.just("done"), st.sampled_from(list(State))),
+    st.tuples(st.just("done"), st.one_of(st.just(FOUND), st.lists(st.sampled_from(list(Event)), max_size=3))),
     st.tuples(st.just("failed"), st.booleans()),
     st.tuples(st.just("take search"), st.none()),
     st.tuples(st.just("searched"), st.booleans()),
@@ -40,6 +43,7 @@ class Chaos:
         self.now, self.clock, self.last = 1000.0, 0.0, 0.0
         self.jobs, self.searches = [], []
         self.published = None  # clock restarts, stamp
+        self.engine = None, State.SEARCHING  # its epoch and state
 
     def stamp(self, what):
         if what == "next":
@@ -86,9 +90,22 @@ class Chaos:
             session.reset()
             self.published = None  # its odometry is forgotten too
 
-    def answer(self, job, state):
-        known = state is State.TRACKING
-        self.session.handle_result(job, tracking(job) if known else unknown(job, state, ask=search_request()), self.now)
+    def answer(self, job, events):
+        """Answer a frame as an engine does: it moves along the table, and doubts the place when asked to."""
+        epoch, state = self.engine
+        if epoch != job.epoch:
+            state = State.SEARCHING
+        if job.require_verification:
+            events = [Event.VERIFICATION_REQUIRED, *events]
+        changes = []
+        for event in events:
+            possible = event is not Event.MATCH_VERIFIED or state.has_place  # it registers around a place only
+            if possible and next_state(state, event) is not state:
+                state = next_state(state, event)
+                changes.append(event)
+        self.engine = job.epoch, state
+        result = tracking(job) if state is State.TRACKING else unknown(job, state, ask=search_request())
+        self.session.handle_result(job, replace(result, events=tuple(changes)), self.now)
 
     def hold(self):
         counters = self.session.counters
@@ -96,6 +113,7 @@ class Chaos:
         assert 0 <= counters.received - ends(counters) <= 10
         state, why = self.session.state()
         assert why
+        assert state is not State.TRACKING or self.engine[1] is State.TRACKING
         sent = self.session.pose()
         if sent is None:
             return
@@ -116,7 +134,7 @@ class Chaos:
             self.session.tick(self.now)
             self.happen("take", None)
             while self.jobs:
-                self.happen("done", State.SEARCHING)
+                self.happen("done", ())
         counters = self.session.counters
         assert counters.received == ends(counters)
 
@@ -136,7 +154,7 @@ def test_random_events_keep_invariants(events):
 
 
 frame = st.permutations(["odometry", "cloud", "odometry", "take", "done"]).map(
-    lambda names: [(n, State.TRACKING if n == "done" else None if n == "take" else "next") for n in names]
+    lambda names: [(n, FOUND if n == "done" else None if n == "take" else "next") for n in names]
 )
 usual = st.lists(frame, max_size=3).map(lambda frames: [event for events in frames for event in events])
 
