@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """How much is known of a robot's place."""
+    """State of a robot's localization: how much is known of its place."""
 
     SEARCHING = "SEARCHING"
     """No place explains what the robot sees well enough, or too little has been seen."""
@@ -31,7 +31,7 @@ class State(StrEnum):
 
 
 class Event(StrEnum):
-    """What can happen to a robot's place; the value is a clause for people."""
+    """Event that may change the state; its value is a clause for people."""
 
     NO_PLACE = "the search finds no place that fits"
     PLACE_PROPOSED = "the search finds a place that is not alone or not confirmed"

@@ -38,7 +38,7 @@ def _no_points() -> Points:
 
 @dataclass(frozen=True)
 class RequestSpec:
-    """What requests have to bring.
+    """Parts that requests have to bring.
 
     Attributes:
         descriptor: the local scan's descriptor; None if no scan is needed.
