@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.harness.files import fingerprint, remembered
+from bench.harness.files import fingerprint, folder, remembered
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
 from coview_stream.config import KeyframeConfig, MapConfig
@@ -50,19 +50,25 @@ def world_name(config: SimulationConfig) -> str:
     return f"{config.scene}-{config.sensor}-{config.seed}"
 
 
-def map_of(folder: Path, config: SimulationConfig) -> Path:
+def map_of(below: Path, config: SimulationConfig) -> Path:
     """Return where :func:`prepare` puts a world's map."""
-    return folder / world_name(config) / "site.coview"
+    return below / world_name(config) / "site.coview"
 
 
-def prepare(folder: Path, config: SimulationConfig) -> Path:
+def prepare(below: Path, config: SimulationConfig) -> Path:
     """Return a world's directory; simulate it and build its map there unless that is done."""
-    out, site = folder / world_name(config), map_of(folder, config)
+    out, site = below / world_name(config), map_of(below, config)
     world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
     made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
     remembered(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
     remembered(out / "built.json", made, lambda: BaseMap.build(out / "base.laz").save(site))
     return out
+
+
+def opened(config: SimulationConfig) -> tuple[BaseMap, Run, tuple[Floats, Floats]]:
+    """Map, run and truth (stamps, and poses of each frame) of a world, which is made now unless it is there."""
+    world = prepare(folder(), config)
+    return BaseMap.load(map_of(folder(), config)), open_run(world / "run"), read_tum(world / "truth.tum")
 
 
 KEYFRAMES = 5  # keyframes of a query: a drive of eight metres
@@ -100,20 +106,9 @@ class Place:
         return pose_from(np.eye(3), self.queries[-1].position)
 
 
-def world(folder: Path, scene: str) -> Path:
-    """Simulate a world and build its map unless that is done; return its directory."""
-    return prepare(folder, WORLDS[scene])
-
-
-def base_map(folder: Path, scene: str) -> BaseMap:
-    """Load the map of a world."""
-    return BaseMap.load(map_of(folder, WORLDS[scene]))
-
-
-def places(folder: Path, scene: str, count: int) -> list[Place]:
-    """``count`` places, evenly along the run of a world that is there."""
-    there, site = folder / world_name(WORLDS[scene]), base_map(folder, scene)
-    run, (_, truth) = open_run(there / "run"), read_tum(there / "truth.tum")
+def places(scene: str, count: int) -> list[Place]:
+    """``count`` places, evenly along the run of one of :data:`WORLDS`."""
+    site, run, (_, truth) = opened(WORLDS[scene])
     way = driven(run.poses)
     last = way[-1] - KEYFRAMES * KeyframeConfig().distance
     return [_place(run, truth, int(k), site) for k in np.searchsorted(way, np.linspace(0.0, last, count))]

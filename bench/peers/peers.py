@@ -28,7 +28,7 @@ from bench.harness.files import folder, isolated
 from bench.harness.rows import Row, bounded, failed, informs
 from bench.harness.suite import run
 from bench.harness.tables import number, table
-from bench.harness.worlds import WORLDS, map_of, places, world
+from bench.harness.worlds import WORLDS, map_of, places
 from bench.peers.methods import OUR_TRACKING, OURS, PEERS, Peer
 from coview_stream import BaseMap
 
@@ -163,15 +163,14 @@ def contest(count: int, limit_s: float) -> Iterator[Trial]:
     with tempfile.TemporaryDirectory() as scratch:
         for scene, config in WORLDS.items():
             file = Path(scratch) / scene
-            isolated(_keep, folder(), scene, count, file)
+            isolated(_keep, scene, count, file)
             for peer in PEERS:
                 print(f"... {peer.name}, {scene}", file=sys.stderr, flush=True)
                 yield run_trial(peer, scene, count, map_of(folder(), config), file, limit_s)
 
 
-def _keep(folder: Path, scene: str, count: int, file: Path) -> None:
-    world(folder, scene)
-    file.write_bytes(pickle.dumps(places(folder, scene, count), protocol=pickle.HIGHEST_PROTOCOL))
+def _keep(scene: str, count: int, file: Path) -> None:
+    file.write_bytes(pickle.dumps(places(scene, count), protocol=pickle.HIGHEST_PROTOCOL))
     coview_kernels.shutdown()
 
 

@@ -20,13 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import coview_kernels
-from bench.harness.files import folder
 from bench.harness.rows import Row, bounded, informs, reached
-from bench.harness.worlds import map_of, prepare
-from coview_stream import BaseMap, Localizer
-from coview_stream.clouds import read_tum
+from bench.harness.worlds import opened
+from coview_stream import Localizer
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
 POINTS = 65_536
@@ -44,12 +41,11 @@ class Drive(NamedTuple):
     memory: dict[int, float]  # resident MB, every 500 frames
 
 
-def opened(length: float) -> tuple[Any, Any, Any]:
+def town(length: float) -> tuple[Any, Any, Floats]:
     """Map, run and true poses (N, 4, 4) of the simulated town, with warm kernels."""
-    config = SimulationConfig("town", "os64-2048", seed=4004, size=240.0, length=length)
-    world = prepare(folder(), config)
     coview_kernels.warm_up()
-    return BaseMap.load(map_of(folder(), config)), open_run(world / "run"), read_tum(world / "truth.tum")[1]
+    base_map, run, truth = opened(SimulationConfig("town", "os64-2048", seed=4004, size=240.0, length=length))
+    return base_map, run, truth[1]
 
 
 def there_and_back(frames: Sequence[Any]) -> Iterator[int]:
@@ -80,7 +76,7 @@ def drive(base_map: Any, run: Any, truth: Floats, count: int) -> Drive:
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Drive, and judge the times."""
-    base_map, run, truth = opened(12.0 if asked.quick else 36.0)
+    base_map, run, truth = town(12.0 if asked.quick else 36.0)
     count = 600 if asked.quick else 10_000
     done = drive(base_map, run, truth, count)
     name = f"engine/{len(base_map)} stations, {POINTS} points"

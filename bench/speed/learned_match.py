@@ -26,12 +26,7 @@ from bench.harness.rows import Row, against, bounded, informs, medians
 from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.geometry.transforms import rot_z
-from coview_stream.localization.search.learned.consistent_pairs import (
-    consistency_graph,
-    largest_clique,
-    maximum_clique,
-    relaxed_clique,
-)
+from coview_stream.localization.search.learned import consistent_pairs as pairs
 from coview_stream.localization.search.learned.correlation import correlate, rotate_images
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 
@@ -107,16 +102,16 @@ def _cliques(repeat: int) -> Iterator[Row]:
     config = LearnedMatchConfig()
     for label, share in (("1 in 10 right", 0.1), ("none right", 0.0)):
         here, there = _pairs(np.random.default_rng(1), share)
-        weights = consistency_graph(here, there, config)
-        found, most = maximum_clique(weights, config.nodes), enumerated(weights > 0)
+        weights = pairs.consistency_graph(here, there, config)
+        found, most = pairs.maximum_clique(weights, config.nodes), enumerated(weights > 0)
         if found.exact and len(found) != most:
             raise RuntimeError(f"a clique of {len(found)}, there is one of {most}")
         nothing = np.empty(0, dtype=np.int64)
         graph, relaxing, ours, search, listing = medians(
-            partial(consistency_graph, here, there, config),
-            partial(relaxed_clique, weights),
-            partial(maximum_clique, weights, config.nodes),
-            partial(largest_clique, weights > 0, nothing, config.nodes),
+            partial(pairs.consistency_graph, here, there, config),
+            partial(pairs.relaxed_clique, weights),
+            partial(pairs.maximum_clique, weights, config.nodes),
+            partial(pairs.largest_clique, weights > 0, nothing, config.nodes),
             partial(enumerated, weights > 0),
             repeat=repeat,
         )

@@ -32,9 +32,8 @@ import numpy.typing as npt
 from scipy import fft
 
 import coview_kernels as kernels
-from bench.harness.files import folder
 from bench.harness.rows import REPEAT, Row, against, bounded, informs, medians
-from bench.harness.worlds import base_map, places, world
+from bench.harness.worlds import WORLDS, opened, places
 from coview_kernels.runtime import workers
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Floats32
@@ -162,9 +161,8 @@ def _against_loop(index: Any, stations: F16, query: Floats32, repeat: int) -> Ro
 
 def town() -> tuple[dict[str, F16], dict[str, Floats32]]:
     """Descriptors (M, R, S) and a keyframe's (R, S), by channel, of a simulated town."""
-    world(folder(), "town")
-    site = base_map(folder(), "town")
-    newest = places(folder(), "town", 2)[1].queries[-1]
+    site, _, _ = opened(WORLDS["town"])
+    newest = places("town", 2)[1].queries[-1]
     centre = np.array([*newest.position[:2], ground_below(newest.scan, newest.position)])
     queries = describe(newest.scan, centre, site.descriptor_config)
     order = np.random.default_rng(0).permutation(len(site))

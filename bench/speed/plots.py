@@ -19,16 +19,14 @@ from typing import NamedTuple
 import numpy as np
 
 import coview_kernels as kernels
-from bench.harness.files import folder
 from bench.harness.rows import Row, informs, medians
-from bench.harness.worlds import base_map, world
+from bench.harness.worlds import WORLDS, opened
 from bench.speed.engine import there_and_back
 from bench.speed.frame import LIMITS, STANDING, best_numpy, frame
 from bench.speed.match import Spectral, Turned, multiplied, town
 from coview_kernels import runtime
 from coview_stream import Localizer, LocalizerConfig
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.recordings.open_run import open_run
 from coview_stream.report.style import TRUTH, figure
 
 OUT = Path("docs/images")
@@ -100,8 +98,8 @@ def _fleet(count: int) -> list[Callable[[], bool]]:
 
     A call takes in a robot's next frame and tells whether it is tracked.
     """
-    run = open_run(world(folder(), "town") / "run")
-    site, config, frames = base_map(folder(), "town"), LocalizerConfig(), [run.read(k) for k in range(len(run))]
+    site, run, _ = opened(WORLDS["town"])
+    frames, config = list(run), LocalizerConfig()
     crops = LocalMaps(site, config.registration.source_range)
 
     def robot(start: int) -> Callable[[], bool]:

@@ -33,13 +33,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bench.harness.files import folder
 from bench.harness.rows import Row, against, informs
-from bench.harness.worlds import map_of, prepare
+from bench.harness.worlds import opened
 from bench.peers.libraries import SmallGicp
 from coview_kernels import nearest, runtime, transform_unique, warm_up
-from coview_stream import BaseMap
-from coview_stream.clouds import read_tum
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import (
@@ -55,7 +52,6 @@ from coview_stream.geometry.transforms import (
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
-from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
 POINTS, VOXEL, REACH, WINDOW = 10_000, 0.25, 50.0, 5.0
@@ -103,11 +99,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
 def places(count: int) -> Iterator[Place]:
     """Spread ``count`` places over a run through a simulated town."""
     config = SimulationConfig("town", "os64", seed=4005, size=200.0, length=60.0)
-    world = prepare(folder(), config)
-    base_map = BaseMap.load(map_of(folder(), config))
-    maps = LocalMaps(base_map, 60.0, crops=1000)
-    stamps, poses = read_tum(world / "truth.tum")
-    frames = list(open_run(world / "run"))
+    base_map, run, (stamps, poses) = opened(config)
+    maps, frames = LocalMaps(base_map, 60.0, crops=1000), list(run)
     wanted = set(np.linspace(0, len(frames) - 1, count + 1).astype(int)[1:].tolist())
     recent: list[tuple[Floats, Floats32]] = []
     for index, frame in enumerate(frames):

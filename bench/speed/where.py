@@ -18,7 +18,7 @@ import numpy as np
 from bench.harness.clock import Clock
 from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
-from bench.speed.engine import drive, opened
+from bench.speed.engine import drive, town
 from coview_stream import Localizer
 from coview_stream.localization import localizer
 from coview_stream.localization.registration import local_map, verification
@@ -45,7 +45,7 @@ STAGES = (
 
 def measured(frames: int) -> list[dict[str, float]]:
     """Seconds of every stage, frame by frame."""
-    base_map, run, truth = opened(36.0)
+    base_map, run, truth = town(36.0)
     clock, out = Clock(), []
     with clock.around(STAGES):
         timed = Localizer.step
