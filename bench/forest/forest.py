@@ -1,10 +1,8 @@
 """Where am I in a forest: every method on the same queries.
 
 Worlds of the training simulator whose seeds were never trained on, and any worlds on disk (``--world``, in the layout
-of ``coview-stream simulate``). Of each the map is built with learned features, and every query is asked of Scan
-Context, co-view context, both together, the correlation of canopy heights, the learned global descriptor, dense
-correlation, keypoints with cliques, and registration with verification (docs/forest.md says what the columns mean).
-What is done stays in ``--work``: an interrupted benchmark goes on.
+of ``coview-stream simulate``); of each the map is built with learned features. docs/forest.md says what the methods
+and columns mean. What is done stays in ``--work``: an interrupted benchmark goes on.
 """
 
 from __future__ import annotations

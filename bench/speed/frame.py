@@ -1,12 +1,11 @@
-"""Intake of a 64k-point frame and the descriptor of a keyframe, beside NumPy.
+"""Intake of a 64k-point frame and the descriptor of a keyframe, beside NumPy, with one thread on every side.
 
-Intake: transform, range filter (0.5 to 80 m) and one point per 0.3 m voxel. The frame has 64 rings of 1024 beams in a
-street: ground, walls, ceiling of crowns, 2 cm of noise. Two baselines: the plain reference, and the fastest NumPy
-that we could write (voxel and index in one int64, one sort). One thread on every side.
+Intake: transform, range filter (0.5 to 80 m) and one point per 0.3 m voxel, of 64 rings of 1024 beams in a street with
+2 cm of noise; beside the plain reference, and the fastest NumPy that we could write (voxel and index in one int64, one
+sort).
 
-Describe: a full virtual local scan is what 20 keyframes see within 50 m, one point per 0.5 m voxel: here a street of
-40 m with its frames every 2 m, laid over crowns and facades, 131,072 points in the order of the keyframes. Bins
-20 x 60, both channels that a map stores (greatest height, co-visible). The baseline is the plain reference; its
+Describe: both channels that a map stores, 20 x 60 bins, of a full virtual local scan: what 20 keyframes 2 m apart see
+within 50 m, one point per 0.5 m voxel, 131,072 in the order of the keyframes. The baseline is the plain reference; its
 co-visibility serves us too, since one grid takes it less than a launch.
 """
 

@@ -1,14 +1,13 @@
 """Where a learned query fits: dense correlation with a map, and the pairs of keypoints that agree.
 
 Dense correlation: 32 dimensions on cells of 2 m, a query of 64 m at 36 headings, maps of 0.1 and 1 km2 of random
-features (no place is easier than another). The baselines are what one writes with SciPy, the map's spectra made
-beforehand as ours are: ``one FFT`` transforms every channel of a turned query over the whole map, multiplies, adds
-and transforms back, heading by heading; ``fftconvolve`` is ``scipy.signal.fftconvolve`` per heading with everything
-made anew, timed at one heading and multiplied by 36. Turning the query is part of every side. All three must agree.
+features (no place is easier than another). The baselines, the map's spectra made beforehand as ours are: every channel
+of a turned query transformed over the whole map, heading by heading (``OneFft``), and ``scipy.signal.fftconvolve`` with
+everything made anew, timed at one heading and multiplied by 36. Turning the query is part of every side.
 
 The clique: 300 pairs of which 10 % are right, at 0.3 m noise, as in a forest; and pairs that are all wrong. The
-baseline is Bron and Kerbosch's enumeration with pivots on Python's sets, which is what ``networkx.find_cliques`` does.
-It must find as many. BLAS has the threads of OPENBLAS_NUM_THREADS, the transforms one.
+baseline is Bron and Kerbosch's enumeration with pivots on Python's sets, as in ``networkx.find_cliques``. All sides
+must agree. BLAS has the threads of OPENBLAS_NUM_THREADS, the transforms one.
 """
 
 from __future__ import annotations

@@ -1,19 +1,17 @@
 """Descriptors of 10,000 stations over 10 M points beside NumPy and a k-d tree: ``python -m bench map_build``.
 
-Both sides start from the same points and stations and end with both channels of every station. Ours rasters the
-map once and gathers cells. The baseline is vectorised: it keeps the highest point of every 0.5 m voxel (a tenth of the
-points: with all of them it is several times slower), puts them into SciPy's
-cKDTree, and for each station asks the tree for those within 50 m, bins them in NumPy and finds the co-visible
-bins. It is measured at stations spread over the site and scaled to all, as the row's name says; thinning and the
-tree count once.
+Both sides start from the same points and stations and end with both channels of every station. Ours rasters the map
+once and gathers cells. The baseline keeps the highest point of every 0.5 m voxel (with all points it is several times
+slower), and for each station asks SciPy's cKDTree for those within 50 m, bins them in NumPy and finds the co-visible
+bins. It is measured at some stations and scaled to all, as the row's name says; thinning and the tree count once.
 
-The rows below say how far the results are apart: a raster cell counts at its centre, so points within 0.35 m of
-an edge may move to the next bin. For 2.8 % of the scan context's bins and 4.9 % of the co-view's (2.5 and 3.6 with
-``--quick``) that is more than 0.5 m; the means are 0.14 and 0.21 m. With a raster one cell off it is 4.9 and 7.6 %
-(3.9 and 5.3); with heights 0.3 m off (``--quick``) the means are 0.28 and 0.31 m. The bounds lie between.
+A raster cell counts at its centre, so points within 0.35 m of an edge may move to the next bin. For 2.8 % of the scan
+context's bins and 4.9 % of the co-view's (2.5 and 3.6 with ``--quick``) that is more than 0.5 m; the means are 0.14 and
+0.21 m. With a raster one cell off it is 4.9 and 7.6 % (3.9 and 5.3); with heights 0.3 m off (``--quick``) the means are
+0.28 and 0.31 m. The bounds lie between.
 
-``--whole`` builds a map instead, reading and ground included, and takes its seconds and memory. Without files it makes
-a cloud of its own: hills, boxes and round crowns, 10 M points on as much ground as 10,000 stations need.
+``--whole`` builds a map instead, reading and ground included, and takes its seconds and memory: of the files that are
+named, or of a cloud of its own: hills, boxes and round crowns, 10 M points on as much ground as 10,000 stations need.
 """
 
 from __future__ import annotations

@@ -1,18 +1,13 @@
 """The nearest stations to a keyframe, among 9,527 at all 60 shifts, beside the best that NumPy can do.
 
-Both baselines use all of what NumPy and BLAS offer, with everything that depends on the map made beforehand:
-
-* spectra: a batched product per frequency over spectra laid out for it, then one product for all 60 shifts;
-* turned queries: one product of 60 turned queries with the unit columns of all stations.
-
-The ratio is against the faster of the two in the same run. Stations and keyframes are those of a simulated town
-(airborne map, ground run): a keyframe differs from every station, and nothing is pruned easily. ``noise`` are random
-numbers, for which there is nothing to tell stations apart by; ``all alike`` are copies of one station, each with noise
-of 1 in 1000: every station has to be scored. The run is one query at a time; BLAS and the kernel have the threads
-that the environment gives them (OPENBLAS_NUM_THREADS, COVIEW_THREADS). The plain C++ loop is
-``peers/plain_loop.cpp``, built with -O3: every shift of every station, one by one, as a program would that knows
-neither spectra nor BLAS; the columns' norms are taken once for all shifts. It has one thread, so that its ratio is
-judged where we have one too; its time is the median of three runs, norms included.
+Both baselines have everything made beforehand that depends on the map: a batched product per frequency over spectra
+laid out for it (``Spectral``), and one product of 60 turned queries with the unit columns of all stations (``Turned``).
+The ratio is against the faster of the two in the same run, one query at a time, BLAS and the kernel with the threads
+that the environment gives them (OPENBLAS_NUM_THREADS, COVIEW_THREADS). Stations and keyframes are those of a simulated
+town (airborne map, ground run), where nothing is pruned easily; ``noise`` are random numbers; ``all alike`` are copies
+of one station, each with noise of 1 in 1000: every station has to be scored. The plain C++ loop
+(``peers/plain_loop.cpp``, -O3) scores every shift of every station one by one, norms of columns taken once; it has one
+thread, so that its ratio is judged where we have one too; its time is the median of three runs, norms included.
 """
 
 from __future__ import annotations

@@ -1,25 +1,21 @@
 """Registration beside small_gicp: 10,000 points against a tile of the map.
 
-Places along a drive with a simulated 64-beam lidar in an airborne town map.
-Every way gets the same 10,000 points of the last five metres' frames (thinned to 0.25 m within 50 m), the same tile
-of the map and the same starts: up to 0.5 m off in each direction and 3 degrees of heading ("search"), or a tenth of
-that ("tracking").
+Places along a drive with a simulated 64-beam lidar in an airborne town map. Every way gets the same 10,000 points of
+the last five metres' frames (thinned to 0.25 m within 50 m), the same tile and the same starts: up to 0.5 m off in each
+direction and 3 degrees of heading ("search"), or a tenth of that ("tracking").
 
 * ours: the engine's settings and, as its search does it, every fifth point for the coarse scales (0.8 m while
   tracking, 1.5 and 0.8 m from the far starts), then all for the last one (0.4 m).
-* small_gicp: GICP and VGICP, with settings chosen here. Tried from the far starts, on every other place, one
-  thread (ms, rms of the error): for VGICP voxels of 0.5, 1 and 2 m (57, 33, 30 ms; 1.7, 1.7, 2.3 cm), covariances
-  of 10 and 20 neighbours (33 and 42 ms; 1.7 and 1.9 cm), correspondences within 1 and 2 m (34 and 33 ms) and the
-  source thinned to 0.5 m (23 ms, 1.8 cm); for GICP within 1 and 2 m (52 and 67 ms; 1.8 and 2.0 cm), thinned 52 and
-  42 ms (1.7 and 1.9 cm). So VGICP gets 1 m, 10, 2 m and the thinned source, GICP 10, 1 m and the thinned source.
-  Fewer points still serve either side, at errors within 5 %: at all places VGICP takes 22 ms of 28 with the source
-  thinned to 0.75 m and 13 ms with every third point, ours 6.6 ms of 13.7 with every third. Those are not compared.
-  The tile is prepared before, as ours is; the source's covariances, without which it cannot begin and which ours
-  does not need, are part of the time. "align only" leaves them out, and has no target: a scan needs them.
+* small_gicp: settings chosen from the far starts, on every other place, one thread (ms, rms of the error): for VGICP
+  voxels of 0.5, 1 and 2 m (57, 33, 30 ms; 1.7, 1.7, 2.3 cm), covariances of 10 and 20 neighbours (33 and 42 ms; 1.7
+  and 1.9 cm), correspondences within 1 and 2 m (34 and 33 ms) and the source thinned to 0.5 m (23 ms, 1.8 cm); for
+  GICP within 1 and 2 m (52 and 67 ms; 1.8 and 2.0 cm), thinned 52 and 42 ms (1.7 and 1.9 cm). So both get the thinned
+  source and 10 neighbours, VGICP 1 m and 2 m, GICP 1 m. Fewer points still serve either side; that is not compared.
+  The tile is prepared before, as ours is; the source's covariances, which ours does not need, are part of the time:
+  "align only" leaves them out, and has no target, since a scan needs them.
 
-A row compares the median times; the sides take turns at every start. It holds where we are 1.5 times as fast at
-equal error: our root mean square, in metres and in degrees, at most 5 % above the peer's; rows of their own have both.
-The time is taken with the threads that COVIEW_THREADS grants.
+A row compares median times; the sides take turns at every start. It holds where we are 1.5 times as fast at equal
+error: our root mean square, in metres and in degrees, at most 5 % above the peer's. It has the threads of COVIEW_THREADS.
 """
 
 from __future__ import annotations
