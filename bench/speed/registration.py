@@ -15,7 +15,7 @@ direction and 3 degrees of heading ("search"), or a tenth of that ("tracking").
   "align only" leaves them out, and has no target, since a scan needs them.
 
 A row compares median times; the sides take turns at every start. It holds where we are 1.5 times as fast at equal
-error: our root mean square, in metres and in degrees, at most 5 % above the peer's. It has the threads of COVIEW_THREADS.
+error: our root mean square, in metres and in degrees, at most 5 % above the peer's, with COVIEW_THREADS threads.
 """
 
 from __future__ import annotations
