@@ -95,6 +95,6 @@ def test_serve_runs_last_pose_keeper_unless_no_state(monkeypatch, world_file, tm
     options = opening.ServeOptions(world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None)
     node = opening.open_node(options)
     try:
-        assert ("coview-memory" in [t.name for t in node._threads]) == kept
+        assert ("coview-last-pose" in [t.name for t in node._threads]) == kept
     finally:
         node.close(5.0)

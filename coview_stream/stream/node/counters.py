@@ -11,15 +11,18 @@ import numpy as np
 from coview_stream.errors import EncodingError, MessageError
 from coview_stream.messages.validation import OversizedError
 
-_RATE_WINDOW = 30  # poses over which their rate is taken
-
-_RESTART_NS = 5_000_000_000  # a stamp that lies farther back than this is a restarted clock; set by hand
-
-_MAX_DURATIONS = 600  # a minute of frames at 10 Hz
-
+# all set by hand
 _MAX_ERRORS = 10  # different ones that are kept
-
 _MAX_LOGGED = 20  # errors of one robot's input that are logged, ever: its sender may invent new ones
+_MAX_DURATIONS = 600  # a minute of frames at 10 Hz
+_RESTART_NS = 5_000_000_000  # a stamp that lies farther back than this is a restarted clock
+_MAX_SKIPPED = 1000  # numbers that may be missing between two frames: more, and the sender counts anew
+_MAX_GAPS = 15  # newest gaps between frames, whose median is the usual one
+_MIN_GAPS = 5  # before there is a usual one
+_MIN_GAP = 1.5  # usual gaps: a shorter one is jitter
+_MAX_GAP = 100.0  # usual gaps: a longer one is a pause of the sender
+_RATE_WINDOW = 30  # poses over which their rate is taken
+_MAX_POSE_AGE = 2.0  # seconds since the newest pose, after which the rate is 0
 
 log = logging.getLogger("coview_stream.node")
 
@@ -145,7 +148,7 @@ class MissingFrames:
     """Estimate of the frames that never arrived, by the sender's numbers or the usual gap between stamps."""
 
     def __init__(self) -> None:
-        self._gaps: deque[int] = deque(maxlen=15)
+        self._gaps: deque[int] = deque(maxlen=_MAX_GAPS)
         self._last: tuple[int, int | None] | None = None
 
     def add(self, stamp_ns: int, sequence: int | None) -> int:
@@ -157,11 +160,11 @@ class MissingFrames:
         if last is None or stamp_ns < last[0]:
             return 0
         if sequence is not None and last[1] is not None:
-            return max(0, sequence - last[1] - 1) if sequence - last[1] < 1000 else 0
+            return max(0, sequence - last[1] - 1) if sequence - last[1] < _MAX_SKIPPED else 0
         gap = stamp_ns - last[0]
         self._gaps.append(gap)
         usual = float(np.median(self._gaps))
-        if len(self._gaps) < 5 or not 1.5 < gap / usual < 100:
+        if len(self._gaps) < _MIN_GAPS or not _MIN_GAP < gap / usual < _MAX_GAP:
             return 0
         return round(gap / usual) - 1
 
@@ -189,8 +192,8 @@ class PoseRate:
         self._times.append(now)
 
     def rate(self, now: float) -> float:
-        """Return poses per second; 0 if the newest is older than two seconds."""
+        """Return poses per second; 0 if the newest is too old."""
         span = self._times[-1] - self._times[0] if self._times else 0.0
-        if span <= 0.0 or now - self._times[-1] > 2.0:
+        if span <= 0.0 or now - self._times[-1] > _MAX_POSE_AGE:
             return 0.0
         return round((len(self._times) - 1) / span, 2)

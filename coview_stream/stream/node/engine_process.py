@@ -31,7 +31,7 @@ _POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been 
 
 
 class RejectedError(Exception):
-    """The engine could not use a job; its robot's state is as before."""
+    """The engine could not use a job's frame, which changes nothing; what comes with it may have been applied."""
 
 
 class FailedError(Exception):

@@ -121,7 +121,8 @@ class EngineQueue:
         if job.epoch != self.epoch:
             return False
         self._frame_under_way = None
-        self._search_result = self._search_result or job.search_result  # not applied: it goes with the next frame
+        # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
+        self._search_result = self._search_result or job.search_result
         return True
 
     # ---- requests for the search engine

@@ -65,7 +65,9 @@ class TrackEngine:
         """Take in one frame.
 
         Raises:
-            CloudError, RunError: the frame is unusable; nothing has changed.
+            CloudError, RunError: the frame is unusable and changes nothing. What comes with it (a search's result, a
+                hint, the demand to verify the place) may have been applied; with the next frame once more, it changes
+                nothing either.
         """
         if not isinstance(job, FrameJob):
             raise TypeError(f"{type(job).__name__}: the tracking engine does frames")

@@ -29,7 +29,7 @@ from coview_stream.stream.transport.transport import Publisher, Transport
 log = logging.getLogger("coview_stream.node")
 
 _ROS_NODE = "coview_stream"
-_MAX_POSE_TICKS = 200.0  # of the pose clock, per second
+_MAX_POSE_TICKS = 200.0  # of the pose clock, per second; set by hand, as are those below
 _MAX_RESTART_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
 _ERROR_PAUSE = 0.2  # seconds after an unexpected error
 _IDLE_WAIT = 0.05  # seconds; an engine without work is woken earlier by any message
@@ -206,7 +206,7 @@ class Node:
         group = 0
         while not self._stopping.wait(clock.remaining(time.monotonic())):
             now = time.monotonic()
-            if clock.beat(now):
+            if clock.take_tick(now):
                 self.publish_poses(now, self._robots[group::groups])
                 group = (group + 1) % groups
 

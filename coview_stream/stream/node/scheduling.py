@@ -34,11 +34,11 @@ class RoundRobin:
 
 
 class Rate:
-    """Absolute deadlines of something regular: one late beat does not delay the later ones.
+    """Absolute deadlines of something regular: one late tick does not delay the later ones.
 
     Args:
-        rate: beats per second.
-        now: local time in seconds; the first beat is due at once.
+        rate: ticks per second.
+        now: local time in seconds; the first tick is due at once.
         slack: seconds by which it may be behind and still catch up.
     """
 
@@ -48,11 +48,11 @@ class Rate:
         self.due = now
 
     def remaining(self, now: float) -> float:
-        """Seconds until the next beat, 0 if it is due."""
+        """Seconds until the next tick, 0 if it is due."""
         return max(0.0, self.due - now)
 
-    def beat(self, now: float) -> bool:
-        """Whether a beat is due; if so, it has been taken. After a pause of the machine go on, do not catch up."""
+    def take_tick(self, now: float) -> bool:
+        """Take the tick that is due, and return whether one was; after a pause of the machine none is caught up."""
         if now < self.due:
             return False
         self.due += self.period

@@ -104,7 +104,7 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
                 engine.wait_ready(cancelled)
         if cancelled():
             raise CancelledError("the node is no longer wanted")
-        background = {} if options.state is None else {"memory": LastPoseKeeper(options.state, sessions).run}
+        background = {} if options.state is None else {"last-pose": LastPoseKeeper(options.state, sessions).run}
         node = Node(
             sessions, transport, engines["track"], engines["search"], options.node, options.pose_codec,
             engines.get("odometry"), background,

@@ -22,7 +22,7 @@ log = logging.getLogger("coview_stream.node")
 
 _JSON = "application/json"
 
-_MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
+_MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood; set by hand
 
 
 class Reporter:
@@ -70,7 +70,7 @@ class Reporter:
             if stopping.is_set():
                 return
             now = time.monotonic()
-            self.publish(now, all_robots=clock.beat(now))
+            self.publish(now, all_robots=clock.take_tick(now))
             stopping.wait(_MIN_INTERVAL)
 
     def publish(self, now: float, all_robots: bool = True) -> None:
@@ -173,4 +173,4 @@ class ConnectionMonitor:
         elif come:
             log.info("connected to router %s", ", ".join(sorted(come)))
         elif gone:
-            log.warning("router %s is gone%s", ", ".join(sorted(gone)), "" if now else ": nobody can hear us")
+            log.warning("router %s is gone%s", ", ".join(sorted(gone)), "" if now else ": no subscriber can be reached")

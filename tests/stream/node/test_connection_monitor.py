@@ -29,7 +29,10 @@ def test_first_router_is_not_a_reconnection(said):
 
 def test_returning_router_is_a_reconnection(said):
     assert looks(ConnectionMonitor(), ("A", ""), ("", ""), ("A", ""), ("", ""), ("A", "")) == 2
-    assert said()[1:3] == [("WARNING", "router A is gone: nobody can hear us"), ("INFO", "connected to router A again")]
+    assert said()[1:3] == [
+        ("WARNING", "router A is gone: no subscriber can be reached"),
+        ("INFO", "connected to router A again"),
+    ]
 
 
 def test_router_replaced_between_two_polls_is_a_reconnection(said):

@@ -14,7 +14,7 @@ from coview_kernels.launch import Launch
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, MapError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
-from coview_stream.localization.state import State
+from coview_stream.localization.state import Event, State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine, open_engine
 from coview_stream.stream.node.jobs import FrameJob, SearchJob
@@ -155,6 +155,28 @@ def test_bad_cloud_is_rejected_and_changes_nothing(engines, reference, world_dri
                 engines[0].run(FrameJob("careless", 1, round(5e8 * k), points, T, search_result=follower.search_result))
         follower.follow(world_drive, [k], reference.verdicts)
     for fix, undisturbed in zip(follower.fixes, reference.fixes, strict=True):
+        same(fix, undisturbed)
+
+
+def test_what_comes_with_a_rejected_frame_is_applied_once(engines, reference, world_drive):
+    """Search results, hints and demands to verify the place: handed over again with the next frame."""
+    plain, careless = Follower(engines[0], None, "plain"), Follower(engines[0], None, "twice")
+    events = {plain.robot: [], careless.robot: []}
+    for k in range(FRAMES):
+        for robot in (plain, careless):
+            result = reference.verdicts[k - 1] if 0 < k <= len(reference.verdicts) else None
+            job = replace(robot.job(world_drive, k), search_result=result, hint=world_drive.T_map_body[k])
+            job = replace(job, require_verification=k == FRAMES - 1)
+            if robot is careless:
+                with pytest.raises(CloudError):
+                    engines[0].run(replace(job, points=job.points[:3]))
+            answer = engines[0].run(job)
+            robot.fixes.append(answer.fix)
+            events[robot.robot].append(answer.events)
+    assert events["twice"] == events["plain"]
+    assert sum(events["plain"], ())[-2:] == (Event.VERIFICATION_REQUIRED, Event.MATCH_VERIFIED)
+    assert Event.PLACE_ACCEPTED in sum(events["plain"], ())
+    for fix, undisturbed in zip(careless.fixes, plain.fixes, strict=True):
         same(fix, undisturbed)
 
 

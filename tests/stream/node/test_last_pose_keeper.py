@@ -279,7 +279,7 @@ def test_error_for_one_robot_does_not_stop_saving_others(tmp_path, monkeypatch, 
 
 
 def running(site, kept):
-    site.node._background = {"memory": kept.run}
+    site.node._background = {"last-pose": kept.run}
     site.node.start()
     return site
 
