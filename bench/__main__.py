@@ -12,7 +12,7 @@ import argparse
 import json
 import math
 import os
-import shlex
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -102,7 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"bench: no benchmark {name!r}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 2
     asked = _parser(name).parse_args(words)
-    asked.command = shlex.join(["python", "-m", "bench", *filter(None, [name]), *words])
     if asked.list:
         print("\n".join(f"{each:14}{entry.what}" for each, entry in BENCHMARKS.items() if entry.what))
         return 0
@@ -147,4 +146,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the benchmark's own processes end with this one
     sys.exit(main())
