@@ -1,0 +1,211 @@
+"""Queue of one robot's frames and search requests to the engines, without a session."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_robot import POINTS, ns, pose, search_request, search_result, tracking, unknown
+
+from coview_stream.messages.types import CloudMessage
+from coview_stream.stream.node.counters import Counters, ErrorLog
+from coview_stream.stream.node.engine_queue import EngineQueue
+from coview_stream.stream.node.frame_sync import PairedFrame
+from coview_stream.stream.node.jobs import SearchJob
+
+EPOCH = 4  # after resets: the first of this queue
+NOW = 1000.0
+
+
+class Queue(EngineQueue):
+    """A queue with counters of its own."""
+
+    def __init__(self):
+        self.counters, self.errors = Counters(), ErrorLog()
+        super().__init__("r1", EPOCH, self.counters, self.errors)
+
+    @property
+    def counted(self):
+        """Counters that are not zero."""
+        return {name: count for name, count in self.counters.to_json().items() if count}
+
+    def put(self, seconds, now=NOW):
+        """Queue a frame that came 0.1 s before ``now``; its odometry had driven as many metres as its stamp says."""
+        frame = PairedFrame(CloudMessage(ns(seconds), POINTS), now - 0.1, pose(seconds), None)
+        self.put_frame(frame, now, travelled=seconds, turned=0.5)
+
+    def take(self, seconds=0.0, now=NOW, **more):
+        """Queue a frame and hand it out."""
+        self.put(seconds, now)
+        return self.take_frame(False, **more)
+
+    def search(self, seconds=0.0):
+        """Queue a search request and hand it out."""
+        self.put_search_request(replace(search_request(seconds), epoch=(self.epoch, 1)))
+        return self.take_search_request()
+
+
+@pytest.fixture
+def queue():
+    return Queue()
+
+
+# ---- frames
+
+
+def test_frame_goes_to_the_engine_as_it_was_put(queue):
+    assert queue.take_frame(False) is None
+    queue.put(0.2)
+    job = queue.take_frame(True, hint := pose(3.0))
+    assert (job.robot, job.epoch, job.stamp_ns, job.defer) == ("r1", EPOCH, ns(0.2), False)
+    assert (job.require_verification, job.search_result) == (True, None)
+    assert job.hint is hint
+    np.testing.assert_array_equal(job.T_odom_body, pose(0.2))
+    frame = queue.frame_done(job, tracking(job), NOW)
+    assert (frame.job, frame.travelled, frame.turned) == (job, 0.2, 0.5)
+    assert queue.counted == {"processed": 1}
+
+
+def test_newest_frame_replaces_the_one_that_waits(queue):
+    for k in range(3):
+        queue.put(0.1 * k, NOW + 0.1 * k)
+    job = queue.take_frame(False)
+    assert job.stamp_ns == ns(0.2)
+    assert job.defer  # the engine is behind
+    assert queue.take_frame(False) is None
+    assert queue.counted == {"dropped": 2}
+    queue.frame_done(job, tracking(job), NOW + 0.5)
+    assert queue.longest_wait == pytest.approx(0.5)  # since the first of them
+
+
+def test_only_one_frame_is_under_way(queue):
+    job = queue.take(0.0)
+    assert queue.take(0.1) is None
+    queue.frame_done(job, tracking(job), NOW)
+    after = queue.take_frame(False)
+    assert (after.stamp_ns, after.defer) == (ns(0.1), False)
+
+
+def test_latency_runs_from_the_coming_of_the_cloud(queue):
+    assert queue.processed_at is None
+    job = queue.take(0.0)
+    queue.frame_done(job, tracking(job), NOW + 0.03)
+    assert queue.latency.to_json()["p50"] == pytest.approx(130.0)
+    assert queue.engine_latency.to_json()["p50"] == pytest.approx(10.0)
+    assert queue.processed_at == NOW + 0.03
+
+
+def test_fix_of_an_old_epoch_is_only_counted(queue):
+    job = queue.take(0.0)
+    queue.put(0.1)
+    queue.begin_epoch(EPOCH + 1)
+    assert queue.take_frame(False) is None  # the one that waited was dropped
+    assert queue.frame_done(job, unknown(job, ask=search_request()), NOW) is None
+    assert queue.take_search_request() is None
+    assert queue.counted == {"processed": 1, "dropped": 1}
+    assert queue.take(0.2).epoch == EPOCH + 1
+
+
+def test_failures_of_an_old_epoch_are_only_counted(queue):
+    frame, search = queue.take(0.0), queue.search()
+    queue.begin_epoch(EPOCH + 1)
+    after = queue.take(0.1)
+    other = queue.search()
+    assert not queue.frame_failed(frame, "boom", rejected=False)
+    queue.search_failed(search, "boom")
+    assert queue.take(0.2) is None  # what is under way is another one
+    assert queue.search() is None
+    assert (after.epoch, other.epoch) == (EPOCH + 1, EPOCH + 1)
+    assert queue.counted == {"engine_errors": 1, "search_errors": 1}
+
+
+def test_jobs_from_before_a_reset_are_ignored(queue):
+    old = replace(queue.take(0.0), epoch=EPOCH - 1)
+    search = SearchJob("r1", replace(search_request(), epoch=(EPOCH - 1, 1)))
+    assert queue.frame_done(old, tracking(old), NOW) is None
+    assert not queue.frame_failed(old, "boom", rejected=True)
+    queue.search_done(search, search_result())
+    queue.search_failed(search, "boom")
+    assert queue.counted == {}
+    assert list(queue.errors.texts) == []
+    assert queue.processed_at is None
+
+
+@pytest.mark.parametrize(("rejected", "counter"), [(True, "rejected"), (False, "engine_errors")])
+def test_frame_that_failed_is_counted_and_named_once(queue, rejected, counter):
+    for k in range(2):
+        assert queue.frame_failed(queue.take(0.1 * k), f"Traceback\nboom {k}", rejected)
+    assert queue.counted == {counter: 2}
+    (error,) = queue.errors.texts
+    assert error.endswith("the first: boom 0")
+
+
+# ---- searches
+
+
+def test_newest_search_request_replaces_the_one_that_waits(queue):
+    job = queue.search(0.0)
+    assert job.request.stamp == 0.0
+    for k in (1, 2):
+        assert queue.search(0.1 * k) is None  # one is under way
+    queue.search_done(job, search_result())
+    assert queue.take_search_request().request.stamp == 0.2
+    assert queue.counted == {"searches_skipped": 1, "searches": 1}
+
+
+def test_request_of_a_fix_is_queued(queue):
+    job = queue.take(0.0)
+    queue.frame_done(job, unknown(job, ask=search_request(0.7)), NOW)
+    assert queue.take_search_request().request.stamp == 0.7
+
+
+def test_search_result_goes_with_the_next_frame_once(queue):
+    result = search_result()
+    queue.search_done(queue.search(), result)
+    job = queue.take(0.0)
+    assert job.search_result is result
+    queue.frame_done(job, unknown(job), NOW)
+    assert queue.take(0.1).search_result is None
+
+
+def test_search_result_of_a_rejected_frame_goes_with_the_next_one_too(queue):
+    result = search_result()
+    queue.search_done(queue.search(), result)
+    assert queue.frame_failed(queue.take(0.0), "too few points", rejected=True)
+    assert queue.take(0.1).search_result is result
+
+
+def test_newer_search_result_replaces_that_of_a_rejected_frame(queue):
+    newer = search_result(0.1)
+    queue.search_done(queue.search(), search_result(0.0))
+    job = queue.take(0.0)
+    queue.search_done(queue.search(0.1), newer)
+    queue.frame_failed(job, "too few points", rejected=True)
+    assert queue.take(0.1).search_result is newer
+
+
+@pytest.mark.parametrize("accepted", [None, "a place"])
+def test_only_an_accepted_search_result_is_kept_over_a_later_one(queue, accepted):
+    first, second = search_result(0.0, accepted=accepted), search_result(1.0)
+    for result in (first, second):
+        queue.search_done(queue.search(), result)
+    assert queue.take(0.0).search_result is (first if accepted else second)
+
+
+def test_failed_search_keeps_an_accepted_result(queue):
+    accepted = search_result(accepted="a place")
+    queue.search_done(queue.search(), accepted)
+    queue.search_failed(queue.search(0.1), "boom")
+    assert queue.take(0.0).search_result is accepted
+    assert queue.counted == {"searches": 1, "search_errors": 1}
+
+
+def test_search_result_of_an_old_epoch_is_only_counted(queue):
+    job = queue.search()
+    waiting = search_result()
+    queue.search_done(job, waiting)
+    queue.begin_epoch(EPOCH + 1)
+    queue.search_done(job, search_result(accepted="a place"))
+    assert queue.take(0.0).search_result is None
+    assert queue.counted == {"searches": 2}
