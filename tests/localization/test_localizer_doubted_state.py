@@ -258,3 +258,24 @@ def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
         assert fix.state is expected
         assert fix.evidence.state is expected
         assert fix.evidence.cause is not None
+
+
+@pytest.mark.slow
+def test_robot_moved_during_odometry_pause_gets_no_wrong_pose(world_map, world_drive):
+    """Odometry paused, the robot was moved by hand 10 m back, and odometry goes on where it was."""
+    localizer = Localizer(world_map)
+    for k in range(6):
+        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    assert fix.state is State.TRACKING
+    localizer.require_verification()
+    fixes = [localizer.step(world_drive.clouds[0], world_drive.T_odom_body[5], 2.6)]
+    ahead = world_drive.T_odom_body[5]
+    for k in range(1, 4):
+        ahead = ahead @ pose_from(np.eye(3), [2.1, 0.0, 0.0])
+        fixes.append(localizer.step(world_drive.clouds[k], ahead, 2.6 + 0.5 * k))
+    wrong = [
+        round(pose_error(fix.T_map_body, world_drive.T_map_body[k])[0], 1)
+        for k, fix in enumerate(fixes)
+        if fix.T_map_body is not None
+    ]
+    assert not wrong, f"poses wrong by {wrong} m"

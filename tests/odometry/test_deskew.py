@@ -114,3 +114,11 @@ def test_points_at_the_stamp_are_not_moved():
     points = measured(wall(20), straight, np.zeros(40))
     same = deskew(points, np.zeros(40), segment(straight, [0.0, 0.1]), ns(0.0), straight(0.0))
     np.testing.assert_array_equal(same, points)
+
+
+@pytest.mark.parametrize("times", [[0.05, 0.05], [0.3, 0.4]])
+def test_deskew_with_all_points_off_the_stamp(times):
+    points = np.array([[5.0, 1.0, 0.5], [6.0, 1.0, 0.5]], np.float32)
+    moved = deskew(points, np.array(times), segment(lambda t: pose(10.0 * t), (0.0, 0.1)), ns(0.0), pose(0.0))
+    expected = points + np.array([10.0 * min(times[0], 0.1), 0.0, 0.0])
+    np.testing.assert_allclose(moved, expected, atol=0.02)

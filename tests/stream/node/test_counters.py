@@ -1,4 +1,4 @@
-"""Counters, percentiles, and the estimate of what never arrived."""
+"""Counters, percentiles, the rate of poses, and the estimate of what never arrived."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from coview_stream.stream.node.counters import Counters, Latency, MissingFrames
+from coview_stream.stream.node.counters import Counters, Latency, MissingFrames, PoseRate
 
 FRAME = 100_000_000  # ns
 
@@ -88,3 +88,10 @@ def test_restarted_sequence_numbers_count_no_missing_frames():
 
 def test_backward_stamps_count_no_missing_frames():
     assert unnumbered(*range(10), 3, 4)[-2:] == [0, 0]
+
+
+def test_pose_rate_of_simultaneous_poses():
+    rate = PoseRate()
+    rate.add(1.0)
+    rate.add(1.0)
+    assert rate.rate(1.0) >= 0.0

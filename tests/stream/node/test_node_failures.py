@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from fake_node import STEP, Site, publish_statuses
-from fake_robot import ns, search_request, unknown
+from fake_robot import ns, search_request, tracking, unknown
 from sockets import until
 
 from coview_stream.config.node import NodeConfig
@@ -236,3 +236,31 @@ def test_failing_status_is_not_retried_in_a_loop():
     finally:
         site.node.close()
     assert asked[2] - asked[0] > 0.5
+
+
+def test_unencodable_pose_of_one_robot_does_not_affect_others():
+    site = Site("r1", "r2")
+    site.node.declare()
+    site.engine.answer = lambda job: tracking(job, sigma=float("nan") if job.robot == "r1" else 0.1)
+    for name in ("r1", "r2"):
+        site.frame(name, 0.0)
+    site.node.publish_poses(time.monotonic())
+    assert len(site.net.samples("coview/r2/out/pose")) == 1
+
+
+def test_unexpected_engine_error_does_not_stop_the_node():
+    site = Site("r1")
+    run = site.track.run
+    errors = [RuntimeError("unforeseen")]
+    site.track.run = lambda job: run(job) if not errors else (_ for _ in ()).throw(errors.pop())
+    site.node.start()
+    try:
+        clock = iter(range(100_000))
+
+        def localized():
+            site.sees("r1", 0.02 * next(clock))
+            return site.net.samples("coview/r1/out/pose")
+
+        until(localized, 3.0)
+    finally:
+        site.node.close()

@@ -212,3 +212,15 @@ def test_engine_restarts_are_counted(robot):
     assert (robot.counters.engine_restarts, robot.counters.losses) == (1, 1)
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
+
+
+def test_frame_without_odometry_is_not_counted_missing():
+    robot = Robot()
+    robot.moved(0.0, x=0.0)
+    robot.saw(0.0, attachment=numbered(1, 0.0))
+    robot.session.take_frame()
+    robot.saw(0.3, attachment=numbered(2, 0.3))
+    robot.session.tick(robot.now + 1.0)  # the second found none
+    robot.moved(0.45, x=0.0)
+    robot.saw(0.45, attachment=numbered(3, 0.45))
+    assert (robot.counters.no_odometry, robot.counters.missing) == (1, 0)

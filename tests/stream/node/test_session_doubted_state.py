@@ -130,3 +130,35 @@ def test_loss_has_newest_reason_and_is_counted_once():
     assert changes(robot)[1:] == [("TRACKING", "LOST", "no odometry for 0.5 s"), ("LOST", "LOST", "in doubt for 60 s")]
     robot.session.tick(silent + 0.3)
     assert len(changes(robot)) == 3
+
+
+def test_frame_from_before_gap_does_not_count_as_verification():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.2)
+    robot.session.tick(robot.now + 0.6)  # silence: LOST, the next frame is suspect
+    busy = robot.session.take_frame()
+    assert busy.require_verification
+    robot.moved(2.0, x=0.6, now=robot.now + 1.7)  # the robot was carried away meanwhile
+    assert robot.counters.odometry_gaps == 1
+    robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)  # verified, but where it was before
+    robot.moved(2.1, x=0.6, now=robot.now + 0.1)
+    robot.saw(2.05)
+    job = robot.session.take_frame()
+    assert job.require_verification
+
+
+@pytest.mark.parametrize(("seconds", "state"), [(6.0, State.DOUBTED), (12.0, State.LOST)])
+def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    robot.session.on_disconnected(robot.now + 1.0)
+    robot.moved(0.3 + seconds, x=0.6, now=robot.now + seconds)
+    assert robot.session.pose() is None
+    assert robot.session.state()[0] is state
+    robot.moved(0.4 + seconds, x=0.6, now=robot.now + 0.1)
+    robot.saw(0.35 + seconds)
+    job = robot.session.take_frame()
+    assert job.require_verification or state is State.LOST
+    robot.session.handle_result(job, tracking(job), robot.now + 0.01)
+    assert robot.session.pose() is not None

@@ -124,3 +124,46 @@ def test_engine_failure_starts_new_epoch(robot):
     assert robot.session.pose() is None
     assert state(robot) is State.LOST
     assert robot.frame(0.4, unknown).epoch != epoch
+
+
+def test_frame_result_of_before_reset_is_ignored():
+    robot = Robot()
+    robot.drive(-0.1, 0.1)
+    robot.saw(0.0)
+    job = robot.session.take_frame()
+    robot.session.reset()
+    robot.session.handle_result(job, tracking(job), robot.now)
+    assert robot.counters.received == robot.counters.processed == 0
+
+
+def test_search_result_of_before_reset_is_ignored():
+    robot = Robot()
+    robot.frame(0.0, unknown, ask=search_request(0.0))
+    job = robot.session.take_search_request()
+    robot.session.reset()
+    robot.session.handle_result(job, search_result(), robot.now)
+    assert robot.counters.searches == 0
+
+
+def test_odometry_gap_during_first_fix_restarts_search():
+    robot = Robot()
+    robot.frame(0.0, unknown, state=State.AMBIGUOUS)
+    robot.drive(0.05, 0.3)
+    robot.saw(0.2)
+    busy = robot.session.take_frame()  # carries the verdict that will be accepted
+    robot.moved(2.0, x=0.6, now=robot.now + 0.02)
+    assert robot.counters.odometry_gaps == 1
+    robot.session.handle_result(busy, tracking(busy), robot.now + 0.01)
+    assert robot.session.pose() is None
+    robot.moved(2.1, x=0.6, now=robot.now + 0.1)
+    robot.saw(2.05)
+    assert robot.session.take_frame().epoch > busy.epoch  # the search begins anew
+
+
+def test_long_odometry_outage_loses_the_place():
+    robot = Robot().localized(0.0)
+    robot.drive(0.05, 0.3)
+    assert robot.session.pose() is not None
+    robot.moved(2.7, x=0.6, now=robot.now + 2.4)
+    assert robot.session.pose() is None
+    assert robot.session.state() == (State.LOST, "odometry was away for too long")

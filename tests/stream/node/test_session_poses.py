@@ -228,3 +228,31 @@ def test_restarted_sender_clock_may_publish_older_stamps():
     job = robot.session.take_frame()
     robot.session.handle_result(job, tracking(job), 1102.0)
     assert robot.session.pose().stamp_ns == ns(1.45)
+
+
+def test_one_stamp_never_gets_two_poses():
+    robot = Robot().localized(0.0)
+    first = robot.session.pose()
+    robot.saw(0.0)
+    robot.drive(0.05, 0.1)
+    robot.saw(0.1)
+    job = robot.session.take_frame()
+    before = robot.session.pose()
+    robot.session.handle_result(job, tracking(job, T_map_odom=pose(5.0)), robot.now)
+    assert robot.session.pose() is before
+    robot.drive(0.15, 0.2)
+    after = robot.session.pose()
+    assert after.stamp_ns > before.stamp_ns >= first.stamp_ns
+    assert abs(after.T_map_body[0, 3] - before.T_map_body[0, 3]) > 1.0
+
+
+def test_late_cloud_covariance_includes_odometry_since():
+    drift = replace(DRIFT, position=0.2, height=0.2)
+    known = np.diag([0.01, 0.01, 0.01, 0.0, 0.0, 0.0])
+    robot = Robot()
+    robot.drive(0.0, 3.0)  # 2 m/s
+    robot.saw(1.0, now=1003.0)  # two seconds in the network
+    job = robot.session.take_frame()
+    robot.session.handle_result(job, tracking(job, drift=drift, covariance=known), 1003.0)
+    grown = robot.session.pose().covariance - known
+    np.testing.assert_allclose(grown, drift.reported(4.0, 0.0), rtol=0.05)

@@ -165,3 +165,13 @@ usual = st.lists(frame, max_size=3).map(lambda frames: [event for events in fram
 def test_random_events_of_a_mostly_working_robot_keep_invariants(chapters):
     """Random events alone seldom come as far as a pose."""
     live([event for chapter in chapters for event in chapter])
+
+
+reset = st.tuples(st.just("reset"), st.none())
+
+
+@pytest.mark.slow
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.lists(st.one_of(usual, usual, st.lists(st.one_of(*quiet, reset), max_size=4)), max_size=12))
+def test_random_events_with_resets_keep_invariants(chapters):
+    live([event for chapter in chapters for event in chapter])
