@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.harness.rows import Row
+from bench.harness.rows import Row, failed
 from bench.harness.suite import BENCHMARKS, counted, run
 from bench.harness.tables import HEAD, WIDTHS, cells, filled, line, machine, rule, suite_tables
 from coview_stream.clouds.atomic_file import atomic_path
@@ -68,8 +68,11 @@ def _measured(name: str, words: Sequence[str], asked: argparse.Namespace) -> Ite
     elif not name:
         for each, entry in BENCHMARKS.items():
             if entry.suite is not None:
-                quick = ["--quick"] * asked.quick
-                yield from _apart(each, [*entry.suite, *quick], asked.threads, entry.limit_s)
+                try:
+                    words = [*entry.suite, *["--quick"] * asked.quick]
+                    yield from _apart(each, words, asked.threads, entry.limit_s)
+                except CoViewError as error:  # a library is missing, say: the others go on
+                    yield failed(each, str(error))
     elif BENCHMARKS[name].threads and asked.rows_to is None:
         yield from _apart(name, words, asked.threads, math.inf)
     else:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.harness.rows import Row, failed
+from coview_stream.errors import CoViewError
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = m
     """Yield the rows of ``python -m bench NAME WORDS`` as they come.
 
     A benchmark that ends in an exception, is killed, runs past its limit or yields nothing adds a row that does
-    not hold and says so; what it printed itself is shown on stderr only then.
+    not hold and says so; what it printed itself is shown on stderr only then. Raises CoViewError as it did.
     """
     conditions = (threads and counted(threads), "--quick" in words and "quick")
     label = "".join(f", {said}" for said in conditions if said)
@@ -127,14 +128,17 @@ def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = m
         finally:
             watch.cancel()
             _end(process)
+        said.seek(0)
+        tail = said.read().splitlines()[-12:]
+        if code == 2 and tail:
+            raise CoViewError(tail[-1].removeprefix(f"bench {name}: "))
         if code < 0:
             late = time.monotonic() - begin >= limit_s
             why = f"ran past its {limit_s:g} s" if late else f"ended by signal {signal.Signals(-code).name}"
         else:
             why = f"ended with exit code {code}" if code else "" if count else "yielded no row"
         if why:
-            said.seek(0)
-            print("\n".join(said.read().splitlines()[-12:]), file=sys.stderr)
+            print("\n".join(tail), file=sys.stderr)
             yield failed(f"{name}{label}", why)
 
 

@@ -11,6 +11,7 @@ from bench.harness.worlds import Place
 from bench.peers.methods import Answer, started
 from coview_stream import BaseMap
 from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, norms, pose_from
 
@@ -28,8 +29,7 @@ class KissMatcher:
     VOXEL, INLIERS = 1.0, 5
 
     def __init__(self, site: BaseMap) -> None:
-        import kiss_matcher
-
+        kiss_matcher = require_library("kiss_matcher", "kiss-matcher>=1.0.2", "the comparison with KISS-Matcher")
         config = kiss_matcher.KISSMatcherConfig(voxel_size=self.VOXEL, use_quatro=True)
         self._matcher: Any = kiss_matcher.KISSMatcher(config)
         self._map = np.array(site.points, dtype=np.float32)
@@ -55,6 +55,7 @@ class MapClosures:
     _APART = 10  # between the numbers of queries: neighbours in number are never compared
 
     def __init__(self, site: BaseMap) -> None:
+        require_library("map_closures", "map-closures>=2.2", "the comparison with MapClosures")
         from map_closures.config import MapClosuresConfig
         from map_closures.map_closures import MapClosures as Closures
 
@@ -140,19 +141,22 @@ class Features:
         return cloud, feature
 
 
+def small_gicp() -> Any:
+    """Import it, or raise ``DependencyError`` with the remedy."""
+    return require_library("small_gicp", "small-gicp>=1.0.1", "the comparison with small_gicp")
+
+
 class SmallGicp:
     """small_gicp 1.0 (MIT): GICP or VGICP (voxels of 1 m, covariances of 10 points) to a prepared cloud."""
 
     def __init__(self, points: Points, way: Literal["GICP", "VGICP"], voxel: float, near: float, threads: int) -> None:
         """Prepare the target, thinned to ``voxel`` metres; correspondences count within ``near`` metres."""
-        import small_gicp
-
-        self._library: Any = small_gicp
+        self._library = small_gicp()
         self._threads = threads
         self._target, tree = self.prepared(points, voxel)
         self._about: dict[str, Any] = {"max_correspondence_distance": near, "num_threads": threads}
         if way == "VGICP":
-            voxels = small_gicp.GaussianVoxelMap(1.0)
+            voxels = self._library.GaussianVoxelMap(1.0)
             voxels.insert(self._target)
             self._target = voxels
         else:

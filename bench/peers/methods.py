@@ -1,4 +1,4 @@
-"""Who takes part, what a peer has to do, and coview_stream itself.
+"""What a peer has to do, and coview_stream itself.
 
 * As in the product: the search gets the keyframes of the drive one after the other and gives a pose once three of
   them have confirmed it (``LocalizerConfig()``); the time is that of all keyframes until then.
@@ -8,9 +8,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -43,25 +42,6 @@ class Method(Protocol):
 
     def answer(self, place: Place) -> Answer:
         """Say where the submap lies, or that it is not known."""
-
-
-@dataclass(frozen=True)
-class Peer:
-    """A method with its name, what it needs, and how it is made.
-
-    Attributes:
-        name: in tables and rows.
-        make: prepares a method for a map.
-        package: what has to be installed, as pip names it; empty for what comes with coview_stream.
-        module: that it imports as.
-        tracking: it starts from a pose nearby (0.5 m and 3 degrees off) instead of nowhere.
-    """
-
-    name: str
-    make: Callable[[BaseMap], Method]
-    package: str = ""
-    module: str = ""
-    tracking: bool = False
 
 
 def started(place: Place) -> Pose:
@@ -128,31 +108,3 @@ class Tracking:
         evidence = verify(source, T, RangeImage.of(newest.cloud), T_map_body, target, surveyed)
         cause, _ = EvidenceBaseline().judge(evidence, LocalizerConfig().acceptance)
         return Answer(T, cause is RejectionReason.VERIFIED)
-
-
-def _library(name: str, *options: Any) -> Callable[[BaseMap], Method]:
-    """Make a class of :mod:`bench.peers.libraries`, which imports what may not be installed only then."""
-
-    def make(site: BaseMap) -> Method:
-        from bench.peers import libraries
-
-        method: Method = getattr(libraries, name)(site, *options)
-        return method
-
-    return make
-
-
-OURS, OUR_TRACKING = "coview_stream", "coview_stream, tracking"
-
-PEERS = (
-    Peer(OURS, Keyframes),
-    Peer("coview_stream, one scan", OneScan),
-    Peer("KISS-Matcher", _library("KissMatcher"), "kiss-matcher", "kiss_matcher"),
-    Peer("MapClosures", _library("MapClosures"), "map-closures", "map_closures"),
-    Peer("Open3D FPFH + RANSAC", _library("Features", "ransac")),
-    Peer("Open3D FPFH + FGR", _library("Features", "fgr")),
-    Peer(OUR_TRACKING, Tracking, tracking=True),
-    Peer("small_gicp GICP", _library("NearbyGicp", "GICP"), "small-gicp", "small_gicp", tracking=True),
-    Peer("small_gicp VGICP", _library("NearbyGicp", "VGICP"), "small-gicp", "small_gicp", tracking=True),
-)
-"""The first of either kind is coview_stream."""

@@ -9,17 +9,17 @@ are of those. Extra ``peers``; a peer that is not installed gets a line that say
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import pickle
 import sys
 import tempfile
 import time
 from argparse import SUPPRESS, ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,8 +29,10 @@ from bench.harness.rows import Row, bounded, failed, informs
 from bench.harness.suite import run
 from bench.harness.tables import number, table
 from bench.harness.worlds import WORLDS, map_of, places
-from bench.peers.methods import OUR_TRACKING, OURS, PEERS, Peer
+from bench.peers.libraries import Features, KissMatcher, MapClosures, NearbyGicp
+from bench.peers.methods import Keyframes, Method, OneScan, Tracking
 from coview_stream import BaseMap
+from coview_stream.errors import CoViewError
 
 NEAR, ALIGNED = 3.0, 5.0  # a pose is right within this, metres and degrees (the papers' success)
 
@@ -39,12 +41,35 @@ _HEAD = (
 )  # fmt: skip
 
 
+class Peer(NamedTuple):
+    """A method with its name, and how it is made for a map; ``tracking`` starts from a pose nearby, not nowhere."""
+
+    name: str
+    make: Callable[[BaseMap], Method]
+    tracking: bool = False
+
+
+OURS, OUR_TRACKING = "coview_stream", "coview_stream, tracking"
+
+PEERS = (
+    Peer(OURS, Keyframes),
+    Peer("coview_stream, one scan", OneScan),
+    Peer("KISS-Matcher", KissMatcher),
+    Peer("MapClosures", MapClosures),
+    Peer("Open3D FPFH + RANSAC", partial(Features, way="ransac")),
+    Peer("Open3D FPFH + FGR", partial(Features, way="fgr")),
+    Peer(OUR_TRACKING, Tracking, tracking=True),
+    Peer("small_gicp GICP", partial(NearbyGicp, way="GICP"), tracking=True),
+    Peer("small_gicp VGICP", partial(NearbyGicp, way="VGICP"), tracking=True),
+)
+
+
 @dataclass
 class Trial:
     """What one peer did on one world's queries, or why it did nothing.
 
-    ``answers`` are of the queries in order: ``seconds``, ``vouched``, and ``metres`` and ``degrees`` from
-    the truth, None without a pose. Queries that it did not come to are missing.
+    ``answers`` are of the queries that it came to, in order: ``seconds``, ``vouched``, and ``metres`` and ``degrees``
+    from the truth, None without a pose.
     """
 
     peer: str
@@ -98,8 +123,7 @@ def share(trials: Sequence[Trial]) -> float:
 
 def compared(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) -> Iterator[Row]:
     """Rows of one peer beside ``reference``, our answers to the same queries; ``ours``: it is one of ours itself."""
-    name = f"peers/{theirs[0].peer}"
-    answered = [trial for trial in theirs if trial.answers]
+    name, answered = f"peers/{theirs[0].peer}", [trial for trial in theirs if trial.answers]
     if not answered:
         why = "; ".join(dict.fromkeys(trial.trouble or "no answer" for trial in theirs))
         yield failed(name, why) if ours else informs(f"{name}: {why}", math.nan, "")
@@ -127,24 +151,23 @@ def compared(theirs: Sequence[Trial], reference: Sequence[Trial], ours: bool) ->
 def run_trial(peer: Peer, scene: str, count: int, map_file: Path, places_file: Path, limit_s: float) -> Trial:
     """Let a peer answer, in a process of its own; what it did before a crash or the limit counts."""
     trial = Trial(peer.name, scene, count)
-    if peer.module and importlib.util.find_spec(peer.module) is None:
-        trial.trouble = f"not installed; pip install {peer.package}"
-        return trial
-    for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file)], None, limit_s):
-        if row.holds is False:
-            trial.trouble = row.name.removeprefix("peers: ")
-        elif row.details:
-            trial.answers.append(row.details)
-        else:
-            trial.prepare_s = row.ours
+    try:
+        for row in run("peers", ["--trial", peer.name, str(map_file), str(places_file)], None, limit_s):
+            if row.holds is False:
+                trial.trouble = row.name.removeprefix("peers: ")
+            elif row.details:
+                trial.answers.append(row.details)
+            else:
+                trial.prepare_s = row.ours
+    except CoViewError as error:  # it is not installed
+        trial.trouble = str(error)
     return trial
 
 
 def _asked(name: str, map_file: str, places_file: str) -> Iterator[Row]:
     """Yield the seconds of a peer's preparation, then those of each query with its answer."""
     peer = next(peer for peer in PEERS if peer.name == name)
-    found = pickle.loads(Path(places_file).read_bytes())
-    site = BaseMap.load(Path(map_file))
+    found, site = pickle.loads(Path(places_file).read_bytes()), BaseMap.load(Path(map_file))
     begin = time.perf_counter()
     method = peer.make(site)
     yield informs("trial/prepare", time.perf_counter() - begin, "s")

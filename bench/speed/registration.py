@@ -31,7 +31,7 @@ import numpy as np
 
 from bench.harness.rows import Row, against, informs
 from bench.harness.worlds import opened
-from bench.peers.libraries import SmallGicp
+from bench.peers.libraries import SmallGicp, small_gicp
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32
@@ -71,6 +71,7 @@ class Place(NamedTuple):
 
 def rows(asked: Namespace) -> Iterator[Row]:
     """Compare with each of small_gicp's ways, from each kind of start."""
+    small_gicp()  # before the world is made
     found = list(places(11 if asked.quick else 31))
     warm_up()
     peers, threads = {}, runtime.workers()

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from bench.peers.methods import OURS
-from bench.peers.peers import Trial, compared, milliseconds
+from bench.peers.peers import OURS, Trial, compared, milliseconds
 
 
 def answer(metres, degrees=0.5, vouched=True, seconds=0.1):
