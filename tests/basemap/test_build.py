@@ -85,6 +85,7 @@ def test_map_from_several_files_equals_map_from_one(whole, cut, tmp_path):
     assert len(one ^ two) <= 0.05 * len(one)
 
 
+@pytest.mark.slow
 def test_two_storeys_give_two_stations_in_one_cell(tmp_path):
     axis = np.arange(-8.0, 8.0, 0.2)
     x, y = (v.ravel() for v in np.meshgrid(axis, axis))

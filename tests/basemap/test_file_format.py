@@ -86,6 +86,7 @@ def test_hash_does_not_depend_on_memory_layout(path, tmp_path):
     np.testing.assert_array_equal(file_format.load(tmp_path / "turned.coview")[0]["points"], arrays()["points"])
 
 
+@pytest.mark.slow
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 @example(where=0.0, bit=0)
 @example(where=0.9999999, bit=7)

@@ -33,6 +33,7 @@ def test_eval_prints_table_and_json(truth, tmp_path, capsys):
     assert verdict["translation"]["mean"] == 0.25
 
 
+@pytest.mark.slow
 def test_empty_trajectory_is_never_localized(truth, tmp_path, capsys):
     empty = tmp_path / "est.tum"
     empty.write_text("")

@@ -58,6 +58,7 @@ def node():
     made.transport.close()
 
 
+@pytest.mark.slow
 def test_replayed_run_arrives_complete(node, run_folder, capsys):
     node.subscribe()
     command = ["replay", str(run_folder), "--robot", "r1", "--connect", node.endpoint]

@@ -131,6 +131,7 @@ def test_bad_serve_options_are_refused(args, message, world_file, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_serve_odometry_kiss_icp_names_missing_library(tmp_path, monkeypatch, world_file, capsys):
     (tmp_path / "kiss_icp").mkdir()
     (tmp_path / "kiss_icp" / "__init__.py").write_text("raise ImportError('no', name='kiss_icp')")

@@ -27,6 +27,7 @@ def exp_of(xi):
     return M
 
 
+@pytest.mark.slow
 def test_body_axes_covariance_matches_sampled_motions():
     """Samples drawn in the body's tangent scatter along the map's axes as the converted covariance says."""
     body = random_covariance()

@@ -11,6 +11,7 @@ import coview_kernels as ck
 EYE = np.eye(4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_compute_the_same_results(copied):
     rng = np.random.default_rng(0)

@@ -131,6 +131,7 @@ def test_top_k_equals_exhaustive_search(kind, way, monkeypatch):
         assert serial == {way != "parallel" or runtime.workers() == 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_bounds_contain_the_exact_correlation(kind):
     rng = np.random.default_rng(100 + KINDS.index(kind))
@@ -153,6 +154,7 @@ def test_bounds_are_tight_enough_to_prune():
     assert (found.station[0], found.shift[0]) == (700, 9)
 
 
+@pytest.mark.slow
 @NATIVE
 @pytest.mark.parametrize("shape", [(20, 60), (3, 7), (1, 63), (40, 34)])
 def test_kernel_agrees_with_numpy_to_the_bit(shape):

@@ -86,6 +86,7 @@ def test_confidence_is_between_zero_and_one(world_fixes):
     assert world_fixes[-1].confidence > 0.3
 
 
+@pytest.mark.slow
 def test_utm_map_and_utm_odometry_keep_millimetres(world_map, world_drive, world_fixes):
     odometry = small_world.pose_from(small_world.ODOM_FAR[:3, :3], [443_000.4, 5_900_000.8, -60.0])
     far = world_drive.seen_from(odometry)
@@ -166,6 +167,7 @@ def test_input_arrays_are_not_modified(world_map, world_drive):
     np.testing.assert_array_equal(T, world_drive.T_odom_body[0])
 
 
+@pytest.mark.slow
 def test_reset_clears_all_but_the_map(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     follow(localizer, world_drive, 2)

@@ -246,6 +246,7 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
     assert fixes[-1].state is State.TRACKING
 
 
+@pytest.mark.slow
 def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
     """What came before the pause is no doubt that has lasted: one good frame is enough, one bad one is not too much."""
     for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.DOUBTED)):

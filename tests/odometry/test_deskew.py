@@ -47,6 +47,7 @@ def apart(a, b):
     return float(np.linalg.norm(a.astype(np.float64) - b, axis=1).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", [straight, turning])
 @pytest.mark.parametrize(("begin", "end"), [(0.0, 0.1), (-0.1, 0.0), (-0.05, 0.05)])
 def test_deskewed_sweep_equals_instant_scan(motion, begin, end):

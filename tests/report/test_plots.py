@@ -35,6 +35,7 @@ def has_colour(picture, name):
     return bool((np.abs(picture[:, :, :3] - to_rgb(name)).max(axis=2) < 0.02).any())
 
 
+@pytest.mark.slow
 def test_map_plot_shows_base_map_and_stations(base, tmp_path):
     plots.plot_map(base, base[::100], tmp_path / "map.png")
     picture = pixels(tmp_path / "map.png")
@@ -46,6 +47,7 @@ def test_map_plot_shows_base_map_and_stations(base, tmp_path):
     assert pale.sum() > 10 * dark.sum()  # the ground
 
 
+@pytest.mark.slow
 def test_trajectory_is_coloured_by_state(base, tmp_path):
     line = np.column_stack([np.linspace(-15, 15, 40), np.zeros(40), np.zeros(40)])
     states = ["SEARCHING"] * 10 + ["TRACKING"] * 30

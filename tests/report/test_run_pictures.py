@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from coview_stream.localization.offline import locate
 from coview_stream.localization.result import Fix
 from coview_stream.localization.state import State
@@ -9,6 +11,7 @@ from coview_stream.recordings import open_run
 from coview_stream.report.run_pictures import draw_run
 
 
+@pytest.mark.slow
 def test_run_draws_trajectory_and_descriptors_of_first_match(world_map, world_run, tmp_path):
     result = locate(world_map, open_run(world_run))
     draw_run(result, world_map, tmp_path)
@@ -16,6 +19,7 @@ def test_run_draws_trajectory_and_descriptors_of_first_match(world_map, world_ru
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_run_without_match_draws_trajectory_only(world_map, world_run, tmp_path):
     result = locate(world_map, open_run(world_run))
     result.fixes, result.winner = [Fix(0.0, State.SEARCHING)], None

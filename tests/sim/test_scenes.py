@@ -51,6 +51,7 @@ def test_scene_triangles_are_valid(any_scene):
         assert mesh.triangles.max() < len(mesh.vertices)
 
 
+@pytest.mark.slow
 def test_scene_change_keeps_the_map_and_replaces_configured_share():
     before, after = build_scene("village", 3, 140.0), build_scene("village", 3, 140.0, changed=0.3)
     for name in ("solid", "foliage"):

@@ -35,6 +35,7 @@ def test_swap_rotation_translation_reorders_the_same_covariance():
     assert swap_rotation_translation(C)[0, 3] == C[3, 0]
 
 
+@pytest.mark.slow
 def test_propagated_heading_error_becomes_position_error():
     """Each of many poses drawn from a covariance drives 10 m ahead: their spread is the covariance carried along."""
     sigma = np.radians([0.1, 0.2, 1.0])
@@ -151,6 +152,7 @@ def scan(target):
     return RegistrationCloud(exact.points + noise, exact.above, exact.height)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tight", [1.0, 0.1])
 def test_remove_prior_equals_registration_without_prior(target, scan, tight):
     """The prior is off by centimetres and, at its tightest, knows more than the pairs do."""

@@ -141,6 +141,7 @@ def test_step_without_prior_is_that_of_the_pairs():
 # ---- registrations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centre", [None, np.zeros(3), np.array([8.0, -5.0, 1.0])])
 def test_gicp_and_trimmed_icp_agree_from_one_metre_and_five_degrees(target, centre):
     scan = scan_of(target)

@@ -257,6 +257,7 @@ def test_good_candidate_is_tried_again_without_votes(search, world_drive, monkey
     assert search.update(next(frames)).evidence.score == 0.0
 
 
+@pytest.mark.slow
 def test_single_minimum_mode_uses_nearest_stations_only(search, world_drive, monkeypatch):
     single = replace(search.config, consensus=ConsensusConfig(mode="single"))
     paper = GlobalSearch(search.base_map, single, LocalMaps(search.base_map, 50.0))

@@ -52,6 +52,7 @@ def lost(world_map, world_drive):
     return localizer, k
 
 
+@pytest.mark.slow
 def test_continuous_odometry_hints_the_place_after_loss(world_map, world_drive):
     localizer, k = lost(world_map, world_drive)
     request = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)

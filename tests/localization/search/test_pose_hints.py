@@ -85,6 +85,7 @@ def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
 # ---- wrong ones
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])])
 def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, off):
     localizer = Localizer(world_map)
@@ -97,6 +98,7 @@ def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, 
             np.testing.assert_allclose(fix.T_map_body, usual.T_map_body, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [(12, -4), (-14, 9)])
 def test_wrong_hint_is_not_accepted_without_other_candidates(world_map, world_drive, monkeypatch, share):
     localizer = voteless(Localizer(world_map), monkeypatch)

@@ -50,6 +50,7 @@ def nees(errors, covariances):
     return np.mean([e @ np.linalg.solve(C, e) for e, C in zip(errors, covariances, strict=True)]) / 6
 
 
+@pytest.mark.slow
 def test_clustered_covariance_matches_true_error_unlike_inverse_hessian():
     errors, spreads, hessians = zip(*(registered(seed, 0.03) for seed in range(40)), strict=True)
     assert 0.5 < nees(errors, spreads) < 2.5

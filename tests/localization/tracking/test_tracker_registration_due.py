@@ -195,6 +195,7 @@ def test_reported_covariance_is_translation_first_with_shared_error(started, wor
     assert reported[0, 5] == pytest.approx(predicted[3, 2])
 
 
+@pytest.mark.slow
 def test_reported_covariance_never_falls_below_shared_error(world_map, slow_drive):
     ride = Ride.begin(world_map, None, slow_drive.clouds[0], slow_drive.T_map_body[0])
     for cloud, truth in zip(slow_drive.clouds[1:], slow_drive.T_map_body[1:], strict=False):

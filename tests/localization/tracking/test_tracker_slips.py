@@ -20,6 +20,7 @@ SIDEWAYS = pose_from(np.eye(3), [0.0, 0.5, 0.0])
 # ---- odometry that slips
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "slip",
     [

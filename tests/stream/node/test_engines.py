@@ -80,6 +80,7 @@ def launched(monkeypatch):
     return names
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(coview_kernels.backend() == "numpy", reason="no kernels are compiled")
 def test_engines_name_the_kernels_that_they_launch(world_map, world_drive, launched, monkeypatch):
     """What is not named is compiled when the first job needs it, which takes a second."""
@@ -129,6 +130,7 @@ def test_engine_poses_are_correct(alone, world_drive):
             assert pose_error(fix.T_map_body, truth)[0] < 0.08
 
 
+@pytest.mark.slow
 def test_two_robots_give_same_results_as_each_alone(engines, alone, world_drive):
     other_drive = world_drive.seen_from(OTHER_ODOMETRY)
     one, two = Follower(*engines, "one"), Follower(*engines, "two", epoch=9)
@@ -190,6 +192,7 @@ def test_new_epoch_resets_both_engines(engines, alone, world_drive):
     np.testing.assert_allclose(follower.fixes[-1].T_map_body, alone[-1].T_map_body, atol=0.02)
 
 
+@pytest.mark.slow
 def test_forgotten_robot_starts_from_scratch(engines, alone, world_drive):
     follower = Follower(*engines, "forgotten")
     follower.follow(world_drive, range(3))

@@ -323,6 +323,7 @@ def test_hanging_disk_does_not_block_the_node(tmp_path, monkeypatch):
         released.set()
 
 
+@pytest.mark.slow
 def test_hanging_disk_at_start_does_not_block_the_node(tmp_path, monkeypatch):
     released = threading.Event()
     monkeypatch.setattr(memory, "load", lambda *args: released.wait(30.0))

@@ -147,6 +147,7 @@ def live(events):
     chaos.come_to_rest()
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None, derandomize=True)
 @given(st.lists(st.one_of(*quiet), max_size=60))
 def test_random_events_keep_invariants(events):

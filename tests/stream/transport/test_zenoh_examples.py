@@ -58,6 +58,7 @@ def test_peer_example_on_one_machine(tmp_path: Path) -> None:
         check_round_trip(node, robot)
 
 
+@pytest.mark.slow
 def test_router_example_connects_clients(tmp_path: Path) -> None:
     with Router() as router:
         config = moved(EXAMPLES / "client.json5", tmp_path, router.endpoint)

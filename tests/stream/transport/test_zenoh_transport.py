@@ -201,6 +201,7 @@ def test_process_without_close_exits_cleanly() -> None:
     assert "FATAL" not in done.stderr
 
 
+@pytest.mark.slow
 def test_close_ends_all_threads_and_is_idempotent() -> None:
     with Router() as router:
         transport: Transport = open_transport(connect=[router.endpoint])

@@ -137,6 +137,7 @@ def pointwise(image):
     return Features(local, sigma, np.ones((8, height // 4, width // 4), dtype=np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("xy", "degrees"), [((5.6, -8.8), 100.0), ((5.6, -8.8), -57.0), ((6.0, -9.0), 90.0), ((6.0, -9.0), 0.0)]
 )
