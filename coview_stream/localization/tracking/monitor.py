@@ -19,7 +19,7 @@ _NEWEST_SHARE = 0.2  # of a new score in the baseline: about the last five regis
 
 
 class RejectionReason(StrEnum):
-    """Reason of the verdict on a registration while tracking; docs/tracking.md says what an operator can do about each."""
+    """Reason of a verdict on a registration while tracking; docs/tracking.md says what an operator can do about it."""
 
     VERIFIED = "verified"
     """Nothing speaks against the place."""
