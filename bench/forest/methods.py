@@ -31,11 +31,7 @@ class Methods:
     """All methods on one map, which has been built with learned features."""
 
     def __init__(self, base_map: BaseMap) -> None:
-        """Prepare everything that a first query would wait for.
-
-        Raises:
-            MapError: the map has no learned features, or some of other weights.
-        """
+        """Prepare everything that a first query would wait for; ``MapError`` without features of these weights."""
         self.config, self.base_map = LocalizerConfig(reloc="auto"), base_map
         learned = SearchIndex.of(base_map, replace(self.config, reloc="learned")).learned
         retrieval = SearchIndex.of(base_map, replace(self.config, reloc="coview")).retrieval

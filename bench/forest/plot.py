@@ -34,11 +34,7 @@ _RADIUS = 30.0
 
 
 def measured(data: Path, name: str) -> list[dict[str, Any]]:
-    """Ask all methods for the plot in a tile, at each heading.
-
-    Raises:
-        InputError: a scan cannot be read.
-    """
+    """Ask all methods for the plot in a tile, at each heading."""
     air, ground = (_metres(data / "forest_plot" / name) for name in ("ALS_Clip.laz", "MLS_Clip.laz"))
     whole, shift = pasted(_metres(data / "forest_als" / name), air, np.random.default_rng(7))
     with tempfile.TemporaryDirectory() as folder:

@@ -1,9 +1,7 @@
 """Whole runs in forests, searched by the paper's descriptors, by learned features, and by both; and outside the map.
 
-In the usual worlds, or in those that ``--world`` names, each also on the map of the next. The usual ones are written as
-``coview-stream simulate`` writes them: the simulator's own forests have a track that the robot follows; in the stands
-of the training simulator it finds its way between the trees, and the inclined rotating lidar can be driven as well.
-Their seeds were never trained on.
+In the usual worlds, whose seeds were never trained on, or in those that ``--world`` names, each also on the map of the
+next. The simulator's own forests have a track; in the training simulator's stands the robot finds its way.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from bench.forest.worlds import WORLDS, base_of, code, noted, on_disk, place, sa
 from bench.harness.files import fingerprint, remembered
 from bench.harness.rows import Row, failed, informs
 from bench.harness.tables import number, table
-from bench.harness.trajectory_scores import Told, errors
+from bench.harness.trajectory_scores import Told, errors, rms
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.config import LocalizerConfig, Reloc
@@ -79,11 +77,7 @@ RUNS = (
 
 
 def world_of(run: Through) -> Path:
-    """Return the directory of a run's world, simulated now unless it is there.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
+    """Return the directory of a run's world, simulated now unless it is there."""
     out = place() / run.name
 
     def make() -> None:
@@ -144,22 +138,13 @@ def followed(world: Path, site: Path, reloc: Reloc) -> tuple[Told, Floats]:
     """Localize the run of a world on a map: what was said of each frame, and the true poses (N, 4, 4)."""
     stamps, truth = read_tum(world / "truth.tum")
     located = locate(BaseMap.load(site), open_run(world / "run"), LocalizerConfig(reloc=reloc))
-    fixes = located.fixes
-    said = np.array([fix.stamp for fix in fixes])
-    nearest = np.abs(stamps[:, None] - said[None]).argmin(axis=0)
-    nowhere = np.full((4, 4), np.nan)
-    poses = np.array([nowhere if fix.T_map_body is None else fix.T_map_body for fix in fixes])
-    states = [fix.state.reported for fix in fixes]
-    reasons = [fix.evidence.reason if fix.evidence else "" for fix in fixes]
-    told = Told(said, states, reasons, poses, np.full((len(said), 6, 6), np.nan), np.array(located.seconds))
-    return told, truth[nearest]
+    told = Told.of(located.fixes, np.array([fix.stamp for fix in located.fixes]), np.array(located.seconds))
+    return told, truth[np.abs(stamps[:, None] - told.stamps[None]).argmin(axis=0)]
 
 
 def scored(told: Told, truth: Floats, outside: bool) -> Run:
     """Figures of one run; outside the map every pose is a false one."""
-    error = errors(told, truth)
-    known = told.tracking
-    way = driven(truth)
+    error, known, way = errors(told, truth), told.tracking, driven(truth)
     wrong = known & ((error.metres > NEAR_METRES) | (error.degrees > NEAR_DEGREES) | outside)
     right, first = known & ~wrong, int(np.argmax(known)) if known.any() else None
     searching = told.seconds[~np.r_[False, known[:-1]]]
@@ -168,15 +153,11 @@ def scored(told: Told, truth: Floats, outside: bool) -> Run:
         "first_fix_m": None if first is None else float(way[first]),
         "posed": float(known.mean()),
         "posed_after": None if first is None else float(known[first:].mean()),
-        "rmse_m": _rms(error.metres[right]),
-        "rmse_deg": _rms(error.degrees[right]),
+        "rmse_m": rms(error.metres[right]),
+        "rmse_deg": rms(error.degrees[right]),
         "false": int(wrong.sum()),
         "searching_ms": float(1e3 * np.percentile(searching, 95)) if len(searching) else None,
     }
-
-
-def _rms(values: Floats) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def options(parser: ArgumentParser) -> None:

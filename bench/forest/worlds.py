@@ -115,11 +115,7 @@ class Place:
 
 
 def drawn(folder: Path, seed: int, queries: int) -> Place:
-    """Return the world of a seed, simulated now unless ``folder`` has it.
-
-    Raises:
-        DependencyError: Open3D cannot be loaded.
-    """
+    """Return the world of a seed, simulated now unless ``folder`` has it."""
     recipe, out = Recipe(submaps=queries), folder / f"drawn-{seed}-{queries}"
     spec = {"seed": seed, "recipe": recipe.to_dict(), "code": fingerprint(*WORLDS)}
     kind = str(remembered(out / "drawn.json", spec, lambda: _simulate(out, seed, recipe))["kind"])
@@ -147,11 +143,7 @@ def _read(file: Path) -> Drive:
 
 
 def base_of(directory: Path) -> Path:
-    """Return the map's cloud of a world on disk.
-
-    Raises:
-        InputError: there is neither base.laz nor base.las.
-    """
+    """Return the map's cloud of a world on disk; ``InputError`` without one."""
     for name in ("base.laz", "base.las"):
         if (directory / name).is_file():
             return directory / name
@@ -159,11 +151,7 @@ def base_of(directory: Path) -> Path:
 
 
 def recorded(directory: Path, most: int) -> Place:
-    """Read a world on disk (base, run/frames, run/odometry.tum, truth.tum); at most ``most`` queries, spread over it.
-
-    Raises:
-        InputError, RunError, CloudError: a part is missing or cannot be read.
-    """
+    """Read a world on disk (base, run/frames, run/odometry.tum, truth.tum); at most ``most`` queries, spread."""
     run = open_run(directory / "run")
     stamps, poses = read_tum(directory / "truth.tum")
     way = driven(run.poses)

@@ -48,11 +48,7 @@ class Row:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Row:
-        """Undo :meth:`to_dict`.
-
-        Raises:
-            ValueError: the keys are not those of a row.
-        """
+        """Undo :meth:`to_dict`; ``ValueError`` where the keys are not those of a row."""
         names = [each.name for each in fields(Row)]
         if list(values) != names:
             raise ValueError(f"a row has {', '.join(names)}, not {', '.join(values)}")

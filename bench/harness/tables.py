@@ -76,11 +76,7 @@ def suite_tables(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def filled(page: str, tables: Mapping[str, str]) -> str:
-    """Return the page with the tables in their places: ``<!-- table: NAME -->`` to the next ``<!-- end -->``.
-
-    Raises:
-        InputError: the page has no place for any of the tables.
-    """
+    """Put tables into their places, ``<!-- table: NAME -->`` to ``<!-- end -->``; ``InputError`` without any place."""
     if not {match[2] for match in _PLACE.finditer(page)} & set(tables):
         raise InputError(f"no place for {', '.join(tables)}: '<!-- table: NAME -->' and '<!-- end -->'")
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coview_stream.geometry.arrays import Bools, Floats
+from coview_stream.localization.result import Fix
 
 FALSE_METRES, FALSE_DEGREES = 1.0, 5.0  # a pose further from the truth than either is false
 DOUBTFUL_METRES = 0.5
@@ -37,6 +38,24 @@ class Told:
     poses: Floats
     covariances: Floats
     seconds: Floats
+
+    @classmethod
+    def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Told:
+        """Collect what was said at the ``stamps``; a frame that was refused has the reason in place of its fix."""
+        poses, covariances = np.full((len(fixes), 4, 4), np.nan), np.full((len(fixes), 6, 6), np.nan)
+        states, reasons = [], []
+        for k, fix in enumerate(fixes):
+            if isinstance(fix, str):
+                states.append("SKIPPED")
+                reasons.append(fix)
+                continue
+            states.append(fix.state.reported)
+            reasons.append(fix.evidence.reason if fix.evidence else "")
+            if fix.T_map_body is not None:
+                poses[k] = fix.T_map_body
+            if fix.covariance is not None:
+                covariances[k] = fix.covariance
+        return cls(stamps, states, reasons, poses, covariances, seconds)
 
     @property
     def tracking(self) -> Bools:
@@ -126,9 +145,9 @@ def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str,
         "driven_m": float(driven[-1]),
         "right_percent": 100 * float(right.mean()),
         "first_fix_m": float(driven[known.argmax()]) if known.any() else None,
-        "rmse_m": _rms(error.metres[known]),
+        "rmse_m": rms(error.metres[known]),
         "max_m": _max(error.metres[known]),
-        "rmse_deg": _rms(error.degrees[known]),
+        "rmse_deg": rms(error.degrees[known]),
         "max_deg": _max(error.degrees[known]),
         "false_frames": int(false.sum()),
         "false_s": float(hold[false].sum()),
@@ -141,7 +160,8 @@ def score(told: Told, truth: Floats, driven: Floats, events: Sequence[tuple[str,
     }
 
 
-def _rms(values: Floats) -> float | None:
+def rms(values: Floats) -> float | None:
+    """Return the root mean square; None of nothing."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 

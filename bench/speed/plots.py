@@ -1,9 +1,5 @@
 """The plots of ``docs/performance.md``: milliseconds over candidates, points and robots.
 
-* ``candidates``: matching one query with 1,000 to 100,000 stations, all of them at all shifts.
-* ``points``: taking in a frame, by its points.
-* ``robots``: one round of frames of several robots that are tracked on one map in one process.
-
 Medians of wall time, curves of one plot measured in turns, drawn as ``performance_NAME.png``. Threads are set from
 outside (``OPENBLAS_NUM_THREADS``, ``COVIEW_THREADS``); a plot says how many there were.
 """
@@ -20,6 +16,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from bench.harness.rows import Row, informs, medians
+from bench.harness.suite import counted
 from bench.harness.worlds import WORLDS, opened
 from bench.speed.engine import there_and_back
 from bench.speed.frame import LIMITS, STANDING, best_numpy, frame
@@ -49,10 +46,7 @@ class Curves(NamedTuple):
 
 
 def candidates(quick: bool) -> Curves:
-    """One keyframe with 1,000 to 100,000 stations at all 60 shifts; the best 20 are asked for.
-
-    Index, spectra and transposed descriptors are made beforehand.
-    """
+    """One keyframe with 1,000 to 100,000 stations at all 60 shifts; what depends on the map is made beforehand."""
     sizes = [1_000, 3_000] if quick else [1_000, 3_000, 10_000, 30_000, 100_000]
     known, queries = town()
     channel = next(iter(known))
@@ -88,16 +82,12 @@ def robots(quick: bool) -> Curves:
 
         rounds = [medians(turn, repeat=1, warm_up=0)[0] for _ in range(11 if quick else 61)]
         found.append(np.percentile(rounds, [50, 95]).tolist())
-    title, axis = "Tracking several robots on one map", "robots in one process"
-    names = ("a round of frames, median", "95th percentile")
-    return Curves(title, axis, counts, names, found, (PERIOD_MS, "period of 10 Hz"))
+    names, limit = ("a round of frames, median", "95th percentile"), (PERIOD_MS, "period of 10 Hz")
+    return Curves("Tracking several robots on one map", "robots in one process", counts, names, found, limit)
 
 
 def _fleet(count: int) -> list[Callable[[], bool]]:
-    """Robots that have found their places along one run, far from each other, and drive it to and fro.
-
-    A call takes in a robot's next frame and tells whether it is tracked.
-    """
+    """Robots that have found their places along one run; a call takes in the next frame and tells whether it tracks."""
     site, run, _ = opened(WORLDS["town"])
     frames, config = list(run), LocalizerConfig()
     crops = LocalMaps(site, config.registration.source_range)
@@ -124,11 +114,7 @@ PLOTS: dict[str, Callable[[bool], Curves]] = {"candidates": candidates, "points"
 
 
 def draw(shown: Curves, command: str, path: Path) -> None:
-    """Draw curves over logarithmic axes; below them, how they were made.
-
-    Raises:
-        InputError: the picture cannot be written.
-    """
+    """Draw curves over logarithmic axes; below them, how they were made."""
     with figure(path, figsize=(7.2, 4.6)) as (drawing, axes):
         for k, name in enumerate(shown.names):
             curve = [found[k] for found in shown.milliseconds]
@@ -142,8 +128,7 @@ def draw(shown: Curves, command: str, path: Path) -> None:
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.grid(True, which="major", color="#dddddd", linewidth=0.6)
         axes.legend(fontsize=9)
-        threads = runtime.workers()
-        text = f"{command}    {threads} thread{'s' if threads > 1 else ''}"
+        text = f"{command}    {counted(runtime.workers())}"
         drawing.supxlabel(text, fontsize=8, color="#666666", family="DejaVu Sans Mono")
 
 

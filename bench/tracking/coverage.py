@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -129,17 +129,8 @@ def _percent(inside: Sequence[float] | None) -> str:
     return "-" if inside is None else " / ".join(f"{100 * share:.1f}" for share in inside)
 
 
-def draw(spread: Mapping[str, Mapping[str, Floats]], path: Path, title: str) -> None:
-    """Draw observed over nominal coverage for position and yaw, in the first minute after a fix and later.
-
-    Args:
-        spread: squared distances by part and axes, see :func:`pooled`.
-        path: picture to write.
-        title: what was measured.
-
-    Raises:
-        InputError: the picture cannot be written.
-    """
+def draw(spread: Squares, path: Path, title: str) -> None:
+    """Draw observed over nominal coverage for position and yaw, by part of the time (see :func:`pooled`)."""
     nominal = np.linspace(0.0, 1.0, 201)
     with figure(path, figsize=(9.6, 5.0), ncols=2, axes={"sharey": True}) as (drawing, both):
         for axes, part, after in zip(both, PARTS, (" after a fix", ""), strict=True):

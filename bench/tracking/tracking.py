@@ -1,10 +1,8 @@
 """How tracking holds, loses and recovers.
 
-Ten plain drives of 300 to 600 m in towns, on campuses and in sparse forests, with odometry that drifts by 0.5 to 5 %;
-and drives on which the robot is kidnapped or carried, crosses 100 m without a map, is covered for half a minute, meets
-a changed world (30 %), or has an odometry that jumps, starts again or is 5 % out of scale
-(:mod:`bench.tracking.scenarios`). The truth only scores. NAME picks the scenarios whose names contain it; worlds, maps
-and answers stay in ``--work``, so that a run can be made in portions and an unchanged engine is not asked twice.
+Ten plain drives, and drives on which something happens to the robot (:mod:`bench.tracking.scenarios`). The truth only
+scores. NAME picks the scenarios whose names contain it; worlds, maps and answers stay in ``--work``, so that a run can
+be made in portions and an unchanged engine is not asked twice.
 
 Coverage is the share of the poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by
 itself, of several by their squared Mahalanobis distance.
@@ -31,6 +29,7 @@ from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
 from bench.tracking.worlds import Recorded, map_of, open_world
 from coview_stream import BaseMap, Localizer
 from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.localization.result import Fix
 
 MAX_METRES, MAX_DEGREES, MAX_RECOVERY = 0.12, 0.35, 20.0
 """The targets: root mean squares over the plain drives, and metres driven after an event."""
@@ -91,10 +90,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
 
 
 def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
-    """Return the figures of a scenario, and the squared distances that its coverage is made of.
-
-    They are kept in ``folder``, as worlds and maps are, until the code is another one.
-    """
+    """Return the figures of a scenario, and the squared distances of its coverage; kept until the code changes."""
     bench = fingerprint("bench/tracking", "bench/harness/trajectory_scores.py")
     spec = {"code": fingerprint(), "bench": bench, "scenario": repr(scenario.world)}
 
@@ -115,27 +111,17 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
 
 def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
     """Feed a drive to a new localizer, which is told frames and odometry and nothing else; write down what it says."""
-    count = len(drive)
-    poses, covariances = np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
-    seconds, states, reasons = np.zeros(count), [], []
-    localizer = Localizer(BaseMap.load(site))
-    for k in range(count):
+    localizer, seconds = Localizer(BaseMap.load(site)), np.zeros(len(drive))
+    fixes: list[Fix | str] = []
+    for k in range(len(drive)):
         cloud = seen(recorded.read(int(drive.frames[k])), int(drive.cover[k]), int(drive.frames[k]))
         begin = time.perf_counter()
         try:
-            fix = localizer.step(cloud, drive.odometry[k], float(drive.stamps[k]))
+            fixes.append(localizer.step(cloud, drive.odometry[k], float(drive.stamps[k])))
+            seconds[k] = time.perf_counter() - begin
         except (CloudError, RunError) as error:
-            states.append("SKIPPED")
-            reasons.append(str(error))
-            continue
-        seconds[k] = time.perf_counter() - begin
-        states.append(fix.state.reported)
-        reasons.append(fix.evidence.reason if fix.evidence else "")
-        if fix.T_map_body is not None:
-            poses[k] = fix.T_map_body
-        if fix.covariance is not None:
-            covariances[k] = fix.covariance
-    return Told(drive.stamps, states, reasons, poses, covariances, seconds)
+            fixes.append(str(error))
+    return Told.of(fixes, drive.stamps, seconds)
 
 
 def cells(figures: Figures) -> list[str]:
@@ -151,10 +137,7 @@ def cells(figures: Figures) -> list[str]:
 
 
 def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick: bool = False) -> Iterator[Row]:
-    """Judge all drives together; ``found`` is their coverage.
-
-    ``quick`` drives are too short to be found again on, and too few for a coverage.
-    """
+    """Judge all drives together; ``quick`` ones are too short for recovery and for ``found``, the coverage."""
     plain = [figures for figures in drives if figures["plain"]]
     for unit, key, most in (("m", "rmse_m", MAX_METRES), ("deg", "rmse_deg", MAX_DEGREES)):
         if plain:
