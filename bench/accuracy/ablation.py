@@ -1,15 +1,12 @@
 """What each choice of the method is worth.
 
-Every variant changes a choice (the last ones several of the paper's at once) and runs on the same simulated
-worlds: Scan Context against co-view context, exhaustive retrieval against ring key, consensus against the
-single minimum, with and without a common zero for the heights. Per variant: how often the search names the
-right place (from one keyframe, from five), then the whole localizer on the same run. What is done stays in
-``--work``.
+Every variant changes a choice (the last ones several of the paper's at once) and runs on the same simulated worlds: how
+often the search names the right place (from one keyframe, from five), then the whole localizer on the same run. What is
+done stays in ``--work``.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from argparse import ArgumentParser, Namespace
@@ -21,16 +18,15 @@ from typing import Any
 
 import numpy as np
 
+from bench.accuracy.accuracy import evaluated
 from bench.accuracy.stages import WINDOW, Bank, Variant, places
 from bench.harness.files import code_line, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table
 from bench.harness.worlds import KINDS, LIDARS, TUNED_SEEDS, map_of, prepare, world_name
-from coview_stream.clouds import read_tum
 from coview_stream.config import ConsensusConfig, DescriptorConfig, LocalizerConfig, RetrievalConfig
 from coview_stream.localization.offline import locate
 from coview_stream.recordings.open_run import open_run
-from coview_stream.report.evaluation import evaluate
 from coview_stream.sim import SimulationConfig
 
 SEEDS = tuple(range(2101, 2109))
@@ -81,17 +77,14 @@ def ablate(folder: Path, config: SimulationConfig, names: Sequence[str]) -> Meas
 
 def _localize(world: Path, bank: Bank, variant: Variant) -> dict[str, Any]:
     config = LocalizerConfig(retrieval=variant.retrieval, consensus=variant.consensus)
-    posed = locate(bank.map(variant.descriptor), open_run(world / "run"), config).posed
-    poses = np.array([fix.T_map_body for fix in posed]).reshape(-1, 4, 4)
-    verdict = evaluate((np.array([fix.stamp for fix in posed]), poses), read_tum(world / "truth.tum"))
-    return dict(json.loads(verdict.to_json()))
+    return evaluated(locate(bank.map(variant.descriptor), open_run(world / "run"), config), world)
 
 
 def measure(
     folder: Path, config: SimulationConfig, names: Sequence[str], call: Callable[..., Any] = isolated
 ) -> Measured:
     """Measures of the variants in one world, each in a process of its own."""
-    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/ablation.py", "bench/accuracy/stages.py")}
+    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy")}
     spec = {"world": config.to_dict(), "variants": list(names), **code}
 
     def make() -> Measured:

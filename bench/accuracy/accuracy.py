@@ -1,8 +1,7 @@
 """How accurate, how often right, and never falsely so.
 
-Simulates held-out worlds, builds their maps and localizes a run in each; then runs on the map of another
-world of the same kind, where the only right answer is no pose. One process per run, one at a time; what is done stays
-in ``--work``, so that it can resume.
+Localizes a run in each held-out world; then runs on the map of another world of the same kind, where the only right
+answer is no pose. One process per run, one at a time; what is done stays in ``--work``, so that it can resume.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from bench.harness.tables import number, table
 from bench.harness.worlds import KINDS, LIDARS, UTM, map_of, prepare, world_name
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
-from coview_stream.localization.offline import locate
+from coview_stream.localization.offline import RunResult, locate
 from coview_stream.recordings.open_run import open_run
 from coview_stream.report.evaluation import evaluate
 from coview_stream.sim import SimulationConfig
@@ -84,9 +83,14 @@ def measure(folder: Path, run: SimulationConfig, site: SimulationConfig) -> Run:
     }
     if run != site:
         return found | {"false_frames": len(located.posed), "success": not located.posed}
+    return found | evaluated(located, folder / world_name(run))
+
+
+def evaluated(located: RunResult, world: Path) -> Run:
+    """Figures of ``evaluate`` for a world's run on its own map."""
     poses = np.array([fix.T_map_body for fix in located.posed]).reshape(-1, 4, 4)
     estimate = np.array([fix.stamp for fix in located.posed]), poses
-    return found | json.loads(evaluate(estimate, read_tum(folder / world_name(run) / "truth.tum")).to_json())
+    return dict(json.loads(evaluate(estimate, read_tum(world / "truth.tum")).to_json()))
 
 
 def run_one(folder: Path, run: SimulationConfig, site: SimulationConfig, call: Callable[..., Any] = isolated) -> Run:

@@ -46,18 +46,12 @@ class Variant:
 
 @dataclass(frozen=True)
 class Seen:
-    """A keyframe as the search sees it.
+    """A keyframe as the search sees it."""
 
-    Attributes:
-        scan: (N, 3) virtual local scan, odometry frame, metres.
-        position: (3,) of the sensor; ``ground``: the height below it.
-        T_map_odom: (4, 4) the truth, map frame relative to the map's origin.
-    """
-
-    scan: Points
-    position: Floats
-    ground: float
-    T_map_odom: Pose
+    scan: Points  # (N, 3) virtual local scan, odometry frame, metres
+    position: Floats  # (3,) of the sensor
+    ground: float  # height below it
+    T_map_odom: Pose  # (4, 4) the truth, map frame relative to the map's origin
 
 
 @dataclass

@@ -1,9 +1,7 @@
 """A real forest: one plot that was scanned from the ground and from the air, sought among real airborne tiles.
 
-The airborne scan of the plot (27 x 26 m, ponderosa) is put into the middle of each tile (another, coniferous
-forest), thinned to the density of the tile; the query is the mobile scan of the plot at several headings. It is one
-plot, from another forest than what surrounds it, and smaller than what a query usually shows: a check, no statistic.
-Queries of the tiles themselves cannot be made, for they were never scanned from the ground.
+The airborne scan of the plot is put into the middle of each tile, thinned to the tile's density; the query is the
+mobile scan of the plot at several headings: a check, no statistic (docs/forest.md).
 """
 
 from __future__ import annotations
@@ -105,8 +103,6 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     share = success(answers, "after", EXACT_METRES, EXACT_DEGREES)
     shown.append(["registered within 0.3 m and 1 deg, %", f"{100 * share:.0f}"])
     shown.append(["registered: median metres off, wrong places included", medians(answers, "after", (2, 2))[0]])
-    head = (
-        f"AR@1 / AR@5, %, {len(answers)} queries, chance {100 * np.mean([answer['chance'] for answer in answers]):.1f}",
-        "",
-    )
+    chance = 100 * np.mean([answer["chance"] for answer in answers])
+    head = (f"AR@1 / AR@5, %, {len(answers)} queries, chance {chance:.1f}", "")
     return {"": noted(table(head, shown), "forest_plot DATA")}

@@ -1,7 +1,4 @@
-"""A drive becomes a query as in the product, and the places that a method names become poses.
-
-What the ring buffer would hold, in the odometry's frame; then the product's own registration and verification.
-"""
+"""A drive becomes a query as in the product, and the places that a method names become poses."""
 
 from __future__ import annotations
 

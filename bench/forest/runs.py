@@ -10,7 +10,7 @@ import json
 import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,6 @@ class Through:
     seed: int
     length: float
     drawn: bool = False
-    recipe: Recipe = field(default=_STAND)
 
     @property
     def name(self) -> str:
@@ -95,12 +94,12 @@ def world_of(run: Through) -> Path:
 
 def _drive_stand(out: Path, run: Through) -> None:
     """Write a drive through a drawn stand; the way is shorter than asked where the trees leave none."""
-    world, rng = draw_world(run.seed, run.recipe), np.random.default_rng([run.seed, _PATH])
+    world, rng = draw_world(run.seed, _STAND), np.random.default_rng([run.seed, _PATH])
     frames = out / "run" / "frames"
     frames.mkdir(parents=True, exist_ok=True)
     for old in frames.iterdir():
         old.unlink()
-    write_cloud(out / "base.laz", base_scan(world, run.seed, run.recipe)[0].astype(np.float64))
+    write_cloud(out / "base.laz", base_scan(world, run.seed, _STAND)[0].astype(np.float64))
     ways: list[Floats] = [world.path(rng, world.size / 2 - 30.0, run.length) for _ in range(8)]
     truth = _poses(max(ways, key=len), _SPEED * FRAME_PERIOD * _EVERY, world.ground, rng)
     caster, sensor = Caster(world.now, threads=1, leaf_depth=0.3), trained_sensor(run.sensor)

@@ -2,9 +2,8 @@
 
 All that depends on a map's size (correlation, reading the stations, votes, keypoints of the map) works on the large
 map: the middle 128 m of a drawn stand, repeated. Registration looks at the surroundings of five places, the same on
-any map, so each place is registered where its likeness in the original stand is. The copies are alike: where five fit
-equally well, none is given up early, and a query takes longer than where one place is right. The limits are for two
-cores; BLAS takes the threads of OPENBLAS_NUM_THREADS, the kernels those of COVIEW_THREADS, transforms and network one.
+any map, so each place is registered where its likeness in the original stand is. The limits are for two cores; BLAS
+takes the threads of OPENBLAS_NUM_THREADS, the kernels those of COVIEW_THREADS, transforms and network one.
 """
 
 from __future__ import annotations

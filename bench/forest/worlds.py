@@ -87,21 +87,13 @@ def on_disk(world: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Drive:
-    """What a robot has seen up to now.
-
-    Attributes:
-        sensor: its name.
-        travelled: metres, by odometry.
-        odometry: (F, 4, 4) odometry <- body of each frame, oldest first; metres.
-        clouds: (N, 3) of each frame, body frame, metres.
-        truth: (4, 4) map <- body of the newest frame, in the frame of the map's source.
-    """
+    """What a robot has seen up to now."""
 
     sensor: str
-    travelled: float
-    odometry: Floats
-    clouds: tuple[Points, ...]
-    truth: Pose
+    travelled: float  # metres, by odometry
+    odometry: Floats  # (F, 4, 4) odometry <- body of each frame, oldest first; metres
+    clouds: tuple[Points, ...]  # (N, 3) of each frame, body frame, metres
+    truth: Pose  # (4, 4) map <- body of the newest frame, in the frame of the map's source
 
 
 @dataclass(frozen=True)

@@ -24,23 +24,15 @@ REPEAT = 31  # runs behind every median; an odd number, so that the median is on
 class Row:
     """One figure of ours, the baseline's if there is one, and whether the target holds."""
 
-    name: str
-    """What was measured, after the benchmark's name: ``match/top-k, 9527 stations``."""
-    ours: float = math.nan
-    """Our figure; NaN where there is none."""
+    name: str  # what was measured, after the benchmark's name: ``match/top-k, 9527 stations``
+    ours: float = math.nan  # our figure; NaN where there is none
     baseline: float | None = None
-    unit: str = ""
-    """``ms``, ``s``, ``MB``, ``%``."""
-    ratio: float | None = None
-    """How many times better ours is; None where there is no baseline."""
-    target: str = ""
-    """In words, e.g. ``>= 3`` (a ratio), ``<= 8 ms`` or ``>= 95 %``; empty where the row only informs."""
-    holds: bool | None = None
-    """Whether the target holds; None where the row only informs."""
-    said: str = ""
-    """Shown in place of ``ours`` where one number does not say it."""
-    details: dict[str, Any] = field(default_factory=dict)
-    """Everything measured, for the benchmark's own tables and for ``--json``."""
+    unit: str = ""  # ``ms``, ``s``, ``MB``, ``%``
+    ratio: float | None = None  # how many times better ours is; None where there is no baseline
+    target: str = ""  # in words: ``>= 3`` (a ratio), ``<= 8 ms`` or ``>= 95 %``; empty where the row only informs
+    holds: bool | None = None  # None where the row only informs
+    said: str = ""  # shown in place of ``ours`` where one number does not say it
+    details: dict[str, Any] = field(default_factory=dict)  # everything measured, for own tables and ``--json``
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON, which knows no NaN: None stands for a figure that is none."""

@@ -26,20 +26,15 @@ from coview_stream.errors import CoViewError
 class Benchmark:
     """One name: where its ``rows`` are and how it is run.
 
-    Attributes:
-        module: to import, below ``bench``.
-        what: it measures, in one line.
-        threads: thread counts to run it with, each in a process of its own; None leaves the count to the machine.
-            Empty: it runs in this process, as long as it takes.
-        suite: the words it is run with when no name is given; None: it is not part of the suite.
-        limit_s: wall time after which it is ended in the suite: a row that does not hold.
+    ``threads`` are counts to run it with, each in a process of its own; None leaves the count to the machine. Without
+    any it runs in this process, as long as it takes.
     """
 
-    module: str
-    what: str
+    module: str  # to import, below ``bench``
+    what: str  # it measures, in one line
     threads: tuple[int | None, ...] = ()
-    suite: tuple[str, ...] | None = None
-    limit_s: float = 240.0
+    suite: tuple[str, ...] | None = None  # words it is run with when no name is given; None: not part of the suite
+    limit_s: float = 240.0  # wall time after which it is ended in the suite: a row that does not hold
 
     def load(self) -> Any:
         """Import its module."""
@@ -79,9 +74,8 @@ BENCHMARKS = {
 
 def thread_settings(threads: int | None) -> dict[str, str]:
     """Environment that gives BLAS, OpenMP and our kernels so many threads; empty for the machine's own."""
-    if threads is None:
-        return {}
-    return dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "COVIEW_THREADS"), str(threads))
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "COVIEW_THREADS")
+    return {} if threads is None else dict.fromkeys(names, str(threads))
 
 
 def counted(threads: int) -> str:

@@ -21,23 +21,14 @@ MAX_HELD = 0.5  # seconds that a false pose counts at most: until the next frame
 
 @dataclass(frozen=True)
 class Told:
-    """What the localizer said, frame by frame (N).
+    """What the localizer said, frame by frame (N)."""
 
-    Attributes:
-        stamps: seconds.
-        states: names; ``SKIPPED`` for a frame that it refused.
-        reasons: of the newest evidence.
-        poses: (N, 4, 4) map <- body, NaN where there was none.
-        covariances: (N, 6, 6) over (x, y, z, roll, pitch, yaw), NaN where there was no pose.
-        seconds: that each step took.
-    """
-
-    stamps: Floats
-    states: Sequence[str]
-    reasons: Sequence[str]
-    poses: Floats
-    covariances: Floats
-    seconds: Floats
+    stamps: Floats  # seconds
+    states: Sequence[str]  # names; ``SKIPPED`` for a frame that it refused
+    reasons: Sequence[str]  # of the newest evidence
+    poses: Floats  # (N, 4, 4) map <- body, NaN where there was none
+    covariances: Floats  # (N, 6, 6) over (x, y, z, roll, pitch, yaw), NaN where there was no pose
+    seconds: Floats  # that each step took
 
     @classmethod
     def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Told:
@@ -66,17 +57,11 @@ class Told:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of all frames, NaN where there is no pose.
+    """Errors of all frames, NaN where there is no pose."""
 
-    Attributes:
-        twist: (N, 6) over (x, y, z, roll, pitch, yaw) in map axes, metres and radians.
-        metres: (N,) length of the first three.
-        degrees: (N,) angle of the others.
-    """
-
-    twist: Floats
-    metres: Floats
-    degrees: Floats
+    twist: Floats  # (N, 6) over (x, y, z, roll, pitch, yaw) in map axes, metres and radians
+    metres: Floats  # (N,) length of the first three
+    degrees: Floats  # (N,) angle of the others
 
     @property
     def right(self) -> Bools:

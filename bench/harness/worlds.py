@@ -82,18 +82,11 @@ WORLDS = {
 
 @dataclass(frozen=True)
 class Place:
-    """One query with its answer.
+    """One query with its answer."""
 
-    Attributes:
-        queries: of the keyframes, oldest first, for the localizer.
-        submap: (N, 3) float32 all points of the keyframes, metres: axes of the odometry (gravity aligned), zero at
-            the robot.
-        T_map_submap: (4, 4) the truth; the map's coordinates are relative to its origin.
-    """
-
-    queries: list[SearchRequest]
-    submap: Points
-    T_map_submap: Pose
+    queries: list[SearchRequest]  # of the keyframes, oldest first, for the localizer
+    submap: Points  # (N, 3) all points of the keyframes, metres: axes of the odometry (gravity aligned), robot at zero
+    T_map_submap: Pose  # (4, 4) the truth; the map's coordinates are relative to its origin
 
     def errors(self, T_map_submap: Pose) -> tuple[float, float]:
         """Distance (metres) and angle (degrees) of an answer from the truth."""

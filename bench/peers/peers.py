@@ -1,10 +1,8 @@
 """Other libraries on the same queries, on this machine.
 
-Per peer: how often it is right (within 3 m and 5 degrees, and within 1 m) and vouches for it, how often it vouches for
-a wrong pose, its errors when right, the median time of a query and the time to prepare the map. The queries are those
-of a robot that was switched on eight metres ago; ``bench/peers/libraries.py`` says what each peer is given and how it
-is set. A trial ends after ``--limit`` seconds, so that a slow peer answers the first queries only; both sides' shares
-are of those. Extra ``peers``; a peer that is not installed gets a line that says so.
+The queries are those of a robot that was switched on eight metres ago; ``bench/peers/libraries.py`` says how each peer
+is set, docs/performance.md what the columns mean. A trial ends after ``--limit`` seconds, so that a slow peer answers
+the first queries only; both sides' shares are of those. Extra ``peers``; one that is missing gets a line that says so.
 """
 
 from __future__ import annotations

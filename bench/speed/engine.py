@@ -2,10 +2,9 @@
 
 A simulated town, 240 m wide, driven at 1.5 m/s with an Ouster-like lidar of 2,048 columns, of whose returns 65,536 are
 kept in each frame. The run is fed forwards and backwards (the robot reverses) until 10,000 frames are one drive.
-``while searching`` are the steps up to the first fix that searched the map; a robot that must not wait for that calls
-``add_frame`` and ``apply_search_result`` (the search in another process, as ``serve`` does). The processor share is
-that of all threads, in per cent of one core at 10 frames a second. The error is there so that no time is won by being
-wrong, the share of frames with a pose so that none is won by not answering.
+``while searching`` are the steps up to the first fix that searched the map. The processor share is that of all threads,
+in per cent of one core at 10 frames a second. The error is there so that no time is won by being wrong, the share of
+frames with a pose so that none is won by not answering.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Each kernel beside its NumPy twin: ``python -m bench kernels``.
 
 A row per kernel at the sizes of a localizer step and of a map build; a kernel that does not win here is deleted.
-The twins are plain and vectorised; the targets that count are those of the benchmarks of the whole step (``match``,
-``frame``, ``map_build``, ``registration``), which compare with the best formulation known. Run it on idle cores: a
-busy neighbour slows the kernels, which use all threads, more than NumPy.
+``match``, ``frame``, ``map_build`` and ``registration`` compare with the best formulation known. Run it on idle cores:
+a busy neighbour slows the kernels, which use all threads, more than NumPy.
 """
 
 from __future__ import annotations

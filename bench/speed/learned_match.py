@@ -1,13 +1,9 @@
 """Where a learned query fits: dense correlation with a map, and the pairs of keypoints that agree.
 
-Dense correlation: 32 dimensions on cells of 2 m, a query of 64 m at 36 headings, maps of 0.1 and 1 km2 of random
-features (no place is easier than another). The baselines, the map's spectra made beforehand as ours are: every channel
-of a turned query transformed over the whole map, heading by heading (``OneFft``), and ``scipy.signal.fftconvolve`` with
-everything made anew, timed at one heading and multiplied by 36. Turning the query is part of every side.
-
-The clique: 300 pairs of which 10 % are right, at 0.3 m noise, as in a forest; and pairs that are all wrong. The
-baseline is Bron and Kerbosch's enumeration with pivots on Python's sets, as in ``networkx.find_cliques``. All sides
-must agree. BLAS has the threads of OPENBLAS_NUM_THREADS, the transforms one.
+Dense correlation: 32 dimensions on cells of 2 m, a query of 64 m at 36 headings, maps of random features. Turning the
+query is part of every side; ``fftconvolve`` is timed at one heading and multiplied by 36. The clique: 300 pairs of
+which 10 % are right, at 0.3 m noise, as in a forest; and pairs that are all wrong. All sides must agree
+(docs/performance.md). BLAS has the threads of OPENBLAS_NUM_THREADS, the transforms one.
 """
 
 from __future__ import annotations

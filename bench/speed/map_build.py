@@ -1,9 +1,8 @@
 """Descriptors of 10,000 stations over 10 M points beside NumPy and a k-d tree: ``python -m bench map_build``.
 
-Both sides start from the same points and stations and end with both channels of every station. Ours rasters the map
-once and gathers cells. The baseline keeps the highest point of every 0.5 m voxel (with all points it is several times
-slower), and for each station asks SciPy's cKDTree for those within 50 m, bins them in NumPy and finds the co-visible
-bins. It is measured at some stations and scaled to all, as the row's name says; thinning and the tree count once.
+Ours rasters the map once and gathers cells. The baseline keeps the highest point of every 0.5 m voxel (with all points
+it is several times slower), and for each station bins those within 50 m. It is measured at some stations and scaled to
+all, as the row's name says; thinning and the tree count once.
 
 A raster cell counts at its centre, so points within 0.35 m of an edge may move to the next bin. For 2.8 % of the scan
 context's bins and 4.9 % of the co-view's (2.5 and 3.6 with ``--quick``) that is more than 0.5 m; the means are 0.14 and
@@ -155,8 +154,8 @@ def _described(quick: bool) -> Iterator[Row]:
         yield informs(f"{name}, {channel}: cosine distance, mean", float(1 - cosine.mean()), "")
 
 
-def _write(path: Path, points: int, stations: int, block: float) -> None:
-    write_cloud(path, synthetic(points, stations, block))
+def _write(path: Path, *sizes: Any) -> None:
+    write_cloud(path, synthetic(*sizes))
 
 
 def _build(files: Sequence[Path], out: Path, block: float) -> dict[str, Any]:

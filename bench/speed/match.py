@@ -1,13 +1,10 @@
 """The nearest stations to a keyframe, among 9,527 at all 60 shifts, beside the best that NumPy can do.
 
-Both baselines have everything made beforehand that depends on the map: a batched product per frequency over spectra
-laid out for it (``Spectral``), and one product of 60 turned queries with the unit columns of all stations (``Turned``).
-The ratio is against the faster of the two in the same run, one query at a time, BLAS and the kernel with the threads
-that the environment gives them (OPENBLAS_NUM_THREADS, COVIEW_THREADS). Stations and keyframes are those of a simulated
-town (airborne map, ground run), where nothing is pruned easily; ``noise`` are random numbers; ``all alike`` are copies
-of one station, each with noise of 1 in 1000: every station has to be scored. The plain C++ loop
-(``peers/plain_loop.cpp``, -O3) scores every shift of every station one by one, norms of columns taken once; it has one
-thread, so that its ratio is judged where we have one too; its time is the median of three runs, norms included.
+Both baselines (``Spectral``, ``Turned``) have everything made beforehand that depends on the map; the ratio is against
+the faster of the two in the same run, one query at a time. Stations and keyframes are those of a simulated town, where
+nothing is pruned easily; ``noise`` are random numbers; ``all alike`` are copies of one station, each with noise of 1 in
+1000. The plain C++ loop (``peers/plain_loop.cpp``) has one thread, so that its ratio is judged where we have one too;
+its time is the median of three runs, norms included. See docs/performance.md.
 """
 
 from __future__ import annotations

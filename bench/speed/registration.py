@@ -35,16 +35,7 @@ from bench.peers.libraries import SmallGicp, small_gicp
 from coview_kernels import nearest, runtime, transform_unique, warm_up
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import (
-    Pose,
-    inverse,
-    norms,
-    pose_from,
-    rot_z,
-    rotation_angle,
-    to_local,
-    transform,
-)
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, rotation_angle, to_local, transform
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, height_above_lowest
 from coview_stream.localization.registration.register import register
@@ -113,7 +104,7 @@ def places(count: int) -> Iterator[Place]:
 
 
 def _source(points: Floats32, position: Floats) -> RegistrationCloud:
-    near = points.compress(norms(points, position.astype(np.float32)) < REACH, axis=0)
+    near = points[np.linalg.norm(points - position.astype(np.float32), axis=1) < REACH]
     thin, _ = transform_unique(near, np.eye(4), VOXEL)
     height = height_above_lowest(thin)
     some = np.sort(np.random.default_rng(1).permutation(len(thin))[:POINTS])

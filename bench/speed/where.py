@@ -1,8 +1,7 @@
 """Where the time of a step goes while tracking, stage by stage.
 
-The drive of ``python -m bench engine`` with a clock around each stage, median and 95th percentile of wall time over the
-frames that register (about one in nine) and over the others, which take their frame in and answer by odometry. Stages
-that are part of another are indented below it. The clocks cost some microseconds each.
+The drive of ``python -m bench engine`` with a clock around each stage. Stages that are part of another are indented
+below it. The clocks cost some microseconds each.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What goes away in the middle of a stream, what a network does to a node, and what ill-behaved robots do.
-
-The node must live, recover, and count it.
-"""
+"""What goes away in a stream, what a network does to a node, and ill-behaved robots: it must live, recover, count."""
 
 from __future__ import annotations
 

@@ -36,24 +36,20 @@ Kind = Literal["odometry", "cloud"]
 class RobotPlan:
     """What one robot streams from ``begin`` to ``seconds``: clouds and odometry, one each period (0: none).
 
-    Attributes:
-        cloud: codec, as ``odometry``.
-        frame_seconds: how long one frame of the run lasts (recorded: 0.1).
-        points: to which every cloud is resampled.
-        phases: begin and end of something odd. ``late``: each message is followed by one from 0.5 s before; ``twice``:
-            each comes twice; ``reversed``: time runs backwards; ``future``: begins with one message of each kind that
-            claims to be of tomorrow; ``restart``: the stamps are RESTARTED seconds older.
+    ``phases`` are begin and end of something odd. ``late``: each message is followed by one from 0.5 s before;
+    ``twice``: each comes twice; ``reversed``: time runs backwards; ``future``: begins with one message of each kind
+    that claims to be of tomorrow; ``restart``: the stamps are RESTARTED seconds older.
     """
 
     robot: str
     seconds: float
     begin: float = 0.0
-    cloud: str = "xyz"
+    cloud: str = "xyz"  # codec
     odometry: str = "json"
     cloud_period: float = 0.1
     odometry_period: float = 0.02
-    frame_seconds: float = 0.1
-    points: int | None = None
+    frame_seconds: float = 0.1  # how long one frame of the run lasts (recorded: 0.1)
+    points: int | None = None  # to which every cloud is resampled
     phases: Mapping[Phase, tuple[float, float]] = field(default_factory=dict)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import signal
 import sys
 import time
@@ -11,11 +13,11 @@ from pathlib import Path
 from subprocess import STDOUT
 from typing import Any, NamedTuple
 
-import numpy as np
 import psutil
 
 from bench.harness.rows import Row, judged
 from bench.harness.suite import ROOT, environment
+from bench.harness.trajectory_scores import rms
 from bench.stream import scores
 from bench.stream.drive import Drive, RobotPlan
 from bench.stream.processes import Helper, Recorder, Sent, free_port, route, send, wait_until
@@ -162,10 +164,8 @@ class Stage:
         """Resident memory of the family, MB; pages shared between its processes count once per process."""
         total = 0
         for member in self.family():
-            try:
+            with contextlib.suppress(psutil.Error):  # it ended in the meantime
                 total += member.memory_info().rss
-            except psutil.Error:  # it ended in the meantime
-                continue
         return total / 1e6
 
     def log_lines(self) -> list[str]:
@@ -213,15 +213,13 @@ class Stage:
         ticks = scores.tracking_intervals(recorder.ticks(start, end), [], without)
         puts = sent.puts[plan.robot]
         last = told[-1].fields if told else {}
-        states = [status.state for status in told]
-        rms = [float(np.sqrt(np.mean(part**2))) for part in (metres, degrees)] if poses else None
         return {
             "poses": len(poses),
             "unreadable": recorder.unreadable,
             "false": scores.false_poses(metres, degrees),
             "first_fix_s": arrivals[0] - start if poses else None,
             "first_fix_m": drive.metres(poses[0].stamp_ns) if poses else None,
-            "rmse_m_deg": rms,
+            "rmse_m_deg": [rms(metres), rms(degrees)] if poses else None,
             "worst_m_deg": [float(metres.max()), float(degrees.max())] if poses else None,
             "rate_hz": scores.rate_hz(intervals),
             "jitter_ms": scores.jitter_ms(intervals),
@@ -229,7 +227,7 @@ class Stage:
             "steps_back": scores.steps_back([pose.stamp_ns for pose in poses]),
             "share_posed": scores.share_posed(arrivals, arrivals[0], end) if poses else 0.0,
             "cloud_to_pose_ms": scores.percentiles_ms(scores.reaction(puts, scores.corrected(poses)), 50, 95, 99),
-            "states": [state for k, state in enumerate(states) if k == 0 or state != states[k - 1]],
+            "states": [state for state, _ in itertools.groupby(status.state for status in told)],
             "counters": last.get("counters"),
             "node_errors": last.get("errors"),
             "clouds_sent": len(puts),

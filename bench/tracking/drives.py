@@ -39,25 +39,15 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class Drive:
-    """Frames as the robot gets them.
+    """Frames as the robot gets them."""
 
-    Attributes:
-        frames: (K,) which of the recorded ones.
-        stamps: (K,) seconds.
-        truth: (K, 4, 4) map <- body.
-        odometry: (K, 4, 4) odom <- body.
-        driven: (K,) metres on its own wheels up to each frame.
-        cover: (K,) what lies over the sensor.
-        events: what to recover from.
-    """
-
-    frames: Ints
-    stamps: Floats
-    truth: Floats
-    odometry: Floats
-    driven: Floats
-    cover: Ints
-    events: tuple[Event, ...] = ()
+    frames: Ints  # (K,) which of the recorded ones
+    stamps: Floats  # (K,) seconds
+    truth: Floats  # (K, 4, 4) map <- body
+    odometry: Floats  # (K, 4, 4) odom <- body
+    driven: Floats  # (K,) metres on its own wheels up to each frame
+    cover: Ints  # (K,) what lies over the sensor
+    events: tuple[Event, ...] = ()  # what to recover from
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -167,8 +167,7 @@ def _events(drives: Sequence[Figures]) -> list[str]:
     ends: list[str] = []
     for figures in drives:
         name = figures["name"]
-        reasons: Counter[str] = Counter(figures["reasons"])
-        lines += [f"- {name}: lost {n} x, {reason}" for reason, n in reasons.most_common()]
+        lines += [f"- {name}: lost {n} x, {reason}" for reason, n in Counter(figures["reasons"]).most_common()]
         for event in figures["events"]:
             m, s = event["recovery_m"], event["recovery_s"]
             back = "never right again" if m is None else f"right after {m:.1f} m, {s:.1f} s"

@@ -40,20 +40,15 @@ _SELF = "bench/tracking/worlds.py"
 
 
 class World(NamedTuple):
-    """A place and a drive of ``length`` metres at ``speed`` m/s, and how far the odometry of its plain run drifts.
+    """A place and a drive of ``length`` metres at ``speed`` m/s, and how far the odometry of its plain run drifts."""
 
-    Attributes:
-        kind: town, campus or sparse-forest (120 stems per hectare, a third of the simulator's forest).
-        drift: share of the distance, over 100 m (see :func:`bench.tracking.drives.drift_share`).
-    """
-
-    kind: str
+    kind: str  # town, campus or sparse-forest (120 stems per hectare, a third of the simulator's forest)
     sensor: str
     seed: int
     size: float
     length: float
     speed: float
-    drift: float
+    drift: float  # share of the distance, over 100 m (see :func:`bench.tracking.drives.drift_share`)
 
     @property
     def name(self) -> str:
