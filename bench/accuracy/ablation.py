@@ -30,7 +30,7 @@ from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import SimulationConfig
 
 SEEDS = tuple(range(2101, 2109))
-"""Held out: nobody tunes on them, nor on those of ``python -m bench accuracy``."""
+"""Held out: not for tuning, as those of ``python -m bench accuracy``."""
 
 _LENGTH = 24.0  # metres driven in each world
 _RING_KEY = RetrievalConfig(mode="ring_key")

@@ -22,7 +22,7 @@ from bench.harness.files import remembered
 from bench.harness.rows import Row, failed, informs
 from coview_stream import BaseMap
 
-FIRST_SEED = 20_000  # nobody trains or tunes on the seeds from here on
+FIRST_SEED = 20_000  # seeds from here on are neither for training nor for tuning
 RADIUS = 30.0
 """Metres: virtual scans reach as far as the queries do, so that the descriptors compare like with like."""
 
