@@ -13,7 +13,7 @@ from coview_stream.sim.mesh import Mesh, height_field
 
 _LOOP_STEP = 0.25  # metres between points of the route
 _STREET_STEP = 1.0  # metres between points of a street
-_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb
+_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb; set by hand
 
 
 @dataclass(frozen=True)

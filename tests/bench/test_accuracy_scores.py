@@ -123,7 +123,7 @@ def test_variants_differ_from_the_default_and_from_each_other():
     assert ablation.VARIANTS[0] == Variant(ablation.VARIANTS[0].name)
 
 
-def test_tracking_is_measured_where_nobody_tunes():
+def test_tracking_seeds_are_not_those_of_tuning():
     assert len({each.name for each in scenarios()}) == len(scenarios())
     assert {each.world.seed for each in scenarios()} == set(range(5001, 5011))
     assert not TUNED_SEEDS & {each.world.seed for each in scenarios()}

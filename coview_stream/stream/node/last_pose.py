@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 VERSION = 1
 
 _FORMAT = "coview_stream last pose"
-_MAX_BYTES = 65_536  # of a file; what we write has 500
-_MAX_NAME = 60  # characters of a robot's name in that of its file
+_MAX_BYTES = 65_536  # of a file; what we write has 500; set by hand
+_MAX_NAME = 60  # characters of a robot's name in that of its file; set by hand
 
 
 @dataclass(frozen=True)

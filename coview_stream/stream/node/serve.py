@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("coview_stream.node")
 
 # the engines stand back: the pose clock and the receiving threads are in this process; set by hand
-_ODOMETRY_NICE = 2  # every pose waits for it
+_ODOMETRY_NICE = 2  # every pose waits for it; all three set by hand
 _TRACK_NICE = 4
 _SEARCH_NICE = 10
 

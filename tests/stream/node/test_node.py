@@ -18,20 +18,6 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.node.counters import Counters
 
 
-@pytest.fixture
-def site():
-    made = Site("r1")
-    made.node.declare()
-    return made
-
-
-@pytest.fixture
-def pair():
-    made = Site("r1", "r2")
-    made.node.declare()
-    return made
-
-
 def test_node_declares_keys_with_urgencies(pair):
     assert pair.net.subscribed == {
         "coview/r1/in/cloud": "newest",

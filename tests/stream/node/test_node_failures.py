@@ -18,20 +18,6 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.node.engine_process import DiedError
 
 
-@pytest.fixture
-def site():
-    made = Site("r1")
-    made.node.declare()
-    return made
-
-
-@pytest.fixture
-def pair():
-    made = Site("r1", "r2")
-    made.node.declare()
-    return made
-
-
 def test_failures_of_one_robot_do_not_affect_others(pair):
     rng = np.random.default_rng(5)
     pair.engine.failing["r1"] = ZeroDivisionError("boom")

@@ -6,7 +6,6 @@ import json
 import time
 
 import numpy as np
-import pytest
 from fake_node import STEP, Site
 from fake_robot import SHA, T_MAP_ODOM, message, ns
 from small_world import pose_error
@@ -17,13 +16,6 @@ from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.messages.validation import read_attachment
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine
 from coview_stream.stream.transport.rmw import NO_HASH, gid_of
-
-
-@pytest.fixture
-def site():
-    made = Site("r1")
-    made.node.declare()
-    return made
 
 
 def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
