@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -108,10 +107,15 @@ def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = m
             stderr=subprocess.STDOUT, start_new_session=True,  # so that its own children end with it
         )  # fmt: skip
         os.close(write)
-        watch = threading.Timer(min(limit_s, threading.TIMEOUT_MAX), _end, (process,))
+        late, count = threading.Event(), 0
+
+        def end_late() -> None:
+            late.set()
+            _end(process)
+
+        watch = threading.Timer(min(limit_s, threading.TIMEOUT_MAX), end_late)
         watch.daemon = True
         watch.start()
-        begin, count = time.monotonic(), 0
         try:
             for line in pipe:
                 if line.endswith("\n"):  # not cut off
@@ -127,8 +131,7 @@ def run(name: str, words: Sequence[str], threads: int | None, limit_s: float = m
         if code == 2 and tail:
             raise CoViewError(tail[-1].removeprefix(f"bench {name}: "))
         if code < 0:
-            late = time.monotonic() - begin >= limit_s
-            why = f"ran past its {limit_s:g} s" if late else f"ended by signal {signal.Signals(-code).name}"
+            why = f"ran past its {limit_s:g} s" if late.is_set() else f"ended by signal {signal.Signals(-code).name}"
         else:
             why = f"ended with exit code {code}" if code else "" if count else "yielded no row"
         if why:
