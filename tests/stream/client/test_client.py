@@ -288,8 +288,9 @@ def test_client_over_real_sockets():
     try:
         with RobotClient("r1", endpoint) as robot:
             assert not robot.wait_for_node(0.05)
-            node.subscribe("coview/r1/in/cloud", lambda s: clouds.append(decode_cloud(s)), "newest")
+            # odometry first, as the node does: the client waits for a subscriber to its clouds
             node.subscribe("coview/r1/in/odom", lambda s: odometry.append(decode_odometry(s)), "all")
+            node.subscribe("coview/r1/in/cloud", lambda s: clouds.append(decode_cloud(s)), "newest")
             node.answer("coview/r1/rpc/reset", lambda parameters: {"ok": True})
             pose_out = node.publisher("coview/r1/out/pose", "realtime")
             status_out = node.publisher("coview/r1/out/status", "data")
