@@ -26,6 +26,8 @@ from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.smallest_distance import SmallestDistance
+from coview_stream.localization.search.votes import TableVote
 from coview_stream.recordings.open_run import open_run
 
 WINDOW = 5  # keyframes that vote together in the coarse measure
@@ -109,13 +111,19 @@ class _Search:
 
     def __init__(self, variant: Variant, base_map: BaseMap) -> None:
         self.variant, self.places = variant, Places()
-        config = base_map.stations, base_map.config.block
-        self._alone = Consensus(*config, replace(variant.consensus, window=1, mode="consensus"))
-        self._window = Consensus(*config, replace(variant.consensus, window=WINDOW))
+        grid, window = base_map.station_grid, replace(variant.consensus, window=WINDOW)
+        self._alone = Consensus(grid, replace(variant.consensus, window=1))
+        self._window: Consensus | SmallestDistance = (
+            SmallestDistance(grid.stations, window) if window.mode == "single" else Consensus(grid, window)
+        )
 
     def vote(self, seen: Seen, centre: Floats, volumes: dict[Channel, Floats32]) -> None:
-        self._alone.vote(centre, volumes)
-        self._window.vote(centre, volumes)
+        vote = TableVote.of_distances(centre, volumes.values())
+        self._alone.vote(vote)
+        if isinstance(self._window, SmallestDistance):
+            self._window.vote(centre, volumes.values())
+        else:
+            self._window.vote(vote)
         self.places.keyframes += 1
         self.places.top1 += right(self._alone.hypotheses()[0].T_map_odom, seen)
         if len(self._window) == WINDOW:

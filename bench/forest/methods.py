@@ -17,9 +17,10 @@ from coview_stream.descriptors.birds_eye_view import CELL, SLABS, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points, Pose, rot_z, to_local, transform
-from coview_stream.localization.search.consensus import Consensus, Hypothesis, robust_zscore
+from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.votes import TableVote, robust_zscore
 
 METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "keypoints", "verified")
 """In the tables' order."""
@@ -96,8 +97,8 @@ class Methods:
         with clock("correlation"):
             volume = self._learned.distances(view)
             peaks = replace(self.config.consensus, mode="consensus", peaks=self.config.learned.peaks)
-            consensus = Consensus(stations, self.base_map.config.block, peaks)
-            consensus.vote(centre, {"learned": volume})
+            consensus = Consensus(self.base_map.station_grid, peaks)
+            consensus.vote(TableVote.of_distances(centre, [volume]))
             voted = [replace(each, learned=True) for each in consensus.hypotheses()]
         with clock("keypoints"):
             sharpened = self._learned.refine(voted, view)

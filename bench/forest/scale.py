@@ -25,6 +25,7 @@ from bench.harness.clock import Clock
 from bench.harness.rows import Row, bounded
 from bench.harness.tables import number, table
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.geometry.arrays import Bools, Floats32, Ints
@@ -32,6 +33,7 @@ from coview_stream.geometry.transforms import pose_from, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.votes import TableVote
 
 LIMITS = {10: 0.4, 32: 3.0}  # seconds allowed to a query, by tiles of 32 m along the edge: 0.10 and 1.05 km2
 CUT = 4  # tiles along the edge of what is repeated
@@ -99,7 +101,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         assert learned is not None
         learned.prepare()
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
-        consensus = Consensus(large.stations, base_map.config.block, peaks)
+        consensus = Consensus(StationGrid(large.stations, base_map.config.block), peaks)
         prepared = time.perf_counter() - begin
         spent: list[list[float]] = []
         for query in [queries[0], *queries * _REPEAT]:
@@ -111,7 +113,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
             with clock("correlation"):
                 volume = learned.distances(view)
             with clock("consensus"):
-                consensus.vote(centre, {"learned": volume})
+                consensus.vote(TableVote.of_distances(centre, [volume]))
                 named = consensus.hypotheses()
             with clock("keypoint refinement"):
                 named = learned.refine(named, view)

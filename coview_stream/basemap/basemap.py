@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.basemap import file_format, tiles
+from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
 from coview_stream.errors import ConfigError, CoViewError, MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
@@ -121,6 +122,11 @@ class BaseMap:
     def stations(self) -> Floats32:
         """(M, 3) ground positions, relative to :attr:`origin`."""
         return np.array(self._arrays["stations"])
+
+    @cached_property
+    def station_grid(self) -> StationGrid:
+        """Look-up of stations by position."""
+        return StationGrid(self.stations, self.config.block)
 
     @property
     def points(self) -> Floats32:

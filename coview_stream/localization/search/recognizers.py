@@ -12,6 +12,8 @@ from coview_stream.descriptors.coview import Descriptor, describe, on_ground
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.smallest_distance import SmallestDistance
+from coview_stream.localization.search.votes import TableVote
 
 if TYPE_CHECKING:  # imports SciPy, which takes a while
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
@@ -88,7 +90,12 @@ class CoViewRecognizer:
         self.base_map = base_map
         self.config = config
         self.retrieval = retrieval
-        self.consensus = Consensus(base_map.stations, base_map.config.block, replace(config.consensus, peaks=peaks))
+        consensus = replace(config.consensus, peaks=peaks)
+        self.consensus: Consensus | SmallestDistance = (
+            SmallestDistance(base_map.stations, consensus)
+            if consensus.mode == "single"
+            else Consensus(base_map.station_grid, consensus)
+        )
         self.last_query: dict[Channel, Descriptor] = {}
 
     def vote(self, request: SearchRequest) -> None:
@@ -98,10 +105,11 @@ class CoViewRecognizer:
             return
         centre = on_ground(request.scan, request.position) if descriptor.ground_zero else request.position
         self.last_query = describe(request.scan, centre, descriptor)
-        if self.config.consensus.mode == "single":
-            self.consensus.vote_nearest(centre, self.retrieval.best(self.last_query, 1), descriptor.sectors)
+        volumes = self.retrieval.distances(self.last_query).values()
+        if isinstance(self.consensus, SmallestDistance):
+            self.consensus.vote(centre, volumes)
         else:
-            self.consensus.vote(centre, self.retrieval.distances(self.last_query))
+            self.consensus.vote(TableVote.of_distances(centre, volumes))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks."""

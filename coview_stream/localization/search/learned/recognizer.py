@@ -14,6 +14,7 @@ from coview_stream.geometry.transforms import pose_from, transform, wrap_angle, 
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.votes import TableVote
 
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other; set by hand
 
@@ -25,7 +26,7 @@ class LearnedRecognizer:
         self.config = config
         self.learned = learned
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
-        self.consensus = Consensus(base_map.stations, base_map.config.block, peaks)
+        self.consensus = Consensus(base_map.station_grid, peaks)
         self._query: QueryFeatures | None = None
 
     def vote(self, request: SearchRequest) -> None:
@@ -35,7 +36,7 @@ class LearnedRecognizer:
         centre = on_ground(request.surroundings, request.position)
         self._query = self.learned.encode(request.surroundings, centre)
         hinted = [transform(T, request.position[None])[0, :2] for T in request.hints]
-        self.consensus.vote(centre, {"learned": self.learned.distances(self._query, hinted)})
+        self.consensus.vote(TableVote.of_distances(centre, [self.learned.distances(self._query, hinted)]))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks on every storey that they may be on, refined by keypoints."""
@@ -57,7 +58,8 @@ class LearnedRecognizer:
         """Return a peak, and the same at the stations above and below: from above they look alike."""
         if peak.station is None:
             return [peak]
-        stations, own = self.consensus.stations, self.consensus.stations[peak.station]
+        stations = self.consensus.grid.stations
+        own = stations[peak.station]
         others = np.flatnonzero((np.abs(stations[:, :2] - own[:2]) < 0.25 * self.consensus.grid.block).all(axis=1))
         rises = {int(k): float(stations[k, 2] - own[2]) for k in others if k != peak.station}
         return [peak] + [

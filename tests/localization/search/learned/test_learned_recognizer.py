@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.geometry.transforms import transform
 from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
@@ -29,7 +30,7 @@ def named(heights, peaks=5):
         distances=lambda view, suggested: np.tile(flat, (len(heights), 1)),
         refine=lambda hypotheses, view: hypotheses,
     )
-    source = LearnedRecognizer(SimpleNamespace(stations=stations, config=SimpleNamespace(block=2.0)), config, learned)
+    source = LearnedRecognizer(SimpleNamespace(station_grid=StationGrid(stations, 2.0)), config, learned)
     ground = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32) * (1, 1, 0)
     body = np.eye(4)
     body[2, 3] = 1.5

@@ -9,6 +9,7 @@ import pytest
 from planted_features import LOW, SECTORS, TILES, Planted
 from scipy import ndimage
 
+from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import ConsensusConfig, LearnedConfig
 from coview_stream.descriptors.feature_build import feature_arrays
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
@@ -16,6 +17,7 @@ from coview_stream.descriptors.network import Features
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.votes import TableVote
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +62,12 @@ def test_votes_of_keyframes_add_up_at_the_newest(planted, known, stations):
     """Each alone is hardly to be told from noise; odometry lays them on each other."""
     yaw, start = -2 * np.pi * 11 / SECTORS, np.array([-21.0, 41.0])
     T = pose_from(rot_z(yaw), [*start, 0.0])
-    consensus = Consensus(stations[:-1], 2.0, ConsensusConfig())
+    consensus = Consensus(StationGrid(stations[:-1], 2.0), ConsensusConfig())
     for k in range(5):
         centre = np.array([4.0 * k, 1.0 * k, 0.0])
         there = transform(T, centre[None])[0]
         view = planted.seen(there[:2], yaw, centre, noise=3.0, seed=k)
-        consensus.vote(centre, {"learned": known.distances(view)[:-1]})
+        consensus.vote(TableVote.of_distances(centre, [known.distances(view)[:-1]]))
     best = consensus.hypotheses()[0]
     assert np.linalg.norm(transform(best.T_map_odom, centre[None])[0] - there)[None] < 2.0
     assert abs(wrap_angle(yaw_of(best.T_map_odom) - yaw)) < np.radians(6)
@@ -158,8 +160,8 @@ def test_clouds_to_pose_end_to_end(map_points, monkeypatch, xy, degrees):
         gap = transform(hypothesis.T_map_odom, centre[None])[0] - place
         return np.hypot(*gap[:2]), np.degrees(abs(wrap_angle(yaw_of(hypothesis.T_map_odom) - yaw)))
 
-    consensus = Consensus(stations, 2.0, ConsensusConfig())
-    consensus.vote(centre, {"learned": known.distances(view)})
+    consensus = Consensus(StationGrid(stations, 2.0), ConsensusConfig())
+    consensus.vote(TableVote.of_distances(centre, [known.distances(view)]))
     metres, turn = errors(consensus.hypotheses()[0])
     assert metres < 2.0
     assert turn < 8.0
