@@ -67,6 +67,7 @@ BENCHMARKS = {
     "forest_scale": Benchmark("forest.scale", "time of a learned query on 0.1 and 1 km2"),
     "forest_plot": Benchmark("forest.plot", "a real plot among real airborne tiles"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
+    "many": Benchmark("stream.many_robots", "sixteen robots on one node, of which eight search without end"),
 }
 """Name, and what it is; in the suite's order."""
 
