@@ -59,6 +59,10 @@ class LidarSession(Session):
         with self._lock:
             return self._lidar_frames.take(self._odometry_epoch)
 
+    def has_job(self, engine: str) -> bool:
+        """As of a session."""
+        return self._lidar_frames.has_frame if engine == "odometry" else super().has_job(engine)
+
     def handle_result(self, job: Job, result: Result, now: float) -> None:
         """As of a session; the odometry of a frame is added like odometry that was sent, and the frame after it."""
         if not (isinstance(job, OdometryJob) and isinstance(result, OdometryResult)):
@@ -165,9 +169,14 @@ class LidarFrameQueue:
             self._waiting.append(LidarFrame(message, now))
         return kind
 
+    @property
+    def has_frame(self) -> bool:
+        """Whether a frame may be taken."""
+        return self._under_way is None and len(self._waiting) > 0
+
     def take(self, epoch: int) -> OdometryJob | None:
         """Hand out the oldest frame; None while one is under way."""
-        if self._under_way is not None or not self._waiting:
+        if not self.has_frame:
             return None
         self._under_way = self._waiting.popleft()
         message = self._under_way.message

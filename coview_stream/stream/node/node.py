@@ -19,7 +19,7 @@ from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.node.counters import last_line
 from coview_stream.stream.node.engine_process import DiedError, EngineRunner, FailedError, RejectedError
 from coview_stream.stream.node.jobs import Job
-from coview_stream.stream.node.scheduling import Rate, RoundRobin
+from coview_stream.stream.node.scheduling import Rate, RoundRobin, search_order
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
 from coview_stream.stream.transport import rmw
@@ -32,7 +32,7 @@ _ROS_NODE = "coview_stream"
 _MAX_POSE_TICKS = 200.0  # of the pose clock, per second; set by hand, as are those below
 _MAX_RESTART_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
 _ERROR_PAUSE = 0.2  # seconds after an unexpected error
-_IDLE_WAIT = 0.05  # seconds; an engine without work is woken earlier by any message
+_IDLE_WAIT = 0.05  # seconds; an engine without work is woken earlier by a job
 _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish what they are at
 
@@ -68,14 +68,14 @@ class Node:
         self._engines = {"track": track, "search": search} | ({"odometry": odometry} if odometry else {})
         self._turns = {name: RoundRobin(len(self.sessions)) for name in self._engines}
         self._deaths = dict.fromkeys(self._engines, 0)  # in a row
-        self._wake = threading.Condition()
+        self._wake = {name: threading.Event() for name in self._engines}  # there may be a job
         self._errors = RateLimitedErrors(log)
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._background = dict(background or {})
         self._reporter = Reporter(self.sessions, transport, self._errors)
         self._robots = [
-            RobotEndpoints(session, transport, self._reporter, self._wake_engines, pose_format)
+            RobotEndpoints(session, transport, self._reporter, self._wake_engines_for, pose_format)
             for session in self.sessions
         ]
         self._ending: threading.Thread | None = None
@@ -112,7 +112,8 @@ class Node:
         if not self._stopping.is_set():
             self._stopping.set()
             self._reporter.changed.set()
-            self._wake_engines()
+            for wake in self._wake.values():
+                wake.set()
             self._ending = threading.Thread(target=self._end, name="coview-end", daemon=True)
             self._ending.start()
         if self._ending is not None:
@@ -131,9 +132,11 @@ class Node:
 
     # ---- the engines, each fed by a thread of its own
 
-    def _wake_engines(self) -> None:
-        with self._wake:
-            self._wake.notify_all()
+    def _wake_engines_for(self, session: Session) -> None:
+        """Wake the engines that have a job of a robot: not all at every message, of which there may be thousands."""
+        for engine, wake in self._wake.items():
+            if session.has_job(engine):
+                wake.set()
 
     def _feed(self, engine: str) -> None:
         while not self._stopping.is_set():
@@ -143,19 +146,21 @@ class Node:
                 self._stopping.wait(_ERROR_PAUSE)
 
     def _feed_one(self, engine: str) -> None:
+        self._wake[engine].clear()  # before looking: what comes from now on sets it again
         found = self.next_job(engine)
         if found is not None:
             self.work(engine, *found)
-            return
-        with self._wake:
-            self._wake.wait(timeout=_IDLE_WAIT)
+        else:
+            self._wake[engine].wait(timeout=_IDLE_WAIT)
 
     def next_job(self, engine: str) -> tuple[Session, Job] | None:
         """Return whose turn it is at an engine, and the job; None if there is nothing to do."""
-        turns, urgent = self._turns[engine], None
-        if engine == "search":  # with a candidate a few more searches will do; all others start from nothing
-            urgent = [session.has_candidate() for session in self.sessions]
-        for k in turns.order(urgent):
+        turns = self._turns[engine]
+        if engine == "search":
+            order = search_order([session.search_demand for session in self.sessions], time.monotonic())
+        else:
+            order = [k for k in turns.order() if self.sessions[k].has_job(engine)]
+        for k in order:
             session = self.sessions[k]
             job = _take_job(session, engine)
             if job is not None:
@@ -186,7 +191,7 @@ class Node:
             self._deaths[engine] = 0
             session.handle_result(job, result, time.monotonic())
             self._reporter.report_change(session)
-            self._wake_engines()  # a frame may have asked for a search
+            self._wake_engines_for(session)  # a frame may have asked for a search
 
     def _engine_died(self, engine: str, error: DiedError) -> None:
         why = last_line(str(error))
@@ -232,7 +237,7 @@ class RobotEndpoints:
         session: of the robot.
         transport: where everything is declared.
         reporter: publishes the robot's status.
-        wake_engines: called when there may be a job.
+        wake_engines: called with the session when there may be a job.
         pose_format: codec of the poses; None leaves it to the robot's keys.
     """
 
@@ -241,7 +246,7 @@ class RobotEndpoints:
         session: Session,
         transport: Transport,
         reporter: Reporter,
-        wake_engines: Callable[[], None],
+        wake_engines: Callable[[Session], None],
         pose_format: str | None = None,
     ) -> None:
         self.session = session
@@ -278,12 +283,12 @@ class RobotEndpoints:
     def on_cloud(self, sample: Sample) -> None:
         """Take in a cloud."""
         self.session.on_cloud(sample, time.monotonic())
-        self._wake_engines()
+        self._wake_engines(self.session)
 
     def on_odometry(self, sample: Sample) -> None:
         """Take in an odometry sample."""
         self.session.on_odometry(sample, time.monotonic())
-        self._wake_engines()
+        self._wake_engines(self.session)
 
     def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/relocalize``."""

@@ -68,11 +68,6 @@ class RobotState:
         return self._fix is not None and self._fix.state.has_place
 
     @property
-    def has_candidate(self) -> bool:
-        """Whether the search has proposed a place that only needs confirmation."""
-        return self._fix is not None and self._fix.state is State.AMBIGUOUS
-
-    @property
     def requires_verification(self) -> bool:
         """Whether a frame has to verify the place before there is a pose again."""
         return self._verify_from_ns is not None

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+
+# of searches; set by hand
+_PATIENCE = 2.0  # seconds that a keyframe waits before it comes before all that have waited less
+_NEW = 8  # searches in which a robot counts as newly lost; most are found within them
+_MAX_SUPPORT = 16  # searches in a row that propose a place: with more, the map has another one like it
 
 
 class RoundRobin:
     """Order in which robots are served by one engine: who has waited longest first.
-
-    Every second time the urgent ones come first; no robot is passed over for long.
 
     Args:
         count: of robots; they are numbered from 0.
@@ -18,19 +22,52 @@ class RoundRobin:
         self._last_turn = [0] * count
         self._turns = 0
 
-    def order(self, urgent: Sequence[bool] | None = None) -> list[int]:
+    def order(self) -> list[int]:
         """Return the robots in the order in which they may be served now."""
-        preferred = urgent if self._turns % 2 == 0 else None
-
-        def rank(k: int) -> tuple[bool, int]:
-            return preferred is not None and not preferred[k], self._last_turn[k]
-
-        return sorted(range(len(self._last_turn)), key=rank)
+        return sorted(range(len(self._last_turn)), key=self._last_turn.__getitem__)
 
     def serve(self, k: int) -> None:
         """Count the turn that robot ``k`` has now."""
         self._turns += 1
         self._last_turn[k] = self._turns
+
+
+@dataclass(frozen=True)
+class SearchDemand:
+    """One robot's demand to be searched for: a keyframe of it waits.
+
+    Attributes:
+        since: local time in seconds from which a keyframe has been waiting, be it this one or one that it replaced.
+        searches: how many there were since the robot was lost.
+        support: how many of the newest of them, in a row, proposed a place.
+    """
+
+    since: float
+    searches: int = 0
+    support: int = 0
+
+
+def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
+    """Return which robots of ``demands`` want a search, in the order in which they are to have it.
+
+    A keyframe that has waited for two seconds comes first, the oldest of them before the others: so nobody waits much
+    longer, unless the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been
+    proposed comes before those that are newly lost, for it needs the fewest searches until it needs none, and these
+    before those that have searched in vain for long.
+
+    Args:
+        demands: of each robot; None for one that wants nothing.
+        now: local time in seconds.
+    """
+
+    def rank(demand: SearchDemand) -> tuple[bool, int, bool, float]:
+        overdue = now - demand.since >= _PATIENCE
+        support = demand.support if demand.support <= _MAX_SUPPORT and not overdue else 0
+        new = overdue or demand.searches < _NEW
+        return not overdue, -support, not new, demand.since
+
+    wanted = [(rank(demand), k) for k, demand in enumerate(demands) if demand is not None]
+    return [k for _, k in sorted(wanted)]
 
 
 class Rate:

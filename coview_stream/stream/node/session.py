@@ -22,6 +22,7 @@ from coview_stream.stream.node.frame_sync import FrameSync
 from coview_stream.stream.node.jobs import FrameJob, FrameResult, Job, OdometryJob, Result, SearchJob
 from coview_stream.stream.node.last_pose import LastKnownPose, PoseHint
 from coview_stream.stream.node.robot_state import RobotState, StateHistory
+from coview_stream.stream.node.scheduling import SearchDemand
 from coview_stream.stream.transport.keys import RobotKeys
 
 
@@ -213,9 +214,16 @@ class Session:
         """Hand a frame to the odometry engine; None, for the robot sends its odometry."""
         return None
 
-    def has_candidate(self) -> bool:
-        """Whether the search has proposed a place that only needs confirmation."""
-        return self.robot_state.has_candidate
+    def has_job(self, engine: str) -> bool:
+        """Whether there is a job for ``track``, ``search`` or ``odometry``; without the lock: perhaps no more."""
+        if engine == "track":
+            return self.queue.has_frame
+        return engine == "search" and self.search_demand is not None
+
+    @property
+    def search_demand(self) -> SearchDemand | None:
+        """Demand for a search, as :attr:`EngineQueue.search_demand`; without the lock."""
+        return self.queue.search_demand
 
     def handle_result(self, job: Job, result: Result, now: float) -> None:
         """Apply the result of a job at local time ``now``: a fix at once, that of a search with the next frame."""
@@ -227,7 +235,7 @@ class Session:
                     self.robot_state.add_fix(result.fix, frame, result.events)
                     self._record_state()
             elif isinstance(job, SearchJob) and isinstance(result, SearchResult):
-                self.queue.search_done(job, result)
+                self.queue.search_done(job, result, now)
 
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
         """Count a job without a result; unless it was ``rejected``, its engine has forgotten the robot."""

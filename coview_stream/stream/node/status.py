@@ -132,6 +132,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "latency_ms": queue.latency.to_json(),
         "engine_ms": queue.engine_latency.to_json(),
         "longest_wait_s": round(queue.longest_wait, 3),
+        "longest_search_wait_s": round(queue.longest_search_wait, 3),
         "counters": session.counters.to_json(),
         "connection": {"routers": list(connection.routers), "peers": list(connection.peers), "reconnects": reconnects},
         "errors": list(session.errors.texts),

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from fake_robot import POINTS, ns, pose, search_request, search_result, tracking, unknown
 
+from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.state import State
 from coview_stream.messages.types import CloudMessage
 from coview_stream.stream.node.counters import Counters, ErrorLog
 from coview_stream.stream.node.engine_queue import EngineQueue
 from coview_stream.stream.node.frame_sync import PairedFrame
 from coview_stream.stream.node.jobs import SearchJob
+from coview_stream.stream.node.scheduling import SearchDemand
 
 EPOCH = 4  # after resets: the first of this queue
 NOW = 1000.0
@@ -40,9 +44,13 @@ class Queue(EngineQueue):
         self.put(seconds, now)
         return self.take_frame(False, **more)
 
-    def search(self, seconds=0.0):
+    def ask(self, seconds=0.0, now=NOW, restart=1):
+        """Queue a search request."""
+        self.put_search_request(replace(search_request(seconds), epoch=(self.epoch, restart)), now)
+
+    def search(self, seconds=0.0, now=NOW, restart=1):
         """Queue a search request and hand it out."""
-        self.put_search_request(replace(search_request(seconds), epoch=(self.epoch, 1)))
+        self.ask(seconds, now, restart)
         return self.take_search_request()
 
 
@@ -125,7 +133,7 @@ def test_jobs_from_before_a_reset_are_ignored(queue):
     search = SearchJob("r1", replace(search_request(), epoch=(EPOCH - 1, 1)))
     assert queue.frame_done(old, tracking(old), NOW) is None
     assert not queue.frame_failed(old, "boom", rejected=True)
-    queue.search_done(search, search_result())
+    queue.search_done(search, search_result(), NOW)
     queue.search_failed(search, "boom")
     assert queue.counted == {}
     assert list(queue.errors.texts) == []
@@ -149,7 +157,7 @@ def test_newest_search_request_replaces_the_one_that_waits(queue):
     assert job.request.stamp == 0.0
     for k in (1, 2):
         assert queue.search(0.1 * k) is None  # one is under way
-    queue.search_done(job, search_result())
+    queue.search_done(job, search_result(), NOW)
     assert queue.take_search_request().request.stamp == 0.2
     assert queue.counted == {"searches_skipped": 1, "searches": 1}
 
@@ -162,7 +170,7 @@ def test_request_of_a_fix_is_queued(queue):
 
 def test_search_result_goes_with_the_next_frame_once(queue):
     result = search_result()
-    queue.search_done(queue.search(), result)
+    queue.search_done(queue.search(), result, NOW)
     job = queue.take(0.0)
     assert job.search_result is result
     queue.frame_done(job, unknown(job), NOW)
@@ -171,16 +179,16 @@ def test_search_result_goes_with_the_next_frame_once(queue):
 
 def test_search_result_of_a_rejected_frame_goes_with_the_next_one_too(queue):
     result = search_result()
-    queue.search_done(queue.search(), result)
+    queue.search_done(queue.search(), result, NOW)
     assert queue.frame_failed(queue.take(0.0), "too few points", rejected=True)
     assert queue.take(0.1).search_result is result
 
 
 def test_newer_search_result_replaces_that_of_a_rejected_frame(queue):
     newer = search_result(0.1)
-    queue.search_done(queue.search(), search_result(0.0))
+    queue.search_done(queue.search(), search_result(0.0), NOW)
     job = queue.take(0.0)
-    queue.search_done(queue.search(0.1), newer)
+    queue.search_done(queue.search(0.1), newer, NOW)
     queue.frame_failed(job, "too few points", rejected=True)
     assert queue.take(0.1).search_result is newer
 
@@ -189,13 +197,13 @@ def test_newer_search_result_replaces_that_of_a_rejected_frame(queue):
 def test_only_an_accepted_search_result_is_kept_over_a_later_one(queue, accepted):
     first, second = search_result(0.0, accepted=accepted), search_result(1.0)
     for result in (first, second):
-        queue.search_done(queue.search(), result)
+        queue.search_done(queue.search(), result, NOW)
     assert queue.take(0.0).search_result is (first if accepted else second)
 
 
 def test_failed_search_keeps_an_accepted_result(queue):
     accepted = search_result(accepted="a place")
-    queue.search_done(queue.search(), accepted)
+    queue.search_done(queue.search(), accepted, NOW)
     queue.search_failed(queue.search(0.1), "boom")
     assert queue.take(0.0).search_result is accepted
     assert queue.counted == {"searches": 1, "search_errors": 1}
@@ -204,8 +212,70 @@ def test_failed_search_keeps_an_accepted_result(queue):
 def test_search_result_of_an_old_epoch_is_only_counted(queue):
     job = queue.search()
     waiting = search_result()
-    queue.search_done(job, waiting)
+    queue.search_done(job, waiting, NOW)
     queue.begin_epoch(EPOCH + 1)
-    queue.search_done(job, search_result(accepted="a place"))
+    queue.search_done(job, search_result(accepted="a place"), NOW)
     assert queue.take(0.0).search_result is None
     assert queue.counted == {"searches": 2}
+
+
+# ---- demand for searches
+
+
+def test_demand_lasts_from_the_first_keyframe_that_waits_to_its_search(queue):
+    assert queue.search_demand is None
+    queue.ask(0.1, NOW + 1.0)
+    queue.ask(0.2, NOW + 2.0)  # the newest waits in place of the first, and as long as that
+    assert queue.search_demand == SearchDemand(NOW + 1.0)
+    job = queue.take_search_request()
+    queue.ask(0.3, NOW + 3.0)
+    assert queue.search_demand is None  # one search at a time
+    queue.search_done(job, search_result(), NOW + 3.5)
+    assert queue.search_demand == SearchDemand(NOW + 3.0, searches=1, support=1)
+    assert queue.longest_search_wait == pytest.approx(2.5)
+
+
+def test_support_is_of_searches_in_a_row(queue):
+    for state, support in ((State.AMBIGUOUS, 1), (State.AMBIGUOUS, 2), (State.SEARCHING, 0), (State.AMBIGUOUS, 1)):
+        queue.search_done(queue.search(), SearchResult(None, KeyframeEvidence(0.0, state, "")), NOW)
+        queue.ask()
+        assert queue.search_demand.support == support
+
+
+def test_searches_are_counted_from_the_loss(queue):
+    for restart, searches in ((1, 1), (1, 2), (2, 1)):
+        queue.search_done(queue.search(restart=restart), search_result(), NOW)
+        queue.ask(restart=restart)
+        assert queue.search_demand.searches == searches
+    old = queue.take_search_request()
+    queue.ask(restart=3)
+    queue.search_done(old, search_result(), NOW)  # says nothing of what is searched for now
+    assert queue.search_demand == SearchDemand(NOW, 0, 0)
+
+
+def test_failed_search_makes_room_for_the_next(queue):
+    job = queue.search()
+    queue.ask(0.1, NOW + 1.0)
+    queue.search_failed(job, "boom")
+    assert queue.search_demand == SearchDemand(NOW + 1.0)
+    assert queue.longest_search_wait == 0.0
+
+
+def test_keyframes_from_before_the_place_was_found_are_not_searched_for(queue):
+    job = queue.search()
+    queue.ask(0.1)
+    queue.search_done(job, search_result(accepted="a place"), NOW)
+    assert queue.search_demand is None
+    assert queue.take_search_request() is None
+    queue.ask(0.2)
+    frame = queue.take(0.3)
+    queue.frame_done(frame, tracking(frame), NOW)
+    assert queue.search_demand is None
+
+
+def test_new_odometry_wants_nothing_until_its_first_keyframe(queue):
+    queue.ask()
+    queue.begin_epoch(EPOCH + 1)
+    assert queue.search_demand is None
+    queue.ask(0.1, NOW + 4.0)
+    assert queue.search_demand == SearchDemand(NOW + 4.0)

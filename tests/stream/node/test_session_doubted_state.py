@@ -106,13 +106,6 @@ def test_unverified_place_without_frames_is_lost_and_recovered_by_first_frame(an
     assert state(robot) is State.TRACKING
 
 
-def test_doubted_state_gets_no_search_priority(covered):
-    assert not covered.session.has_candidate()
-    searching = Robot()
-    searching.frame(0.0, unknown, state=State.AMBIGUOUS)
-    assert searching.session.has_candidate()
-
-
 def test_loss_has_newest_reason_and_is_counted_once():
     robot = Robot().localized(0.0)
     silent = robot.now + 0.6
