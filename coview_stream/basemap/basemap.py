@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.basemap import file_format, tiles
+from coview_stream.basemap.likelihood_field import field_arrays
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
 from coview_stream.errors import ConfigError, CoViewError, MapError
@@ -152,6 +154,16 @@ class BaseMap:
         return tiles.crop(
             self.points, self._arrays["normals"], self._arrays["tile_index"], self.config.tile, centre, radius
         )
+
+    @cached_property
+    def field(self) -> kernels.FieldMap:
+        """Likelihood field; relative to :attr:`origin`. A map that was built before there was one has it made now."""
+        arrays = self._arrays
+        if "field.tiles" not in arrays:
+            normals = arrays["normals"] * np.float32(1.0 / 127.0)
+            surveyed, corner = arrays["surveyed"] > 0, arrays["surveyed_corner"]
+            arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
+        return kernels.FieldMap(*(arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")))
 
     def surveyed(self, xy: Reals) -> Bools:
         """Tell of (K, 2) positions, relative to :attr:`origin`, whether the map has points around them."""

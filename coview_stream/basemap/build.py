@@ -15,6 +15,7 @@ from scipy import ndimage
 from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.floors import below_another
 from coview_stream.basemap.ground import ground_filter
+from coview_stream.basemap.likelihood_field import field_arrays
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.tiles import sort_by_tile
 from coview_stream.clouds.cloud import merge
@@ -85,6 +86,9 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
             learned = feature_arrays(points, step)
     sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
+    with _progress_bar(progress, "likelihood field") as step:
+        field = field_arrays(points, normals, surveyed > 0, surveyed_corner, config.block)
+        step(1, 1)
     arrays: Arrays = {
         "origin": origin + shift,
         "stations": stations,
@@ -94,6 +98,7 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
         "surveyed": surveyed,
         "surveyed_corner": surveyed_corner,
         **{f"descriptor.{name}": values for name, values in described.items()},
+        **field,
         **learned[0],
     }
     parameters = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview
+from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
 from coview_kernels.matching import MatchIndex, Nearest
 from coview_kernels.nearest import PointGrid, nearest
@@ -21,6 +22,9 @@ from coview_kernels.warm_up import warm_up
 __all__ = [
     "Alignment",
     "Belief",
+    "FieldMap",
+    "FieldScan",
+    "FieldScores",
     "MatchIndex",
     "Nearest",
     "PointGrid",
@@ -33,6 +37,7 @@ __all__ = [
     "column_spectra",
     "coview",
     "describe_points",
+    "field_scores",
     "nearest",
     "polar_bin",
     "shutdown",

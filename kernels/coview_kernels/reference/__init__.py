@@ -7,6 +7,7 @@ Functions here trust their arguments; the public twins in :mod:`coview_kernels` 
 from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
+from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.matching_bounds import best_correlations
 from coview_kernels.reference.nearest import nearest
@@ -18,6 +19,7 @@ __all__ = [
     "best_correlations",
     "coview",
     "describe_points",
+    "field_scores",
     "nearest",
     "polar_bin",
     "station_bins",

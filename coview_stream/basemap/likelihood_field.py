@@ -1,0 +1,146 @@
+"""Likelihood field of a map: rasters of what verification asks of the map at a pose, which is scored by looking up.
+
+Square cells of half a metre, in tiles of 16 m that are stored only where the map has been surveyed:
+
+* occupied: one bit for each half metre of height, by which a cell's structure is known in three dimensions. Bit
+  ``floor(2 z) mod 64`` stands for heights z of the map's frame: what lies 32 m higher shares it.
+* ground: height of the lowest surface at the cell's middle.
+* edge: height of the roof edges that walls must stand below (:func:`roof_edges`).
+
+It is made with the map, memory-mapped with it, and takes 44 MB per km2.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels.reference.field import CELL, EDGE_STEP, NO_GROUND, NOT_SURVEYED, TILE
+from coview_stream.basemap.file_format import Arrays
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.rasters import max_filter, min_filter
+from coview_stream.geometry.transforms import Points
+
+# set by hand
+_BASE = 8  # metres: a tile's heights count from a multiple of it
+_GROUND_BAND = 0.4  # metres above the lowest point nearby: still the ground
+_STEEPEST = 0.7  # of a normal's vertical part: steeper surfaces are no ground
+_GROUND_GROWTH = 2  # cells by which the ground is continued into cells without points
+_DROP = 2.0  # metres: what falls less is no wall
+_REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
+_OVERHANG = 3  # cells, odd: a wall stands this close to the edge
+_NOTHING = np.float32(-1e6)
+_Number = TypeVar("_Number", bound=np.generic)
+
+
+def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Floats, block: float) -> Arrays:
+    """Make the field of a cloud (N, 3) with unit normals (N, 3); arrays for the map's file.
+
+    Args:
+        points: map frame, metres.
+        normals: unit normals.
+        surveyed: (H, W) cells of ``block`` metres, row along y, that the map has been surveyed in.
+        corner: (2,) x and y of the lower corner of its first cell.
+        block: metres, a multiple of half a metre.
+    """
+    ratio = round(block / CELL)
+    low = np.rint(np.asarray(corner) / CELL).astype(np.int64)[::-1]  # row, column of the first cell
+    first = low // TILE * TILE
+    shape = -((first - low - np.array(surveyed.shape) * ratio) // TILE) * TILE
+    known = np.zeros(shape, dtype=bool)
+    top, left = low - first
+    fine = surveyed.astype(bool).repeat(ratio, axis=0).repeat(ratio, axis=1)
+    known[top : top + fine.shape[0], left : left + fine.shape[1]] = fine
+    rows, columns = (np.floor(points[:, d] / CELL).astype(np.int64) - first[1 - d] for d in (1, 0))
+    flat = rows * shape[1] + columns
+    occupied = np.zeros(shape[0] * shape[1], dtype=np.uint64)
+    level = np.floor(points[:, 2] / CELL).astype(np.int64) & 63
+    voxels = np.unique(flat * 64 + level)
+    np.bitwise_or.at(occupied, voxels >> 6, np.uint64(1) << (voxels & 63).astype(np.uint64))
+    ground = _ground_heights(points, normals, flat, (int(shape[0]), int(shape[1])))
+    edge = _edges(points, flat, (int(shape[0]), int(shape[1])))
+    tiles, used = _tiles(known)
+    heights = _tiles_of(ground, used)
+    base = np.floor(np.nanmin(heights.reshape(len(heights), -1), axis=1, initial=np.inf) / _BASE)
+    base = np.where(np.isfinite(base), base, 0.0).astype(np.int32) * _BASE
+    lifted = heights - base[:, None, None]
+    centimetres = np.where(np.isfinite(lifted), np.clip(np.rint(lifted * 100.0), -32000, 32000), NO_GROUND)
+    centimetres[~_tiles_of(known, used)] = NOT_SURVEYED
+    over = (_tiles_of(edge, used) - base[:, None, None]) / EDGE_STEP
+    return {
+        "field.tiles": np.column_stack([tiles + first // TILE, base]).astype(np.int32),
+        "field.occupied": _tiles_of(occupied.reshape(shape).view(np.int64), used),
+        "field.ground": centimetres.astype(np.int16),
+        "field.edge": np.clip(np.floor(over), 0, 255).astype(np.uint8),
+    }
+
+
+def _tiles(known: Bools) -> tuple[Ints, Ints]:
+    """Return row and column (T, 2) of the tiles with any surveyed cell, and their number among all tiles (T,)."""
+    down, across = known.shape[0] // TILE, known.shape[1] // TILE
+    used = np.flatnonzero(known.reshape(down, TILE, across, TILE).any(axis=(1, 3)).ravel())
+    return np.column_stack(np.divmod(used, across)), used
+
+
+def _tiles_of(raster: npt.NDArray[_Number], used: Ints) -> npt.NDArray[_Number]:
+    """Cut a raster into the tiles (T, TILE, TILE) that are used."""
+    down, across = raster.shape[0] // TILE, raster.shape[1] // TILE
+    return np.ascontiguousarray(
+        raster.reshape(down, TILE, across, TILE).transpose(0, 2, 1, 3).reshape(-1, TILE, TILE)[used]
+    )
+
+
+def _ground_heights(points: Points, normals: Points, flat: Ints, shape: tuple[int, int]) -> Floats32:
+    """Return the ground's height (H, W) at the cells' middles, metres; NaN where there is none."""
+    size = shape[0] * shape[1]
+    lowest = np.full(size, np.inf, dtype=np.float32)
+    np.minimum.at(lowest, flat, points[:, 2])
+    around = min_filter(lowest.reshape(shape), 3).ravel()
+    upward = np.abs(normals[:, 2])
+    low = (points[:, 2] < around[flat] + np.float32(_GROUND_BAND)) & (upward > _STEEPEST)
+    chosen = points[low].astype(np.float64)
+    across = (np.floor(chosen[:, :2] / CELL) + 0.5) * CELL - chosen[:, :2]
+    slope = -normals[low, :2].astype(np.float64) / normals[low, 2:3]
+    height = chosen[:, 2] + (across * slope).sum(axis=1)
+    count = np.bincount(flat[low], minlength=size)
+    total = np.bincount(flat[low], weights=height, minlength=size)
+    ground = np.full(size, np.nan)
+    np.divide(total, count, out=ground, where=count > 0)
+    return _grown(ground.reshape(shape)).astype(np.float32)
+
+
+def _grown(ground: Floats) -> Floats:
+    """Continue the ground (H, W) into the cells around it, as the mean of those that know it."""
+    for _ in range(_GROUND_GROWTH):
+        has = np.isfinite(ground)
+        padded, there = np.pad(np.where(has, ground, 0.0), 1), np.pad(has, 1).astype(np.float64)
+        total, count = np.zeros_like(ground), np.zeros_like(ground)
+        for down in range(3):
+            for across in range(3):
+                window = np.s_[down : down + ground.shape[0], across : across + ground.shape[1]]
+                total += padded[window]
+                count += there[window]
+        ground = np.where(has | (count == 0), ground, total / np.maximum(count, 1.0))
+    return ground
+
+
+def _edges(points: Points, flat: Ints, shape: tuple[int, int]) -> Floats32:
+    top = np.full(shape[0] * shape[1], _NOTHING, dtype=np.float32)
+    np.maximum.at(top, flat, np.ascontiguousarray(points[:, 2]))
+    return roof_edges(top.reshape(shape))
+
+
+def roof_edges(top: Floats32) -> Floats32:
+    """Find the walls that a map seen from above must have: below the edges of what stands high.
+
+    Args:
+        top: (H, W) greatest height of half-metre cells, metres; -1e6 where there is nothing, which counts as low, for
+            below a roof's edge there often is nothing.
+
+    Returns:
+        (H, W) height of the edges; -1e6 where there is none.
+    """
+    edge = np.where(top - min_filter(top, _REACH) > _DROP, top, _NOTHING)
+    return max_filter(edge, _OVERHANG)

@@ -1,0 +1,185 @@
+"""Scores of hypotheses against a map's likelihood field, each moved to the best pose around it first.
+
+A hypothesis says where a scan stands: position and heading of a pivot in it. For each of them the kernel looks for the
+best shift and heading, coarse to fine, and for the height at which the scan's ground lies on the map's; then it counts
+what of the scan the map explains there (:class:`FieldScores`). All is looking up: no point is searched for.
+
+1. coarse: some of the scan's structure on cells of a metre, at all shifts of up to three metres and seven headings up
+   to six degrees off: one pass over the points for each heading, as the shifts are neighbouring cells.
+2. height: the mean difference of the map's ground and the scan's, twice.
+3. fine: the eight neighbours half a metre away, and two headings a degree off; then the same at half these steps. A
+   point counts twice on cells of half a metre that have structure, once within half a metre of it.
+4. counts, with all points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, as_finite64, as_float32
+from coview_kernels.launch import Launch
+from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
+
+COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
+"""Points of the coarse level, of a fine one, and for the height; fine levels. ``python -m bench field`` prints how
+often the right place comes first with them; with a third fewer points one of 24 places was lost on one world."""
+
+
+class FieldScores(NamedTuple):
+    """Numbers of a scan's points that the map explains at each of H hypotheses, at the best pose near it."""
+
+    pose: F64
+    """(H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians."""
+    structure: I32
+    """(H,) structure points on surveyed cells."""
+    near: I32
+    """(H,) of them, those within about half a metre of map structure."""
+    covered: I32
+    """(H,) of them, those that are near or below a roof edge."""
+    low: I32
+    """(H,) ground points on surveyed cells."""
+    grounded: I32
+    """(H,) of them, those on the map's ground."""
+    passed: I32
+    """(H,) free points on map structure."""
+
+
+@dataclass(frozen=True)
+class FieldScan:
+    """A scan as the field compares it: level, relative to the pivot, metres, neighbours one after the other.
+
+    Attributes:
+        structure: (N, 3) float32 points above the ground.
+        low: (G, 3) float32 points on the ground.
+        free: (F, 3) float32 points that rays have passed through.
+    """
+
+    structure: F32
+    low: F32
+    free: F32
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap:
+    """Rasters of a map in tiles of 32 x 32 cells of half a metre; row along y, column along x.
+
+    Attributes:
+        tiles: (T, 3) int32 row and column of each tile, and the height in metres that its heights count from.
+        occupied: (T, 32, 32) int64; bit ``floor(2 z) mod 64`` is set where the cell has a point at height z.
+        ground: (T, 32, 32) int16 centimetres above the tile's height, or one of the two values below.
+        edge: (T, 32, 32) uint8 quarter metres above the tile's height, 0 for none.
+    """
+
+    tiles: I32
+    occupied: I64
+    ground: I16
+    edge: U8
+
+    @cached_property
+    def corner(self) -> I64:
+        """(2,) row and column of the table's first tile, one before the first used one."""
+        return np.asarray(self.tiles[:, :2].min(axis=0, initial=1 << 30).astype(np.int64) - 1)
+
+    @cached_property
+    def layers(self) -> FieldLayers:
+        """The rasters as they are looked up; 20 bytes a cell, made at first use."""
+        shape = self.tiles[:, :2].max(axis=0, initial=0).astype(np.int64) - self.corner + 2
+        table = np.zeros(np.maximum(shape, 2), dtype=np.int32)
+        row, column = (self.tiles[:, :2] - self.corner).T
+        table[row, column] = np.arange(1, len(self.tiles) + 1)
+        tiles = len(self.tiles) + 1
+        bits = np.zeros((tiles, TILE, TILE, 2), dtype=np.int64)
+        bits[1:, ..., 1] = self.occupied
+        bits[..., 0] = _near(bits[..., 1], table)
+        surface = np.full((tiles, TILE, TILE), NOT_SURVEYED & 0xFFFF, dtype=np.int32)
+        surface[1:] = (self.edge.astype(np.int32) << 16) | (self.ground.astype(np.int32) & 0xFFFF)
+        base = np.concatenate([[0.0], self.tiles[:, 2]]).astype(np.float32)
+        return FieldLayers(table, base, bits, surface, _coarse(bits[..., 1], table))
+
+
+def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine: bool = True) -> FieldScores:
+    """Score hypotheses; each is moved to the best pose around it first, if ``refine``.
+
+    Args:
+        field: the map.
+        scan: points to compare, relative to the pivot.
+        poses: (H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians.
+        refine: whether the poses are moved.
+
+    Raises:
+        ValueError: a shape is wrong, or a pose not finite.
+    """
+    start = as_finite64("poses", poses, None, 4)
+    structure, low, free = (as_float32(name, getattr(scan, name), None, 3) for name in ("structure", "low", "free"))
+    few = min(COARSE, len(structure)), min(FINE, len(structure)), min(LOW, len(low))
+    plan = Plan(structure, low, free, *few, LEVELS if refine else 0)
+    layers = field.layers
+    corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
+    # float32 resolves a tenth of a millimetre a kilometre from the corner
+    pose, counts = runtime.dispatch(_native, reference.field_scores, layers, plan, start - corner)
+    return FieldScores(pose + corner, *np.ascontiguousarray(counts.T))
+
+
+def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
+    poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 6), dtype=np.int32)
+    Launch(
+        "field", "score",
+        layers.coarse.reshape(-1), layers.coarse.shape[1], layers.table.reshape(-1), layers.table.shape[1],
+        layers.base, layers.bits.reshape(-1), layers.surface.reshape(-1),
+        plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1),
+        np.array(plan[3:], dtype=np.int32), poses.reshape(-1), counts.reshape(-1), runtime.workers(),
+    )()  # fmt: skip
+    return poses, counts
+
+
+def _near(occupied: I64, table: I32) -> I64:
+    """Return (T + 1, 32, 32) bits set within half a metre of what is occupied: in the six neighbours as well."""
+    padded = np.zeros((len(occupied), TILE + 2, TILE + 2), dtype=np.int64)
+    padded[:, 1:-1, 1:-1] = occupied
+    row, column = np.nonzero(table)
+    tile = table[row, column]
+    for down, across, to, of in (
+        (-1, 0, np.s_[0, 1:-1], np.s_[-1, :]),
+        (1, 0, np.s_[-1, 1:-1], np.s_[0, :]),
+        (0, -1, np.s_[1:-1, 0], np.s_[:, -1]),
+        (0, 1, np.s_[1:-1, -1], np.s_[:, 0]),
+    ):
+        padded[(tile, *to)] = occupied[(table[row + down, column + across], *of)]
+    words = occupied.view(np.uint64)
+    one, rest = np.uint64(1), np.uint64(63)
+    near = (words | (words << one) | (words >> rest) | (words >> one) | (words << rest)).view(np.int64)
+    near |= padded[:, :-2, 1:-1] | padded[:, 2:, 1:-1] | padded[:, 1:-1, :-2] | padded[:, 1:-1, 2:]
+    return np.asarray(near)
+
+
+def _coarse(occupied: I64, table: I32) -> I32:
+    """Return (H, W) int32 for the cells of a metre of the whole table: bit ``floor(z) mod 32`` within a metre."""
+    half = TILE // 2
+    cells = occupied.view(np.uint64).reshape(-1, half, 2, half, 2)
+    folded = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
+    rows, columns = table.shape
+    metres = folded[table].transpose(0, 2, 1, 3).reshape(rows * half, columns * half)
+    one, rest = np.uint32(1), np.uint32(31)
+    out = metres | (metres << one) | (metres >> rest) | (metres >> one) | (metres << rest)
+    out[1:] |= metres[:-1]
+    out[:-1] |= metres[1:]
+    out[:, 1:] |= metres[:, :-1]
+    out[:, :-1] |= metres[:, 1:]
+    return np.ascontiguousarray(out).view(np.int32)
+
+
+def _pairs(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:
+    """Return 32 bits of 64: each is set where either of two neighbouring ones is."""
+    both = (words | (words >> np.uint64(1))) & np.uint64(0x5555555555555555)
+    for shift, mask in (
+        (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF),
+        (8, 0x0000FFFF0000FFFF), (16, 0x00000000FFFFFFFF),
+    ):  # fmt: skip
+        both = (both | (both >> np.uint64(shift))) & np.uint64(mask)
+    return both.astype(np.uint32)

@@ -1,0 +1,170 @@
+"""Scores of hypotheses against a likelihood field, in NumPy: a hypothesis after another, a pose after another."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_kernels.arrays import F32, F64, I32, I64, Mask
+
+CELL, TILE = 0.5, 32
+NO_GROUND, NOT_SURVEYED = -32768, -32767
+"""Values of the ground's raster that stand for no height."""
+
+REACH, TURNS, TURN = 3, 7, 0.0349066
+"""Metres of a coarse shift to either side, headings of the coarse level, and radians between these."""
+
+ON_GROUND, UNDER_EDGE, UPPER_FLOOR, EDGE_STEP = 0.15, 0.5, 1.5, 0.25
+"""Metres: off the ground that still are on it; above a roof edge that still are below it; above the lowest surface from
+which on the bits alone tell a floor; a unit of the stored edges."""
+
+_TURN_BACK = (0, 1, -1)
+
+
+class FieldLayers(NamedTuple):
+    """Rasters of a map as they are looked up; tile 0 is empty and stands for what has not been surveyed."""
+
+    table: I32
+    """(R, C) number of each tile; 0 for none, as along the table's border."""
+    base: F32
+    """(T + 1,) height that a tile's heights count from, metres."""
+    bits: I64
+    """(T + 1, 32, 32, 2) bit ``floor(2 z) mod 64``: near structure; on it."""
+    surface: I32
+    """(T + 1, 32, 32) ground in the lower half, centimetres; edge above it."""
+    coarse: I32
+    """(16 R, 16 C) cells of a metre: bit ``floor(z) mod 32`` within a metre of structure."""
+
+
+class Plan(NamedTuple):
+    """A scan, and how much of it each level takes."""
+
+    structure: F32
+    low: F32
+    free: F32
+    coarse: int
+    fine: int
+    height: int
+    levels: int
+
+
+def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
+    """Score hypotheses (H, 4), metres from the table's corner: twin of :func:`coview_kernels.field_scores`.
+
+    Returns:
+        Poses (H, 4), and counts (H, 6) in the order of :class:`coview_kernels.FieldScores`.
+    """
+    poses, counts = start.copy(), np.zeros((len(start), 6), dtype=np.int32)
+    for pose, count in zip(poses, counts, strict=True):
+        if plan.levels:
+            _refine(layers, plan, pose)
+        count[:] = _counts(layers, plan, pose)
+    return poses, counts
+
+
+def _refine(layers: FieldLayers, plan: Plan, pose: F64) -> None:
+    structure, low = _spread(plan.structure, plan.coarse), _spread(plan.low, plan.height)
+    best = -1
+    shift = (0, 0, 0)
+    for a in range(TURNS):
+        hits = _coarse_hits(layers.coarse, structure, pose, float(pose[3]) + TURN * (a - TURNS // 2))
+        for i, j in np.ndindex(hits.shape):
+            value = 16 * int(hits[i, j]) - abs(i - REACH) - abs(j - REACH) - abs(a - TURNS // 2)
+            if value > best:
+                best, shift = value, (i - REACH, j - REACH, a - TURNS // 2)
+    pose += np.array([shift[1], shift[0], 0.0, TURN * shift[2]])
+    for reach in (2.0, 0.5):
+        pose[2] += _rise(layers, low, pose, reach)
+    structure = _spread(plan.structure, plan.fine)
+    step, angle = 0.5, 0.5 * TURN
+    for _ in range(plan.levels):
+        best, move = -1, np.zeros(4)
+        for k in _TURN_BACK:
+            for i, j in np.ndindex(3, 3):
+                there = pose + np.array([step * (j - 1), step * (i - 1), 0.0, angle * k])
+                value = 4 * _fine_hits(layers, structure, there) - abs(i - 1) - abs(j - 1) - abs(k)
+                if value > best:
+                    best, move = value, there - pose
+        pose += move
+        step, angle = 0.5 * step, 0.5 * angle
+    pose[2] += _rise(layers, low, pose, 0.5)
+
+
+def _spread(points: F32, count: int) -> F32:
+    """Return ``count`` points that are spread evenly over all."""
+    return points[np.arange(count) * len(points) // max(count, 1)]
+
+
+def _placed(points: F32, pose: F64) -> F32:
+    x, y, z, yaw = pose.astype(np.float32)
+    c, s = np.cos(yaw), np.sin(yaw)
+    u, v, w = points.T
+    return np.stack([x + c * u - s * v, y + s * u + c * v, z + w], axis=1)
+
+
+def _coarse_hits(coarse: I32, structure: F32, pose: F64, yaw: float) -> I64:
+    at = np.floor(_placed(structure, np.array([*pose[:3], yaw]))).astype(np.int64)
+    high, wide = coarse.shape
+    inside = (at[:, 1] >= REACH) & (at[:, 1] < high - REACH) & (at[:, 0] >= REACH) & (at[:, 0] < wide - REACH - 1)
+    column, row, level = at[inside].T
+    side = np.arange(-REACH, REACH + 1)
+    words = coarse[row[:, None, None] + side[:, None], column[:, None, None] + side]
+    return np.asarray(((words >> (level & 31)[:, None, None]) & 1).sum(axis=0, dtype=np.int64))
+
+
+def _cells(layers: FieldLayers, points: F32) -> tuple[I64, I64, I64]:
+    """Tile, row and column (N,) of the cells that hold the points."""
+    low = np.zeros(2, dtype=np.int64)
+    limit = np.array(layers.table.shape) * TILE - 1
+    cell = np.clip(np.floor(points[:, 1::-1] / np.float32(CELL)).astype(np.int64), low, limit)
+    row, column = cell.T
+    tile = layers.table[row // TILE, column // TILE].astype(np.int64)
+    return tile, row % TILE, column % TILE
+
+
+def _bit(words: I64, z: F32) -> Mask:
+    level = np.floor(z / np.float32(CELL)).astype(np.int64) & 63
+    return np.asarray((words >> level) & 1, dtype=bool)
+
+
+def _heights(layers: FieldLayers, cell: tuple[I64, I64, I64]) -> tuple[F32, Mask, Mask]:
+    """Height of the ground, whether there is one, and whether the cell has been surveyed."""
+    stored = layers.surface[cell].astype(np.int16).astype(np.int32)
+    height = layers.base[cell[0]] + np.float32(0.01) * stored.astype(np.float32)
+    return height, stored > NOT_SURVEYED, stored != NOT_SURVEYED
+
+
+def _rise(layers: FieldLayers, low: F32, pose: F64, reach: float) -> float:
+    """Metres by which the scan has to rise for its ground to lie on the map's, from points within ``reach`` of it."""
+    placed = _placed(low, pose)
+    height, has, _ = _heights(layers, _cells(layers, placed))
+    off = height - placed[:, 2]
+    some = has & (np.abs(off) < reach)
+    return float(off[some].mean()) if some.any() else 0.0
+
+
+def _fine_hits(layers: FieldLayers, structure: F32, pose: F64) -> int:
+    placed = _placed(structure, pose)
+    words = layers.bits[_cells(layers, placed)]
+    return int(_bit(words[:, 0], placed[:, 2]).sum()) + int(_bit(words[:, 1], placed[:, 2]).sum())
+
+
+def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
+    placed = _placed(plan.structure, pose)
+    cell = _cells(layers, placed)
+    _, _, surveyed = _heights(layers, cell)
+    edge = layers.surface[cell] >> 16
+    near = _bit(layers.bits[cell][:, 0], placed[:, 2]) & surveyed
+    top = np.where(edge > 0, layers.base[cell[0]] + np.float32(EDGE_STEP) * edge.astype(np.float32), np.float32(-1e6))
+    covered = (near | (top > placed[:, 2] - np.float32(UNDER_EDGE))) & surveyed
+    lower = _placed(plan.low, pose)
+    under = _cells(layers, lower)
+    height, has, known = _heights(layers, under)
+    off = lower[:, 2] - height
+    upper = (off > UPPER_FLOOR) & _bit(layers.bits[under][:, 1], lower[:, 2])
+    grounded = ((has & (np.abs(off) < ON_GROUND)) | upper) & known
+    free = _placed(plan.free, pose)
+    passed = _bit(layers.bits[_cells(layers, free)][:, 1], free[:, 2])
+    masks = surveyed, near, covered, known, grounded, passed
+    return tuple(int(mask.sum()) for mask in masks)

@@ -1,0 +1,116 @@
+"""Scores against a likelihood field: the kernel as its twin, and both as plain geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import coview_kernels as kernels
+from coview_kernels import reference
+from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan
+from coview_kernels.reference.field import NO_GROUND, TILE, Plan
+
+
+def street(rng: np.random.Generator) -> tuple[FieldMap, np.ndarray]:
+    """A flat street of 3 x 3 tiles (48 m) with walls; the map, and the walls' points."""
+    walls = []
+    for x, y, length, along in ((10, 12, 20, 0), (8, 30, 26, 0), (12, 10, 14, 1), (38, 14, 20, 1), (22, 36, 8, 1)):
+        t, z = rng.uniform(0, length, 1500), rng.uniform(0, 6, 1500)
+        side = np.full_like(t, 0.25)
+        walls.append(np.column_stack([x + (t if along == 0 else side), y + (side if along == 0 else t), z]))
+    points = np.concatenate(walls)
+    column, row, level = np.floor(points * 2).astype(int).T
+    occupied = np.zeros((3 * TILE, 3 * TILE), dtype=np.uint64)
+    np.bitwise_or.at(occupied, (row, column), np.uint64(1) << level.astype(np.uint64))
+    tiles = np.array([[r, c, 0] for r in range(3) for c in range(3)], dtype=np.int32)
+    shape = (9, TILE, TILE)
+    cut = occupied.reshape(3, TILE, 3, TILE).transpose(0, 2, 1, 3).reshape(shape)
+    edge = np.zeros(shape, dtype=np.uint8)
+    edge[4, :5, :5] = 40
+    ground = np.zeros(shape, dtype=np.int16)
+    ground[2, :6] = NO_GROUND
+    return FieldMap(tiles, np.ascontiguousarray(cut).view(np.int64), ground, edge), points
+
+
+def scan_at(points: np.ndarray, pose: np.ndarray, rng: np.random.Generator) -> FieldScan:
+    """What a robot at ``pose`` (x, y, z, yaw) sees of the walls and the ground; its pivot is 1.5 m above the ground."""
+    c, s = np.cos(pose[3]), np.sin(pose[3])
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    high = points[points[:, 2] > 1.0][::3]
+    flat = np.column_stack([rng.uniform(2, 46, (400, 2)), np.zeros(400)])
+    free = np.column_stack([rng.uniform(2, 46, (300, 2)), rng.uniform(1, 6, 300)])
+    seen = [((p - pose[:3]) @ turn).astype(np.float32) for p in (high, flat, free)]
+    return FieldScan(*seen)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(11)
+    field, points = street(rng)
+    pose = np.array([24.0, 22.0, 1.5, 0.4])
+    return field, scan_at(points, pose, rng), pose, rng.uniform([8, 8, 0.5, -3], [40, 40, 2.5, 3], (40, 4))
+
+
+def test_pose_is_found_from_three_metres_and_six_degrees_off(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field, scan, pose, _ = scene
+    starts = pose + np.array([[0, 0, 0, 0], [2.6, -2.2, 0.8, 0.1], [-2.9, 2.4, -1.0, -0.1], [0.4, 0.3, 0.2, 0.03]])
+    found = kernels.field_scores(field, scan, starts)
+    off = np.abs(found.pose - pose)
+    assert (off[:, :2] < 0.3).all()
+    assert (off[:, 2] < 0.05).all()
+    assert (off[:, 3] < np.radians(0.8)).all()
+    assert (found.near > 0.95 * found.structure).all()
+    assert (found.grounded > 0.8 * found.low).all()
+
+
+def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field, scan, pose, others = scene
+    starts = np.vstack([pose, others])
+    corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
+    few = min(COARSE, len(scan.structure)), min(FINE, len(scan.structure)), min(LOW, len(scan.low))
+    for levels in (0, 2):
+        plan = Plan(scan.structure, scan.low, scan.free, *few, levels)
+        poses, counts = reference.field_scores(field.layers, plan, starts - corner)
+        found = kernels.field_scores(field, scan, starts, refine=levels > 0)
+        # a point on a cell's edge may round to either side; a few of a thousand do
+        same = (np.abs(found.pose - poses - corner) < 0.02).all(axis=1)
+        assert same.mean() > 0.9
+        assert np.abs(np.column_stack(found[1:])[same] - counts[same]).max() <= 6
+
+
+def test_unsurveyed_cells_are_left_out(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field, scan, pose, _ = scene
+    half = kernels.field_scores(field, scan, [pose + np.array([24.0, 0, 0, 0])], refine=False)
+    away = kernels.field_scores(field, scan, [pose + np.array([500.0, -300.0, 0, 0])])
+    assert 0.2 * len(scan.structure) < half.structure[0] < 0.8 * len(scan.structure)
+    assert not any(int(n[0]) for n in away[1:])
+    assert np.isfinite(away.pose).all()
+
+
+def test_walls_below_a_roof_edge_are_covered():
+    field, _ = street(np.random.default_rng(3))
+    below = np.column_stack([np.full(50, 17.0), np.full(50, 17.0), np.linspace(1, 9, 50)]).astype(np.float32)
+    empty = np.zeros((0, 3), dtype=np.float32)
+    found = kernels.field_scores(field, FieldScan(below, empty, empty), np.zeros((1, 4)), refine=False)
+    assert found.structure[0] == 50
+    assert found.covered[0] == 50
+    assert found.near[0] == 0
+
+
+def test_empty_scan_and_no_hypotheses_are_answered(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field, scan, pose, _ = scene
+    empty = np.zeros((0, 3), dtype=np.float32)
+    found = kernels.field_scores(field, FieldScan(empty, empty, empty), [pose])
+    assert np.abs(found.pose[0, :3] - pose[:3]).max() <= 4.0
+    assert not any(int(n[0]) for n in found[1:])
+    assert len(kernels.field_scores(field, scan, np.empty((0, 4))).pose) == 0
+
+
+def test_wrong_shapes_and_poses_are_refused(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
+    field, scan, pose, _ = scene
+    with pytest.raises(ValueError, match="poses"):
+        kernels.field_scores(field, scan, pose)
+    with pytest.raises(ValueError, match="NaN"):
+        kernels.field_scores(field, scan, [pose * np.nan])
+    with pytest.raises(ValueError, match="structure"):
+        kernels.field_scores(field, FieldScan(scan.structure[:, :2], scan.low, scan.free), [pose])
