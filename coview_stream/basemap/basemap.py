@@ -165,6 +165,11 @@ class BaseMap:
             arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
         return kernels.FieldMap(*(arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")))
 
+    @cached_property
+    def survey(self) -> kernels.Raster:
+        """Cells that the map has points around, above zero; relative to :attr:`origin`."""
+        return kernels.Raster(self._arrays["surveyed"].T, np.array(self._arrays["surveyed_corner"]), self.config.block)
+
     def surveyed(self, xy: Reals) -> Bools:
         """Tell of (K, 2) positions, relative to :attr:`origin`, whether the map has points around them."""
         grid, corner = self._arrays["surveyed"], self._arrays["surveyed_corner"]

@@ -10,6 +10,7 @@ Floats32 = npt.NDArray[np.float32]
 Reals = npt.NDArray[np.floating]  # of any precision
 Complexes = npt.NDArray[np.complex64]
 Ints = npt.NDArray[np.int64]
+Int32s = npt.NDArray[np.int32]
 Int8s = npt.NDArray[np.int8]
 Indices = npt.NDArray[np.intp]
 Bools = npt.NDArray[np.bool_]

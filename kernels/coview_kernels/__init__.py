@@ -9,6 +9,18 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview
+from coview_kernels.evidence import (
+    Beams,
+    Distances,
+    PointCounts,
+    PointKind,
+    Raster,
+    RayCounts,
+    Sight,
+    match_points,
+    match_rays,
+    sort_beams,
+)
 from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
 from coview_kernels.matching import MatchIndex, Nearest
@@ -21,15 +33,22 @@ from coview_kernels.warm_up import warm_up
 
 __all__ = [
     "Alignment",
+    "Beams",
     "Belief",
+    "Distances",
     "FieldMap",
     "FieldScan",
     "FieldScores",
     "MatchIndex",
     "Nearest",
+    "PointCounts",
     "PointGrid",
+    "PointKind",
     "PolarGrid",
+    "Raster",
+    "RayCounts",
     "Scale",
+    "Sight",
     "VoxelFilter",
     "align_planes",
     "all_shift_distance",
@@ -38,9 +57,12 @@ __all__ = [
     "coview",
     "describe_points",
     "field_scores",
+    "match_points",
+    "match_rays",
     "nearest",
     "polar_bin",
     "shutdown",
+    "sort_beams",
     "station_bins",
     "submit",
     "transform_unique",

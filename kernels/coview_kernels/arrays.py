@@ -44,6 +44,11 @@ def as_int32(name: str, value: npt.ArrayLike, *shape: int | None) -> I32:
     return _as_array(name, value, np.int32, shape)
 
 
+def as_uint8(name: str, value: npt.ArrayLike, *shape: int | None) -> U8:
+    """Return ``value`` as a C-contiguous uint8 array of ``shape`` (None: any length); ValueError otherwise."""
+    return _as_array(name, value, np.uint8, shape)
+
+
 def as_finite64(name: str, value: npt.ArrayLike, *shape: int | None) -> F64:
     """Return ``value`` as a C-contiguous float64 array of ``shape`` without NaN or inf; ValueError otherwise."""
     array: F64 = _as_array(name, value, np.float64, shape)

@@ -39,6 +39,9 @@ def test_public_names():
     assert set(coview_kernels.__all__) == {
         *("Alignment", "Belief", "Scale", "align_planes"),
         *("VoxelFilter", "describe_points"),
+        *("Beams", "Distances", "PointCounts", "PointKind", "Raster", "RayCounts", "Sight"),
+        *("match_points", "match_rays", "sort_beams"),
+        *("FieldMap", "FieldScan", "FieldScores", "field_scores"),
         *("MatchIndex", "Nearest"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unit_columns"),

@@ -17,7 +17,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationMethod
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 from coview_stream.localization.registration.result import MIN_PAIRS
@@ -33,7 +33,6 @@ _CELL = 0.5  # metres, of the raster of roof edges
 _DROP = 2.0  # metres: what falls less is no wall
 _REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
 _OVERHANG = 3  # cells, odd: a wall stands this close to the edge
-_SLACK = 0.5  # metres that a point may rise above the edge
 _NOTHING = -1e6
 
 
@@ -66,7 +65,7 @@ class LocalMap:
         return True
 
     @cached_property
-    def edges(self) -> RoofEdges:
+    def edges(self) -> kernels.Raster:
         """The walls that the map must have though it may not show them."""
         return roof_edges(self.points)
 
@@ -101,30 +100,13 @@ class LocalMaps:
         return self._crops[key]
 
 
-@dataclass(frozen=True)
-class RoofEdges:
-    """Walls that a map crop, seen from above, must have: below the edges of what stands high.
-
-    Attributes:
-        height: (H, W) of the edges, metres; far below everything where there is none. Rows along x, columns along y.
-        corner: (2,) x and y of the first cell's corner, map frame, metres.
-    """
-
-    height: Floats32
-    corner: Floats
-
-    def covers(self, points: Reals) -> Bools:
-        """Tell which of (N, 3) points stand below an edge of the map."""
-        cells = np.floor((points[:, :2] - self.corner) / _CELL).astype(np.int64)
-        inside = ((cells >= 0) & (cells < self.height.shape)).all(axis=1)
-        cells[~inside] = 0
-        return np.asarray(inside & (self.height[cells[:, 0], cells[:, 1]] > points[:, 2] - _SLACK))
-
-
-def roof_edges(points: Points) -> RoofEdges:
-    """Find the edges of (K, 3) map points.
+def roof_edges(points: Points) -> kernels.Raster:
+    """Find the edges of what stands high among (K, 3) map points, below which the map must have walls.
 
     Cells without points count as low: below a roof's edge there often are none.
+
+    Returns:
+        Height (H, W) of the edges, metres, rows along x, columns along y; far below everything where there is none.
     """
     corner = np.array([points[:, d].min() for d in range(2)], dtype=np.float64) - 2 * _CELL
     i, j = (np.floor((points[:, d] - corner[d]) / _CELL).astype(np.int64) for d in range(2))
@@ -133,4 +115,4 @@ def roof_edges(points: Points) -> RoofEdges:
     np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
     top = flat.reshape(rows, columns)
     edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
-    return RoofEdges(max_filter(edge, _OVERHANG), corner)
+    return kernels.Raster(max_filter(edge, _OVERHANG), corner, _CELL)

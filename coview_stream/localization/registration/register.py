@@ -14,7 +14,7 @@ import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, transform
+from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.result import MIN_PAIRS, Prior, Registration
@@ -164,8 +164,7 @@ class ScanMatch:
     def evidence(self) -> Evidence:
         """Shares of the scan that fit the map at ``T_map_odom``."""
         T, scan = self.T_map_odom, self.scan
-        surveyed = self.base_map.surveyed(transform(T, scan.cloud.points)[:, :2])
-        return verify(scan.cloud, T, scan.range_image, T @ scan.T_odom_body, self.target, surveyed)
+        return verify(scan.cloud, T, scan.range_image, T @ scan.T_odom_body, self.target, self.base_map.survey)
 
 
 def register_and_verify(

@@ -24,13 +24,16 @@ road 0.6 to 0.7. Hence the lead over the best rival, the ground share and the ev
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Bools, Floats32, Ints, Reals
-from coview_stream.geometry.transforms import Points, Pose, inverse, norms, transform
+from coview_stream.geometry.arrays import Floats32, Int32s
+from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
@@ -39,6 +42,7 @@ _STRUCTURE_HEIGHT = 1.0  # metres above the ground
 _STRUCTURE_REACH = 0.5  # metres: two voxels of the map
 _GROUND_SEARCH = 1.0  # metres to the next map point of the ground, which a sparse map shows every half metre
 _GROUND_REACH = 0.15  # metres off its plane
+_ABOVE_EDGE = 0.5  # metres that structure may rise above the edge that it stands below
 _MIN_STRUCTURE = 60  # points; fewer cannot tell places apart
 _PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
 
@@ -47,9 +51,7 @@ _FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
 _MIN_RANGE = 1.0  # metres: nearer returns are the robot's own
 _FREE_EVERY = 3  # of the map's points: a share needs no more
 _FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
-_BEAM = np.radians(2.0)  # cell of the range image
-_COLUMNS = int(np.ceil(2 * np.pi / _BEAM)) + 1
-_CELLS = _COLUMNS * (int(np.ceil(np.pi / _BEAM)) + 1)
+_BEAM = math.radians(2.0)  # cell of the range image
 _BEAM_HITS = 2  # returns in a cell: fewer say nothing
 _MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
 _SLACK = 0.5  # metres, plus _SLACK_SLOPE per metre of range, before a ray counts as having passed
@@ -57,6 +59,9 @@ _SLACK_SLOPE = 0.03
 _FLOOR_RADIUS = 10.0  # metres around the sensor in which its ground is looked for
 _FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the ground
 _MIN_FLOOR_POINTS = 20  # fewer do not show the ground
+
+_DISTANCES = kernels.Distances(_STRUCTURE_REACH, _GROUND_SEARCH, _GROUND_REACH, _ABOVE_EDGE)
+_SIGHT = kernels.Sight(_BEAM, _MIN_RANGE, _FREE_RANGE, _SLACK, _SLACK_SLOPE)
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Evidence:
     Attributes:
         near: of the points > 1 m above the ground, those within 0.5 m of a map point; 0 if there are fewer than 60.
         covered: of the same points, those that are near, or below an edge of the map (see
-            :class:`coview_stream.localization.registration.local_map.RoofEdges`).
+            :mod:`coview_stream.localization.registration.local_map`).
         ground: of the points on the ground, those within 0.15 m of the plane of a map point less than 1 m away.
         free_space: of the map points that rays met or passed through, those that they met.
         inside: of all points, those that lie where the map has been surveyed.
@@ -85,7 +90,12 @@ class Evidence:
 
 
 def verify(
-    source: RegistrationCloud, T_map_source: Pose, seen: RangeImage, T_map_body: Pose, target: LocalMap, surveyed: Bools
+    source: RegistrationCloud,
+    T_map_source: Pose,
+    seen: RangeImage,
+    T_map_body: Pose,
+    target: LocalMap,
+    survey: kernels.Raster,
 ) -> Evidence:
     """Return the evidence for a registered pose.
 
@@ -95,21 +105,18 @@ def verify(
         seen: the newest frame: the rays whose way was free.
         T_map_body: (4, 4) pose of that frame.
         target: the map around it.
-        surveyed: (M,) which points of ``source`` lie where the map has been surveyed; the others are left out.
+        survey: where the map has been surveyed; points of ``source`` elsewhere are left out.
     """
-    moved = transform(T_map_source, source.points)
-    distance, partner = kernels.nearest(target.grid, moved, _GROUND_SEARCH)
-    high = surveyed & (source.height > _STRUCTURE_HEIGHT)
-    low = surveyed & ~source.above
-    few = int(high.sum()) < _MIN_STRUCTURE
-    found = distance[high] < _STRUCTURE_REACH
-    near = 0.0 if few else float(found.mean())
-    covered = 0.0 if few else float((found | target.edges.covers(moved[high])).mean())
-    grounded = float(_on_surface(moved[low], partner[low], target).sum())
-    ground = (grounded + 0.5 * _PSEUDO) / (float(low.sum()) + _PSEUDO)
+    kinds = _kinds(source)
+    found = kernels.match_points(
+        target.grid, target.normals, source.points, kinds, T_map_source, target.edges, survey, _DISTANCES
+    )
+    few = found.high < _MIN_STRUCTURE
+    near, covered = (0.0, 0.0) if few else (found.near / found.high, found.covered / found.high)
+    ground = (found.grounded + 0.5 * _PSEUDO) / (found.low + _PSEUDO)
     met, passed = free_space(seen, T_map_body, target.points)
     free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
-    return Evidence(near, covered, ground, free, float(surveyed.mean()) if len(surveyed) else 0.0)
+    return Evidence(near, covered, ground, free, found.surveyed / len(kinds) if len(kinds) else 0.0)
 
 
 @dataclass(frozen=True)
@@ -125,22 +132,19 @@ class RangeImage:
 
     nearest: Floats32
     farthest: Floats32
-    hits: Ints
+    hits: Int32s
     floor: float
 
     @classmethod
     def of(cls, cloud: Points) -> RangeImage:
         """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
-        cloud = cloud[:: max(1, -(-len(cloud) // _MAX_RAYS))]
-        ranges = norms(cloud)
-        usable = ranges > _MIN_RANGE
-        ranges = ranges[usable]
-        cell = _beam_cells(cloud.compress(usable, axis=0), ranges)
-        nearest = np.full(_CELLS, np.inf, dtype=np.float32)
-        farthest = np.zeros(_CELLS, dtype=np.float32)
-        np.minimum.at(nearest, cell, ranges)
-        np.maximum.at(farthest, cell, ranges)
-        return cls(nearest, farthest, np.bincount(cell, minlength=_CELLS), _floor_below(cloud))
+        every = max(1, -(-len(cloud) // _MAX_RAYS))
+        return cls(*kernels.sort_beams(cloud, _SIGHT, every), _floor_below(cloud[::every]))
+
+    @cached_property
+    def limits(self) -> Floats32:
+        """(2, C) nearest and farthest return of each cell; below any range where they are too few to say anything."""
+        return np.where(self.hits >= _BEAM_HITS, (self.nearest, self.farthest), np.float32(-np.inf))
 
 
 def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int, int]:
@@ -154,40 +158,19 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
         T_map_body: (4, 4).
         points: (K, 3) map points, map frame.
     """
-    position = T_map_body[:3, 3]
-    points = points[::_FREE_EVERY]
-    dx, dy = points[:, 0] - position[0], points[:, 1] - position[1]
-    wanted = (dx * dx + dy * dy < _FREE_RANGE**2) & (points[:, 2] > position[2] + seen.floor + _FREE_HEIGHT)
-    body = transform(inverse(T_map_body), points.compress(wanted, axis=0).astype(np.float64))
-    distance = norms(body)
-    off = distance > _MIN_RANGE
-    body, distance = body.compress(off, axis=0), distance[off]
-    cell = _beam_cells(body, distance)
-    looked = seen.hits[cell] >= _BEAM_HITS
-    slack = _SLACK + _SLACK_SLOPE * distance
-    passed = looked & (distance < seen.nearest[cell] - slack)
-    met = looked & ~passed & (distance <= seen.farthest[cell] + slack)
-    return int(met.sum()), int(passed.sum())
+    lowest = float(T_map_body[2, 3]) + seen.floor + _FREE_HEIGHT
+    return kernels.match_rays(seen.limits, points, T_map_body, lowest, _SIGHT, _FREE_EVERY)
 
 
-def _on_surface(points: Reals, partner: Ints, target: LocalMap) -> Bools:
-    """Tell which of (N, 3) points lie on their partner's plane; partners (N,) index the K map points, K for none."""
-    has = partner < len(target.points)
-    near = partner[has]
-    off = np.abs(np.einsum("ij,ij->i", points[has] - target.points[near], target.normals[near]))
-    on = np.zeros(len(points), dtype=bool)
-    on[has] = off < _GROUND_REACH
-    return on
-
-
-def _beam_cells(points: Reals, ranges: Reals) -> Ints:
-    """Cell (N,) of the range image that each of (N, 3) points at ``ranges`` (N,) lies in."""
-    azimuth = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
-    elevation = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / _BEAM).astype(np.int64)
-    return np.asarray(elevation * _COLUMNS + azimuth)
+def _kinds(source: RegistrationCloud) -> npt.NDArray[np.uint8]:
+    """Kind (N,) of each point of a scan, as :class:`coview_kernels.PointKind`."""
+    kind = kernels.PointKind
+    low = np.where(source.above, kind.OTHER, kind.LOW)
+    return np.where(source.height > _STRUCTURE_HEIGHT, kind.HIGH, low).astype(np.uint8)
 
 
 def _floor_below(cloud: Points) -> float:
     """Height of the ground relative to the sensor: a low percentile of the points near it, never above it."""
-    near = cloud[:, 2][np.hypot(cloud[:, 0], cloud[:, 1]) < _FLOOR_RADIUS]
+    x, y = cloud[:, 0], cloud[:, 1]
+    near = cloud[:, 2][x * x + y * y < _FLOOR_RADIUS**2]
     return min(0.0, float(np.percentile(near, _FLOOR_PERCENTILE))) if len(near) >= _MIN_FLOOR_POINTS else 0.0

@@ -7,6 +7,7 @@ Functions here trust their arguments; the public twins in :mod:`coview_kernels` 
 from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
+from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
 from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.matching_bounds import best_correlations
@@ -20,8 +21,11 @@ __all__ = [
     "coview",
     "describe_points",
     "field_scores",
+    "match_points",
+    "match_rays",
     "nearest",
     "polar_bin",
+    "sort_beams",
     "station_bins",
     "transform_unique",
     "visible",

@@ -7,6 +7,7 @@ import pytest
 import small_world
 from courtyard import local_map, parts, plane
 
+import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
 from coview_stream.localization.registration import verification
@@ -36,10 +37,14 @@ def seen(world_map, world_drive):
         wrong = zero @ about @ pose_from(np.eye(3), -T[:3, 3])
         T_body = wrong @ T
         target = maps.around(T_body[:3, 3])
-        surveyed = world_map.surveyed(transform(wrong, source.points)[:, :2])
-        return verify(source, wrong, RangeImage.of(cloud), T_body, target, surveyed)
+        return verify(source, wrong, RangeImage.of(cloud), T_body, target, world_map.survey)
 
     return evidence
+
+
+def surveyed(half):
+    """Survey of a square around the origin."""
+    return kernels.Raster(np.ones((1, 1), np.uint8), np.full(2, -half), 2 * half)
 
 
 def test_true_pose_scores_high(seen):
@@ -119,8 +124,7 @@ def test_little_structure_scores_low():
     target = local_map(*field)
     height = field[0][:, 2].copy()
     source = RegistrationCloud(field[0], height > 0.5, height)
-    everywhere = np.ones(len(height), bool)
-    sparse = verify(source, np.eye(4), RangeImage.of(fan(25.0)), BODY, target, everywhere)
+    sparse = verify(source, np.eye(4), RangeImage.of(fan(25.0)), BODY, target, surveyed(40.0))
     assert sparse.ground > 0.99
     assert sparse.near == 0.0
     assert sparse.score == 0.0
@@ -128,12 +132,11 @@ def test_little_structure_scores_low():
 
 def test_points_outside_surveyed_cells_are_ignored(seen):
     target = local_map(*parts(plane([-20, -20, 0], [40, 0, 0], [0, 40, 0]), plane([9, -9, 0], [0, 18, 0], [0, 0, 4])))
-    elsewhere = target.points + np.array([0, 0, 300], np.float32)
+    elsewhere = target.points + np.array([300, 0, 0], np.float32)
     points = np.concatenate([target.points, elsewhere])
     height = np.tile(target.points[:, 2], 2)
     source = RegistrationCloud(points, height > 0.5, height)
-    surveyed = np.arange(len(points)) < len(target.points)
-    found = verify(source, np.eye(4), RangeImage.of(fan(25.0, 5.0)), BODY, target, surveyed)
+    found = verify(source, np.eye(4), RangeImage.of(fan(25.0, 5.0)), BODY, target, surveyed(40.0))
     assert found.near == 1.0
     assert found.ground > 0.99
     assert found.inside == 0.5
