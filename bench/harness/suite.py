@@ -52,6 +52,7 @@ BENCHMARKS = {
     "map_build": Benchmark("speed.map_build", "descriptors of 10,000 stations", _ANY, ()),
     "registration": Benchmark("speed.registration", "trimmed ICP beside small_gicp", _BOTH, ()),
     "engine": Benchmark("speed.engine", "Localizer.step on a large map: times, CPU share, memory", _ANY, ()),
+    "search": Benchmark("speed.search", "the whole search step beside an earlier commit", _ANY, (), 1200.0),
     "start": Benchmark("stream.start", "import, first run, ready to serve", _ANY, ()),
     "peers": Benchmark(
         "peers.peers", "other libraries on the same queries", _ANY, ("--places", "10", "--limit", "30"), 420.0
