@@ -19,9 +19,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.harness.rows import Row, failed
+from bench.harness.rows import RUNS, Row, failed
 from bench.harness.suite import BENCHMARKS, counted, run
-from bench.harness.tables import HEAD, WIDTHS, cells, filled, line, machine, rule, suite_tables
+from bench.harness.tables import HEAD, WIDTHS, benchmark_of, cells, filled, line, machine, rule, suite_tables
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import CoViewError, InputError
 
@@ -67,9 +67,9 @@ def _measured(name: str, words: Sequence[str], asked: argparse.Namespace) -> Ite
             raise InputError(f"--read {asked.read} is not what --json writes: {error}") from error
     elif not name:
         for each, entry in BENCHMARKS.items():
-            if entry.suite is not None:
+            if entry.in_suite(bool(asked.write)):
                 try:
-                    words = [*entry.suite, *["--quick"] * asked.quick]
+                    words = [*(entry.suite or ()), *["--quick"] * asked.quick]
                     yield from _apart(each, words, asked.threads, entry.limit_s)
                 except CoViewError as error:  # a library is missing, say: the others go on
                     yield failed(each, str(error))
@@ -90,11 +90,16 @@ def _refused(asked: argparse.Namespace) -> str:
 
 
 def _tables(name: str, rows: Sequence[Row], asked: argparse.Namespace) -> dict[str, str]:
-    """Return the tables that a benchmark has of its own, by their places in a page."""
-    module: Any = BENCHMARKS[name].load() if name else None
-    if not rows or not hasattr(module, "tables"):
-        return {}
-    return {f"bench {name} {each}".strip(): text for each, text in module.tables(rows, asked).items()}
+    """Return the tables that a benchmark has of its own, or each of the suite, by their places in a page."""
+    out: dict[str, str] = {}
+    measured = [row for row in rows if row.target != RUNS]
+    for each in [name] if name else dict.fromkeys(map(benchmark_of, measured)):
+        module: Any = BENCHMARKS[each].load() if each in BENCHMARKS else None
+        own = measured if name else [row for row in measured if benchmark_of(row) == each]
+        if own and hasattr(module, "tables"):
+            options = asked if name else _parser(each).parse_args(BENCHMARKS[each].suite or ())
+            out |= {f"bench {each} {part}".strip(): text for part, text in module.tables(own, options).items()}
+    return out
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

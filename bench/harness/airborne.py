@@ -10,16 +10,14 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
-from bench.harness.files import fingerprint, folder, remembered
-from coview_stream import BaseMap
+from bench.harness.files import fingerprint, remembered
 from coview_stream.basemap.ground import ground_surface
 from coview_stream.clouds import read_cloud, write_cloud, write_tum
-from coview_stream.config import MapConfig
 from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats, Floats32, Indices
 from coview_stream.geometry.rasters import filled
@@ -146,25 +144,20 @@ def _level(heading: Floats, pitch: Floats, roll: Floats, rng: np.random.Generato
     return np.asarray(Rotation.from_euler("ZYX", np.column_stack([heading, smooth])).as_matrix())
 
 
-class Survey(NamedTuple):
-    """Files of a drive on the survey: the map, and the directory with ``run/`` and ``truth.tum``."""
-
-    site: Path
-    drive: Path
-
-
-def surveyed(name: str, below: Path | None = None, build: bool = True) -> Survey:
-    """Return map and drive of one of :data:`ROUTES`, made now unless they are there; InputError without the survey."""
+def survey() -> Path:
+    """Return the survey's file; InputError without it."""
     if not SURVEY.is_file():
-        raise InputError(f"{SURVEY} is not there; set COVIEW_DATA to the folder of real scans")
-    home = (below or folder()) / "autzen"
-    site, out, route = home / "site.coview", home / name, ROUTES[name]
-    if build:
-        made = {"map": asdict(MapConfig()), "code": fingerprint("coview_stream/basemap", "coview_stream/descriptors")}
-        remembered(home / "built.json", made, lambda: BaseMap.build(SURVEY).save(site))
+        raise InputError(f"{SURVEY.name} is not there; set COVIEW_DATA to the folder of real scans")
+    return SURVEY
+
+
+def recorded(name: str, below: Path) -> Path:
+    """Return the directory with ``run/`` and ``truth.tum`` of one of :data:`ROUTES`, made now unless it is there."""
+    survey()
+    out, route = below / name, ROUTES[name]
     code = fingerprint("bench/harness/airborne.py", "coview_stream/sim")
     remembered(out / "drive.json", {"route": asdict(route), "code": code}, lambda: _write(route, out))
-    return Survey(site, out)
+    return out
 
 
 def _write(route: Route, out: Path) -> dict[str, Any]:

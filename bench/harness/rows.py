@@ -17,6 +17,9 @@ from typing import Any
 
 import numpy as np
 
+RUNS = "runs"
+"""Target of a benchmark that came to no figure."""
+
 REPEAT = 31  # runs behind every median; an odd number, so that the median is one of them
 
 
@@ -116,4 +119,4 @@ def informs(name: str, value: float, unit: str, details: dict[str, Any] | None =
 
 def failed(name: str, why: str) -> Row:
     """Row of a benchmark that came to no figure: it does not hold."""
-    return Row(f"{name}: {why}", target="runs", holds=False)
+    return Row(f"{name}: {why}", target=RUNS, holds=False)

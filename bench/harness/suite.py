@@ -34,10 +34,15 @@ class Benchmark:
     threads: tuple[int | None, ...] = ()
     suite: tuple[str, ...] | None = None  # words it is run with when no name is given; None: not part of the suite
     limit_s: float = 240.0  # wall time after which it is ended in the suite: a row that does not hold
+    page: bool = False  # whether the suite has it when it writes a page: tables and pictures without a target
 
     def load(self) -> Any:
         """Import its module."""
         return importlib.import_module(f"bench.{self.module}")
+
+    def in_suite(self, writes: bool) -> bool:
+        """Tell whether the suite has it, which writes a page or does not."""
+        return self.suite is not None or (self.page and writes)
 
 
 _BOTH, _ANY = (1, 2), (None,)
@@ -53,6 +58,9 @@ BENCHMARKS = {
     "registration": Benchmark("speed.registration", "trimmed ICP beside small_gicp", _BOTH, ()),
     "engine": Benchmark("speed.engine", "Localizer.step on a large map: times, CPU share, memory", _ANY, ()),
     "search": Benchmark("speed.search", "the whole search step beside an earlier commit", _ANY, (), 1200.0),
+    "airborne": Benchmark(
+        "speed.airborne", "search on a real airborne map of 1.5 km2: times, memory, sizes", limit_s=1800.0, page=True
+    ),
     "start": Benchmark("stream.start", "import, first run, ready to serve", _ANY, ()),
     "peers": Benchmark(
         "peers.peers", "other libraries on the same queries", _ANY, ("--places", "10", "--limit", "30"), 420.0
@@ -60,8 +68,8 @@ BENCHMARKS = {
     "accuracy": Benchmark("accuracy.accuracy", "errors, runs localised and false fixes in held-out worlds"),
     "ablation": Benchmark("accuracy.ablation", "what each choice of the method is worth"),
     "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),
-    "where": Benchmark("speed.where", "where the time of a step goes, stage by stage"),
-    "plots": Benchmark("speed.plots", "the plots of docs/performance.md"),
+    "where": Benchmark("speed.where", "where the time of a step goes, stage by stage", page=True),
+    "plots": Benchmark("speed.plots", "the plots of docs/performance.md", limit_s=900.0, page=True),
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors and canopy heights"),
     "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),
