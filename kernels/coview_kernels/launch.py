@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from coview_kernels import runtime
-
-_TESTED_VERSIONS = {"taichi": (1, 7)}
+from coview_kernels.front_end import tested
 
 SPAN = 512
 """Iterations per chunk of a parallel loop.
@@ -53,8 +52,7 @@ class Launch:
         """Run the kernel and wait for its end."""
         program = runtime.program()
         if self._program is not program:
-            library = runtime.library()
-            if _TESTED_VERSIONS.get(library.__name__) != tuple(library.__version__[:2]):
+            if not tested(runtime.library()):
                 self._kernel()(*self._arguments)
                 return
             self._prepare(program)

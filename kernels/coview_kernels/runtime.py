@@ -29,6 +29,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
+from coview_kernels import front_end
 from coview_kernels.owner_thread import OwnerThread, StoppedError
 
 P = ParamSpec("P")
@@ -80,7 +81,8 @@ def _import(name: str) -> ModuleType:
     _ensure_home()
     # the import prints a banner otherwise; a user's own setting stays
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
-    return importlib.import_module(name)
+    with front_end.lean_import(name):
+        return importlib.import_module(name)
 
 
 def _ensure_home() -> None:
@@ -111,31 +113,7 @@ def _init(library: Any) -> None:
         )
     finally:
         del misc.print
-    _disable_wrapping(library)
-
-
-def _disable_wrapping(library: Any) -> None:
-    """Make the compiler's front end write its notes on the source unwrapped.
-
-    Taichi makes one for every node of a kernel, for error messages, and breaks its lines at 80 columns: a third of the
-    time that a kernel takes to load from the cache, where nothing can be wrong any more.
-    """
-    try:
-        notes: Any = importlib.import_module(f"{library.__name__}.lang.ast.ast_transformer_utils")
-    except ImportError:
-        return
-    if hasattr(notes, "TextWrapper"):
-        notes.TextWrapper = _Unwrapped
-
-
-class _Unwrapped:
-    """Replacement of ``textwrap.TextWrapper`` that leaves lines long."""
-
-    def __init__(self, **_: Any) -> None: ...
-
-    def wrap(self, text: str) -> list[str]:
-        """Return the line, or nothing for a blank one."""
-        return [text] if text.strip() else []
+    front_end.shorten(library)
 
 
 def cores() -> int:

@@ -4,7 +4,6 @@ import importlib.util
 import os
 import subprocess
 import sys
-import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -216,16 +215,6 @@ def test_import_of_a_kernel_module_off_the_owner_thread_raises():
         check=False,
     )
     assert "runtime.kernels" in done.stderr
-
-
-def test_wrapping_of_source_notes_is_disabled():
-    """What :func:`coview_kernels.runtime._disable_wrapping` replaces is there: else kernels load a third slower."""
-    if backend() == "numpy":
-        pytest.skip("no compiler")
-    notes = importlib.import_module(f"{backend()}.lang.ast.ast_transformer_utils")
-    wrapper = notes.TextWrapper(width=80)
-    assert wrapper.wrap("x" * 100 + " y") == ["x" * 100 + " y"]
-    assert wrapper.wrap("  ") == textwrap.TextWrapper(width=80).wrap("  ")
 
 
 def test_warm_up_of_an_unknown_kernel_raises():
