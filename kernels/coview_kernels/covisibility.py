@@ -14,6 +14,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, I32, VERTICALS, Vertical, check_same_shape, check_vertical
 from coview_kernels.launch import Launch
+from coview_kernels.warm_up import compiled_by
 
 _MIN_BINS = 10_000  # for a kernel to be quicker: 8 grids of 20 x 60 (measured)
 
@@ -68,3 +69,6 @@ def _grids(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]:
         raise ValueError(f"max_height has shape {np.shape(max_height)}, expected (..., rings, sectors)")
     check_same_shape("count", points, "max_height", height.shape)
     return height, points
+
+
+compiled_by("coview", lambda: coview(*np.ones((2, 100, 20, 60))))

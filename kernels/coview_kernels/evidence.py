@@ -14,6 +14,7 @@ from coview_kernels.arrays import F32, F64, U8, as_finite64, as_float32, as_uint
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
 from coview_kernels.reference.evidence import Beams, Distances, PointCounts, PointKind, Raster, RayCounts, Sight
+from coview_kernels.warm_up import SAMPLE, compiled_by
 
 __all__ = [
     "Beams",
@@ -188,3 +189,15 @@ def _plain_sort_beams(points: F32, sight: Sight, every: int) -> Beams:
 
 def _plain_match_rays(limits: F32, points: F32, T_map_body: F64, lowest: float, sight: Sight, every: int) -> RayCounts:
     return reference.match_rays(limits, points[::every], T_map_body, lowest, sight)
+
+
+def _compile_points() -> None:
+    walls = Raster(np.ones((1, 1), dtype=np.float32), np.zeros(2), 1.0)
+    survey = walls._replace(values=np.ones((1, 1), dtype=np.uint8))
+    match_points(PointGrid(SAMPLE), SAMPLE, SAMPLE, np.ones(2), np.eye(4), walls, survey, Distances(1.0, 1.0, 1.0, 1.0))
+
+
+_ANY = Sight(1.0, 1.0, 1.0, 1.0, 1.0)
+compiled_by("match_points", _compile_points)
+compiled_by("match_rays", lambda: match_rays(np.ones((2, _ANY.cells)), SAMPLE, np.eye(4), 0.0, _ANY))
+compiled_by("sort_beams", lambda: sort_beams(SAMPLE, _ANY))

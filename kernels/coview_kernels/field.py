@@ -25,6 +25,7 @@ from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, as_finite64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
+from coview_kernels.warm_up import SAMPLE, compiled_by
 
 COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
 """Points of the coarse level, of a fine one, and for the height; fine levels. ``python -m bench field`` prints how
@@ -183,3 +184,12 @@ def _pairs(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:
     ):  # fmt: skip
         both = (both | (both >> np.uint64(shift))) & np.uint64(mask)
     return both.astype(np.uint32)
+
+
+def _compile() -> None:
+    cells = np.zeros((1, TILE, TILE), dtype=np.int64)
+    field = FieldMap(np.zeros((1, 3), np.int32), cells, cells.astype(np.int16), cells.astype(np.uint8))
+    field_scores(field, FieldScan(SAMPLE, SAMPLE, SAMPLE), np.zeros((1, 4)))
+
+
+compiled_by("field_scores", _compile)

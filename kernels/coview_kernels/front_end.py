@@ -63,8 +63,8 @@ def shorten(library: Any) -> None:
     """Replace the slow parts of the front end of ``library``, for our kernels and its own functions; idempotent."""
     if not tested(library):
         return
-    kernel = importlib.import_module(f"{library.__name__}.lang.kernel_impl")
-    notes = importlib.import_module(f"{library.__name__}.lang.ast.ast_transformer_utils")
+    kernel: Any = importlib.import_module(f"{library.__name__}.lang.kernel_impl")
+    notes: Any = importlib.import_module(f"{library.__name__}.lang.ast.ast_transformer_utils")
     if kernel in _replaced:
         return
     _replaced.append(kernel)

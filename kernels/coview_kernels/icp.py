@@ -20,6 +20,7 @@ from coview_kernels.arrays import F32, F64, Mask, as_finite64, as_float32, check
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
 from coview_kernels.reference.icp import Alignment, Plan, Scale
+from coview_kernels.warm_up import SAMPLE, compiled_by
 
 __all__ = ["Alignment", "Belief", "Scale", "align_planes"]
 
@@ -145,3 +146,11 @@ def _settings(frame: F64, plan: Plan, above: int) -> F64:
         values[17:29], values[29:65] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
     values[65:] = np.ravel(plan.scales)
     return values
+
+
+def _compile() -> None:
+    arguments = PointGrid(SAMPLE), SAMPLE, SAMPLE, np.ones(2), np.eye(4), np.zeros(3), [Scale(1.0, 1.0)]
+    align_planes(*arguments, keep=1.0, iterations=1, min_pairs=1)
+
+
+compiled_by("align_planes", _compile)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I32, I64, as_finite64, as_float32
+from coview_kernels.warm_up import SAMPLE, compiled_by
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -129,3 +130,6 @@ def _sort_by_cell(points: F32, edge: float) -> Cells:
     rows = np.empty(4 * len(points), dtype=np.int32)
     runtime.kernels("nearest").sort(points, frame, cell, starts, rows)
     return Cells(frame, starts, rows)
+
+
+compiled_by("nearest", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))

@@ -24,6 +24,7 @@ from coview_kernels.arrays import (
 from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table
 from coview_kernels.sectors import ring_edges2, sector_edges
+from coview_kernels.warm_up import SAMPLE, compiled_by
 
 _MAX_SIDE = 100_000  # rings or sectors that float32 resolves
 _MAX_BINS = 1 << 20
@@ -212,3 +213,9 @@ def _station_bins(
         *(grid.max_height.reshape(-1), grid.count.reshape(-1)),
     )()
     return grid
+
+
+_CENTRE, _ONE, _INDEX = (0.0, 0.0, 0.0), np.ones((1, 1)), np.zeros(1, dtype=np.int32)
+compiled_by("describe_points", lambda: describe_points(SAMPLE, _CENTRE, 2, 4, 8.0))
+compiled_by("polar_bin", lambda: polar_bin(SAMPLE, _CENTRE, 2, 4, 8.0))
+compiled_by("station_bins", lambda: station_bins(_ONE, _ONE, 1.0, _INDEX, _INDEX, _INDEX, 2, 4, 2.0))
