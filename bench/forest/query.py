@@ -18,8 +18,10 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan, v
 from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
-from coview_stream.localization.search.refinement import Candidate, Refinement
+from coview_stream.localization.search.global_search import REGISTERED
+from coview_stream.localization.search.refinement import Candidate, register_places, verify_places
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.scoring import score_hypotheses
 from coview_stream.report.evaluation import driven
 
 BEST, APART = 5, 10.0  # places that each method names, and metres between two of them
@@ -106,7 +108,7 @@ class Chain:
         alone = replace(config.acceptance, confirmations=1, evidence_sum=1e-9)
         registration = replace(config.registration, method="trimmed-icp")
         self.config = replace(config, registration=registration)
-        self._refinement = Refinement(base_map, self.config, LocalMaps(base_map, registration.source_range))
+        self._base_map, self._local_maps = base_map, LocalMaps(base_map, registration.source_range)
         self._acceptance = AcceptanceTest(replace(self.config, acceptance=alone))
 
     def scan(self, query: SearchRequest) -> ScanInput:
@@ -116,7 +118,8 @@ class Chain:
 
     def register(self, named: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
         """Return verified candidates, best first."""
-        return self._refinement.fine(self._refinement.coarse(named, scan), scan)
+        places = score_hypotheses(self._base_map.field, named, scan)[:REGISTERED]
+        return verify_places(register_places(places, scan, self._base_map, self.config, self._local_maps))
 
     def metric(
         self, named: list[Hypothesis], candidates: list[Candidate], truth: Pose, query: SearchRequest

@@ -59,14 +59,14 @@ class ConsensusConfig:
         mode: ``consensus``; or ``single``, the paper's rule: the one smallest distance of all keyframes.
             ``python -m bench ablation`` compares them.
         window: newest keyframes that vote; set by hand.
-        peaks: best hypotheses that go on to registration; set by hand.
+        peaks: best hypotheses that are scored by the likelihood field; set by hand.
         distinct_distance: metres; a hypothesis farther than this from every better one is one of its own; set by hand.
         distinct_yaw: radians; so is one turned by more than this; set by hand.
     """
 
     mode: Literal["consensus", "single"] = "consensus"
     window: int = 10
-    peaks: int = 6
+    peaks: int = 256
     distinct_distance: float = 6.0
     distinct_yaw: float = math.radians(20)
 

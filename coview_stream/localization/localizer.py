@@ -12,6 +12,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_from, to_local, to_map_origin
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
@@ -80,7 +81,9 @@ class Localizer:
         self.state = State.SEARCHING
         self._events: list[Event] = []  # that have changed the state since take_events
         self._epoch = Epoch(epoch, self._epoch.restart + 1)
-        self._buffer = KeyframeBuffer(self.config.keyframe)
+        spec = self._search.spec
+        radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
+        self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
         self._tracker = Tracker(self.base_map, self.config, self._local_maps)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
@@ -236,7 +239,9 @@ class Localizer:
         if frame.keyframe is None:
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
-        return SearchRequest.of(self._buffer, frame.keyframe, frame.cloud, spec, travelled, self._epoch, hints)
+        request = SearchRequest.of(self._buffer, frame.keyframe, frame.cloud, spec, travelled, self._epoch, hints)
+        # what the search would begin with: a tenth of the points remains, and requests travel through pipes
+        return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
 
     def _begin_tracking(self, result: SearchResult) -> MapMatch | None:
         """Begin at the place that a search has accepted, if any, with a registration of the newest frame there."""

@@ -13,7 +13,16 @@ from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, U8, as_finite64, as_float32, as_uint8, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
-from coview_kernels.reference.evidence import Beams, Distances, PointCounts, PointKind, Raster, RayCounts, Sight
+from coview_kernels.reference.evidence import (
+    Beams,
+    Distances,
+    PointCounts,
+    PointKind,
+    Raster,
+    RayCounts,
+    Sight,
+    beam_cells,
+)
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
 __all__ = [
@@ -24,6 +33,7 @@ __all__ = [
     "Raster",
     "RayCounts",
     "Sight",
+    "beam_cells",
     "match_points",
     "match_rays",
     "sort_beams",

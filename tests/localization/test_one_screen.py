@@ -17,7 +17,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "method.md"
 MAX_LINES = 40
 STEPS = {
     Localizer.step: ["predict", "search", "match to map", "verify", "update"],
-    GlobalSearch.update: ["vote", "propose", "register", "verify", "decide"],
+    GlobalSearch.update: ["vote", "propose", "score", "register", "verify", "decide"],
 }
 
 
@@ -54,6 +54,7 @@ def test_steps_are_called_in_order_and_are_headings_of_the_method_page(function)
 def test_headings_of_the_method_page_are_in_the_order_of_the_steps():
     there = headings()
     first = there.index("predict")
-    assert there[first : first + 10] == [
-        "predict", "search", "vote", "propose", "register", "verify", "decide", "match to map", "verify", "update",
+    assert there[first : first + 11] == [
+        "predict", "search", "vote", "propose", "score", "register", "verify", "decide",
+        "match to map", "verify", "update",
     ]  # fmt: skip

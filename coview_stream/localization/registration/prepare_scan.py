@@ -63,14 +63,22 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
         The thinned points and, for each, its height above the lowest ground nearby. The choice is random but
         seeded: equal input gives equal output.
     """
-    near = points.compress(norms(points, position.astype(np.float32)) < config.source_range, axis=0)
-    thin, _ = kernels.transform_unique(near, np.eye(4), config.source_voxel)
+    thin = thinned(points, position, config)
     height = height_above_lowest(thin)
     if len(thin) > config.source_points:
         chosen = np.random.default_rng(_SEED).choice(len(thin), config.source_points, replace=False)
         chosen.sort()
         thin, height = thin[chosen], height[chosen]
     return RegistrationCloud(thin, height > _CLEAR, height)
+
+
+def thinned(points: Points, position: Floats, config: RegistrationConfig) -> Points:
+    """Return the points (K, 3) of a local scan that are in range, one per voxel: :func:`prepare_scan`'s first step.
+
+    Arguments are those of :func:`prepare_scan`, which makes the same of the result as of ``points``.
+    """
+    near = points.compress(norms(points, position.astype(np.float32)) < config.source_range, axis=0)
+    return kernels.transform_unique(near, np.eye(4), config.source_voxel)[0]
 
 
 def height_above_lowest(points: Points) -> Floats32:

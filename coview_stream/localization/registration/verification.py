@@ -32,25 +32,25 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Floats32, Int32s
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int32s, Ints
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 
 # structure and ground
-_STRUCTURE_HEIGHT = 1.0  # metres above the ground
+STRUCTURE_HEIGHT = 1.0  # metres above the ground
 _STRUCTURE_REACH = 0.5  # metres: two voxels of the map
 _GROUND_SEARCH = 1.0  # metres to the next map point of the ground, which a sparse map shows every half metre
 _GROUND_REACH = 0.15  # metres off its plane
 _ABOVE_EDGE = 0.5  # metres that structure may rise above the edge that it stands below
-_MIN_STRUCTURE = 60  # points; fewer cannot tell places apart
-_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
+MIN_STRUCTURE = 60  # points; fewer cannot tell places apart
+PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
 
 # free space
-_FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
+FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
 _MIN_RANGE = 1.0  # metres: nearer returns are the robot's own
 _FREE_EVERY = 3  # of the map's points: a share needs no more
-_FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
+FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
 _BEAM = math.radians(2.0)  # cell of the range image
 _BEAM_HITS = 2  # returns in a cell: fewer say nothing
 _MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
@@ -61,7 +61,7 @@ _FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the gro
 _MIN_FLOOR_POINTS = 20  # fewer do not show the ground
 
 _DISTANCES = kernels.Distances(_STRUCTURE_REACH, _GROUND_SEARCH, _GROUND_REACH, _ABOVE_EDGE)
-_SIGHT = kernels.Sight(_BEAM, _MIN_RANGE, _FREE_RANGE, _SLACK, _SLACK_SLOPE)
+_SIGHT = kernels.Sight(_BEAM, _MIN_RANGE, FREE_RANGE, _SLACK, _SLACK_SLOPE)
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ def verify(
     found = kernels.match_points(
         target.grid, target.normals, source.points, kinds, T_map_source, target.edges, survey, _DISTANCES
     )
-    few = found.high < _MIN_STRUCTURE
+    few = found.high < MIN_STRUCTURE
     near, covered = (0.0, 0.0) if few else (found.near / found.high, found.covered / found.high)
-    ground = (found.grounded + 0.5 * _PSEUDO) / (found.low + _PSEUDO)
+    ground = (found.grounded + 0.5 * PSEUDO) / (found.low + PSEUDO)
     met, passed = free_space(seen, T_map_body, target.points)
-    free = (met + 0.5 * _PSEUDO) / (met + passed + _PSEUDO)
+    free = (met + 0.5 * PSEUDO) / (met + passed + PSEUDO)
     return Evidence(near, covered, ground, free, found.surveyed / len(kinds) if len(kinds) else 0.0)
 
 
@@ -141,6 +141,16 @@ class RangeImage:
         every = max(1, -(-len(cloud) // _MAX_RAYS))
         return cls(*kernels.sort_beams(cloud, _SIGHT, every), _floor_below(cloud[::every]))
 
+    @staticmethod
+    def cells(points: Floats, ranges: Floats) -> Ints:
+        """Return the cells (N,) of direction of points (N, 3), body frame, at ``ranges`` (N,) from the sensor."""
+        return kernels.beam_cells(points, ranges, _SIGHT)
+
+    def passed(self, cell: Ints, ranges: Floats) -> Bools:
+        """Tell which of N points, in cells of direction and at ``ranges`` (N,), metres, rays have passed through."""
+        slack = _SLACK + _SLACK_SLOPE * ranges
+        return np.asarray((ranges > _MIN_RANGE) & (ranges < self.limits[0, cell] - slack))
+
     @cached_property
     def limits(self) -> Floats32:
         """(2, C) nearest and farthest return of each cell; below any range where they are too few to say anything."""
@@ -158,7 +168,7 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
         T_map_body: (4, 4).
         points: (K, 3) map points, map frame.
     """
-    lowest = float(T_map_body[2, 3]) + seen.floor + _FREE_HEIGHT
+    lowest = float(T_map_body[2, 3]) + seen.floor + FREE_HEIGHT
     return kernels.match_rays(seen.limits, points, T_map_body, lowest, _SIGHT, _FREE_EVERY)
 
 
@@ -166,7 +176,7 @@ def _kinds(source: RegistrationCloud) -> npt.NDArray[np.uint8]:
     """Kind (N,) of each point of a scan, as :class:`coview_kernels.PointKind`."""
     kind = kernels.PointKind
     low = np.where(source.above, kind.OTHER, kind.LOW)
-    return np.where(source.height > _STRUCTURE_HEIGHT, kind.HIGH, low).astype(np.uint8)
+    return np.where(source.height > STRUCTURE_HEIGHT, kind.HIGH, low).astype(np.uint8)
 
 
 def _floor_below(cloud: Points) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.localization.registration.verification import Evidence
@@ -10,6 +11,7 @@ from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.refinement import Candidate
 from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest, same_place
+from coview_stream.localization.search.scoring import Rivals, ScoredPlace
 from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"
@@ -25,12 +27,14 @@ class SearchResult:
         evidence: of the best candidate, with the state it leads to and the reason.
         travelled: metres that odometry had driven at the keyframe.
         epoch: the request's.
+        rivals: all places that the keyframe was scored at, the best candidate's among them.
     """
 
     accepted: Candidate | None
     evidence: KeyframeEvidence
     travelled: float = 0.0
     epoch: Epoch = FIRST_EPOCH
+    rivals: Rivals = field(default_factory=lambda: Rivals.of(()))
 
 
 class AcceptanceTest:
@@ -46,16 +50,27 @@ class AcceptanceTest:
         self._confirmed = 0
         self._evidence_sum = 0.0
 
-    def decide(self, candidates: list[Candidate], request: SearchRequest, votes: int) -> SearchResult:
-        """Judge a keyframe's candidates, best first; ``votes`` is how many keyframes have voted for them."""
+    def decide(
+        self, candidates: list[Candidate], request: SearchRequest, votes: int, places: Sequence[ScoredPlace] = ()
+    ) -> SearchResult:
+        """Judge a keyframe.
+
+        Args:
+            candidates: registered and verified, best first.
+            request: the keyframe.
+            votes: how many keyframes have voted for them.
+            places: all that were scored, best first, from which the candidates come.
+        """
+        rivals = Rivals.of(places)
         if not candidates:
             self.clear()
             reason = "no hypothesis fits the map" if votes else "too few points to search with"
             evidence = KeyframeEvidence(request.stamp, State.SEARCHING, reason)
-            return SearchResult(None, evidence, request.travelled, request.epoch)
+            return SearchResult(None, evidence, request.travelled, request.epoch, rivals)
         best = candidates[0]
         here = [same_place(c.T_map_odom, best.T_map_odom, request) for c in candidates]
         rival = max((c.evidence.score for c, same in zip(candidates, here, strict=True) if not same), default=0.0)
+        rival = max(rival, _best_other(best, candidates, places, request))
         lead = max(c.hypothesis.lead for c, same in zip(candidates, here, strict=True) if same)
         if not self._agrees(best, request):
             self.clear()
@@ -77,7 +92,7 @@ class AcceptanceTest:
             best.hypothesis.station, None if best.hypothesis.learned else best.hypothesis.shift,
         )  # fmt: skip
         accepted = best if state is State.TRACKING else None
-        return SearchResult(accepted, evidence, request.travelled, request.epoch)
+        return SearchResult(accepted, evidence, request.travelled, request.epoch, rivals)
 
     def _objection(self, evidence: Evidence, rival: float, lead: float) -> tuple[State, str]:
         """Return why this keyframe does not count for its best candidate; an empty reason if it does.
@@ -129,3 +144,15 @@ class AcceptanceTest:
         return self._leading is not None and same_place(
             best.T_map_odom, self._leading.T_map_odom, request, rule.agree_distance, rule.agree_angle
         )
+
+
+def _best_other(
+    best: Candidate, candidates: list[Candidate], places: Sequence[ScoredPlace], request: SearchRequest
+) -> float:
+    """Return the rank of the best place that was scored but not registered; 0 if there is none."""
+    registered = {id(c.place) for c in candidates}
+    for place in places:  # best first
+        elsewhere = not same_place(place.hypothesis.T_map_odom, best.T_map_odom, request)
+        if id(place) not in registered and elsewhere:
+            return place.rank
+    return 0.0

@@ -1,4 +1,4 @@
-"""Global search: from the ring buffer's newest keyframe to verified hypotheses, and when to believe one."""
+"""Global search: from the ring buffer's newest keyframe to scored and verified hypotheses, and when to believe one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from coview_stream.localization.search.acceptance import AcceptanceTest, SearchR
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
-from coview_stream.localization.search.refinement import Candidate, Refinement
-from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
+from coview_stream.localization.search.refinement import Candidate, RegisteredPlace, register_places, verify_places
+from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest
+from coview_stream.localization.search.scoring import ScoredPlace, score_hypotheses
 
-_REMEMBERED = 2  # best candidates that the next keyframe tries again; set by hand
+_REMEMBERED = 40  # best places that the next keyframe scores again; set by hand
+REGISTERED = 3  # best places that are registered and verified, beside the hints; set by hand
 
 
 class GlobalSearch:
@@ -38,7 +40,7 @@ class GlobalSearch:
         index = index or SearchIndex.of(base_map, config)
         self.coview, self.learned = _recognizers(base_map, config, index)
         self._recognizers = [each for each in (self.coview, self.learned) if each is not None]
-        self._refinement = Refinement(base_map, self.config, local_maps)
+        self._local_maps = local_maps
         self._acceptance = AcceptanceTest(self.config)
         self._epoch = Epoch()
         self.clear()
@@ -83,12 +85,13 @@ class GlobalSearch:
         scan = ScanInput(
             prepare_scan(request.submap, request.position, self.config.registration), request.cloud, request.T_odom_body
         )
-        votes = self._vote(request)  # eqs 1-9: descriptors, distances to all stations at all turns
+        votes = self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         hypotheses, hints = self._propose(request)  # eq. 12: peaks of the consensus as T_map_odom
-        registered = self._register([*hypotheses, *hints], scan)  # eq. 13, coarse scales
-        candidates = self._verify(registered, scan)  # eq. 13, fine scales, and the evidence there
-        self._remember(candidates, hints, request)
-        return self._decide(candidates, request, votes)
+        places = self._score(hypotheses, hints, scan)  # the likelihood field, at the best pose near each
+        registered = self._register(places, scan)  # eq. 13, the best few
+        candidates = self._verify(registered)  # the evidence there
+        self._remember(places, candidates, hints, request)
+        return self._decide(candidates, request, votes, places)
 
     def _vote(self, request: SearchRequest) -> int:
         """Let every recognizer compare the keyframe with the map; return how many keyframes have voted."""
@@ -100,42 +103,38 @@ class GlobalSearch:
         """Return what the votes name and what was good at the last keyframe; and the hints to try now."""
         learned = [] if self.learned is None else self.learned.hypotheses()
         coview = [] if self.coview is None else self.coview.hypotheses()
+        return [*coview, *learned, *self._remembered], self._hints.due(request.hints)
 
-        def known(each: Hypothesis, others: list[Hypothesis]) -> bool:
-            return any(same_place(each.T_map_odom, other.T_map_odom, request) for other in others)
+    def _score(self, hypotheses: list[Hypothesis], hints: list[Hypothesis], scan: ScanInput) -> list[ScoredPlace]:
+        """Score all of them by the map's likelihood field; the places that they come to, best first."""
+        return score_hypotheses(self.base_map.field, [*hypotheses, *hints], scan, len(hints))
 
-        # a place that both name stands once, if keypoints have made the learned one exact: that one
-        exact = [each for each in learned if each.exact]
-        voted = [each for each in coview if not known(each, exact)] + learned
-        hints = [each for each in self._hints.due(request.hints) if not known(each, self._remembered)]
-        return [*voted, *self._remembered], hints
+    def _register(self, places: list[ScoredPlace], scan: ScanInput) -> list[RegisteredPlace]:
+        """Register the best places, and those that hints came to."""
+        chosen = [place for rank, place in enumerate(places) if rank < REGISTERED or place.hinted]
+        return register_places(chosen, scan, self.base_map, self.config, self._local_maps)
 
-    def _register(self, hypotheses: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
-        """Register every hypothesis at the coarse scales."""
-        return self._refinement.coarse(hypotheses, scan)
+    def _verify(self, registered: list[RegisteredPlace]) -> list[Candidate]:
+        """Verify what was registered; best first."""
+        return verify_places(registered)
 
-    def _verify(self, registered: list[Candidate], scan: ScanInput) -> list[Candidate]:
-        """Register the promising ones at the fine scales and verify them; best first."""
-        return self._refinement.fine(registered, scan)
-
-    def _remember(self, candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest) -> None:
-        """Keep what the next keyframe tries again: the best candidates, and hints that were not refuted."""
-        min_score = self.config.acceptance.score
+    def _remember(
+        self, places: list[ScoredPlace], candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest
+    ) -> None:
+        """Keep what the next keyframe tries again: the best places, and hints that were not refuted."""
         if hints:
-            best = max((c.evidence.score for c in candidates if c.hypothesis.station is None), default=0.0)
+            best = max((c.evidence.score for c in candidates if c.place.hinted), default=0.0)
             positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
             # where the map knows nothing, a keyframe does not speak against a hint
             surveyed = all(self.base_map.surveyed(position).all() for position in positions)
-            self._hints.tried(refuted=surveyed and best < min_score)
-        self._remembered = [
-            replace(c.hypothesis, T_map_odom=c.T_map_odom, lead=0.0)
-            for c in candidates[:_REMEMBERED]
-            if c.evidence.score >= min_score
-        ]
+            self._hints.tried(refuted=surveyed and best < self.config.acceptance.score)
+        self._remembered = [replace(place.hypothesis, lead=0.0) for place in places[:_REMEMBERED]]
 
-    def _decide(self, candidates: list[Candidate], request: SearchRequest, votes: int) -> SearchResult:
+    def _decide(
+        self, candidates: list[Candidate], request: SearchRequest, votes: int, places: list[ScoredPlace]
+    ) -> SearchResult:
         """Accept the best candidate, or say why not yet."""
-        result = self._acceptance.decide(candidates, request, votes)
+        result = self._acceptance.decide(candidates, request, votes, places)
         if result.accepted is not None:
             self.clear()
         return result
@@ -150,7 +149,6 @@ def _recognizers(
         from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
 
         learned = LearnedRecognizer(base_map, config, index.learned)
-    # together they name no more than can be registered in time
-    peaks = config.consensus.peaks if learned is None else min(config.consensus.peaks, config.learned.peaks)
+    peaks = config.consensus.peaks
     coview = None if index.retrieval is None else CoViewRecognizer(base_map, config, index.retrieval, peaks)
     return coview, learned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose
 
 _PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
+_RECENT = 5  # keyframes whose points are kept as they are: as many as anybody asks for
+_PARTS = 3  # in which the points of keyframes are gathered; set by hand
 
 # of OdometryCheck
 _VOXEL = 1.0  # metres; set by hand
@@ -45,18 +48,30 @@ class Keyframe:
 
 
 class KeyframeBuffer:
-    """Ring buffer of the newest ``capacity`` keyframes, made from the frames that are added.
+    """Buffer of the newest keyframes, made from the frames that are added.
 
-    All coordinates are in the odometry frame, which must be gravity aligned and near its own origin.
+    All coordinates are in the odometry frame, which must be gravity aligned and near its own origin. The points of the
+    newest ``capacity`` keyframes or somewhat fewer are gathered, one per voxel, for virtual local scans; of the newest
+    five the points are kept as they are as well.
+
+    Args:
+        config: distance between keyframes, how many are held, and their voxels.
+        reach: metres around the newest keyframe, horizontally, beyond which no virtual scan looks; points farther
+            away are dropped.
 
     Attributes:
         keyframes: the newest ones, oldest first.
     """
 
-    def __init__(self, config: KeyframeConfig) -> None:
+    def __init__(self, config: KeyframeConfig, reach: float = math.inf) -> None:
         self.config = config
-        self.keyframes: deque[Keyframe] = deque(maxlen=config.capacity)
+        self.reach = reach
+        self.keyframes: deque[Keyframe] = deque(maxlen=min(config.capacity, _RECENT))
         self._pending: list[Points] = []
+        # the points of so many keyframes each, one per voxel, which are dropped as a whole
+        self._part_size = max(1, config.capacity // _PARTS)
+        self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)
+        self._in_part = 0  # keyframes in the newest of them
 
     def add(self, points: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
         """Add a frame's points (N, 3), odometry frame, which are kept; return the keyframe that it completes, if any.
@@ -73,26 +88,53 @@ class KeyframeBuffer:
         keyframe = Keyframe(stamp, T_odom_body, self._unique(np.concatenate(self._pending)))
         self.keyframes.append(keyframe)
         self._pending = []
+        self._gather(keyframe)
         return keyframe
 
+    def _gather(self, keyframe: Keyframe) -> None:
+        """Add a keyframe's points to the newest part: where it has none in their voxels, and within reach."""
+        if not self._parts or self._in_part == self._part_size:
+            near = [_within(part, keyframe.position, self.reach) for part in self._parts]
+            self._parts = deque([*near, np.empty((0, 3), dtype=np.float32)], maxlen=self._parts.maxlen)
+            self._in_part = 0
+        points = np.concatenate((self._parts[-1], keyframe.points))
+        self._parts[-1] = self._unique(_within(points, keyframe.position, self.reach))
+        self._in_part += 1
+
     def recent(self, count: int) -> Points:
-        """Return the points (N, 3) of the newest ``count`` keyframes and of the frames since."""
+        """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since."""
         parts = [k.points for k in list(self.keyframes)[-count:]] + self._pending
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
-        """Make a virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel."""
-        points = np.concatenate([k.points for k in self.keyframes])
-        near = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) < radius
-        return self._unique(points[near], voxel)
+        """Make a virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel.
+
+        ``radius`` is at most the buffer's reach, and ``voxel`` at least as large as the buffer's.
+        """
+        near = [_within(part, centre, radius) for part in self._parts]
+        return self._unique(np.concatenate(near), voxel)
 
     def clear(self) -> None:
         """Forget all keyframes, for odometry does not connect them with the next frame."""
         self.keyframes.clear()
         self._pending = []
+        self._parts.clear()
+        self._in_part = 0
 
     def _unique(self, points: Points, voxel: float | None = None) -> Points:
         return kernels.transform_unique(points, np.eye(4), voxel or self.config.voxel)[0]
+
+
+def _within(points: Points, centre: Floats, radius: float) -> Points:
+    """Return those of (N, 3) points that are within ``radius`` metres of ``centre``, horizontally."""
+    if not math.isfinite(radius):
+        return points
+    x, y = np.float32(centre[0]), np.float32(centre[1])
+    dx, dy = points[:, 0] - x, points[:, 1] - y
+    dx *= dx
+    dy *= dy
+    dx += dy
+    return points.compress(dx < radius * radius, axis=0)
 
 
 class OdometryCheck:

@@ -13,8 +13,8 @@ from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_an
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
 _SUBMAP_KEYFRAMES = 4  # of the newest in the submap that is registered: more are smeared by drift; set by hand
-_SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
-_SAME_ANGLE = np.radians(5.0)  # likewise
+SAME_DISTANCE = 2.0  # metres: hypotheses that registration brought this close together are one; set by hand
+SAME_ANGLE = float(np.radians(5.0))  # likewise
 
 
 class Epoch(NamedTuple):
@@ -105,7 +105,7 @@ class SearchRequest:
 
 
 def same_place(
-    T_a: Pose, T_b: Pose, request: SearchRequest, distance: float = _SAME_DISTANCE, angle: float = float(_SAME_ANGLE)
+    T_a: Pose, T_b: Pose, request: SearchRequest, distance: float = SAME_DISTANCE, angle: float = SAME_ANGLE
 ) -> bool:
     """Whether two ``T_map_odom`` put the keyframe at the same place and heading."""
     a, b = T_a @ request.T_odom_body, T_b @ request.T_odom_body

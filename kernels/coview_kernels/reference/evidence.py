@@ -131,7 +131,7 @@ def sort_beams(points: F32, sight: Sight) -> Beams:
     wide = points.astype(np.float64)
     ranges = np.sqrt(np.einsum("ij,ij->i", wide, wide))
     usable = ranges > sight.least
-    ranges, cell = ranges[usable].astype(np.float32), _cells(wide[usable], ranges[usable], sight)
+    ranges, cell = ranges[usable].astype(np.float32), beam_cells(wide[usable], ranges[usable], sight)
     shortest = np.full(sight.cells, np.inf, dtype=np.float32)
     longest = np.zeros(sight.cells, dtype=np.float32)
     np.minimum.at(shortest, cell, ranges)
@@ -148,14 +148,14 @@ def match_rays(limits: F32, points: F32, T_map_body: F64, lowest: float, sight: 
     distance = np.sqrt(np.einsum("ij,ij->i", body, body))
     far = distance > sight.least
     body, distance = body[far], distance[far]
-    cell, slack = _cells(body, distance, sight), sight.slack + sight.slope * distance
+    cell, slack = beam_cells(body, distance, sight), sight.slack + sight.slope * distance
     passed: Mask = distance < limits[0, cell] - slack
     met = ~passed & (distance <= limits[1, cell] + slack)
     return RayCounts(int(met.sum()), int(passed.sum()))
 
 
-def _cells(points: F64, ranges: F64, sight: Sight) -> I64:
-    """Cell (N,) that each of (N, 3) points at ``ranges`` (N,) lies in."""
+def beam_cells(points: F64, ranges: F64, sight: Sight) -> I64:
+    """Return the cell of direction (N,) that each of (N, 3) points at ``ranges`` (N,) lies in."""
     turn = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / sight.beam).astype(np.int64)
     rise = np.floor((np.arcsin(np.clip(points[:, 2] / ranges, -1, 1)) + np.pi / 2) / sight.beam).astype(np.int64)
     return np.asarray(rise * sight.columns + turn)

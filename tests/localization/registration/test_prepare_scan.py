@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.config import RegistrationConfig
-from coview_stream.localization.registration.prepare_scan import height_above_lowest, prepare_scan
+from coview_stream.localization.registration.prepare_scan import height_above_lowest, prepare_scan, thinned
 
 
 def ground(slope=0.0, half=30.0, z=5.0):
@@ -62,3 +62,15 @@ def test_no_near_points_give_empty_registration_cloud(points):
     source = prepare_scan(points, np.zeros(3), RegistrationConfig())
     assert source.points.shape == (0, 3)
     assert len(source.above) == len(source.height) == 0
+
+
+def test_thinned_scan_gives_the_same_registration_cloud():
+    rng = np.random.default_rng(3)
+    points, position = rng.uniform(-80, 80, (60_000, 3)).astype(np.float32), np.array([3.0, -4.0, 1.0])
+    points[:, 2] *= 0.05
+    config = RegistrationConfig(source_points=800)
+    thin = thinned(points, position, config)
+    assert len(thin) < 0.6 * len(points)
+    a, b = (prepare_scan(each, position, config) for each in (points, thin))
+    np.testing.assert_array_equal(a.points, b.points)
+    np.testing.assert_array_equal(a.height, b.height)

@@ -15,6 +15,7 @@ from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.refinement import Candidate
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.scoring import ScoredPlace
 from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
@@ -27,7 +28,7 @@ WEAK = RULE.score + 0.03
 def candidate(score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0, inside: float = 0.9) -> Candidate:
     hypothesis = Hypothesis(T_map_odom, 5, 2, -3.0, learned=True, lead=lead)
     found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return Candidate(hypothesis, found, Evidence(score, score, 1.0, 1.0, inside))
+    return Candidate(ScoredPlace(hypothesis, score, inside), found, Evidence(score, score, 1.0, 1.0, inside))
 
 
 def keyframes_needed(*candidates: Candidate) -> int | None:

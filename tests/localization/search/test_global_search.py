@@ -29,6 +29,7 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.refinement import Candidate, gravity_information
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
+from coview_stream.localization.search.scoring import ScoredPlace
 from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
@@ -49,7 +50,8 @@ def moved(forward=0.0, degrees=0.0):
 def candidate(score, T_map_odom=HERE, inside=0.9, ground=1.0):
     """A made-up candidate: all that is judged is its pose and its evidence."""
     found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return Candidate(Hypothesis(T_map_odom, 5, 2, -3.0), found, Evidence(score / ground, score, ground, 1.0, inside))
+    place = ScoredPlace(Hypothesis(T_map_odom, 5, 2, -3.0), score, inside)
+    return Candidate(place, found, Evidence(score / ground, score, ground, 1.0, inside))
 
 
 @pytest.fixture
@@ -264,13 +266,42 @@ def test_single_minimum_mode_finds_an_easy_place(search, world_drive):
     assert paper.update(next(run_of(world_drive, 1))).evidence.score > 0.8
 
 
-def test_bad_candidate_is_not_tried_again(search, world_drive, monkeypatch):
-    frames = run_of(world_drive, 2)
+def test_wrong_place_is_scored_again_but_not_confirmed(search, world_drive, monkeypatch):
+    frames = run_of(world_drive, 3)
     wrong = Hypothesis(T_MAP_ODOM @ pose_from(rot_z(2.0), [9.0, -14.0, 0.0]), 0, 0, 0.0)
     monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [wrong])
     assert search.update(next(frames)).evidence.score < RULE.score
     monkeypatch.setattr(search.coview.consensus, "hypotheses", list)
-    assert search.update(next(frames)).evidence.score == 0.0
+    for frame in frames:
+        again = search.update(frame)
+        assert len(again.rivals) == 1
+        assert again.evidence.score < RULE.score
+
+
+def test_result_carries_all_distinct_places_that_were_scored(search, world_drive):
+    result = search.update(next(run_of(world_drive, 1)))
+    rivals = result.rivals
+    assert len(rivals) > 20
+    rank = rivals.scores * rivals.inside
+    assert (np.diff(rank) <= 0).all()
+    assert np.linalg.norm((rivals.T_map_odom[0] - T_MAP_ODOM)[:3, 3]) < 0.6
+    assert rank[0] > 2 * rank[1]
+    robot = rivals.T_map_odom @ np.append(next(run_of(world_drive, 1)).position, 1.0)
+    gap = np.linalg.norm(robot[:, None] - robot[None], axis=2)
+    yaw = np.arctan2(rivals.T_map_odom[:, 1, 0], rivals.T_map_odom[:, 0, 0])
+    turn = np.abs((yaw[:, None] - yaw[None] + np.pi) % (2 * np.pi) - np.pi)
+    assert ((gap >= 2.0) | (turn >= np.radians(5.0)) | np.eye(len(rivals), dtype=bool)).all()
+
+
+def test_place_that_was_only_scored_is_a_rival_too(search):
+    best = candidate(0.7)
+    close = ScoredPlace(Hypothesis(moved(20), 7, 1, -2.0), 0.7 - RULE.lead / 2, 1.0)
+    beyond = replace(close, inside=0.3)  # most of the scan is not on the map there
+    for place, state in ((close, State.AMBIGUOUS), (beyond, State.TRACKING)):
+        search.clear()
+        for _ in range(3 * RULE.confirmations):
+            result = search._acceptance.decide([best], REQUEST, 5, [best.place, place])
+        assert result.evidence.state is state
 
 
 def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, max_tilt):

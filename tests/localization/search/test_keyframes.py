@@ -87,11 +87,40 @@ def test_virtual_scan_gathers_points_around_keyframe():
     assert np.hypot(*(scan[:, :2] - centre[:2]).T).max() < 8.0
 
 
+def test_virtual_scan_is_of_the_newest_keyframes_in_parts():
+    config = KeyframeConfig(distance=2.0, capacity=6, voxel=0.25)  # three parts of two keyframes each
+    buffer = KeyframeBuffer(config)
+    centre, kept = np.zeros(3), []
+    for k in range(9):
+        corner = np.array([[0.125, 0.125 + 2.0 * k, 0.125 + k % 2]], np.float32)
+        buffer.add(corner, at(2.0 * k), float(k))
+        kept.append({int(y // 2) for y in buffer.virtual_scan(centre, 99.0, 0.25)[:, 1]})
+    assert kept[:6] == [set(range(k + 1)) for k in range(6)]
+    assert kept[6:] == [{2, 3, 4, 5, 6}, {2, 3, 4, 5, 6, 7}, {4, 5, 6, 7, 8}]
+
+
+def test_points_beyond_reach_are_dropped():
+    buffer = KeyframeBuffer(CONFIG, reach=10.0)
+    behind = np.array([[-8.0, 0.0, 0.0], [1.0, 0.0, 0.0]], np.float32)
+    buffer.add(behind, at(0.0), 0.0)
+    buffer.add(np.array([[6.0, 0.0, 0.0]], np.float32), at(5.0), 1.0)
+    scan = buffer.virtual_scan(np.array([5.0, 0.0, 1.5]), 99.0, 0.25)
+    np.testing.assert_array_equal(np.sort(scan[:, 0]), [1.0, 6.0])
+    np.testing.assert_array_equal(buffer.recent(2), [*behind, [6.0, 0.0, 0.0]])
+
+
+def test_first_point_of_a_voxel_stays():
+    buffer = KeyframeBuffer(KeyframeConfig(capacity=30), reach=50.0)
+    for k in range(4):
+        buffer.add(np.array([[5.0 + 0.01 * k, 1.0, 0.5]], np.float32), at(2.0 * k), float(k))
+    np.testing.assert_array_equal(buffer.virtual_scan(np.zeros(3), 50.0, 0.5), np.float32([[5.0, 1.0, 0.5]]))
+
+
 def test_clear_drops_all_keyframes():
     buffer = KeyframeBuffer(CONFIG)
     add(buffer, cloud(0), at(0.0), 0.0)
     add(buffer, cloud(1), at(1.0), 0.1)
     buffer.clear()
-    assert len(buffer.recent(5)) == 0
+    assert len(buffer.recent(5)) == len(buffer._parts) == 0
     # the next frame is a keyframe wherever it is
     assert add(buffer, cloud(2), at(1.0), 0.2) is not None

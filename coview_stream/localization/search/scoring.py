@@ -1,0 +1,204 @@
+"""Scores of hypotheses by the map's likelihood field: hundreds of one keyframe at once, before any is registered.
+
+Each hypothesis is moved to the best pose around it, up to three metres and seven degrees away, by looking up what the
+map has there (:func:`coview_kernels.field_scores`), and scored by the shares that verification computes exactly
+(:mod:`coview_stream.localization.registration.verification`). ``python -m bench field`` prints how often the right
+place comes first, and how the two scores compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+import coview_kernels as kernels
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.transforms import Points, norms
+from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.registration.verification import (
+    FREE_HEIGHT,
+    FREE_RANGE,
+    MIN_STRUCTURE,
+    PSEUDO,
+    STRUCTURE_HEIGHT,
+    RangeImage,
+)
+from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
+
+# set by hand
+_STRUCTURE, _LOW = 800, 400  # points of a scan that are looked up: twice as many rank places no better
+_PATCH = 4.0  # metres: points of one patch are looked up one after the other, for they lie in the same memory
+_SAMPLES = 6000  # points in the space around the robot, of which those that rays passed through are looked up
+_DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
+_MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle: a ray has passed only what lies before that
+_LAYERS = 2  # cells that a surface fills on the way through it
+
+
+@dataclass(frozen=True)
+class ScoredPlace:
+    """A hypothesis at the best pose near it.
+
+    Attributes:
+        hypothesis: there; with the lead that any of those had which came to this place.
+        score: evidence score in [0, 1], as the field sees it.
+        inside: share of the scan that lies where the map has been surveyed.
+        hinted: whether a pose hint came to this place.
+    """
+
+    hypothesis: Hypothesis
+    score: float
+    inside: float
+    hinted: bool = False
+
+    @property
+    def rank(self) -> float:
+        """Score times the share that lies inside: what lies beyond the map is not explained by it."""
+        return self.score * self.inside
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """All places that one keyframe was scored at, best first; no two are the same. For whom decides between them.
+
+    Attributes:
+        T_map_odom: (N, 4, 4).
+        scores: (N,) float32 evidence scores in [0, 1].
+        inside: (N,) float32 shares of the scan that lie where the map has been surveyed.
+    """
+
+    T_map_odom: Floats
+    scores: Floats32
+    inside: Floats32
+
+    def __len__(self) -> int:
+        """Return the number of places N."""
+        return len(self.scores)
+
+    @classmethod
+    def of(cls, places: Sequence[ScoredPlace]) -> Rivals:
+        """Gather them from places, which are in this order already."""
+        poses = np.array([p.hypothesis.T_map_odom for p in places]).reshape(-1, 4, 4)
+        scores, inside = (np.array([getattr(p, n) for p in places], dtype=np.float32) for n in ("score", "inside"))
+        return cls(poses, scores, inside)
+
+
+def score_hypotheses(
+    field: kernels.FieldMap, hypotheses: Sequence[Hypothesis], scan: ScanInput, hints: int = 0
+) -> list[ScoredPlace]:
+    """Score hypotheses of ``T_map_odom``, of which the last ``hints`` are pose hints; return the places, best first.
+
+    Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them.
+    """
+    if not hypotheses:
+        return []
+    pivot = scan.T_odom_body[:3, 3]
+    T = np.array([each.T_map_odom for each in hypotheses])
+    yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+    compared, every = _field_scan(scan)
+    found = kernels.field_scores(field, compared, np.column_stack([T[:, :3, :3] @ pivot + T[:, :3, 3], yaw]))
+    score, inside = _scores(found, compared, every)
+    hinted = np.arange(len(hypotheses)) >= len(hypotheses) - hints
+    order, place = _places(found.pose, score * inside)
+    poses = _poses(found.pose, pivot)
+    out = []
+    for number, first in enumerate(order):
+        members = np.flatnonzero(place == number).tolist()
+        voted = [hypotheses[k] for k in members if not hinted[k]]
+        # its own votes, if it has any; a hint that came to a place with votes adds nothing to them
+        own = hypotheses[first] if not hinted[first] or not voted else voted[0]
+        lead = max((each.lead for each in voted), default=0.0)
+        own = replace(own, T_map_odom=poses[first], lead=lead)
+        out.append(ScoredPlace(own, float(score[first]), float(inside[first]), bool(hinted[members].any())))
+    return out
+
+
+def _scores(found: kernels.FieldScores, scan: kernels.FieldScan, every: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Return evidence scores (H,) and shares inside (H,); ``every`` says how many points each one stands for."""
+    structure, low, near = found.structure * every[0], found.low * every[1], found.near * every[0]
+    some = np.maximum(found.structure, 1)
+    ground = (found.grounded * every[1] + 0.5 * PSEUDO) / (low + PSEUDO)
+    passed = found.passed * _points_passed()
+    free = (near + 0.5 * PSEUDO) / (near + passed + PSEUDO)
+    score = np.sqrt(found.near / some * (found.covered / some) * ground * free)
+    score[structure < MIN_STRUCTURE] = 0.0
+    whole = len(scan.structure) * every[0] + len(scan.low) * every[1]
+    return score, (structure + low) / max(whole, 1.0)
+
+
+def _places(pose: Floats, rank: Floats) -> tuple[list[int], Ints]:
+    """Group poses (H, 4): the best pose of each place (P), best first, and the number of the place of each (H,)."""
+    order = np.argsort(-rank, kind="stable")
+    position, yaw = pose[order, :3].astype(np.float32), pose[order, 3]
+    place = np.full(len(order), -1)
+    first: list[int] = []
+    for k in range(len(order)):
+        if place[k] >= 0:
+            continue
+        off = position[k:] - position[k]
+        turn = np.abs((yaw[k:] - yaw[k] + np.pi) % (2.0 * np.pi) - np.pi)
+        same = (np.einsum("ij,ij->i", off, off) < SAME_DISTANCE**2) & (turn < SAME_ANGLE) & (place[k:] < 0)
+        place[k:][same] = len(first)
+        first.append(int(order[k]))
+    numbers = np.empty_like(place)
+    numbers[order] = place
+    return first, numbers
+
+
+def _poses(pose: Floats, pivot: Floats) -> Floats:
+    """Return ``T_map_odom`` (H, 4, 4) that put the pivot (3,) at poses (H, 4)."""
+    T = np.tile(np.eye(4), (len(pose), 1, 1))
+    cos, sin = np.cos(pose[:, 3]), np.sin(pose[:, 3])
+    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cos, -sin, sin, cos
+    T[:, :3, 3] = pose[:, :3] - T[:, :3, :3] @ pivot
+    return T
+
+
+def _field_scan(scan: ScanInput) -> tuple[kernels.FieldScan, tuple[float, float]]:
+    """Return what is looked up of a scan, relative to the body, and how many points each of structure and ground is."""
+    cloud, T = scan.cloud, scan.T_odom_body
+    points = cloud.points - T[:3, 3].astype(np.float32)
+    order = _by_patch(points)
+    points, height, above = points[order], cloud.height[order], cloud.above[order]
+    structure, low = points[height > STRUCTURE_HEIGHT], points[~above]
+    free = (_seen_through(scan.range_image) @ T[:3, :3].T).astype(np.float32)
+    some = _evenly(structure, _STRUCTURE), _evenly(low, _LOW)
+    every = len(structure) / max(len(some[0]), 1), len(low) / max(len(some[1]), 1)
+    return kernels.FieldScan(*some, free[_by_patch(free)]), every
+
+
+def _evenly(points: Points, count: int) -> Points:
+    """Return at most ``count`` points, spread evenly over all in their order."""
+    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
+
+
+def _by_patch(points: Points) -> Ints:
+    x, y = np.floor(points[:, :2] / np.float32(_PATCH)).T
+    return np.asarray(np.lexsort((x, y)))
+
+
+def _seen_through(seen: RangeImage) -> Floats:
+    """Return points (F, 3), body frame, metres, that the frame's rays passed through well above the ground."""
+    points, ranges, cell = _samples()
+    passed: Bools = seen.passed(cell, ranges + _MARGIN) & (points[:, 2] > seen.floor + FREE_HEIGHT)
+    return points[passed]
+
+
+@lru_cache(maxsize=1)
+def _samples() -> tuple[Floats, Floats, Ints]:
+    """Return points (N, 3), evenly in the space around the sensor, their ranges and cells of direction."""
+    rng = np.random.default_rng(20240)
+    radius, turn = FREE_RANGE * np.sqrt(rng.random(_SAMPLES)), 2.0 * np.pi * rng.random(_SAMPLES)
+    height = rng.uniform(*_DEPTH, _SAMPLES)
+    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
+    ranges = norms(points)
+    return points, ranges, RangeImage.cells(points, ranges)
+
+
+def _points_passed(voxel: float = 0.5) -> float:
+    """Return how many points of a scan, one for each ``voxel``, the surface would have that a passed sample is on."""
+    volume = np.pi * FREE_RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES
+    return float(volume / (_LAYERS * 0.5) / voxel**2)
