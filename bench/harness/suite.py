@@ -69,6 +69,9 @@ BENCHMARKS = {
     "ablation": Benchmark("accuracy.ablation", "what each choice of the method is worth"),
     "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),
     "where": Benchmark("speed.where", "where the time of a step goes, stage by stage", page=True),
+    "search_stages": Benchmark(
+        "speed.search_stages", "where the time of a search step goes, beside its floor", (1,), limit_s=900.0, page=True
+    ),
     "plots": Benchmark("speed.plots", "the plots of docs/performance.md", limit_s=900.0, page=True),
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors and canopy heights"),
