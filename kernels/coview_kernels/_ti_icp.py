@@ -3,7 +3,8 @@
 
 Partners are searched for only when they may have changed, and kept beside their point: where few are, an iteration
 reads memory in order. Waking the threads costs as much as an iteration over some hundred points; what follows the
-search is too little to be worth that again, so one thread does it.
+search is too little to be worth that again, so one thread does it. With a single worker nothing is spread: even one
+thread of the pool would have to be woken.
 """
 
 from coview_kernels import runtime
@@ -16,6 +17,7 @@ FLOATS = ti.types.ndarray(ti.f32, 1)
 DOUBLES = ti.types.ndarray(ti.f64, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
 
+SERIAL = runtime.workers() == 1
 SLACK = 1e-9  # metres: more than rounding adds to a bound
 MAX_SHARE = 5.0  # weight of a point of the rarer kind
 MARGIN = 0.15  # metres that a search looks further than it must, so that it serves later poses; 0.05-0.3 are as fast
@@ -29,10 +31,10 @@ PARTNER = 6
 # and before them the bin of every point
 FIRST_BIN, BINS = 107 << 6, 2048
 # settings; see icp.py
-KEEP, ITERATIONS, SCALES, MIN_PAIRS, PRIOR, ABOVE = 8, 9, 10, 11, 12, 13
-PIVOT, MEAN, BELIEF, FIRST = 14, 17, 29, 65
-# and of each scale radius, width of the weights, and the shift and turn that end it
-RADIUS, WIDTH, SHIFT, TURN, EACH = 0, 1, 2, 3, 4
+KEEP, ITERATIONS, SCALES, MIN_PAIRS, PRIOR = 8, 9, 10, 11, 12
+PIVOT, MEAN, BELIEF, FIRST = 13, 16, 28, 64
+# and of each scale radius, width of the weights, the shift and turn that end it, and how many of the points take part
+RADIUS, WIDTH, SHIFT, TURN, POINTS, EACH = 0, 1, 2, 3, 4, 5
 # state: pose by rows (12), then these, the information (36), the sums of a step (30), and six values to work with
 SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, OFF = 12, 13, 14, 15, 16, 17, 53, 83
 RUNNING, DONE, LOST = 0, 1, 2
@@ -60,7 +62,8 @@ def pair(
     near = (at - floats(partners, PARTNER * i)).norm_sqr()
     # by the triangle inequality no other point is nearer than safe: the partner stays, or there still is none
     if safe * safe < ti.min(near, radius * radius):
-        limit = radius + MARGIN
+        # the old partner is a bound already
+        limit = ti.min(ti.sqrt(near), radius) + MARGIN
         best, found, beyond = walk(frame, starts, rows, at[0], at[1], at[2], limit * limit, MARGIN)
         for d in ti.static(range(3)):
             memory[PLACE * i + d] = at[d]
@@ -78,38 +81,38 @@ def pair(
 
 
 @ti.func
-def trim(keep, chunks, n, bins: ti.template()):
+def trim(keep, chunks, n, first, bins: ti.template()):
     """For either kind of point: the farthest bin that is kept, and the weight of each pair that is."""
     last = ti.Vector([-1, -1])
     share = ti.Vector.zero(ti.f64, 2)
     for kind in ti.static(range(2)):
         found = 0
-        for b in range(n + kind * BINS, n + kind * BINS + BINS):
+        for b in range(first + kind * BINS, first + kind * BINS + BINS):
             for c in range(1, chunks):
                 bins[b] = bins[b] + bins[b + 2 * c * BINS]
             found += bins[b]
         kept = 0
         while kept < found and kept < ti.max(1, ti.cast(keep * found, ti.i32)):
             last[kind] += 1
-            kept += bins[n + kind * BINS + last[kind]]
+            kept += bins[first + kind * BINS + last[kind]]
         share[kind] = ti.min(0.5 * n / ti.max(1, kept), MAX_SHARE)
     return last, share
 
 
 @ti.func
 def add_up(
-    T, about, width, above, last, share, source: ti.template(), order: ti.template(),
+    T, about, width, n, last, share, source: ti.template(), kinds: ti.template(),
     partners: ti.template(), bins: ti.template(), state: ti.template(),
 ):  # fmt: skip
     """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs."""
     acc = ti.Vector.zero(ti.f64, 30)
-    for i in range(order.shape[0]):
-        if bins[i] <= (last[0] if i < above else last[1]):
-            at = placed(T, floats(source, 3 * order[i]))
+    for i in range(n):
+        if bins[i] <= (last[1] if kinds[i] > 0 else last[0]):
+            at = placed(T, floats(source, 3 * i))
             normal = floats(partners, PARTNER * i + 3)
             r = normal.dot(at - floats(partners, PARTNER * i))
             ratio = r / width
-            w = (share[0] if i < above else share[1]) / (1.0 + ratio * ratio)
+            w = (share[1] if kinds[i] > 0 else share[0]) / (1.0 + ratio * ratio)
             turn = (at - about).cross(normal)
             J = ti.Vector([turn[0], turn[1], turn[2], normal[0], normal[1], normal[2], r])
             for a in ti.static(range(6)):
@@ -217,7 +220,7 @@ def align(
     rows: WHOLES,
     normals: FLOATS,
     source: FLOATS,
-    order: WHOLES,
+    kinds: WHOLES,
     memory: DOUBLES,
     partners: FLOATS,
     bins: WHOLES,
@@ -225,8 +228,11 @@ def align(
     state: DOUBLES,
     chunks: ti.i32,
 ):
-    """Take a step from the state's pose; the status says whether another one should follow."""
-    n = order.shape[0]
+    """Take a step from the state's pose; the status says whether another one should follow.
+
+    Of the points the first ones take part in the coarse scales; ``kinds`` is 0 or 1.
+    """
+    ti.loop_config(serialize=SERIAL)
     for q in range(chunks * SPAN):
         if q % SPAN == 0:
             c = q // SPAN
@@ -234,20 +240,20 @@ def align(
             T = ti.Vector([state[k] for k in ti.static(range(12))])
             scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
             radius = settings[scale + RADIUS]
-            above = ti.cast(settings[ABOVE], ti.i32)
-            mine = n + 2 * c * BINS
+            n = ti.cast(settings[scale + POINTS], ti.i32)
+            mine = kinds.shape[0] + 2 * c * BINS
             for b in range(mine, mine + 2 * BINS):
                 bins[b] = 0
             for k in range(n // chunks + (2 << BLOCK)):
                 i = (((k >> BLOCK) * chunks + c) << BLOCK) + (k & ((1 << BLOCK) - 1))
                 if i < n:
-                    at = placed(T, floats(source, 3 * order[i]))
+                    at = placed(T, floats(source, 3 * i))
                     near = pair(frame, starts, rows, normals, at, i, radius, memory, partners)
                     b = BINS
                     if near < radius * radius:
                         octave = (ti.bit_cast(ti.cast(near, ti.f32), ti.i32) >> 17) - FIRST_BIN
                         b = ti.min(ti.max(octave, 0), BINS - 1)
-                        place = mine + b if i < above else mine + b + BINS
+                        place = mine + b + kinds[i] * BINS
                         bins[place] = bins[place] + 1  # += would be atomic
                     bins[i] = b
     ti.loop_config(serialize=True)
@@ -256,9 +262,10 @@ def align(
         scale = FIRST + EACH * ti.cast(state[SCALE], ti.i32)
         pivot = ti.Vector([settings[PIVOT + d] for d in ti.static(range(3))])
         about = placed(T, pivot)
-        last, share = trim(settings[KEEP], chunks, n, bins)
+        n = ti.cast(settings[scale + POINTS], ti.i32)
+        last, share = trim(settings[KEEP], chunks, n, kinds.shape[0], bins)
         add_up(
-            T, about, settings[scale + WIDTH], settings[ABOVE], last, share, source, order, partners, bins, state,
+            T, about, settings[scale + WIDTH], n, last, share, source, kinds, partners, bins, state,
         )  # fmt: skip
         if state[SUMS + 29] < settings[MIN_PAIRS]:
             state[STATUS] = LOST

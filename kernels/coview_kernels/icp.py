@@ -1,13 +1,14 @@
 """Trimmed point-to-plane ICP (eq. 13), coarse to fine, with weights against outliers and a prior.
 
-An iteration is one prepared launch, of which the searches are spread over the threads. A
-point's partner is looked up, not searched for, where it cannot have changed: a search also tells how far all other
-map points are at least, and as long as the point has moved less than that leaves room for, the partner is the same
-(the triangle inequality; exact). Late iterations, which move the cloud by centimetres, hardly search at all.
+An iteration is one prepared launch, of which the searches are spread over the threads. A point's partner is looked up,
+not searched for, where it cannot have changed: a search also tells how far all other map points are at least, and as
+long as the point has moved less than that leaves room for, the partner is the same (the triangle inequality; exact).
+Late iterations, which move the cloud by centimetres, hardly search at all.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, F64, Mask, as_finite64, as_float32, check_same_shape
+from coview_kernels.arrays import F32, F64, I64, Mask, as_finite64, as_float32, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import PointGrid
 from coview_kernels.reference.icp import Alignment, Plan, Scale
@@ -58,7 +59,8 @@ def align_planes(
     Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
     keeps the floor(keep * found) nearest pairs, at least one, and all that are as far as the last of them, to a
     hundredth; and it takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r /
-    width)^2). The share is such that both kinds weigh the same for any numbers of points, but 5 at most.
+    width)^2). The share is such that both kinds weigh the same for any numbers of points, but 5 at most. A coarse scale
+    may make do with every so-many-th point of either kind, since the next one goes on from where it ends.
 
     Args:
         grid: the map, (K, 3).
@@ -87,8 +89,13 @@ def align_planes(
         raise ValueError(f"keep must lie in (0, 1], got {keep}")
     if iterations < 1 or not len(scales):
         raise ValueError(f"at least one iteration and scale are needed, got {iterations} and {len(scales)}")
-    if not all(math.isfinite(v) and v > 0 for pair in scales for v in pair):
-        raise ValueError(f"scales must hold positive metres and radians, got {scales}")
+    if not all(math.isfinite(v) and v > 0 for scale in scales for v in scale):
+        raise ValueError(f"scales must hold positive numbers, got {scales}")
+    shares = [scale.every for scale in scales]
+    if any(a % b for a, b in itertools.pairwise(shares)):
+        raise ValueError(
+            f"a scale's points must be among the next one's: each every a multiple of the next, got {shares}"
+        )
     if min_pairs < 1:
         raise ValueError(f"min_pairs must be at least 1, got {min_pairs}")
     belief = None
@@ -101,11 +108,22 @@ def align_planes(
     )  # fmt: skip
     if not len(grid.points) or len(points) < min_pairs:
         return None
-    return runtime.dispatch(_align, _plain, grid, planes, points, of, plan)
+    return runtime.dispatch_here(
+        lambda: "cells" in vars(grid) and _launch.ready(), _align, _plain, grid, planes, points, of, plan
+    )
 
 
 def _plain(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
     return reference.align_planes(grid.tree, normals, source, kind, plan)
+
+
+_WHOLES = np.zeros(1, dtype=np.int32)
+_REALS = np.zeros(1, dtype=np.float32)
+_launch = Launch(
+    *("icp", "align", np.zeros(1), _WHOLES, _WHOLES, _REALS, _REALS, _WHOLES, np.zeros(1), _REALS, _WHOLES),
+    *(np.zeros((6, 7)), np.zeros(1), 1),
+)
+"""One is enough: only one call of native code runs at a time."""
 
 
 def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Alignment | None:
@@ -113,16 +131,16 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     memory, partners = np.full(4 * n, -1.0), np.full(6 * n, _FAR, dtype=np.float32)
     bins = np.empty(n + 2 * chunks * _BINS, dtype=np.int32)
     system, state = np.empty((6, 7)), np.zeros(_SUMS + 36)
-    above = np.flatnonzero(kind)
-    order = np.concatenate((above, np.flatnonzero(~kind)))
+    order, numbers = _by_scale(kind, plan.scales)
     state[:12] = plan.T[:3].ravel()
-    launch = Launch(
-        "icp", "align",
-        _settings(cells.frame, plan, len(above)), cells.starts, cells.rows, normals.reshape(-1),
-        source.reshape(-1), order.astype(np.int32), memory, partners, bins, system, state, chunks,
+    arguments = (
+        _settings(cells.frame, plan, numbers), cells.starts, cells.rows, normals.reshape(-1),
+        source[order].reshape(-1), kind[order].astype(np.int32), memory, partners, bins, system, state, chunks,
     )  # fmt: skip
+    for index, value in enumerate(arguments):
+        _launch.put(index, value)
     while not state[_STATUS]:
-        launch()
+        _launch()
     if state[_STATUS] == _LOST or not np.isfinite(state[:12]).all():
         return None
     pose = np.eye(4)
@@ -134,17 +152,26 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
     )
 
 
-def _settings(frame: F64, plan: Plan, above: int) -> F64:
+def _by_scale(kind: Mask, scales: Sequence[Scale]) -> tuple[I64, I64]:
+    """Order (N,) of the points by the first scale that they take part in, and how many each scale has."""
+    first = np.full(len(kind), len(scales))
+    groups = np.flatnonzero(kind), np.flatnonzero(~kind)
+    for k in reversed(range(len(scales))):
+        for group in groups:
+            first[group[:: scales[k].every]] = k
+    parts = [np.flatnonzero(first == k) for k in range(len(scales) + 1)]
+    return np.concatenate(parts), np.cumsum([len(part) for part in parts[:-1]])
+
+
+def _settings(frame: F64, plan: Plan, numbers: I64) -> F64:
     """Return all numbers that the kernel does not change in one array, as every argument costs 5-10 us."""
-    values = np.zeros(65 + 4 * len(plan.scales))
+    values = np.zeros(64 + 5 * len(plan.scales))
     values[:8] = frame
-    values[8:14] = (
-        plan.keep, plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None, above,
-    )  # fmt: skip
-    values[14:17] = plan.pivot
+    values[8:13] = plan.keep, plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None
+    values[13:16] = plan.pivot
     if plan.prior is not None:
-        values[17:29], values[29:65] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
-    values[65:] = np.ravel(plan.scales)
+        values[16:28], values[28:64] = plan.prior[0][:3].ravel(), plan.prior[1].ravel()
+    values[64:] = [v for scale, n in zip(plan.scales, numbers, strict=True) for v in (*scale[:4], n)]
     return values
 
 

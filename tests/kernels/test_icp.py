@@ -75,8 +75,11 @@ def assert_same(ours, plain, pivot):
 
 
 @settings(max_examples=25)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 3]))
-def test_kernel_agrees_with_numpy(seed, outliers, believed, threads):
+@given(
+    st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 3]),
+    st.sampled_from([(1, 1, 1), (4, 2, 1), (3, 3, 3)]),
+)  # fmt: skip
+def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every):
     rng = np.random.default_rng(seed)
     points, normals = room(rng, 0.01)
     truth = pose([0, 0, rng.uniform(-3, 3)], rng.uniform(-9, 9, 3))
@@ -87,7 +90,8 @@ def test_kernel_agrees_with_numpy(seed, outliers, believed, threads):
     prior = Belief(start, np.diag([1e4, 1e4, 1e3, 50.0, 40.0, 90.0])) if believed else None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coview_kernels.icp.runtime, "workers", lambda: threads)  # in how many parts it is done
-        ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior)
+        scales = tuple(scale._replace(every=n) for scale, n in zip(SCALES, every, strict=True))
+        ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior, scales)
     assert_same(ours, plain, pivot)
     assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < 0.1
 
@@ -181,3 +185,10 @@ def test_min_pairs_below_one_raises():
     assert align_planes(*arguments, **FIXED, min_pairs=1) is not None
     with pytest.raises(ValueError, match="min_pairs must be at least 1"):
         align_planes(*arguments, **FIXED, min_pairs=0)
+
+
+def test_points_of_a_scale_must_be_among_those_of_the_next():
+    cloud = np.random.default_rng(2).uniform(-5, 5, (300, 3)).astype(np.float32)
+    arguments = PointGrid(cloud), cloud, cloud, np.zeros(300, bool), np.eye(4), np.zeros(3)
+    with pytest.raises(ValueError, match="multiple of the next"):
+        align_planes(*arguments, [Scale(1.0, 1.0, every=3), Scale(0.5, 1.0, every=2)], **FIXED)

@@ -10,7 +10,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig, RegistrationConfig
-from coview_stream.geometry.arrays import Bools, Floats, Floats32
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import min_filter
 from coview_stream.geometry.transforms import Points, Pose, norms
 
@@ -64,11 +64,14 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
         seeded: equal input gives equal output.
     """
     thin = thinned(points, position, config)
-    height = height_above_lowest(thin)
+    height, cell = _heights(thin)
+    chosen = np.arange(len(thin))
     if len(thin) > config.source_points:
         chosen = np.random.default_rng(_SEED).choice(len(thin), config.source_points, replace=False)
         chosen.sort()
-        thin, height = thin[chosen], height[chosen]
+    # by place: points that lie together are compared with the same part of the map, which is in the cache then
+    chosen = chosen[np.argsort(cell[chosen], kind="stable")]
+    thin, height = thin[chosen], height[chosen]
     return RegistrationCloud(thin, height > _CLEAR, height)
 
 
@@ -86,8 +89,13 @@ def height_above_lowest(points: Points) -> Floats32:
 
     The neighbours matter where a sparse sensor sees only a facade in a cell and no ground.
     """
+    return _heights(points)[0]
+
+
+def _heights(points: Points) -> tuple[Floats32, Ints]:
+    """Height (N,) of each point above the lowest nearby, and the number (N,) of its cell."""
     if not len(points):
-        return np.empty(0, dtype=np.float32)
+        return np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int64)
     i, j = (np.floor(points[:, d] / _CELL).astype(np.int64) for d in range(2))
     i -= i.min()
     j -= j.min()
@@ -96,8 +104,7 @@ def height_above_lowest(points: Points) -> Floats32:
     lowest = np.full(rows * columns, np.inf, dtype=np.float32)
     np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
     around = min_filter(lowest.reshape(rows, columns), 3)
-    height: Floats32 = points[:, 2] - around.ravel()[cell]
-    return height
+    return points[:, 2] - around.ravel()[cell], cell
 
 
 def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Points:

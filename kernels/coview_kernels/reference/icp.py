@@ -27,6 +27,8 @@ class Scale(NamedTuple):
     """The scale ends with a step that is shorter than this, metres, ..."""
     turn: float = 5e-5
     """... and turns by less than this, radians."""
+    every: int = 1
+    """Of either kind of point one of so many takes part."""
 
 
 class Plan(NamedTuple):
@@ -62,8 +64,11 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
     """See :func:`coview_kernels.align_planes`; ``tree`` holds the map."""
     T, total, answer = plan.T, 0, None
     for scale in plan.scales:
+        part = np.zeros(len(source), dtype=bool)
+        for group in (kind, ~kind):
+            part[np.flatnonzero(group)[:: scale.every]] = True
         for _ in range(plan.iterations):
-            step = _step(tree, normals, source, kind, plan, T, scale)
+            step = _step(tree, normals, source[part], kind[part], plan, T, scale)
             if step is None:
                 return None
             increment, information, rmse, pairs = step
