@@ -52,20 +52,22 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
         then how far the ground lies above its surroundings' mean, 128 for not at all or unknown.
     """
     height, width = shape
-    index = np.floor((points[:, :2] - np.asarray(corner, dtype=points.dtype)) / CELL).astype(np.int64)
-    inside = ((index >= 0) & (index < (width, height))).all(axis=1)
-    points, index = points[inside], index[inside]
+    x, y, z = points.T
+    x, y = x - points.dtype.type(corner[0]), y - points.dtype.type(corner[1])
+    column, row = (np.floor(each * np.float32(1.0 / CELL)).astype(np.int64) for each in (x, y))
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    if not inside.all():
+        x, y, z, column, row = (each[inside] for each in (x, y, z, column, row))
     image = np.zeros((LAYERS, height * width), dtype=np.float32)
     image[-1] = 128.0
-    if not len(points):
+    if not len(z):
         return image.astype(np.uint8).reshape(LAYERS, height, width)
     ratio = round(_GROUND_CELL / CELL)
-    ground, relief = _ground(points, index // ratio, (height // ratio, width // ratio))
-    above = points[:, 2] - _interpolate(ground, (points[:, :2] - corner) / _GROUND_CELL - 0.5)
-    cell = index[:, 1] * width + index[:, 0]
-    _layers(image, cell, above)
-    fine = np.meshgrid((np.arange(width) + 0.5) / ratio - 0.5, (np.arange(height) + 0.5) / ratio - 0.5, indexing="xy")
-    curved = _interpolate(relief, np.stack([each.ravel() for each in fine], axis=1))
+    coarse = (row // ratio) * (width // ratio) + column // ratio
+    ground, relief = _ground(z, coarse, (height // ratio, width // ratio))
+    _layers(image, row * width + column, z - _interpolate(ground, x / _GROUND_CELL - 0.5, y / _GROUND_CELL - 0.5))
+    u, v = ((np.arange(n) + 0.5) / ratio - 0.5 for n in (width, height))
+    curved = _interpolate(relief, np.tile(u, height), np.repeat(v, width))
     image[-1] = np.clip(128.0 + curved * (127.0 / _MAX_RELIEF), 1.0, 255.0)
     return image.astype(np.uint8).reshape(LAYERS, height, width)
 
@@ -73,25 +75,27 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
 def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
     """Fill all layers of a flat image but the last from points in ``cell`` (N,), ``above`` (N,) metres high."""
     size, levels = image.shape[1], int(SLABS[-1] / _LEVEL)
-    standing = (above >= SLABS[0]) & (above < SLABS[-1])
-    level = (above[standing] / _LEVEL).astype(np.int64)
-    occupied = np.zeros(size * levels, dtype=bool)
-    occupied[cell[standing] * levels + level] = True
-    columns = occupied.reshape(size, levels)
+    standing = np.flatnonzero((above >= SLABS[0]) & (above < SLABS[-1]))
+    level = (above[standing] * np.float32(1.0 / _LEVEL)).astype(np.int64)
+    occupied = np.zeros((levels, size), dtype=np.uint8)
+    occupied.reshape(-1)[level * size + cell[standing]] = 1
     for k, (low, high) in enumerate(pairwise(SLABS)):
-        slab = columns[:, int(low / _LEVEL) : int(high / _LEVEL)]
-        image[k] = 255.0 * np.sqrt(slab.mean(axis=1, dtype=np.float32))
+        slab = occupied[int(low / _LEVEL) : int(high / _LEVEL)]  # no more than 255 levels
+        share = slab.sum(axis=0, dtype=np.uint8) * np.float32(1.0 / len(slab))
+        image[k] = 255.0 * np.sqrt(share)
     top = np.zeros(size, dtype=np.float32)
     np.maximum.at(top, cell, np.clip(above, 0.0, SLABS[-1]).astype(np.float32))
     image[-3] = top * (255.0 / SLABS[-1])
     image[-2, cell[above < _MAX_GROUND_HEIGHT]] = 255.0
 
 
-def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
-    """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 where it was not seen."""
-    flat = index[:, 1] * shape[1] + index[:, 0]
+def _ground(z: Reals, cell: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
+    """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 where it was not seen.
+
+    Points are ``z`` (N,) metres high and lie in ``cell`` (N,), flat.
+    """
     lowest = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
-    np.minimum.at(lowest, flat, points[:, 2])
+    np.minimum.at(lowest, cell, z)
     lowest = lowest.reshape(shape)
     seen = np.isfinite(lowest)
     # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
@@ -101,10 +105,11 @@ def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats
     ground = filled(np.where(np.isfinite(eroded), eroded, np.nan).astype(np.float32))
     ground = ndimage.median_filter(ground, 3)
     # the lowest point of a sloping cell lies below its middle: the mean of the points near it corrects that
-    rest = points[:, 2] - ground.ravel()[flat]
-    near = np.abs(rest) < _GROUND_BAND
-    count = np.bincount(flat[near], minlength=ground.size).reshape(shape)
-    total = np.bincount(flat[near], weights=rest[near], minlength=ground.size).reshape(shape)
+    rest = z - ground.ravel()[cell]
+    near = np.flatnonzero(np.abs(rest) < _GROUND_BAND)
+    there = cell[near]
+    count = np.bincount(there, minlength=ground.size).reshape(shape)
+    total = np.bincount(there, weights=rest[near], minlength=ground.size).reshape(shape)
     ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
     level = seen & (count > 0)
     weight = ndimage.gaussian_filter(level.astype(np.float32), _RELIEF_SIGMA / _GROUND_CELL)
@@ -114,6 +119,7 @@ def _ground(points: Points, index: Ints, shape: tuple[int, int]) -> tuple[Floats
     return ground, np.where(level & (weight > 1e-2), ground - mean, 0.0).astype(np.float32)
 
 
-def _interpolate(values: Floats32, at: Reals) -> Floats32:
-    """Interpolate an image (h, w) bilinearly at (N, 2) columns and rows."""
-    return np.asarray(ndimage.map_coordinates(values, at.T[::-1], order=1, mode="nearest", output=np.float32))
+def _interpolate(values: Floats32, column: Reals, row: Reals) -> Floats32:
+    """Interpolate an image (h, w) bilinearly at columns and rows (N,)."""
+    at = np.stack([row, column])
+    return np.asarray(ndimage.map_coordinates(values, at, order=1, mode="nearest", output=np.float32))

@@ -21,11 +21,12 @@ from coview_stream.localization.search.learned.correlation import correlate, dow
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.localization.search.learned.keypoint_registration import refine_by_keypoints
 from coview_stream.localization.search.learned.keypoints import Keypoints, keypoints
-from coview_stream.localization.search.retrieval import ScoreVolume
+from coview_stream.localization.search.votes import ScoreVolume
 
 _SIZE = 64.0
 """Metres along the edge of a query's image."""
 
+_ENERGY = 0.995  # of the features on a map that the dimensions in which they are compared hold; set by hand
 _MAX_SLOPE = 1.0  # metres per metre that the ground rises along a storey; set by hand
 _MAX_STEP = 1.25  # metres more than that: the next storey is at least 2.5 m away; set by hand
 _ROUNDING = 1e-6  # cells
@@ -87,12 +88,18 @@ class FeatureMatcher:
 
     @cached_property
     def index(self) -> FeatureIndex:
-        """The map's features on coarse cells, with their spectra."""
+        """The map's features on coarse cells, in the few dimensions that matter, with their spectra."""
+        return self._reduced[0]
+
+    @cached_property
+    def _reduced(self) -> tuple[FeatureIndex, Floats32]:
+        """The index, and the directions (D, C) of its dimensions."""
         whole, corner = self.features.coarse(self.config.cell)
         margin = round(0.5 * _SIZE / self.config.cell)
         surveyed = (whole != 0).any(axis=0)
-        # half precision: the features are kept beside their spectra, and come from single bytes anyway
-        return FeatureIndex(whole.astype(np.float16), corner, self.config.cell, surveyed=surveyed, margin=margin)
+        axes = principal_axes(whole[:, surveyed], _ENERGY)
+        reduced = np.tensordot(axes, whole, 1).astype(np.float32)
+        return FeatureIndex(reduced, corner, self.config.cell, surveyed=surveyed, margin=margin), axes
 
     @cached_property
     def _feature_blocks(self) -> Ints:
@@ -132,10 +139,11 @@ class FeatureMatcher:
         ``near`` (N, 2), metres. The median is 1, which is also the distance where nothing was compared: no evidence.
         """
         ratio = round(self.config.cell / LOCAL_CELL)
-        local, weight = downsample(query.features.local, query.weight, ratio)
+        index, axes = self._reduced
+        local, weight = downsample(np.tensordot(axes, query.features.local, 1), query.weight, ratio)
         yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
         blocks = self._feature_blocks if self.dense else self._similar_blocks(query, near)
-        read = self._at_stations(correlate(local, weight, self.index, yaws, blocks))
+        read = self._at_stations(correlate(local, weight, index, yaws, blocks))
         compared = np.isfinite(read)
         sample = read[:: max(1, read.size // _SAMPLE)]
         sample = sample[np.isfinite(sample)]
@@ -206,3 +214,16 @@ class FeatureMatcher:
         tiles = (chosen + 0.5) * (TILE * LOCAL_CELL)
         middles = np.vstack([tiles, np.asarray(near, dtype=np.float64).reshape(-1, 2)])
         return self.index.blocks_near(middles, _TILE_RADIUS)
+
+
+def principal_axes(vectors: Floats32, energy: float) -> Floats32:
+    """Find the fewest orthonormal directions (D, C) that hold a share of the energy of vectors (C, N), best first.
+
+    Inner products with the vectors change little where a query is reduced to them: what they leave out of a vector of
+    unit norm is ``1 - energy`` of its square in the mean.
+    """
+    moment = (vectors @ vectors.T).astype(np.float64)
+    values, directions = np.linalg.eigh(moment)
+    share = np.cumsum(values[::-1]) / max(float(values.sum()), 1e-30)
+    count = min(int(np.searchsorted(share, energy)) + 1, len(values))
+    return np.ascontiguousarray(directions[:, ::-1][:, :count].T, dtype=np.float32)

@@ -16,7 +16,7 @@ from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import Features
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.learned.matcher import FeatureMatcher, principal_axes
 from coview_stream.localization.search.votes import TableVote
 
 
@@ -181,3 +181,15 @@ def test_query_features_of_a_cloud(known):
     assert np.linalg.norm(view.place) == pytest.approx(1.0, abs=1e-4)
     assert view.weight[32, 32] > 0
     assert view.weight[0, 0] == 0 == view.weight[32, 0]
+
+
+def test_principal_axes_keep_inner_products_with_what_they_were_found_in():
+    rng = np.random.default_rng(3)
+    mixing = rng.normal(size=(32, 4)).astype(np.float32)
+    vectors = mixing @ rng.normal(size=(4, 500)).astype(np.float32) + rng.normal(0, 1e-3, (32, 500)).astype(np.float32)
+    axes = principal_axes(vectors, 0.999)
+    assert axes.shape == (4, 32)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(4), atol=1e-5)
+    query = rng.normal(size=32).astype(np.float32)
+    np.testing.assert_allclose((axes @ query) @ (axes @ vectors), query @ vectors, atol=0.1)
+    assert len(principal_axes(vectors, 1.0)) == 32
