@@ -14,6 +14,7 @@ lever arm [t]x R, would belong to turning about the map's origin.)
 
 from __future__ import annotations
 
+import math
 from typing import TypeVar
 
 import numpy as np
@@ -163,9 +164,9 @@ def wrap_angle(angle: float) -> float:
 def rotation_angle(T: Pose) -> float:
     """Return the angle of the rotation part, radians in [0, pi]."""
     # the sine keeps its precision near zero, where the cosine of eq. 15 has none left
-    R = T[:3, :3]
-    sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
+    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
+    sine = 0.5 * math.hypot(h - f, c - g, d - b)
+    return math.atan2(sine, 0.5 * (a + e + i - 1.0))
 
 
 def tilt_of(T: Pose) -> float:
