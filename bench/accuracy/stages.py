@@ -32,6 +32,8 @@ from coview_stream.recordings.open_run import open_run
 
 WINDOW = 5  # keyframes that vote together in the coarse measure
 
+_DESCRIBED = ("descriptor.", "station_codes")  # arrays of a map that depend on how stations are described
+
 NEAR, ALIGNED = 3.0, float(np.radians(9.0))
 """A place is right within this, metres and radians: one and a half blocks, one and a half shifts."""
 
@@ -71,7 +73,7 @@ class Bank:
 
     def __init__(self, path: Path) -> None:
         arrays, self._parameters, _ = file_format.load(path)
-        self._geometry = {name: a for name, a in arrays.items() if not name.startswith("descriptor.")}
+        self._geometry = {name: a for name, a in arrays.items() if not name.startswith(_DESCRIBED)}
         self.built = BaseMap(arrays, self._parameters)
         self._known: dict[Channel, npt.NDArray[np.float16]] = {}
 

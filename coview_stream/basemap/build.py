@@ -16,6 +16,7 @@ from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.floors import below_another
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.likelihood_field import field_arrays
+from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.tiles import sort_by_tile
 from coview_stream.clouds.cloud import merge
@@ -98,6 +99,7 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
         "surveyed": surveyed,
         "surveyed_corner": surveyed_corner,
         **{f"descriptor.{name}": values for name, values in described.items()},
+        **StationIndex.of(described).arrays(),
         **field,
         **learned[0],
     }

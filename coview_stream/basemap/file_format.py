@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,6 +24,7 @@ VERSION = 1
 Arrays = dict[str, npt.NDArray[Any]]
 
 _CHUNK = 1 << 22  # bytes written or hashed at a time
+_CACHE_LINE = 64  # bytes
 _TYPES = {
     "F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "I16": "<i2", "I8": "|i1", "U8": "|u1",
 }  # fmt: skip
@@ -38,7 +40,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
     check_target(path)
     text = json.dumps(parameters, sort_keys=True)
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    digest = _digest(text, contiguous)
+    digest = _digest(text, contiguous, lambda name: _chunks(contiguous[name]))
     metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
     try:
         with atomic_file(path, sync=True) as file:
@@ -72,26 +74,27 @@ def check_target(path: Path) -> None:
 def _write(file: BinaryIO, arrays: Arrays, metadata: dict[str, str]) -> None:
     """Write the safetensors layout array by array: the library's own writer holds a second copy of everything."""
     header: dict[str, Any] = {"__metadata__": metadata}
-    # the wide types first, so that every array begins at a multiple of its item size
-    names = sorted(arrays, key=lambda name: (-arrays[name].dtype.itemsize, name))
+    # those that fill cache lines first, so that each of them begins with one; then the wide types, so that every array
+    # begins at a multiple of its item size
+    names = sorted(arrays, key=lambda name: (arrays[name].nbytes % _CACHE_LINE > 0, -arrays[name].dtype.itemsize, name))
     end = 0
     for name in names:
         array = arrays[name]
         begin, end = end, end + array.nbytes
         header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
+    text += b" " * (-(8 + len(text)) % _CACHE_LINE)
     file.write(len(text).to_bytes(8, "little") + text)
     for name in names:
-        data = arrays[name].reshape(-1).view(np.uint8)
-        for begin in range(0, len(data), _CHUNK):
-            file.write(data[begin : begin + _CHUNK].data)
+        for chunk in _chunks(arrays[name]):
+            file.write(chunk)
 
 
-def load(path: Path) -> tuple[Arrays, dict[str, Any], str]:
+def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
     """Memory-map a map: its arrays (read-only), parameters and sha256.
 
-    The whole file is read once, to compare it with its checksum; after that only the pages used are in memory.
+    The whole file is read once, to compare it with its checksum, if ``check``; after that only the pages used are in
+    memory.
 
     Raises:
         MapError: missing, not a base map, of another version, truncated, or damaged.
@@ -106,7 +109,10 @@ def load(path: Path) -> tuple[Arrays, dict[str, Any], str]:
         )
     try:
         arrays = {name: _mapped(path, start, entry) for name, entry in sorted(header.items())}
-        digest = _digest(metadata["parameters"], arrays)
+        digest = str(metadata.get("sha256"))
+        if check:
+            with path.open("rb") as file:
+                digest = _digest(metadata["parameters"], arrays, lambda name: _read(file, start, header[name]))
         parameters = json.loads(metadata["parameters"])
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
@@ -145,12 +151,30 @@ def _mapped(path: Path, start: int, entry: dict[str, Any]) -> npt.NDArray[Any]:
     return np.memmap(path, dtype=dtype, mode="r", offset=start + begin, shape=shape)
 
 
-def _digest(parameters: str, arrays: Arrays) -> str:
+def _read(file: BinaryIO, start: int, entry: dict[str, Any]) -> Iterator[bytes]:
+    """Read an array's bytes in chunks: pages of a memory map would count as this process's memory."""
+    begin, end = entry["data_offsets"]
+    file.seek(start + begin)
+    while begin < end:
+        chunk = file.read(min(_CHUNK, end - begin))
+        if not chunk:
+            raise ValueError("an array reaches beyond the file")
+        yield chunk
+        begin += len(chunk)
+
+
+def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
+    """Cut an array's bytes into chunks."""
+    data = array.reshape(-1).view(np.uint8)
+    for begin in range(0, len(data), _CHUNK):
+        yield data[begin : begin + _CHUNK].data
+
+
+def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[bytes | memoryview]]) -> str:
+    """Hash parameters, and names, types, shapes and content of the arrays."""
     total = hashlib.sha256(parameters.encode())
     for name in sorted(arrays):
-        array = arrays[name]
-        total.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        data = array.reshape(-1).view(np.uint8)
-        for begin in range(0, len(data), _CHUNK):
-            total.update(data[begin : begin + _CHUNK].data)
+        total.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
+        for chunk in content(name):
+            total.update(chunk)
     return total.hexdigest()

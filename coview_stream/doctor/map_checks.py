@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # set by hand; of onnxruntime, the network and what else is imported, in two processes
 _NETWORK_MEMORY = 0.2 * GB
+_INDEX_MEMORY = 600.0  # bytes per station: 512 of the index, and what a search says of each; set by hand
 _SPECTRA_MEMORY = 80.0  # bytes per square metre, set by hand
 
 
@@ -60,14 +61,8 @@ def _features_finding(base_map: BaseMap) -> Finding:
 
 
 def node_memory(base_map: BaseMap) -> float:
-    """Return a node's own bytes: processes, spectra as far as they are cached, and the volumes of one search."""
-    from coview_stream.localization.search.retrieval import _CACHE_BYTES
-
-    config = base_map.descriptor_config
-    channels = len(config.channels)
-    spectra = len(base_map) * config.rings * (config.sectors // 2 + 1) * 8 * channels
-    volumes = len(base_map) * config.sectors * 4 * (channels + 1)  # one exists twice while it is assembled
-    return MIN_MEMORY + min(spectra, _CACHE_BYTES) + volumes + _learned_memory(base_map)
+    """Return a node's own bytes: processes, the station index, and what a search of it takes."""
+    return MIN_MEMORY + len(base_map) * _INDEX_MEMORY + _learned_memory(base_map)
 
 
 def _learned_memory(base_map: BaseMap) -> float:

@@ -29,6 +29,7 @@ from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
+from coview_kernels.station_codes import CodedQuery, StationCodes
 from coview_kernels.voxel_filter import VoxelFilter, transform_unique
 from coview_kernels.warm_up import warm_up
 
@@ -36,6 +37,7 @@ __all__ = [
     "Alignment",
     "Beams",
     "Belief",
+    "CodedQuery",
     "Distances",
     "FieldMap",
     "FieldScan",
@@ -50,6 +52,7 @@ __all__ = [
     "RayCounts",
     "Scale",
     "Sight",
+    "StationCodes",
     "VoxelFilter",
     "align_planes",
     "all_shift_distance",

@@ -13,7 +13,6 @@ from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.smallest_distance import SmallestDistance
-from coview_stream.localization.search.votes import TableVote
 
 if TYPE_CHECKING:  # imports SciPy, which takes a while
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
@@ -44,7 +43,7 @@ class SearchIndex:
     """The part of the recognizers that all searches of one map share; None for what is not used.
 
     Attributes:
-        retrieval: the stations' co-view descriptors.
+        retrieval: comparison with the stations' co-view descriptors.
         learned: the map's learned features.
     """
 
@@ -105,11 +104,10 @@ class CoViewRecognizer:
             return
         centre = on_ground(request.scan, request.position) if descriptor.ground_zero else request.position
         self.last_query = describe(request.scan, centre, descriptor)
-        volumes = self.retrieval.distances(self.last_query).values()
         if isinstance(self.consensus, SmallestDistance):
-            self.consensus.vote(centre, volumes)
+            self.consensus.vote(centre, self.retrieval.distances(self.last_query).values())
         else:
-            self.consensus.vote(TableVote.of_distances(centre, volumes))
+            self.consensus.vote(self.retrieval.vote(centre, self.last_query))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks."""

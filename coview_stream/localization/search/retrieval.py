@@ -1,31 +1,36 @@
-"""Retrieval: the distance of a virtual local scan to every station at every shift (eqs 5-9)."""
+"""Retrieval: a virtual local scan compared with the virtual scans of all stations at every shift (eqs 5-9)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
+from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel, DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import Descriptor, ring_key
-from coview_stream.geometry.arrays import Complexes, Floats32
+from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.localization.search.coview_vote import CoViewVote
+from coview_stream.localization.search.votes import ScoreVolume, TableVote, Vote
 
-ScoreVolume = Floats32
-"""(M, S): one number for each station and shift."""
-
-_CACHE_BYTES = 400_000_000  # spectra of all stations are kept if they fit, else made anew block by block; set by hand
 _BLOCK = 8192  # stations whose spectra are made at a time; set by hand
 
 
 class Stations(Protocol):
-    """The part of a base map that retrieval uses: its stations' descriptors."""
+    """The part of a base map that retrieval uses: its stations' descriptors and their index."""
 
     @property
     def descriptor_config(self) -> DescriptorConfig:
         """Return how the descriptors were made."""
+        ...
+
+    @property
+    def station_index(self) -> StationIndex:
+        """Return the index of the descriptors."""
         ...
 
     def __len__(self) -> int:
@@ -38,76 +43,57 @@ class Stations(Protocol):
 
 
 class Retrieval:
-    """Distances of a query to all stations of a map: exact (mode ``exhaustive``), or by the paper's ``ring_key``."""
+    """Comparison of queries with a map's stations: votes, by the station index; distances, by the descriptors.
+
+    Mode ``exhaustive`` compares with all stations, the paper's ``ring_key`` with those of similar ring keys.
+    """
 
     def __init__(self, stations: Stations, config: RetrievalConfig) -> None:
         self.stations = stations
         self.config = config
-        self._spectra: dict[Channel, Complexes] = {}
-        self._keys: dict[Channel, Floats32] = {}
-        self._indices: dict[Channel, kernels.MatchIndex] = {}
-
-    def distances(self, query: dict[Channel, Descriptor]) -> dict[Channel, ScoreVolume]:
-        """Return the distances (M, S) in [0, 2] of each channel (eqs 7-9); shift n means yaw -2 pi n / S.
-
-        In ``ring_key`` mode stations that are not among the candidates have distance 1 at every shift.
-        """
-        return {name: self._channel(name, descriptor) for name, descriptor in query.items()}
-
-    def best(self, query: dict[Channel, Descriptor], k: int) -> dict[Channel, kernels.Nearest]:
-        """Return the ``k`` nearest stations of each channel (eqs 7-9), each at its best shift, nearest first.
-
-        The same stations as :meth:`distances` would give, at a fraction of its time and memory: bounds rule most of
-        the stations out. An index of 1.3 kB per station is made at the first query.
-        """
-        return {name: self._nearest(name, descriptor, k) for name, descriptor in query.items()}
 
     def prepare(self) -> None:
-        """Make the spectra that are kept, or the first query makes them."""
-        if self.config.mode == "exhaustive" and self._cached():
-            for name in self.stations.descriptor_config.channels:
-                next(self._blocks(name))
+        """Make what the first vote would."""
+        if self.config.mode == "exhaustive":
+            self.stations.station_index.prepare()
 
-    def _cached(self) -> bool:
-        """Tell whether the spectra of all stations fit in memory."""
-        config = self.stations.descriptor_config
-        size = len(self.stations) * (config.sectors // 2 + 1) * config.rings * 8 * len(config.channels)
-        return size <= _CACHE_BYTES
+    def vote(self, centre: Floats, query: Mapping[Channel, Descriptor]) -> Vote:
+        """Return a keyframe's vote; ``centre`` (3,) is the zero of its descriptors, odometry frame."""
+        if self.config.mode == "exhaustive":
+            return CoViewVote(centre, self.stations.station_index, query)
+        return TableVote.of_distances(centre, self.distances(query).values())
 
-    def _channel(self, name: Channel, query: Descriptor) -> ScoreVolume:
-        if self.config.mode == "ring_key":
-            return self._by_ring_key(name, query)
-        sectors = query.shape[-1]
-        parts = [kernels.all_shift_distance(query, spectra, sectors) for spectra in self._blocks(name)]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    def distances(self, query: Mapping[Channel, Descriptor]) -> dict[Channel, ScoreVolume]:
+        """Return the exact distances (M, S) in [0, 2] of each channel (eqs 7-9); shift n means yaw -2 pi n / S.
 
-    def _nearest(self, name: Channel, query: Descriptor, k: int) -> kernels.Nearest:
-        bounded = self.config.mode == "exhaustive" and query.shape[-1] <= kernels.MatchIndex.MAX_SECTORS
-        if not bounded or kernels.backend() == "numpy":  # the compiled kernel only has the bounds
-            volume = self._channel(name, query)
-            nearest = volume.min(axis=1)
-            station = np.argsort(nearest, kind="stable")[:k]
-            return kernels.Nearest(station, volume[station].argmin(axis=1), nearest[station])
-        if name not in self._indices:
-            self._indices[name] = kernels.MatchIndex(self.stations.descriptors(name))
-        return self._indices[name].top_k(query, k, spectra=self._spectra.get(name))
+        They take seconds and gigabytes on large maps: for comparison. In ``ring_key`` mode stations that are not among
+        the candidates have distance 1 at every shift.
+        """
+        exact = self._exhaustive if self.config.mode == "exhaustive" else self._by_ring_key
+        return {name: exact(name, descriptor) for name, descriptor in query.items()}
 
-    def _blocks(self, name: Channel) -> Iterator[Complexes]:
+    def _exhaustive(self, name: Channel, query: Descriptor) -> ScoreVolume:
         descriptors = self.stations.descriptors(name)
-        if not self._cached():
-            for start in range(0, len(descriptors), _BLOCK):
-                yield kernels.column_spectra(descriptors[start : start + _BLOCK].astype(np.float32))
-            return
-        if name not in self._spectra:
-            self._spectra[name] = kernels.column_spectra(descriptors.astype(np.float32))
-        yield self._spectra[name]
+        volume = np.empty((len(descriptors), query.shape[-1]), dtype=np.float32)
+        for start in range(0, len(descriptors), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            volume[part] = _distance(query, descriptors[part])
+        return volume
 
     def _by_ring_key(self, name: Channel, query: Descriptor) -> ScoreVolume:
-        if name not in self._keys:
-            self._keys[name] = ring_key(self.stations.descriptors(name).astype(np.float32))
         gap = np.linalg.norm(self._keys[name] - ring_key(query), axis=1)
         nearest = np.argsort(gap, kind="stable")[: self.config.candidates]
         volume = np.ones((len(self.stations), query.shape[-1]), dtype=np.float32)
-        spectra = kernels.column_spectra(self.stations.descriptors(name)[nearest].astype(np.float32))
-        volume[nearest] = kernels.all_shift_distance(query, spectra, query.shape[-1])
+        volume[nearest] = _distance(query, self.stations.descriptors(name)[nearest])
         return volume
+
+    @cached_property
+    def _keys(self) -> dict[Channel, Floats32]:
+        """(M, R) ring keys by channel."""
+        channels = self.stations.descriptor_config.channels
+        return {name: ring_key(self.stations.descriptors(name).astype(np.float32)) for name in channels}
+
+
+def _distance(query: Descriptor, descriptors: npt.NDArray[np.float16]) -> ScoreVolume:
+    spectra = kernels.column_spectra(descriptors.astype(np.float32))
+    return kernels.all_shift_distance(query, spectra, query.shape[-1])

@@ -11,7 +11,7 @@ from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
-from coview_stream.localization.search.retrieval import ScoreVolume
+from coview_stream.localization.search.votes import ScoreVolume
 
 
 class SmallestDistance:

@@ -8,7 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.localization.search.retrieval import ScoreVolume
+
+ScoreVolume = Floats32
+"""(M, S): one number for each station and shift."""
 
 _SAMPLE = 100_000  # distances that a median is taken of; set by hand
 

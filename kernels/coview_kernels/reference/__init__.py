@@ -13,11 +13,15 @@ from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.matching_bounds import best_correlations
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
+from coview_kernels.reference.station_codes import best_codes, code_products, codes_at
 from coview_kernels.reference.voxel_filter import transform_unique
 
 __all__ = [
     "align_planes",
+    "best_codes",
     "best_correlations",
+    "code_products",
+    "codes_at",
     "coview",
     "describe_points",
     "field_scores",

@@ -1,15 +1,19 @@
-"""Retrieval: exhaustive equals brute force, blocks equal the cache, ring keys score their candidates only."""
+"""Retrieval: distances equal brute force, votes nearly so, and ring keys score their candidates only."""
 
 from __future__ import annotations
+
+from functools import cached_property
 
 import numpy as np
 import pytest
 
+from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import DescriptorConfig, RetrievalConfig
 from coview_stream.descriptors.coview import describe, ring_key
 from coview_stream.localization.search import retrieval
 from coview_stream.localization.search.consensus import yaw_of_shift
 from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.votes import TableVote
 
 M, R, S = 40, 8, 12
 
@@ -31,6 +35,10 @@ class Stations:
 
     def descriptors(self, name):
         return self.full[name]
+
+    @cached_property
+    def station_index(self):
+        return StationIndex.of(self.full)
 
 
 @pytest.fixture(scope="module")
@@ -69,33 +77,50 @@ def test_exhaustive_retrieval_equals_brute_force(stations, query):
         np.testing.assert_allclose(volume[7], 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("block", [1, 7, M, 100])
-def test_blockwise_retrieval_equals_cached(stations, query, monkeypatch, block):
-    cached = Retrieval(stations, RetrievalConfig())
-    expected = cached.distances(query)
-    monkeypatch.setattr(retrieval, "_CACHE_BYTES", 0)
-    monkeypatch.setattr(retrieval, "_BLOCK", block)
-    streamed = Retrieval(stations, RetrievalConfig())
-    for name, volume in streamed.distances(query).items():
-        np.testing.assert_allclose(volume, expected[name], atol=1e-5)
-    assert not streamed._spectra
-    assert set(cached._spectra) == set(query)
-
-
-def test_prepared_spectra_are_reused(stations, query, monkeypatch):
+@pytest.mark.parametrize("block", [1, 7, M])
+def test_distances_are_the_same_in_blocks(stations, query, monkeypatch, block):
     expected = Retrieval(stations, RetrievalConfig()).distances(query)
-    prepared = Retrieval(stations, RetrievalConfig())
-    prepared.prepare()
-    monkeypatch.delattr(retrieval.kernels, "column_spectra")
-    for name, volume in prepared.distances(query).items():
-        np.testing.assert_array_equal(volume, expected[name])
+    monkeypatch.setattr(retrieval, "_BLOCK", block)
+    for name, volume in Retrieval(stations, RetrievalConfig()).distances(query).items():
+        np.testing.assert_allclose(volume, expected[name], atol=1e-5)
 
 
-def test_spectra_are_not_prepared_when_too_large_or_unused(stations, monkeypatch):
-    monkeypatch.delattr(retrieval.kernels, "column_spectra")
-    Retrieval(stations, RetrievalConfig(mode="ring_key")).prepare()
-    monkeypatch.setattr(retrieval, "_CACHE_BYTES", 10)
-    Retrieval(stations, RetrievalConfig()).prepare()
+def test_vote_needs_no_descriptors_of_all_stations(stations, query, monkeypatch):
+    known = Retrieval(stations, RetrievalConfig())
+    known.prepare()
+    monkeypatch.setattr(Stations, "descriptors", None)
+    vote = known.vote(np.zeros(3), query)
+    assert len(vote.candidates()[0])
+
+
+def test_vote_is_that_of_the_exact_distances(stations, query):
+    vote = Retrieval(stations, RetrievalConfig()).vote(np.zeros(3), query)
+    exact = TableVote.of_distances(np.zeros(3), Retrieval(stations, RetrievalConfig()).distances(query).values())
+    station, shift = (each.ravel() for each in np.indices((M, S)))
+    found, expected = vote.at(station, shift), exact.at(station, shift)
+    assert np.abs(found - expected).max() < 1.0
+    assert np.corrcoef(found, expected)[0, 1] > 0.98
+    np.testing.assert_array_equal(vote.at(np.full(3, -1), np.arange(3)), 0.0)
+    assert vote.sectors == S
+
+
+def test_candidates_are_the_best_headings_of_the_best_stations(stations, query):
+    vote = Retrieval(stations, RetrievalConfig()).vote(np.zeros(3), query)
+    station, shift = vote.candidates()
+    scores = vote.at(*(each.ravel() for each in np.indices((M, S)))).reshape(M, S)
+    assert len(set(zip(station.tolist(), shift.tolist(), strict=True))) == len(station)
+    best = scores[station, shift]
+    assert (np.diff(best) >= 0).all()
+    assert (best <= scores[station, (shift + 1) % S]).all()
+    assert (best < scores[station, shift - 1]).all()
+    assert best[0] == scores.min()
+
+
+def test_ring_key_votes_only_for_its_candidates(stations, query):
+    vote = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=1)).vote(np.zeros(3), query)
+    exact = Retrieval(stations, RetrievalConfig(mode="ring_key", candidates=1)).distances(query)
+    scored = [np.flatnonzero((volume != 1.0).any(axis=1)) for volume in exact.values()]
+    assert vote.candidates()[0][0] in np.concatenate(scored)
 
 
 def test_ring_key_retrieval_scores_only_its_candidates(stations, query):
@@ -135,25 +160,3 @@ def test_robot_turned_left_is_found_at_its_heading(turn):
     station, shift = np.unravel_index(volume["scan_context"].argmin(), volume["scan_context"].shape)
     assert station == 8
     assert np.cos(yaw_of_shift(int(shift), S) - yaw) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("mode", ["exhaustive", "ring_key"])
-@pytest.mark.parametrize("k", [1, 5, M + 1])
-def test_best_stations_equal_sorted_distances(stations, query, mode, k):
-    one = Retrieval(stations, RetrievalConfig(mode=mode, candidates=9))
-    found, volumes = one.best(query, k), one.distances(query)
-    for name, volume in volumes.items():
-        nearest = volume.min(axis=1)
-        expected = np.sort(nearest)[: min(k, M)]
-        np.testing.assert_allclose(found[name].distance, expected, atol=1e-6)
-        np.testing.assert_allclose(nearest[found[name].station], expected, atol=1e-6)
-        np.testing.assert_allclose(volume[found[name].station, found[name].shift], expected, atol=1e-6)
-
-
-def test_best_stations_are_the_same_without_kernels(stations, query, monkeypatch):
-    expected = Retrieval(stations, RetrievalConfig()).best(query, 4)
-    monkeypatch.setattr(retrieval.kernels, "backend", lambda: "numpy")
-    for name, found in Retrieval(stations, RetrievalConfig()).best(query, 4).items():
-        np.testing.assert_array_equal(found.station, expected[name].station)
-        np.testing.assert_array_equal(found.shift, expected[name].shift)
-        np.testing.assert_allclose(found.distance, expected[name].distance, atol=1e-6)

@@ -1,0 +1,48 @@
+"""Vote of one keyframe by its descriptors: the station index screens all stations for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from coview_stream.basemap.station_index import StationIndex
+from coview_stream.config import Channel
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.localization.search.votes import argsmallest
+
+_MIN_STATIONS = 4096  # whose shifts are looked at one by one: the best; set by hand
+_SHARE = 16  # on large maps it is one in so many; set by hand
+_PER_STATION = 0.5  # candidates for each station looked at; set by hand
+
+
+class CoViewVote:
+    """Vote by co-view descriptors.
+
+    Attributes:
+        centre: (3,) zero of the descriptors, z on the ground; odometry frame, metres.
+    """
+
+    def __init__(self, centre: Floats, index: StationIndex, query: Mapping[Channel, Floats32]) -> None:
+        self.centre = centre
+        self._index = index
+        self._query = index.query(query)
+
+    @property
+    def sectors(self) -> int:
+        """Number of shifts S."""
+        return self._index.sectors
+
+    def candidates(self) -> tuple[Ints, Ints]:
+        """Return stations and shifts (K,): the best of the headings at which the best stations are most alike."""
+        count = max(_MIN_STATIONS, len(self._index) // _SHARE)
+        stations = argsmallest(self._index.best(self._query), count)
+        scores = self._index.all_shifts(self._query, stations)
+        last, after = np.roll(scores, 1, axis=1), np.roll(scores, -1, axis=1)
+        station, shift = np.nonzero((scores < last) & (scores <= after))
+        chosen = argsmallest(scores[station, shift], int(count * _PER_STATION))
+        return stations[station[chosen]], shift[chosen]
+
+    def at(self, stations: Ints, shifts: Ints) -> Floats32:
+        """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1."""
+        return self._index.at(self._query, stations, shifts)

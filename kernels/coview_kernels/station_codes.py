@@ -1,0 +1,344 @@
+r"""Correlation of a query with all stations from 512 bytes each (eqs 7-9), however many channels and rings they have.
+
+The correlation at shift n is a sum over the frequencies f of :math:`Re(conj(c_f) . q_f e^{i 2 pi f n / S})`, where c
+and q are spectra of unit columns, all rings of all channels together. Of the lowest 32 frequencies those parts are
+kept that vary most: c_f is projected on the first 12 eigenvectors of its second moments over a sample of the
+stations, 4 from frequency 16 on (Karhunen-Loeve transform), and stored as int8 with a step for each number. The query
+gets the same treatment, at higher precision; its channels may be weighted.
+
+What is lost is the same whatever the shift: right places keep about nine tenths of what sets them apart, and ``python
+-m bench scale`` counts how many right places the search loses by it.
+
+Layout: a station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold the frequencies 0 to 15, rows 12 to 15 those
+from 16 on; the first 8 lanes the even ones, the others the odd ones, which change their sign half a turn on, so that
+one sum serves two angles. The lower byte is a real part, the whole in units of 256 an imaginary one: to multiply
+either takes no unpacking but one shift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import C64, F32, I16, I32, I64, as_float32
+from coview_kernels.launch import Launch
+from coview_kernels.similarity import unit_columns
+
+ANGLES = 60
+"""Angles at which :meth:`StationCodes.best` looks."""
+
+_LANES, _LOW, _HIGH = 16, 12, 4  # as in _ti_station_codes.py
+_ROWS = _LOW + _HIGH
+_GROUP = np.repeat([0, 1], [_LOW, _HIGH])  # of each row
+_LANE = np.concatenate([np.arange(0, 16, 2), np.arange(1, 16, 2)])  # frequency of each lane in the first group
+_FREQUENCIES = 32
+_BATCH = 512  # stations transformed at a time
+_SAMPLE = 2048  # stations from which transform and steps are learned
+_INT8_RANGE = 6.0  # standard deviations that int8 spans: 5 to 8 differ by a tenth in error on simulated sites
+_MAX_SUM = 32_500.0  # of int16, with room for what rounding adds
+_MIN_PARALLEL = 4096  # stations from which other threads are worth waking
+_CHUNK = 16_384  # pairs of station and shift at a time
+
+
+@dataclass(frozen=True)
+class CodedQuery:
+    """A query in the stations' terms.
+
+    Attributes:
+        numbers: (16, 16) complex64 its transform.
+        real: (16, 16) float32 what a station's real part counts in units of its integers.
+        imaginary: (16, 16) float32 what its imaginary part does, in units of the whole number.
+        integers: (2, 16, 2, 16) int16 for real and imaginary products.
+        turn: (65, 16) int16 table of rotations.
+        unit: value of one unit of the turned products.
+        sectors: number of shifts S.
+    """
+
+    numbers: C64
+    real: F32
+    imaginary: F32
+    integers: I16
+    turn: I16
+    unit: float
+    sectors: int
+
+    @cached_property
+    def factors(self) -> F32:
+        """(16, 4, 16) of a station's numbers, for real and imaginary products without rounding."""
+        p, s = self.numbers.real, self.numbers.imag
+        each = p * self.real, s * self.imaginary, s * self.real, -p * self.imaginary
+        return np.ascontiguousarray(np.stack(each, axis=1), dtype=np.float32)
+
+    @cached_property
+    def table(self) -> F32:
+        """(S, 16, 2, 16) of a station's numbers, for the correlation at every shift."""
+        angle = (2.0 * np.pi / self.sectors) * np.arange(self.sectors)[:, None, None] * _frequencies()[_GROUP]
+        turned = self.numbers * np.exp(1j * angle).astype(np.complex64)
+        return np.ascontiguousarray(
+            np.stack([turned.real * self.real, turned.imag * self.imaginary], axis=2), dtype=np.float32
+        )
+
+
+class StationCodes:
+    """M stations in 512 bytes each, and what it takes to compare a query with them.
+
+    Attributes:
+        codes: (M, 16, 16) int16; a memory map stays one.
+        basis: (16, 16, D) complex64 eigenvectors; D is rings times channels.
+        step: (16, 2, 16) float32 what one unit of int8 stands for, real and imaginary.
+        norm: (33,) float32 greatest norm of the integers of any station by frequency block, and of all its numbers.
+        sectors: number of shifts S.
+    """
+
+    def __init__(self, codes: I16, basis: C64, step: F32, norm: F32, sectors: int) -> None:
+        self.codes = codes
+        self.basis = basis
+        self.step = step
+        self.norm = norm
+        self.sectors = sectors
+        self._kernels: _Kernels | None = None
+
+    @classmethod
+    def of(cls, descriptors: Sequence[npt.NDArray[Any]]) -> StationCodes:
+        """Code stations by their descriptors (M, R, S), float16 or float32, one array per channel.
+
+        Raises:
+            ValueError: the channels' shapes differ.
+        """
+        count, rings, sectors = descriptors[0].shape
+        if any(each.shape != (count, rings, sectors) for each in descriptors):
+            raise ValueError(f"descriptors have shapes {[each.shape for each in descriptors]}, expected one for all")
+        sample = _spectra(_columns([each[:: -(-count // _SAMPLE) or 1] for each in descriptors]))
+        basis = _eigenvectors(sample)
+        square = (_parts(_projected(sample, basis)) ** 2).mean(axis=0) if count else np.zeros((_ROWS, 2, _LANES))
+        least = 1e-3 * square.max(initial=0.0) + 1e-12  # numbers that are empty in the sample
+        step = np.sqrt(np.maximum(square, least)).astype(np.float32) * np.float32(_INT8_RANGE / 127.0)
+        codes = np.empty((count, _ROWS, _LANES), dtype=np.int16)
+        norm = np.zeros(2 * _LANES + 1, dtype=np.float32)
+        for start in range(0, count, _BATCH):
+            part = slice(start, start + _BATCH)
+            numbers = _parts(_projected(_spectra(_columns([each[part] for each in descriptors])), basis)) / step
+            codes[part] = _pack(numbers)
+            whole = _unpack(codes[part])
+            square = np.concatenate(
+                [(whole[:, rows] ** 2).sum(axis=(1, 2)) for rows in (slice(0, _LOW), slice(_LOW, _ROWS))], axis=1
+            )
+            norm[:-1] = np.maximum(norm[:-1], square.max(axis=0))
+            norm[-1] = max(norm[-1], ((whole * step) ** 2).sum(axis=(1, 2, 3)).max())
+        return cls(codes, basis, step, np.sqrt(norm), sectors)
+
+    def __len__(self) -> int:
+        """Return the number of stations M."""
+        return len(self.codes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what may be copied or sent to another process: all but the prepared launches."""
+        return self.__dict__ | {"_kernels": None}
+
+    def query(self, columns: npt.ArrayLike) -> CodedQuery:
+        """Transform a query: its unit columns (D, S), the channels stacked in the stations' order and weighted.
+
+        Raises:
+            ValueError: another shape.
+        """
+        stacked = as_float32("columns", columns, self.basis.shape[2], self.sectors)
+        numbers = _projected(_spectra(stacked[None]), self.basis)[0]
+        p, s = numbers.real, numbers.imag
+        pair = np.stack([np.stack([p, s], axis=1), np.stack([s, -p], axis=1)]) * self.step
+        size = np.sqrt(np.stack([(pair[:, g == _GROUP] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
+        limit = np.minimum((_MAX_SUM - 4.0 * _ROWS) * 256.0 / np.maximum(self.norm[:-1].reshape(2, -1), 1.0), 32_000.0)
+        gain = limit / np.maximum(size, 1e-30)
+        scale = np.where(size > 0, 256.0 / gain, 0.0)  # of one unit of a product
+        span = float(self.norm[-1]) * float(np.linalg.norm(numbers)) + _ROWS * float(scale.sum())
+        unit = max(2.01 * float(scale.max()), span / 31_000.0, 1e-30)
+        angle = (2.0 * np.pi / ANGLES) * _frequencies()[:, :, None] * np.arange(_LANES)
+        factor = (65_536.0 / unit * scale)[:, :, None]
+        turn = np.concatenate([np.cos(angle) * factor, -np.sin(angle) * factor]).reshape(-1, _LANES)
+        return CodedQuery(
+            numbers,
+            self.step[:, 0],
+            self.step[:, 1] * np.float32(1.0 / 256.0),
+            np.rint(pair * gain[_GROUP][:, None]).astype(np.int16),
+            np.rint(np.concatenate([np.zeros((1, _LANES)), turn])).astype(np.int16),
+            unit,
+            self.sectors,
+        )
+
+    def best(self, query: CodedQuery) -> F32:
+        """Return the greatest correlation (M,) with each station over 60 angles; of 60 sectors, all shifts."""
+        found = runtime.dispatch_here(self._ready, self._native_best, self._plain_best, query)
+        return found * np.float32(query.unit)
+
+    def all_shifts(self, query: CodedQuery, stations: npt.ArrayLike) -> F32:
+        """Return the correlations (K, S) with stations (K,) at all shifts."""
+        index = np.ascontiguousarray(stations, dtype=np.int32)
+        products = runtime.dispatch_here(self._ready, self._native_products, self._plain_products, query, index)
+        return np.asarray(products.reshape(len(index), -1) @ self._rotations)
+
+    def at(self, query: CodedQuery, stations: npt.ArrayLike, shifts: npt.ArrayLike) -> F32:
+        """Return the correlations (K,) with stations (K,) at shifts (K,); 0 for station -1."""
+        index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
+        return runtime.dispatch_here(self._ready, self._native_at, self._plain_at, query, index, turned)
+
+    @cached_property
+    def _rotations(self) -> F32:
+        """(64, S) factors of the products at the shifts."""
+        angle = (2.0 * np.pi / self.sectors) * _frequencies()[:, :, None] * np.arange(self.sectors)
+        return np.stack([np.cos(angle), -np.sin(angle)], axis=1).reshape(4 * _LANES, -1).astype(np.float32)
+
+    def _ready(self) -> bool:
+        return self._kernels is not None and self._kernels.ready()
+
+    def _prepared(self) -> _Kernels:
+        if self._kernels is None:
+            self._kernels = _Kernels(self.codes)
+        return self._kernels
+
+    def _native_best(self, query: CodedQuery) -> I32:
+        return self._prepared().best(query.integers, query.turn)
+
+    def _plain_best(self, query: CodedQuery) -> I32:
+        return reference.best_codes(self.codes, query.integers, query.turn)
+
+    def _native_products(self, query: CodedQuery, stations: I32) -> F32:
+        return self._prepared().products(query.factors, stations)
+
+    def _plain_products(self, query: CodedQuery, stations: I32) -> F32:
+        return reference.code_products(self.codes, query.factors, stations)
+
+    def _native_at(self, query: CodedQuery, stations: I32, shifts: I32) -> F32:
+        return self._prepared().at(query.table, stations, shifts)
+
+    def _plain_at(self, query: CodedQuery, stations: I32, shifts: I32) -> F32:
+        return reference.codes_at(self.codes, query.table, stations, shifts)
+
+
+class _Kernels:
+    """The kernels' launches and the memory that they share with NumPy; to be used as :meth:`ready` says."""
+
+    def __init__(self, codes: I16) -> None:
+        flat = codes.reshape(-1)
+        self._query = np.zeros((2, _ROWS, 2, _LANES), dtype=np.int16)
+        self._turn = np.zeros((1 + 4 * _LANES, _LANES), dtype=np.int16)
+        self._best = np.empty(len(codes), dtype=np.int32)
+        self._stations, self._shifts = np.zeros((2, _CHUNK), dtype=np.int32)
+        self._factors = np.zeros((_ROWS, 4, _LANES), dtype=np.float32)
+        self._products = np.zeros((_CHUNK, 2, 2, _LANES), dtype=np.float32)
+        self._values = np.zeros(_CHUNK, dtype=np.float32)
+        serial = runtime.workers() == 1 or len(codes) < _MIN_PARALLEL
+        name = "best_serial" if serial else "best_parallel"
+        common = self._query.reshape(-1), self._turn.reshape(-1), self._best, _LANES
+        self._launches = (
+            Launch("station_codes", name, flat, *common),
+            Launch(
+                *("station_codes", "products", flat, self._factors.reshape(-1), self._stations),
+                *(self._products.reshape(-1), 0),
+            ),
+            Launch(
+                *("station_codes", "at", flat, self._factors.reshape(-1), self._stations, self._shifts),
+                *(self._values, 0),
+            ),
+        )
+
+    def ready(self) -> bool:
+        """Tell whether all may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
+        return all(launch.ready() for launch in self._launches)
+
+    def best(self, query: I16, turn: I16) -> I32:
+        self._query[:], self._turn[:] = query, turn
+        self._launches[0]()
+        copied: I32 = self._best.copy()
+        return copied
+
+    def products(self, factors: F32, stations: I32) -> F32:
+        self._factors[:] = factors
+        found = np.empty((len(stations), 2, 2, _LANES), dtype=np.float32)
+        for start in range(0, len(stations), _CHUNK):
+            part = stations[start : start + _CHUNK]
+            self._stations[: len(part)] = part
+            self._launches[1].put(4, len(part))
+            self._launches[1]()
+            found[start : start + len(part)] = self._products[: len(part)]
+        return found
+
+    def at(self, table: F32, stations: I32, shifts: I32) -> F32:
+        self._launches[2].put(1, table.reshape(-1))
+        found = np.zeros(len(stations), dtype=np.float32)
+        for start in range(0, len(stations), _CHUNK):
+            part = slice(start, min(start + _CHUNK, len(stations)))
+            count = part.stop - part.start
+            self._stations[:count], self._shifts[:count] = stations[part], shifts[part]
+            self._values[:count] = 0.0
+            self._launches[2].put(5, count)
+            self._launches[2]()
+            found[part] = self._values[:count]
+        return found
+
+
+def _frequencies() -> I64:
+    """Frequency of each lane of both groups (2, 16)."""
+    return np.stack([_LANE, _LANE + _LANES])
+
+
+def _columns(descriptors: Sequence[npt.NDArray[Any]]) -> F32:
+    """Stack the unit columns (m, D, S) of the channels' descriptors (m, R, S)."""
+    return np.concatenate([unit_columns(each) for each in descriptors], axis=1)
+
+
+def _spectra(columns: F32) -> C64:
+    """(32, m, D) weighted spectra of (m, D, S) columns, such that correlations are plain sums; 0 beyond S / 2."""
+    sectors = columns.shape[2]
+    known = min(_FREQUENCIES, sectors // 2 + 1)
+    spectra = np.zeros((_FREQUENCIES, *columns.shape[:2]), dtype=np.complex64)
+    frequency = np.arange(known)
+    weight = np.where((frequency == 0) | (2 * frequency == sectors), 1.0, np.sqrt(2.0)) / sectors
+    whole = np.fft.rfft(columns, axis=-1)[..., :known] * weight.astype(np.float32)
+    spectra[:known] = whole.transpose(2, 0, 1)
+    return spectra
+
+
+def _eigenvectors(sample: C64) -> C64:
+    """(16, 16, D) of the second moments of spectra (32, m, D), greatest first; beyond D there are zeros."""
+    moments = np.matmul(sample.transpose(0, 2, 1).astype(np.complex128), sample.conj())
+    vectors = np.linalg.eigh(moments)[1][:, :, ::-1]  # (32, D, D)
+    basis = np.zeros((_ROWS, _LANES, sample.shape[2]), dtype=np.complex64)
+    for group, (first, rows) in enumerate(((0, _LOW), (_LOW, _HIGH))):
+        kept = vectors[_frequencies()[group], :, :rows].transpose(2, 0, 1)
+        basis[first : first + len(kept)] = kept
+    return basis
+
+
+def _projected(spectra: C64, basis: C64) -> C64:
+    """(m, 16, 16) numbers of spectra (32, m, D)."""
+    numbers = np.empty((spectra.shape[1], _ROWS, _LANES), dtype=np.complex64)
+    for group, rows in enumerate((slice(0, _LOW), slice(_LOW, _ROWS))):
+        lanes = spectra[_frequencies()[group]]  # (16, m, D)
+        numbers[:, rows] = np.matmul(lanes, basis[rows].conj().transpose(1, 2, 0)).transpose(1, 2, 0)
+    return numbers
+
+
+def _parts(numbers: C64) -> F32:
+    """(m, 16, 2, 16) real and imaginary parts."""
+    return np.stack([numbers.real, numbers.imag], axis=2)
+
+
+def _pack(numbers: F32) -> I16:
+    """(..., L) int16 of (..., 2, L): the second in the upper byte, rounded with regard to the lower one."""
+    low = np.clip(np.rint(numbers[..., 0, :]), -127, 127).astype(np.int16) & 255
+    high = np.clip(np.rint(numbers[..., 1, :] - low * np.float32(1.0 / 256.0)), -127, 127).astype(np.int16)
+    packed: I16 = (high << 8) | low
+    return packed
+
+
+def _unpack(pair: I16) -> F32:
+    """(..., 2, L) numbers that (..., L) int16 stand for: the lower byte, and the whole of it in units of 256."""
+    whole = np.empty((*pair.shape[:-1], 2, pair.shape[-1]), dtype=np.float32)
+    whole[..., 0, :] = pair.astype(np.int8)
+    np.multiply(pair, np.float32(1.0 / 256.0), out=whole[..., 1, :])
+    return whole
