@@ -13,6 +13,7 @@ from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_fr
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
+from coview_stream.localization.registration.verification import RangeImage
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
@@ -239,7 +240,8 @@ class Localizer:
         if frame.keyframe is None:
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
-        request = SearchRequest.of(self._buffer, frame.keyframe, frame.cloud, spec, travelled, self._epoch, hints)
+        rays = RangeImage.rays(frame.cloud)
+        request = SearchRequest.of(self._buffer, frame.keyframe, rays, spec, travelled, self._epoch, hints)
         # what the search would begin with: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
 

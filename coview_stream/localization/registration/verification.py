@@ -138,8 +138,13 @@ class RangeImage:
     @classmethod
     def of(cls, cloud: Points) -> RangeImage:
         """Sort a frame (N, 3), body frame, metres, by direction; returns within a metre are the robot's own."""
-        every = max(1, -(-len(cloud) // _MAX_RAYS))
+        every = _rays_apart(cloud)
         return cls(*kernels.sort_beams(cloud, _SIGHT, every), _floor_below(cloud[::every]))
+
+    @staticmethod
+    def rays(cloud: Points) -> Points:
+        """Return those of a frame's points (N, 3) that :meth:`of` takes: it makes the same of them alone."""
+        return cloud[:: _rays_apart(cloud)]
 
     @staticmethod
     def cells(points: Floats, ranges: Floats) -> Ints:
@@ -155,6 +160,11 @@ class RangeImage:
     def limits(self) -> Floats32:
         """(2, C) nearest and farthest return of each cell; below any range where they are too few to say anything."""
         return np.where(self.hits >= _BEAM_HITS, (self.nearest, self.farthest), np.float32(-np.inf))
+
+
+def _rays_apart(cloud: Points) -> int:
+    """Return how many points of a frame (N, 3) apart those are that are used."""
+    return max(1, -(-len(cloud) // _MAX_RAYS))
 
 
 def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int, int]:

@@ -153,3 +153,14 @@ def test_dense_frame_is_verified_by_a_sample(monkeypatch):
 
 def test_empty_frame_has_no_rays():
     assert free_space(RangeImage.of(np.empty((0, 3), np.float32)), BODY, WALL) == (0, 0)
+
+
+@pytest.mark.parametrize("count", [20_000, 32_769, 150_001])
+def test_rays_of_a_frame_make_the_same_range_image(count):
+    cloud = np.random.default_rng(1).normal(0.0, 15.0, (count, 3)).astype(np.float32)
+    rays = RangeImage.rays(cloud)
+    assert len(rays) <= 32_768
+    of_all, of_rays = RangeImage.of(cloud), RangeImage.of(np.ascontiguousarray(rays))
+    for name in ("nearest", "farthest", "hits"):
+        np.testing.assert_array_equal(getattr(of_all, name), getattr(of_rays, name))
+    assert of_all.floor == of_rays.floor
