@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I32, I64, as_finite64, as_float32
+from coview_kernels.launch import Launch
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
 if TYPE_CHECKING:
@@ -97,14 +98,23 @@ def nearest(grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.Array
     pose = None if T is None else as_finite64("T", T, 4, 4)
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(f"radius must be finite and positive, got {radius}")
-    return runtime.dispatch(_nearest, _plain, grid, cloud, float(radius), pose)
+    return runtime.dispatch_here(
+        lambda: "cells" in vars(grid) and _launch.ready(), _nearest, _plain, grid, cloud, float(radius), pose
+    )
+
+
+_WHOLES = np.zeros(1, dtype=np.int32)
+_launch = Launch("nearest", "nearest", np.zeros(8), _WHOLES, _WHOLES, np.zeros((1, 3), np.float32), _EYE, 1.0, _EYE)
+"""One is enough: only one call of native code runs at a time."""
 
 
 def _nearest(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple[F64, I64]:
     cells = grid.cells
     answer = np.empty((2, len(queries)))
     answer[0], answer[1] = np.inf, len(grid.points)
-    runtime.kernels("nearest").nearest(*cells, queries, _EYE if T is None else T, radius, answer)
+    for index, value in enumerate((*cells, queries, _EYE if T is None else T, radius, answer)):
+        _launch.put(index, value)
+    _launch()
     return answer[0], answer[1].astype(np.int64)
 
 
