@@ -1,8 +1,8 @@
 # mypy: ignore-errors
 """Taichi source of field.py: a hypothesis after another on each thread, all of its levels in one go.
 
-The coarse level is the one that vectorises: the shifts of a point by whole metres are neighbouring words of the
-raster, whose bits are added to a local vector.
+The coarse level counts the hits of a point at all 49 shifts at once: they are neighbouring bits of the raster, seven
+from each of seven rows, and are added to 49 numbers whose digits lie side by side in words.
 """
 
 from coview_kernels import runtime
@@ -23,9 +23,11 @@ ti = runtime.library()
 FLOATS = ti.types.ndarray(ti.f32, 1)
 DOUBLES = ti.types.ndarray(ti.f64, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
+PLANES = ti.types.ndarray(ti.u16, 1)
 BITS = ti.types.ndarray(ti.i64, 1)
 
-WINDOW, LANES = 2 * REACH + 1, 8  # coarse shifts a side, and the same in whole registers
+WINDOW = 2 * REACH + 1  # coarse shifts a side
+DIGITS = 7  # of a number of hits: 127 points at most
 CENTIMETRE = 0.01
 
 
@@ -51,49 +53,51 @@ def bit(word, z):
 
 
 @ti.func
-def coarse_best(coarse: ti.template(), high, wide, structure: ti.template(), count, x, y, z, yaw):
+def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x, y, z, yaw):
     """Return the shift and the turn, in steps, at which most points are near structure; small ones first."""
     best, at, turn = -1, 0, 0
     for a in range(TURNS):
         angle = yaw + TURN * (a - TURNS // 2)
         c, s = ti.cos(angle), ti.sin(angle)
-        hits = ti.Vector.zero(ti.i32, WINDOW * LANES)
-        for p in range(count):
-            q = spread(p, count, structure)
+        # digits of 49 numbers that are counted in one go: bit 7 i + j of the d-th word is digit d of shift (i, j)
+        digits = ti.Vector.zero(ti.i64, DIGITS)
+        for p in range(structure.shape[0] // 3):
+            q = 3 * p
             u, v = structure[q], structure[q + 1]
-            row = ti.cast(ti.floor(y + s * u + c * v), ti.i32)
-            column = ti.cast(ti.floor(x + c * u - s * v), ti.i32)
-            if row >= REACH and row < high - REACH and column >= REACH and column < wide - REACH - 1:
+            row = ti.cast(ti.floor(y + s * u + c * v), ti.i32) - REACH
+            column = ti.cast(ti.floor(x + c * u - s * v), ti.i32) - REACH
+            if row >= 0 and row < high - 2 * REACH and column >= 0 and column < 8 * blocks - 8:
                 level = ti.cast(ti.floor(z + structure[q + 2]), ti.i32) & 31
-                first = (row - REACH) * wide + column - REACH
-                for i in range(WINDOW):
-                    for j in range(LANES):
-                        hits[i * LANES + j] += (coarse[first + i * wide + j] >> level) & 1
-        for i in range(WINDOW):
-            for j in range(WINDOW):
-                # of equal ones the nearest: a sixteenth of a point for each step
-                off = ti.abs(i - REACH) + ti.abs(j - REACH) + ti.abs(a - TURNS // 2)
-                value = 16 * hits[i * LANES + j] - off
-                if value > best:
-                    best, at, turn = value, i * WINDOW + j, a
+                first = (level * high + row) * blocks + (column >> 3)
+                carry = ti.cast(0, ti.i64)
+                for i in ti.static(range(WINDOW)):
+                    word = ti.cast(planes[first + i * blocks], ti.i64) >> (column & 7)
+                    carry |= (word & (2**WINDOW - 1)) << (WINDOW * i)
+                for d in ti.static(range(DIGITS)):
+                    both = digits[d] & carry
+                    digits[d] ^= carry
+                    carry = both
+        for k in range(WINDOW * WINDOW):
+            hits = 0
+            for d in ti.static(range(DIGITS)):
+                hits += ti.cast((digits[d] >> k) & 1, ti.i32) << d
+            # of equal ones the nearest: a sixteenth of a point for each step
+            off = ti.abs(k // WINDOW - REACH) + ti.abs(k % WINDOW - REACH) + ti.abs(a - TURNS // 2)
+            value = 16 * hits - off
+            if value > best:
+                best, at, turn = value, k, a
     return at, turn
 
 
 @ti.func
-def spread(p, count, points: ti.template()):
-    """Return the place of the ``p``-th of ``count`` points that are spread evenly over all."""
-    return 3 * ti.cast(ti.cast(p, ti.i64) * (points.shape[0] // 3) // count, ti.i32)
-
-
-@ti.func
 def fine_hits(
-    table: ti.template(), down, across, bits: ti.template(), structure: ti.template(), count, x, y, z, yaw, step,
+    table: ti.template(), down, across, bits: ti.template(), structure: ti.template(), x, y, z, yaw, step,
     hits: ti.template(),
 ):  # fmt: skip
     """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
-    for p in range(count):
-        q = spread(p, count, structure)
+    for p in range(structure.shape[0] // 3):
+        q = 3 * p
         u, v = x + c * structure[q] - s * structure[q + 1], y + s * structure[q] + c * structure[q + 1]
         level = ti.cast(ti.floor(2.0 * (z + structure[q + 2])), ti.i64) & 63
         for i in ti.static(range(3)):
@@ -104,17 +108,16 @@ def fine_hits(
 
 @ti.func
 def rise(
-    table: ti.template(), down, across, base: ti.template(), surface: ti.template(), low: ti.template(), count,
+    table: ti.template(), down, across, base: ti.template(), surface: ti.template(), low: ti.template(),
     x, y, z, yaw, reach,
 ) -> ti.f32:  # fmt: skip
     """Return by how much the scan has to rise to the map's ground, from points within ``reach`` of it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     total, number = ti.cast(0.0, ti.f32), 0
-    for p in range(count):
-        q = spread(p, count, low)
-        u, v = low[q], low[q + 1]
+    for p in range(low.shape[0] // 3):
+        u, v = low[3 * p], low[3 * p + 1]
         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-        d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - low[q + 2]
+        d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - low[3 * p + 2]
         counts = ti.cast(ground_of(surface[at]) > NOT_SURVEYED, ti.i32) & ti.cast(ti.abs(d) < reach, ti.i32)
         total += ti.select(counts > 0, d, 0.0)
         number += counts
@@ -123,15 +126,15 @@ def rise(
 
 @ti.kernel
 def score(
-    coarse: WHOLES, wide: ti.i32, table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, surface: WHOLES,
-    structure: FLOATS, low: FLOATS, free: FLOATS, settings: WHOLES, poses: DOUBLES, counts: WHOLES, chunks: ti.i32,
+    planes: PLANES, blocks: ti.i32, high: ti.i32,
+    table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, surface: WHOLES,
+    few: FLOATS, some: FLOATS, lows: FLOATS, structure: FLOATS, low: FLOATS, free: FLOATS, levels: ti.i32,
+    poses: DOUBLES, counts: WHOLES, chunks: ti.i32,
 ):  # fmt: skip
-    """Move and score the poses; ``settings``: points of the coarse level, of a fine one, of the height; fine levels."""
+    """Move and score poses; the coarse level, the fine ones and the height take ``few``, ``some`` and ``lows``."""
     for task in range(chunks * SPAN):
         if task % SPAN == 0:
             down = table.shape[0] // across
-            high = coarse.shape[0] // wide
-            few, some, lows, levels = settings[0], settings[1], settings[2], settings[3]
             for n in range(poses.shape[0] // 4 // chunks + 1):
                 h = n * chunks + task // SPAN
                 if h < poses.shape[0] // 4:
@@ -140,12 +143,12 @@ def score(
                     z = ti.cast(poses[4 * h + 2], ti.f32)
                     yaw = ti.cast(poses[4 * h + 3], ti.f32)
                     if levels > 0:
-                        at, turn = coarse_best(coarse, high, wide, structure, few, x, y, z, yaw)
+                        at, turn = coarse_best(planes, high, blocks, few, x, y, z, yaw)
                         x += ti.cast(at % WINDOW - REACH, ti.f32)
                         y += ti.cast(at // WINDOW - REACH, ti.f32)
                         yaw += TURN * (turn - TURNS // 2)
-                        z += rise(table, down, across, base, surface, low, lows, x, y, z, yaw, 2.0)
-                        z += rise(table, down, across, base, surface, low, lows, x, y, z, yaw, 0.5)
+                        z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 2.0)
+                        z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
                     for _ in range(levels):
                         # the shift first, then the heading, with the shifts around the one that was best before
@@ -153,7 +156,7 @@ def score(
                         for k in range(3):
                             turned = yaw + angle * ((k + 1) % 3 - 1)
                             hits = ti.Vector.zero(ti.i32, 9)
-                            fine_hits(table, down, across, bits, structure, some, x, y, z, turned, step, hits)
+                            fine_hits(table, down, across, bits, some, x, y, z, turned, step, hits)
                             for i in ti.static(range(3)):
                                 for j in ti.static(range(3)):
                                     value = 4 * hits[3 * i + j] - abs(i - 1) - abs(j - 1) - ti.min(k, 1)
@@ -165,7 +168,7 @@ def score(
                         step *= 0.5
                         angle *= 0.5
                     if levels > 0:
-                        z += rise(table, down, across, base, surface, low, lows, x, y, z, yaw, 0.5)
+                        z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     c, s = ti.cos(yaw), ti.sin(yaw)
                     inside, close, covered, inside_low, grounded, passed = 0, 0, 0, 0, 0, 0
                     for p in range(structure.shape[0] // 3):

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, as_finite64, as_float32
+from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, U16, as_finite64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
 from coview_kernels.warm_up import SAMPLE, compiled_by
@@ -118,7 +118,7 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine:
     """
     start = as_finite64("poses", poses, None, 4)
     structure, low, free = (as_float32(name, getattr(scan, name), None, 3) for name in ("structure", "low", "free"))
-    few = min(COARSE, len(structure)), min(FINE, len(structure)), min(LOW, len(low))
+    few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
     plan = Plan(structure, low, free, *few, LEVELS if refine else 0)
     layers = field.layers
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
@@ -131,12 +131,18 @@ def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
     poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 6), dtype=np.int32)
     Launch(
         "field", "score",
-        layers.coarse.reshape(-1), layers.coarse.shape[1], layers.table.reshape(-1), layers.table.shape[1],
-        layers.base, layers.bits.reshape(-1), layers.surface.reshape(-1),
-        plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1),
-        np.array(plan[3:], dtype=np.int32), poses.reshape(-1), counts.reshape(-1), runtime.workers(),
+        layers.coarse.reshape(-1), layers.coarse.shape[2], layers.coarse.shape[1],
+        layers.table.reshape(-1), layers.table.shape[1], layers.base, layers.bits.reshape(-1),
+        layers.surface.reshape(-1), plan.few.reshape(-1), plan.some.reshape(-1), plan.lows.reshape(-1),
+        plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1), plan.levels,
+        poses.reshape(-1), counts.reshape(-1), runtime.workers(),
     )()  # fmt: skip
     return poses, counts
+
+
+def _spread(points: F32, count: int) -> F32:
+    """Return ``count`` points, or all, that are spread evenly over all."""
+    return points[np.arange(count) * len(points) // count] if len(points) > count else points
 
 
 def _near(occupied: I64, table: I32) -> I64:
@@ -159,8 +165,8 @@ def _near(occupied: I64, table: I32) -> I64:
     return np.asarray(near)
 
 
-def _coarse(occupied: I64, table: I32) -> I32:
-    """Return (H, W) int32 for the cells of a metre of the whole table: bit ``floor(z) mod 32`` within a metre."""
+def _coarse(occupied: I64, table: I32) -> U16:
+    """Return (32, H, W / 8) uint16 planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
     half = TILE // 2
     cells = occupied.view(np.uint64).reshape(-1, half, 2, half, 2)
     folded = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
@@ -172,7 +178,12 @@ def _coarse(occupied: I64, table: I32) -> I32:
     out[:-1] |= metres[1:]
     out[:, 1:] |= metres[:, :-1]
     out[:, :-1] |= metres[:, 1:]
-    return np.ascontiguousarray(out).view(np.int32)
+    planes = np.zeros((32, len(out), columns * half // 8 + 1), dtype=np.uint16)
+    for level, plane in enumerate(planes):
+        packed = np.packbits((out >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16)
+        plane[:, :-1] = packed
+        plane[:, :-2] |= packed[:, 1:] << np.uint16(8)
+    return planes
 
 
 def _pairs(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:

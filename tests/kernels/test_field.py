@@ -7,7 +7,7 @@ import pytest
 
 import coview_kernels as kernels
 from coview_kernels import reference
-from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan
+from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan, _spread
 from coview_kernels.reference.field import NO_GROUND, TILE, Plan
 
 
@@ -67,7 +67,7 @@ def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.
     field, scan, pose, others = scene
     starts = np.vstack([pose, others])
     corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
-    few = min(COARSE, len(scan.structure)), min(FINE, len(scan.structure)), min(LOW, len(scan.low))
+    few = _spread(scan.structure, COARSE), _spread(scan.structure, FINE), _spread(scan.low, LOW)
     for levels in (0, 2):
         plan = Plan(scan.structure, scan.low, scan.free, *few, levels)
         poses, counts = reference.field_scores(field.layers, plan, starts - corner)

@@ -101,18 +101,17 @@ def score_hypotheses(
     compared, every = _field_scan(scan)
     found = kernels.field_scores(field, compared, np.column_stack([T[:, :3, :3] @ pivot + T[:, :3, 3], yaw]))
     score, inside = _scores(found, compared, every)
-    hinted = np.arange(len(hypotheses)) >= len(hypotheses) - hints
-    order, place = _places(found.pose, score * inside)
+    hinted = [k >= len(hypotheses) - hints for k in range(len(hypotheses))]
     poses = _poses(found.pose, pivot)
     out = []
-    for number, first in enumerate(order):
-        members = np.flatnonzero(place == number).tolist()
+    for first, members in _places(found.pose, score * inside):
         voted = [hypotheses[k] for k in members if not hinted[k]]
         # its own votes, if it has any; a hint that came to a place with votes adds nothing to them
         own = hypotheses[first] if not hinted[first] or not voted else voted[0]
         lead = max((each.lead for each in voted), default=0.0)
         own = replace(own, T_map_odom=poses[first], lead=lead)
-        out.append(ScoredPlace(own, float(score[first]), float(inside[first]), bool(hinted[members].any())))
+        hint = len(voted) < len(members)
+        out.append(ScoredPlace(own, float(score[first]), float(inside[first]), hint))
     return out
 
 
@@ -129,23 +128,21 @@ def _scores(found: kernels.FieldScores, scan: kernels.FieldScan, every: tuple[fl
     return score, (structure + low) / max(whole, 1.0)
 
 
-def _places(pose: Floats, rank: Floats) -> tuple[list[int], Ints]:
-    """Group poses (H, 4): the best pose of each place (P), best first, and the number of the place of each (H,)."""
+def _places(pose: Floats, rank: Floats) -> list[tuple[int, list[int]]]:
+    """Group poses (H, 4): the best one of each place, best first, and all that are there."""
     order = np.argsort(-rank, kind="stable")
-    position, yaw = pose[order, :3].astype(np.float32), pose[order, 3]
-    place = np.full(len(order), -1)
-    first: list[int] = []
-    for k in range(len(order)):
-        if place[k] >= 0:
-            continue
-        off = position[k:] - position[k]
-        turn = np.abs((yaw[k:] - yaw[k] + np.pi) % (2.0 * np.pi) - np.pi)
-        same = (np.einsum("ij,ij->i", off, off) < SAME_DISTANCE**2) & (turn < SAME_ANGLE) & (place[k:] < 0)
-        place[k:][same] = len(first)
-        first.append(int(order[k]))
-    numbers = np.empty_like(place)
-    numbers[order] = place
-    return first, numbers
+    x, y, z, yaw = pose[order].astype(np.float32).T
+    gap = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 + (z[:, None] - z) ** 2
+    turn = np.abs((yaw[:, None] - yaw + np.pi) % (2.0 * np.pi) - np.pi)
+    same = (gap < SAME_DISTANCE**2) & (turn < SAME_ANGLE)
+    free = np.ones(len(order), dtype=bool)
+    out = []
+    for k, row in enumerate(same):
+        if free[k]:
+            members = np.flatnonzero(row & free)
+            free[members] = False
+            out.append((int(order[k]), order[members].tolist()))
+    return out
 
 
 def _poses(pose: Floats, pivot: Floats) -> Floats:

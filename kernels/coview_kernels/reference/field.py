@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coview_kernels.arrays import F32, F64, I32, I64, Mask
+from coview_kernels.arrays import F32, F64, I32, I64, U16, Mask
 
 CELL, TILE = 0.5, 32
 NO_GROUND, NOT_SURVEYED = -32768, -32767
@@ -33,19 +33,20 @@ class FieldLayers(NamedTuple):
     """(T + 1, 32, 32, 2) bit ``floor(2 z) mod 64``: near structure; on it."""
     surface: I32
     """(T + 1, 32, 32) ground in the lower half, centimetres; edge above it."""
-    coarse: I32
-    """(16 R, 16 C) cells of a metre: bit ``floor(z) mod 32`` within a metre of structure."""
+    coarse: U16
+    """(32, 16 R, 2 C + 1) a plane for each metre of height modulo 32, a word for every eight cells of a metre along a
+    row: bit k says whether the k-th cell from there on, of 16, is within a metre of structure."""
 
 
 class Plan(NamedTuple):
-    """A scan, and how much of it each level takes."""
+    """A scan, the parts of it that the levels take, and the number of fine levels."""
 
     structure: F32
     low: F32
     free: F32
-    coarse: int
-    fine: int
-    height: int
+    few: F32
+    some: F32
+    lows: F32
     levels: int
 
 
@@ -64,36 +65,29 @@ def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]
 
 
 def _refine(layers: FieldLayers, plan: Plan, pose: F64) -> None:
-    structure, low = _spread(plan.structure, plan.coarse), _spread(plan.low, plan.height)
     best = -1
     shift = (0, 0, 0)
     for a in range(TURNS):
-        hits = _coarse_hits(layers.coarse, structure, pose, float(pose[3]) + TURN * (a - TURNS // 2))
+        hits = _coarse_hits(layers.coarse, plan.few, pose, float(pose[3]) + TURN * (a - TURNS // 2))
         for i, j in np.ndindex(hits.shape):
             value = 16 * int(hits[i, j]) - abs(i - REACH) - abs(j - REACH) - abs(a - TURNS // 2)
             if value > best:
                 best, shift = value, (i - REACH, j - REACH, a - TURNS // 2)
     pose += np.array([shift[1], shift[0], 0.0, TURN * shift[2]])
     for reach in (2.0, 0.5):
-        pose[2] += _rise(layers, low, pose, reach)
-    structure = _spread(plan.structure, plan.fine)
+        pose[2] += _rise(layers, plan.lows, pose, reach)
     step, angle = 0.5, 0.5 * TURN
     for _ in range(plan.levels):
         best, move = -1, np.zeros(4)
         for k in _TURN_BACK:
             for i, j in np.ndindex(3, 3):
                 there = pose + np.array([step * (j - 1), step * (i - 1), 0.0, angle * k])
-                value = 4 * _fine_hits(layers, structure, there) - abs(i - 1) - abs(j - 1) - abs(k)
+                value = 4 * _fine_hits(layers, plan.some, there) - abs(i - 1) - abs(j - 1) - abs(k)
                 if value > best:
                     best, move = value, there - pose
         pose += move
         step, angle = 0.5 * step, 0.5 * angle
-    pose[2] += _rise(layers, low, pose, 0.5)
-
-
-def _spread(points: F32, count: int) -> F32:
-    """Return ``count`` points that are spread evenly over all."""
-    return points[np.arange(count) * len(points) // max(count, 1)]
+    pose[2] += _rise(layers, plan.lows, pose, 0.5)
 
 
 def _placed(points: F32, pose: F64) -> F32:
@@ -103,14 +97,15 @@ def _placed(points: F32, pose: F64) -> F32:
     return np.stack([x + c * u - s * v, y + s * u + c * v, z + w], axis=1)
 
 
-def _coarse_hits(coarse: I32, structure: F32, pose: F64, yaw: float) -> I64:
+def _coarse_hits(planes: U16, structure: F32, pose: F64, yaw: float) -> I64:
     at = np.floor(_placed(structure, np.array([*pose[:3], yaw]))).astype(np.int64)
-    high, wide = coarse.shape
-    inside = (at[:, 1] >= REACH) & (at[:, 1] < high - REACH) & (at[:, 0] >= REACH) & (at[:, 0] < wide - REACH - 1)
-    column, row, level = at[inside].T
-    side = np.arange(-REACH, REACH + 1)
-    words = coarse[row[:, None, None] + side[:, None], column[:, None, None] + side]
-    return np.asarray(((words >> (level & 31)[:, None, None]) & 1).sum(axis=0, dtype=np.int64))
+    _, high, blocks = planes.shape
+    column, row = at[:, 0] - REACH, at[:, 1] - REACH
+    inside = (row >= 0) & (row < high - 2 * REACH) & (column >= 0) & (column < 8 * blocks - 8)
+    column, row, level = column[inside], row[inside], at[inside, 2] & 31
+    side = np.arange(2 * REACH + 1)
+    words = planes[level[:, None], row[:, None] + side, (column >> 3)[:, None]].astype(np.int64)
+    return np.asarray(((words[:, :, None] >> ((column & 7)[:, None, None] + side)) & 1).sum(axis=0, dtype=np.int64))
 
 
 def _cells(layers: FieldLayers, points: F32) -> tuple[I64, I64, I64]:
