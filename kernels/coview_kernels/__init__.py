@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview
+from coview_kernels.distinct import distinct_poses
 from coview_kernels.evidence import (
     Beams,
     Distances,
@@ -61,6 +62,7 @@ __all__ = [
     "column_spectra",
     "coview",
     "describe_points",
+    "distinct_poses",
     "field_scores",
     "match_points",
     "match_rays",

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+import coview_kernels as kernels
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
@@ -121,7 +122,10 @@ class Consensus:
         newest = self._votes[-1][1]
         scores = places.votes.sum(axis=1) * np.float32(1.0 / np.sqrt(len(self._votes)))
         yaw = yaw_of_shift(places.shift, newest.sectors)
-        chosen = distinct(self._seen(places, newest), yaw, self.config)
+        rule = self.config
+        chosen = kernels.distinct_poses(
+            self._seen(places, newest), yaw, rule.peaks, rule.distinct_distance, rule.distinct_yaw
+        )
         poses = np.tile(np.eye(4), (len(chosen), 1, 1))
         cos, sin = np.cos(yaw[chosen]), np.sin(yaw[chosen])
         poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cos, -sin, sin, cos
@@ -156,25 +160,6 @@ class Consensus:
         for other, older in list(self._votes)[:-1]:
             votes[:, other] = older.at(self.grid.at(self._seen(places, older)), shift)
         return places
-
-
-def distinct(positions: Floats, yaw: Floats, config: ConsensusConfig) -> Indices:
-    """Choose the first ``config.peaks`` of poses that differ from all chosen before, as the configuration says.
-
-    Args:
-        positions: (N, 3) metres.
-        yaw: (N,) radians.
-        config: how many, and how far apart.
-    """
-    free = np.ones(len(yaw), dtype=bool)
-    chosen: list[int] = []
-    while len(chosen) < config.peaks and free.any():
-        k = int(free.argmax())
-        chosen.append(k)
-        turn = np.abs((yaw - yaw[k] + np.pi) % (2 * np.pi) - np.pi)
-        near = np.linalg.norm(positions - positions[k], axis=1) < config.distinct_distance
-        free &= ~(near & (turn < config.distinct_yaw))
-    return np.array(chosen, dtype=np.intp)
 
 
 def yaw_of_shift(shift: npt.ArrayLike, sectors: int) -> Floats:

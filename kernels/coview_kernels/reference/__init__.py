@@ -7,6 +7,7 @@ Functions here trust their arguments; the public twins in :mod:`coview_kernels` 
 from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
+from coview_kernels.reference.distinct import distinct_poses
 from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
 from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
@@ -24,6 +25,7 @@ __all__ = [
     "codes_at",
     "coview",
     "describe_points",
+    "distinct_poses",
     "field_scores",
     "match_points",
     "match_rays",

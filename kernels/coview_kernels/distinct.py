@@ -1,0 +1,72 @@
+"""The best of many poses that differ from each other in place or heading."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import F32, I64, as_finite64
+from coview_kernels.launch import Launch
+
+
+def distinct_poses(positions: npt.ArrayLike, yaw: npt.ArrayLike, count: int, distance: float, turn: float) -> I64:
+    """Choose the first poses that differ from all chosen before: indices (K,), rising, at most ``count``.
+
+    Two are one place if they are less than ``distance`` apart and turned by less than ``turn``.
+
+    Args:
+        positions: (N, 3) metres, the best first.
+        yaw: (N,) radians.
+        count: at least 1.
+        distance: metres.
+        turn: radians, at most pi.
+
+    Raises:
+        ValueError: another shape, NaN or inf, or ``count`` below 1.
+    """
+    place, heading = as_finite64("positions", positions, None, 3), as_finite64("yaw", yaw, None)
+    if len(place) != len(heading):
+        raise ValueError(f"yaw has shape {heading.shape}, but positions {place.shape}")
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    poses = np.empty((len(place), 5), dtype=np.float32)
+    if not len(poses):
+        return np.empty(0, dtype=np.int64)
+    poses[:, :3] = place - place[0]  # float32 near its own zero
+    poses[:, 3], poses[:, 4] = np.cos(heading), np.sin(heading)
+    square, cosine = float(distance) ** 2, math.cos(turn)
+    return runtime.dispatch_here(_ready, _native, reference.distinct_poses, poses, count, square, cosine)
+
+
+class _Distinct:
+    """The kernel's launch for so many poses, and the memory that it shares with NumPy."""
+
+    def __init__(self, size: int, count: int) -> None:
+        self.poses = np.zeros((size, 5), dtype=np.float32)
+        self.chosen = np.zeros(count, dtype=np.int32)
+        self.found = np.zeros(1, dtype=np.int32)
+        kept = np.zeros(5 * count, dtype=np.float32)
+        arrays = self.poses.reshape(-1), kept, self.chosen, self.found
+        self.launch = Launch("distinct", "distinct", *arrays, 0, count, 0.0, 0.0)
+
+
+_kernel: _Distinct | None = None
+
+
+def _ready() -> bool:
+    return _kernel is not None and _kernel.launch.ready()
+
+
+def _native(poses: F32, count: int, square: float, cosine: float) -> I64:
+    global _kernel
+    kernel = _kernel
+    if kernel is None or len(kernel.poses) < len(poses) or len(kernel.chosen) != count:
+        kernel = _kernel = _Distinct(2 * len(poses), count)
+    kernel.poses[: len(poses)] = poses
+    for index, value in ((4, len(poses)), (6, square), (7, cosine)):
+        kernel.launch.put(index, value)
+    kernel.launch()
+    return kernel.chosen[: int(kernel.found[0])].astype(np.int64)
