@@ -61,15 +61,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(_describe(error))
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser with all commands."""
+def build_parser(only: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser with all commands, or with one: the others' modules need not be imported to run that."""
     parser = _Parser(
         prog=PROGRAM,
         description="Tells a robot where it is on a base map, by lidar: no GPU, no GNSS, no initial guess.",
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, title="commands")
-    for name in COMMANDS:
+    for name in COMMANDS if only is None else (only,):
         module = importlib.import_module(f"{__name__}.{_MODULES.get(name, name)}")
         sub = commands.add_parser(name, help=module.HELP, description=module.HELP)
         module.add_arguments(sub)
@@ -79,7 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _dispatch(argv: list[str]) -> int:
     try:
-        args = build_parser().parse_args(argv)
+        args = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
     return int(args.run(args))

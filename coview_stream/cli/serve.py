@@ -22,6 +22,7 @@ from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
+    from coview_stream.stream.node.engine_child import EngineChild
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.serve import ServeOptions
 
@@ -83,6 +84,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes; exit code 0 then."""
+    from coview_stream.stream.node.engine_child import start_children
+
+    # first of all: the engines take longest to start, and nothing that they need is known better later
+    children = start_children(args.odometry == KISS_ICP)
+    try:
+        return _run(args, children)
+    finally:
+        for child in children.values():
+            child.close()
+
+
+def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     import logging
 
     from coview_stream.cli.signals import stop_on_signals
@@ -122,13 +135,13 @@ def run(args: argparse.Namespace) -> int:
         args.registration, writable_state_folder(args), args.reloc,
     )  # fmt: skip
     with stop_on_signals() as stop:
-        ended = _serve(options, stop)
+        ended = _serve(options, stop, children)
     if not ended:
         _exit_now()
     return 0
 
 
-def _serve(options: ServeOptions, stop: Stop) -> bool:
+def _serve(options: ServeOptions, stop: Stop, children: dict[str, EngineChild] | None = None) -> bool:
     """Open the node and run it until asked to stop; False if a thread does not end in time.
 
     A thread of its own opens the node: a signal must end a wait for a host that does not answer, too.
@@ -141,7 +154,7 @@ def _serve(options: ServeOptions, stop: Stop) -> bool:
 
     def work() -> None:
         try:
-            opened.append(open_node(options, lambda: stop.requested))
+            opened.append(open_node(options, lambda: stop.requested, children))
         except CancelledError:
             pass
         except BaseException as error:

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from coview_stream.geometry.arrays import Floats32, Ints, Reals
 from coview_stream.geometry.rasters import filled
@@ -94,6 +93,8 @@ def _ground(z: Reals, cell: Ints, shape: tuple[int, int]) -> tuple[Floats32, Flo
 
     Points are ``z`` (N,) metres high and lie in ``cell`` (N,), flat.
     """
+    from scipy import ndimage  # takes a quarter of a second, and not all who load a map draw images
+
     lowest = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
     np.minimum.at(lowest, cell, z)
     lowest = lowest.reshape(shape)
@@ -121,5 +122,7 @@ def _ground(z: Reals, cell: Ints, shape: tuple[int, int]) -> tuple[Floats32, Flo
 
 def _interpolate(values: Floats32, column: Reals, row: Reals) -> Floats32:
     """Interpolate an image (h, w) bilinearly at columns and rows (N,)."""
+    from scipy import ndimage
+
     at = np.stack([row, column])
     return np.asarray(ndimage.map_coordinates(values, at, order=1, mode="nearest", output=np.float32))

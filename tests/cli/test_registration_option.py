@@ -23,7 +23,7 @@ def test_locate_registration_option_names_missing_library(world_file, tmp_path, 
 @pytest.mark.parametrize(("given", "wanted"), [([], "trimmed-icp"), (["--registration", "gicp"], "gicp")])
 def test_serve_passes_registration_option_to_engines(world_file, monkeypatch, given, wanted):
     asked = []
-    monkeypatch.setattr(serve, "_serve", lambda options, stop: asked.append(options) or True)
+    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
     assert [options.registration for options in asked] == [wanted]
 

@@ -36,7 +36,7 @@ def test_serve_reloc_learned_on_map_without_features_fails_before_opening(world_
 @pytest.mark.parametrize(("given", "wanted"), [([], "auto"), (["--reloc", "learned"], "learned")])
 def test_serve_passes_reloc_option_to_engines(world_file, monkeypatch, given, wanted):
     asked = []
-    monkeypatch.setattr(serve, "_serve", lambda options, stop: asked.append(options) or True)
+    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
     assert main(["serve", str(world_file), "--robot", "r1", *given]) == 0
     assert [options.reloc for options in asked] == [wanted]
 

@@ -100,12 +100,12 @@ def test_node_that_does_not_close_is_abandoned(monkeypatch):
         def close(self, patience):
             return False
 
-    monkeypatch.setattr(serve, "open_node", lambda options, cancelled: Stuck())
+    monkeypatch.setattr(serve, "open_node", lambda *_: Stuck())
     assert command._serve(None, Stop(True)) is False
 
 
 def test_error_while_opening_is_raised_to_caller(monkeypatch):
-    def fail(options, cancelled):
+    def fail(*_):
         raise ConfigError("no such thing")
 
     monkeypatch.setattr(serve, "open_node", fail)
@@ -157,7 +157,7 @@ def test_serve_options_reach_node_config(monkeypatch, world_file):
         def close(self, patience):
             return True
 
-    def open_node(options, cancelled):
+    def open_node(options, cancelled, children):
         asked.append(options)
         os.kill(os.getpid(), signal.SIGTERM)
         return Node()

@@ -1,17 +1,13 @@
 """Engine in a process of its own, which is started again when it dies, and a watchdog that ends one that hangs.
 
 Native code (registration, BLAS, tree building) may hold the interpreter lock for long; a process of its own is the only
-thing that keeps the pose clock of this one steady. The child is started anew rather than forked or spawned by
-multiprocessing: a fork after zenoh has been opened deadlocks, and a spawn would import the host's main module.
+thing that keeps the pose clock of this one steady.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
-import socket
 import subprocess
-import sys
 import threading
 import time
 import traceback
@@ -21,6 +17,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Protocol
 
 from coview_stream.errors import CoViewError
+from coview_stream.stream.node.engine_child import EngineChild, Opening, end
 
 if TYPE_CHECKING:
     from coview_stream.config import RegistrationMethod, Reloc
@@ -65,11 +62,12 @@ class EngineProcess:
         kind: ``track``, ``search`` or ``odometry``.
         map_path: the map's file, which every process maps for itself.
         sha256: of the map; a file that was replaced meanwhile is refused, or poses would be of another map than said.
-        nice: added to the child's niceness, so that the clock here is never late.
+        nice: added to the child's niceness, so that the clock here is never late; None for that of its kind.
         registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
         reloc: recognizers that propose the places to search at.
         job_timeout: seconds after which a job counts as hung; set by hand.
         open_timeout: seconds after which opening the map, or preparing for the first job, does; set by hand.
+        child: started before, to be the first one; None starts one.
     """
 
     def __init__(
@@ -77,11 +75,12 @@ class EngineProcess:
         kind: str,
         map_path: str,
         sha256: str,
-        nice: int = 0,
+        nice: int | None = 0,
         job_timeout: float = 30.0,
         open_timeout: float = 120.0,
         registration: RegistrationMethod = "trimmed-icp",
         reloc: Reloc = "auto",
+        child: EngineChild | None = None,
     ) -> None:
         self.kind = kind
         self.map_path = map_path
@@ -91,6 +90,7 @@ class EngineProcess:
         self.open_timeout = open_timeout
         self.registration = registration
         self.reloc = reloc
+        self._started = child
         self._closed = False
         self._lock = threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
@@ -108,19 +108,11 @@ class EngineProcess:
         with self._lock:
             if self._closed:
                 raise DiedError(f"the {self.kind} engine has been closed")
-            ours, theirs = socket.socketpair()
-            with theirs:
-                self._child = subprocess.Popen(
-                    [sys.executable, "-m", "coview_stream.stream.node.worker", str(theirs.fileno()), self.kind,
-                     self.map_path, self.sha256, str(self.nice), self.registration,
-                     self.reloc],
-                    pass_fds=[theirs.fileno()],
-                    stdin=subprocess.DEVNULL,
-                    env=_environment(),
-                    start_new_session=True,  # an interrupt at the terminal is for us to pass on
-                )  # fmt: skip
-            self._pipe = Connection(ours.detach())
+            started, self._started = self._started or EngineChild(self.kind, self.nice), None
+            self._child, self._pipe = started.take()
             self._awaited = ["ready", "prepared"]
+            with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
+                self._pipe.send(Opening(self.map_path, self.sha256, self.registration, self.reloc))
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until the child has opened the map.
@@ -153,6 +145,8 @@ class EngineProcess:
         """Kill the child at once; it keeps nothing that would have to be saved."""
         with self._lock:
             self._closed = True
+        if self._started is not None:
+            self._started.close()
         self._end()
         self._watchdog.close()
 
@@ -189,13 +183,7 @@ class EngineProcess:
         with self._lock:
             child, self._child = self._child, None
             pipe, self._pipe = self._pipe, None
-        if child is not None:
-            child.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(timeout=1.0)
-        if pipe is not None:
-            with contextlib.suppress(OSError):
-                pipe.close()
+        end(child, pipe)
 
 
 def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
@@ -216,12 +204,6 @@ def unwrap(kind: str, value: Any) -> Result:
         result: Result = value
         return result
     raise (RejectedError if kind == "rejected" else FailedError)(str(value))
-
-
-def _environment() -> dict[str, str]:
-    """Return our environment, with this package in reach and one BLAS thread: two engines share the cores."""
-    paths = [p for p in sys.path if p]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
 
 
 class Watchdog:

@@ -136,6 +136,13 @@ class SearchEngine:
         self._index.prepare()
 
 
+def kernels_of(kind: str) -> tuple[str, ...]:
+    """Return the kernels of the engine ``track``, ``search`` or ``odometry``."""
+    if kind == "odometry":
+        return ()
+    return TrackEngine.kernels if kind == "track" else SearchEngine.kernels
+
+
 def open_engine(kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None) -> Engine:
     """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map.
 
@@ -149,7 +156,7 @@ def open_engine(kind: str, map_path: str | Path, sha256: str, config: LocalizerC
         return OdometryEngine()
     if config is not None and config.registration.method == "gicp":
         gicp.library()
-    base_map = BaseMap.load(map_path)
+    base_map = BaseMap.load(map_path, check=False)  # the node has
     if base_map.sha256 != sha256:
         raise MapError(f"{map_path}: has been replaced by another map; start the node (serve) again")
     return TrackEngine(base_map, config) if kind == "track" else SearchEngine(base_map, config)

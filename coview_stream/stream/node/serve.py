@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from coview_stream.config import RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, TransportError
+from coview_stream.stream.node.engine_child import EngineChild, start_children
 from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineProcess
 from coview_stream.stream.transport.keys import RobotKeys, check_disjoint
 from coview_stream.stream.transport.transport import Transport
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
     from coview_stream.stream.node.session import Session
 
 log = logging.getLogger("coview_stream.node")
-
-# the engines stand back: the pose clock and the receiving threads are in this process; set by hand
-_ODOMETRY_NICE = 2  # every pose waits for it; all three set by hand
-_TRACK_NICE = 4
-_SEARCH_NICE = 10
 
 
 @dataclass(frozen=True)
@@ -65,12 +61,17 @@ class ServeOptions:
     reloc: Reloc = "auto"
 
 
-def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: False) -> Node:
+def open_node(
+    options: ServeOptions,
+    cancelled: Callable[[], bool] = lambda: False,
+    children: Mapping[str, EngineChild] | None = None,
+) -> Node:
     """Load the map in the engines, open the network and start; what fails leaves nothing running.
 
     Args:
         options: what to serve, and where.
         cancelled: asked now and then; True gives up.
+        children: from :func:`start_children`, if the engines have been started already.
 
     Raises:
         MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
@@ -79,14 +80,22 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
     check_disjoint(options.keys)
     names = [k.robot for k in options.keys]
     begin = time.monotonic()
-    base_map = BaseMap.load(options.map_path)  # for its errors and hash: the engines map it themselves
-    missing = base_map.require_features(options.reloc)
-    if missing is not None:
-        log.warning("%s: %s", options.map_path, missing)
-    reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
-    engines = _engine_processes(options, base_map.sha256, reloc)
+    if children is None:
+        children = start_children(options.lidar is not None)
+    engines: dict[str, EngineProcess] = {}
     transport = None
     try:
+        # for its errors and hash, while the engines start: they map it themselves
+        base_map = BaseMap.load(options.map_path)
+        missing = base_map.require_features(options.reloc)
+        if missing is not None:
+            log.warning("%s: %s", options.map_path, missing)
+        reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
+        for kind, child in children.items():
+            engines[kind] = EngineProcess(
+                kind, str(options.map_path), base_map.sha256, None,
+                registration=options.registration, reloc=reloc, child=child,
+            )  # fmt: skip
         for engine in engines.values():
             engine.start()
         # imported while the engines start, which takes longer
@@ -111,8 +120,8 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         )  # fmt: skip
         node.start()
     except BaseException as error:
-        for engine in engines.values():
-            engine.close()
+        for opened in (*engines.values(), *children.values()):
+            opened.close()
         if transport is not None:
             transport.close()
         if isinstance(error, DiedError):
@@ -120,17 +129,6 @@ def open_node(options: ServeOptions, cancelled: Callable[[], bool] = lambda: Fal
         raise
     log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names))
     return node
-
-
-def _engine_processes(options: ServeOptions, sha256: str, reloc: Reloc) -> dict[str, EngineProcess]:
-    """Return the engines by name; that of odometry, whose library may be missing, comes first."""
-    path, method = str(options.map_path), options.registration
-    engines = {}
-    if options.lidar is not None:
-        engines["odometry"] = EngineProcess("odometry", path, sha256, _ODOMETRY_NICE)
-    for name, nice in (("track", _TRACK_NICE), ("search", _SEARCH_NICE)):
-        engines[name] = EngineProcess(name, path, sha256, nice, registration=method, reloc=reloc)
-    return engines
 
 
 def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:

@@ -1,50 +1,63 @@
 """Child process of an :class:`~coview_stream.stream.node.engine_process.EngineProcess`; not for people.
 
-``python -m coview_stream.stream.node.worker FD KIND MAP SHA256 NICE METHOD RELOC``, the last two being those of
-registration and of the search.
+``python -m coview_stream.stream.node.worker FD KIND NICE``; what to open comes over the pipe.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 
 def main(argv: list[str]) -> int:
-    """Open the engine, then answer jobs until the parent closes the pipe."""
-    descriptor, kind, map_path, sha256, nice = int(argv[0]), argv[1], argv[2], argv[3], int(argv[4])
+    """Load the kernels, open the engine, then answer jobs until the parent closes the pipe."""
+    descriptor, kind, nice = int(argv[0]), argv[1], int(argv[2])
     pipe = Connection(descriptor)
-    with contextlib.suppress(OSError):
-        os.nice(nice)
+    _stand_back(nice)
     from coview_kernels import warm_up
     from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import CoViewError
     from coview_stream.stream.node.engine_process import attempt
-    from coview_stream.stream.node.engines import open_engine
+    from coview_stream.stream.node.engines import kernels_of, open_engine
 
-    try:
-        method = RegistrationConfig(method=argv[5])  # type: ignore[arg-type]  # any text; it checks
-        config = LocalizerConfig(registration=method, reloc=argv[6])  # type: ignore[arg-type]  # likewise
-        engine = open_engine(kind, map_path, sha256, config)
-        if engine.kernels:
-            warm_up(*engine.kernels)
-    except CoViewError as error:
-        pipe.send(("error", str(error)))
-        return 1
+    if kernels := kernels_of(kind):
+        warm_up(*kernels)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
-        pipe.send(("ready", None))
+        opening = pipe.recv()
         try:
+            method = RegistrationConfig(method=opening.registration)  # any text; it checks
+            config = LocalizerConfig(registration=method, reloc=opening.reloc)  # likewise
+            engine = open_engine(kind, opening.map_path, opening.sha256, config)
+            pipe.send(("ready", None))
             engine.prepare()
         except CoViewError as error:
             pipe.send(("error", str(error)))
             return 1
+        if not gc.isenabled():
+            gc.freeze()  # what is there stays; to look through it again and again would cost every job
+            gc.enable()
         pipe.send(("prepared", None))
         while True:
             pipe.send(attempt(engine, pipe.recv()))
     return 0
 
 
+def _stand_back(nice: int) -> None:
+    """Lower the priority of this process, where Linux groups tasks by session also that of its session's group.
+
+    The niceness alone would only count among the processes of one session, which this one has for itself.
+    """
+    with contextlib.suppress(OSError):
+        os.nice(nice)
+    group = Path("/proc/self/autogroup")
+    with contextlib.suppress(OSError, ValueError):
+        group.write_text(str(min(int(group.read_text().split()[-1]) + nice, 19)))
+
+
 if __name__ == "__main__":
+    gc.disable()  # nearly all that is made while a process starts stays: a tenth of the time
     sys.exit(main(sys.argv[1:]))

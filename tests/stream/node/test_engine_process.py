@@ -19,7 +19,8 @@ from sockets import until
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, CoViewError, InputError
 from coview_stream.localization.state import State
-from coview_stream.stream.node import worker
+from coview_stream.stream.node import engine_process, worker
+from coview_stream.stream.node.engine_child import EngineChild
 from coview_stream.stream.node.engine_process import (
     CancelledError,
     DiedError,
@@ -116,6 +117,42 @@ def test_killed_engine_process_is_restarted(world_file, world_drive):
 
 
 @pytest.mark.slow
+def test_child_that_was_started_before_is_the_first(world_file, world_drive):
+    child = EngineChild("track")
+    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, None, child=child)
+    try:
+        process.start()
+        assert process.pid == child.take()[0].pid
+        child.close()  # does nothing: it is the engine's
+        assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
+        os.kill(process.pid, signal.SIGKILL)
+        with pytest.raises(DiedError):
+            process.run(job())
+        assert process.run(job(world_drive.clouds[0])).request is not None  # another one
+    finally:
+        process.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adopted", [False, True])
+def test_child_without_a_map_ends_when_it_is_closed(adopted):
+    child = EngineChild("search")
+    pid = child._process.pid
+    assert alive(pid)
+    EngineProcess("search", "unused", "0" * 64, child=child).close() if adopted else child.close()
+    assert not alive(pid)
+    child.close()
+
+
+@pytest.mark.slow
+def test_child_ends_with_its_parent():
+    code = "from coview_stream.stream.node.engine_child import EngineChild; print(EngineChild('track')._process.pid)"
+    paths = os.pathsep.join(p for p in sys.path if p)
+    pid = int(subprocess.check_output([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": paths}))
+    until(lambda: not alive(pid), 30.0)
+
+
+@pytest.mark.slow
 def test_unreadable_map_fails_wait_ready(tmp_path):
     broken = tmp_path / "broken.coview"
     broken.write_bytes(b"no map at all")
@@ -141,13 +178,19 @@ def test_engine_that_cannot_prepare_reports_why_each_time(monkeypatch):
     monkeypatch.setattr("coview_stream.stream.node.engines.open_engine", lambda *given: Unprepared())
     ended = []
 
-    def start(process):
-        ours, theirs = socket.socketpair()
-        given = [str(theirs.detach()), "search", "unused", "0" * 64, "0", "trimmed-icp", "auto"]
-        threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
-        process._pipe, process._awaited = Connection(ours.detach()), ["ready", "prepared"]
+    class Thread:
+        """A child that is a thread of this process."""
 
-    monkeypatch.setattr(EngineProcess, "start", start)
+        def __init__(self, kind, nice):
+            self.ours, theirs = socket.socketpair()
+            given = [str(theirs.detach()), kind, str(nice)]
+            threading.Thread(target=lambda: ended.append(worker.main(given)), daemon=True).start()
+
+        def take(self):
+            return None, Connection(self.ours.detach())
+
+    monkeypatch.setattr(engine_process, "EngineChild", Thread)
+    monkeypatch.setattr("coview_stream.stream.node.engines.kernels_of", lambda kind: ())
     process = EngineProcess("search", "unused", "0" * 64)
     for times in (1, 2):
         with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 from coview_stream.geometry.arrays import Complexes, Floats, Floats32, Ints, Reals
 from coview_stream.localization.search.learned.feature_index import FeatureIndex, half_spectra
@@ -117,6 +116,8 @@ def _score(
 
 def _inverse(product: Complexes, index: FeatureIndex, query: _QuerySpectra) -> Floats32:
     """Transform products of spectra (bins, blocks, K) back to correlations (valid, valid, blocks, K)."""
+    from scipy import fft
+
     size, last = index.block, query.first + index.valid
     grid = product.reshape(size, -1, *product.shape[1:])
     rows = fft.ifft(grid, axis=0, overwrite_x=True)[query.first : last]

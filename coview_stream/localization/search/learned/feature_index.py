@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 from coview_stream.geometry.arrays import Bools, Complexes, Floats32, Ints, Reals
 
@@ -138,6 +137,8 @@ class FeatureIndex:
 
 def half_spectra(images: Floats32, size: int) -> Complexes:
     """Transform images (h, w, ...), zero-padded to ``size``, to half spectra (size * (size // 2 + 1), ...)."""
+    from scipy import fft
+
     half = fft.rfft(images, size, axis=1)
     whole = fft.fft(half, size, axis=0, overwrite_x=True)
     return np.asarray(whole.reshape(-1, *images.shape[2:]))

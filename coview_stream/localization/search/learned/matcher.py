@@ -117,6 +117,8 @@ class FeatureMatcher:
         Raises:
             InputError: the weights cannot be loaded. DependencyError: there is no onnxruntime, or a broken one.
         """
+        import scipy.ndimage  # noqa: F401  # a quarter of a second, which the first image would take
+
         _ = self.network, self._feature_blocks if self.dense else self.index
 
     def encode(self, points: Points, centre: Floats) -> QueryFeatures:

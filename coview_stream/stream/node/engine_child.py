@@ -1,0 +1,93 @@
+"""Processes of the engines, which may be started before anything is known of map and robots.
+
+A child imports its libraries and loads its kernels first, which takes most of its start, and only then asks its pipe
+what to open: meanwhile the parent reads options, checks the map and opens the network. It is started anew rather than
+forked or spawned by multiprocessing: a fork after zenoh has been opened deadlocks, and a spawn would import the host's
+main module.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+from multiprocessing.connection import Connection
+from typing import NamedTuple
+
+NICE = {"odometry": 2, "track": 4, "search": 10}
+"""Niceness of the engines, which stand back: the pose clock and the receiving threads are in the parent. Every pose
+waits for odometry. Set by hand."""
+
+
+class Opening(NamedTuple):
+    """What an engine is to be opened with; texts as they were given, to be checked by the engine.
+
+    Attributes:
+        map_path: the map's file.
+        sha256: of the map.
+        registration: method of registration.
+        reloc: recognizers that propose the places to search at.
+    """
+
+    map_path: str
+    sha256: str
+    registration: str
+    reloc: str
+
+
+class EngineChild:
+    """A process of :mod:`coview_stream.stream.node.worker` that waits for its :class:`Opening`.
+
+    Args:
+        kind: ``track``, ``search`` or ``odometry``.
+        nice: added to its niceness; None for that of its kind.
+    """
+
+    def __init__(self, kind: str, nice: int | None = None) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "coview_stream.stream.node.worker", str(theirs.fileno()), kind,
+                 str(NICE[kind] if nice is None else nice)],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                env=_environment(),
+                start_new_session=True,  # an interrupt at the terminal is for the parent to pass on
+            )  # fmt: skip
+        self._pipe = Connection(ours.detach())
+        self._taken = False
+
+    def take(self) -> tuple[subprocess.Popen[bytes], Connection]:
+        """Return the process and the pipe to it, which are the caller's from now on."""
+        self._taken = True
+        return self._process, self._pipe
+
+    def close(self) -> None:
+        """Kill the process unless it has been taken."""
+        if not self._taken:
+            self._taken = True
+            end(self._process, self._pipe)
+
+
+def start_children(lidar_odometry: bool) -> dict[str, EngineChild]:
+    """Start the engines of a node; that of odometry, whose library may be missing, comes first."""
+    return {kind: EngineChild(kind) for kind in NICE if lidar_odometry or kind != "odometry"}
+
+
+def end(process: subprocess.Popen[bytes] | None, pipe: Connection | None) -> None:
+    """Kill a child, which keeps nothing that would have to be saved, and close the pipe to it."""
+    if process is not None:
+        process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=1.0)
+    if pipe is not None:
+        with contextlib.suppress(OSError):
+            pipe.close()
+
+
+def _environment() -> dict[str, str]:
+    """Return our environment, with this package in reach and one BLAS thread: two engines share the cores."""
+    paths = [p for p in sys.path if p]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
