@@ -53,7 +53,7 @@ class EngineChild:
                  str(NICE[kind] if nice is None else nice)],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                env=_environment(),
+                env=_environment(kind),
                 start_new_session=True,  # an interrupt at the terminal is for the parent to pass on
             )  # fmt: skip
         self._pipe = Connection(ours.detach())
@@ -87,7 +87,14 @@ def end(process: subprocess.Popen[bytes] | None, pipe: Connection | None) -> Non
             pipe.close()
 
 
-def _environment() -> dict[str, str]:
-    """Return our environment, with this package in reach and one BLAS thread: two engines share the cores."""
+def _environment(kind: str) -> dict[str, str]:
+    """Return our environment, with this package in reach and threads so few that engines leave each other the cores.
+
+    BLAS has one. The kernels and networks of searches have all cores but one, unless ``COVIEW_THREADS`` says otherwise:
+    they are always busy where a robot is off the map, and what has deadlines needs a core that is free.
+    """
     paths = [p for p in sys.path if p]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
+    ours = {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = {"COVIEW_THREADS": str(max(1, cores - 1))} if kind == "search" else {}
+    return threads | os.environ | ours
