@@ -32,12 +32,21 @@ CENTIMETRE = 0.01
 
 
 @ti.func
-def cell_at(table: ti.template(), down, across, x, y):
-    """Return the place in the layers of the cell that holds (x, y), in the empty tile where there is none."""
-    i = ti.min(ti.max(ti.cast(ti.floor(2.0 * y), ti.i32), 0), 32 * down - 1)
-    j = ti.min(ti.max(ti.cast(ti.floor(2.0 * x), ti.i32), 0), 32 * across - 1)
-    tile = table[(i >> 5) * across + (j >> 5)]
-    return (tile << 10) + ((i & 31) << 5) + (j & 31)
+def clamped(x, tiles) -> ti.i32:
+    """Return the row or column of a coordinate, the first or last where it lies beyond."""
+    return ti.min(ti.max(ti.cast(ti.floor(2.0 * x), ti.i32), 0), 32 * tiles - 1)
+
+
+@ti.func
+def place(table: ti.template(), across, i, j) -> ti.i32:
+    """Return the place in the layers of the cell of row i and column j, in the empty tile where there is none."""
+    return (table[(i >> 5) * across + (j >> 5)] << 10) + ((i & 31) << 5) + (j & 31)
+
+
+@ti.func
+def cell_at(table: ti.template(), down, across, x, y) -> ti.i32:
+    """Return the place in the layers of the cell that holds (x, y)."""
+    return place(table, across, clamped(y, down), clamped(x, across))
 
 
 @ti.func
@@ -68,10 +77,10 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
             column = ti.cast(ti.floor(x + c * u - s * v), ti.i32) - REACH
             if row >= 0 and row < high - 2 * REACH and column >= 0 and column < 8 * blocks - 8:
                 level = ti.cast(ti.floor(z + structure[q + 2]), ti.i32) & 31
-                first = (level * high + row) * blocks + (column >> 3)
+                first = (level * blocks + (column >> 3)) * high + row
                 carry = ti.cast(0, ti.i64)
                 for i in ti.static(range(WINDOW)):
-                    word = ti.cast(planes[first + i * blocks], ti.i64) >> (column & 7)
+                    word = ti.cast(planes[first + i], ti.i64) >> (column & 7)
                     carry |= (word & (2**WINDOW - 1)) << (WINDOW * i)
                 for d in ti.static(range(DIGITS)):
                     both = digits[d] & carry
@@ -97,13 +106,17 @@ def fine_hits(
     """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     for p in range(structure.shape[0] // 3):
-        q = 3 * p
-        u, v = x + c * structure[q] - s * structure[q + 1], y + s * structure[q] + c * structure[q + 1]
-        level = ti.cast(ti.floor(2.0 * (z + structure[q + 2])), ti.i64) & 63
+        u, v = structure[3 * p], structure[3 * p + 1]
+        level = ti.cast(ti.floor(2.0 * (z + structure[3 * p + 2])), ti.i64) & 63
+        rows = ti.Vector.zero(ti.i32, 3)
+        columns = ti.Vector.zero(ti.i32, 3)
+        for k in ti.static(range(3)):
+            rows[k] = clamped(y + s * u + c * v + step * (k - 1), down)
+            columns[k] = clamped(x + c * u - s * v + step * (k - 1), across)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
-                at = cell_at(table, down, across, u + step * (j - 1), v + step * (i - 1))
-                hits[3 * i + j] += ti.cast(((bits[2 * at] >> level) & 1) + ((bits[2 * at + 1] >> level) & 1), ti.i32)
+                at = 2 * place(table, across, rows[i], columns[j])
+                hits[3 * i + j] += ti.cast(((bits[at] >> level) & 1) + ((bits[at + 1] >> level) & 1), ti.i32)
 
 
 @ti.func

@@ -131,7 +131,7 @@ def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
     poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 6), dtype=np.int32)
     Launch(
         "field", "score",
-        layers.coarse.reshape(-1), layers.coarse.shape[2], layers.coarse.shape[1],
+        layers.coarse.reshape(-1), layers.coarse.shape[1], layers.coarse.shape[2],
         layers.table.reshape(-1), layers.table.shape[1], layers.base, layers.bits.reshape(-1),
         layers.surface.reshape(-1), plan.few.reshape(-1), plan.some.reshape(-1), plan.lows.reshape(-1),
         plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1), plan.levels,
@@ -166,7 +166,7 @@ def _near(occupied: I64, table: I32) -> I64:
 
 
 def _coarse(occupied: I64, table: I32) -> U16:
-    """Return (32, H, W / 8) uint16 planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
+    """Return (32, W / 8, H) uint16 planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
     half = TILE // 2
     cells = occupied.view(np.uint64).reshape(-1, half, 2, half, 2)
     folded = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
@@ -178,11 +178,11 @@ def _coarse(occupied: I64, table: I32) -> U16:
     out[:-1] |= metres[1:]
     out[:, 1:] |= metres[:, :-1]
     out[:, :-1] |= metres[:, 1:]
-    planes = np.zeros((32, len(out), columns * half // 8 + 1), dtype=np.uint16)
+    planes = np.zeros((32, columns * half // 8 + 1, len(out)), dtype=np.uint16)
     for level, plane in enumerate(planes):
-        packed = np.packbits((out >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16)
-        plane[:, :-1] = packed
-        plane[:, :-2] |= packed[:, 1:] << np.uint16(8)
+        packed = np.packbits((out >> np.uint32(level)) & one, axis=1, bitorder="little").astype(np.uint16).T
+        plane[:-1] = packed
+        plane[:-2] |= packed[1:] << np.uint16(8)
     return planes
 
 

@@ -32,7 +32,7 @@ from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 # set by hand
 _STRUCTURE, _LOW = 800, 400  # points of a scan that are looked up: twice as many rank places no better
 _PATCH = 4.0  # metres: points of one patch are looked up one after the other, for they lie in the same memory
-_SAMPLES = 6000  # points in the space around the robot, of which those that rays passed through are looked up
+_SAMPLES = 4000  # points in the space around the robot, of which those that rays passed through are looked up
 _DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
 _MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle: a ray has passed only what lies before that
 _LAYERS = 2  # cells that a surface fills on the way through it

@@ -34,7 +34,7 @@ class FieldLayers(NamedTuple):
     surface: I32
     """(T + 1, 32, 32) ground in the lower half, centimetres; edge above it."""
     coarse: U16
-    """(32, 16 R, 2 C + 1) a plane for each metre of height modulo 32, a word for every eight cells of a metre along a
+    """(32, 2 C + 1, 16 R) a plane for each metre of height modulo 32, a word for every eight cells of a metre along a
     row: bit k says whether the k-th cell from there on, of 16, is within a metre of structure."""
 
 
@@ -99,12 +99,12 @@ def _placed(points: F32, pose: F64) -> F32:
 
 def _coarse_hits(planes: U16, structure: F32, pose: F64, yaw: float) -> I64:
     at = np.floor(_placed(structure, np.array([*pose[:3], yaw]))).astype(np.int64)
-    _, high, blocks = planes.shape
+    _, blocks, high = planes.shape
     column, row = at[:, 0] - REACH, at[:, 1] - REACH
     inside = (row >= 0) & (row < high - 2 * REACH) & (column >= 0) & (column < 8 * blocks - 8)
     column, row, level = column[inside], row[inside], at[inside, 2] & 31
     side = np.arange(2 * REACH + 1)
-    words = planes[level[:, None], row[:, None] + side, (column >> 3)[:, None]].astype(np.int64)
+    words = planes[level[:, None], (column >> 3)[:, None], row[:, None] + side].astype(np.int64)
     return np.asarray(((words[:, :, None] >> ((column & 7)[:, None, None] + side)) & 1).sum(axis=0, dtype=np.int64))
 
 
