@@ -85,16 +85,18 @@ def trim(keep, chunks, n, first, bins: ti.template()):
     """For either kind of point: the farthest bin that is kept, and the weight of each pair that is."""
     last = ti.Vector([-1, -1])
     share = ti.Vector.zero(ti.f64, 2)
-    for kind in ti.static(range(2)):
+    for c in range(1, chunks):
+        for b in range(first, first + 2 * BINS):
+            bins[b] = bins[b] + bins[b + 2 * c * BINS]
+    for kind in range(2):  # not unrolled: that takes a tenth of a second to compile in every process
+        mine = first + kind * BINS
         found = 0
-        for b in range(first + kind * BINS, first + kind * BINS + BINS):
-            for c in range(1, chunks):
-                bins[b] = bins[b] + bins[b + 2 * c * BINS]
+        for b in range(mine, mine + BINS):
             found += bins[b]
         kept = 0
         while kept < found and kept < ti.max(1, ti.cast(keep * found, ti.i32)):
             last[kind] += 1
-            kept += bins[first + kind * BINS + last[kind]]
+            kept += bins[mine + last[kind]]
         share[kind] = ti.min(0.5 * n / ti.max(1, kept), MAX_SHARE)
     return last, share
 
