@@ -164,21 +164,22 @@ def solve(pivot, about, settings: ti.template(), state: ti.template(), system: t
 @ti.func
 def eliminate(system: ti.template()):
     """Gauss-Jordan with pivots, as the matrix may be all but singular."""
-    for c in range(6):
+    n = system.shape[0]  # which the compiler does not know: it would unroll all the loops
+    for c in range(n):
         top = c
-        for a in range(c + 1, 6):
+        for a in range(c + 1, n):
             if ti.abs(system[a, c]) > ti.abs(system[top, c]):
                 top = a
-        for b in range(c, 7):
+        for b in range(c, n + 1):
             swap = system[c, b]
             system[c, b] = system[top, b]
             system[top, b] = swap
-        for a in range(6):
+        for a in range(n):
             if a != c:
                 share = system[a, c] / system[c, c]
-                for b in range(c, 7):
+                for b in range(c, n + 1):
                     system[a, b] = system[a, b] - share * system[c, b]
-    for c in range(6):
+    for c in range(n):
         system[c, 6] = -system[c, 6] / system[c, c]
 
 
