@@ -28,7 +28,6 @@ from coview_stream.report.style import TRUTH, figure
 
 OUT = Path("docs/images")
 PERIOD_MS = 100.0  # between the frames of a robot, at 10 Hz
-BEST = 20  # stations that matching has to name
 
 _COLOURS = ("#0072B2", "#D55E00", "#999999")
 _SEARCH_FRAMES = 400  # at most, until a robot is tracked
@@ -48,15 +47,15 @@ class Curves(NamedTuple):
 def candidates(quick: bool) -> Curves:
     """One keyframe with 1,000 to 100,000 stations at all 60 shifts; what depends on the map is made beforehand."""
     sizes = [1_000, 3_000] if quick else [1_000, 3_000, 10_000, 30_000, 100_000]
-    known, queries = town()
-    channel = next(iter(known))
-    stations, query, found = multiplied(known[channel], max(sizes)), queries[channel], []
+    known, columns = town()
+    stations, found = [multiplied(each, max(sizes)) for each in known], []
     for size in sizes:
-        some = stations[:size]
-        sides = kernels.MatchIndex(some).top_k, Spectral(some), Turned(some)
-        found.append(medians(*(partial(side, query, BEST) for side in sides)))
-    names = ("coview_stream, pruned", "spectra, BLAS", "one product of turned queries, BLAS")
-    return Curves("Matching one query at all shifts", "stations", sizes, names, found)
+        some = [each[:size] for each in stations]
+        codes = kernels.StationCodes.of(some)
+        exact = (partial(side(some), columns) for side in (Spectral, Turned))
+        found.append(medians(partial(codes.best, codes.query(columns)), *exact))
+    names = ("coview_stream, 512 bytes a station", "spectra, BLAS", "one product of turned queries, BLAS")
+    return Curves("Best score of every station at all shifts", "stations", sizes, names, found)
 
 
 def points(quick: bool) -> Curves:

@@ -25,7 +25,6 @@ from coview_kernels.evidence import (
 )
 from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
-from coview_kernels.matching import MatchIndex, Nearest
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit
@@ -43,8 +42,6 @@ __all__ = [
     "FieldMap",
     "FieldScan",
     "FieldScores",
-    "MatchIndex",
-    "Nearest",
     "PointCounts",
     "PointGrid",
     "PointKind",

@@ -30,7 +30,7 @@ def functions(name):
 @pytest.mark.parametrize("name", MODULES)
 def test_source_lines_are_those_of_inspect(name):
     known = functions(name)
-    assert known or name == "matching"  # whose kernels are made for each shape
+    assert known
     for function in known:
         assert front_end.source_lines(function) == inspect.getsourcelines(function)
 

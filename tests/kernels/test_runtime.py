@@ -41,7 +41,7 @@ def test_public_names():
         *("Beams", "Distances", "PointCounts", "PointKind", "Raster", "RayCounts", "Sight"),
         *("match_points", "match_rays", "sort_beams"),
         *("FieldMap", "FieldScan", "FieldScores", "field_scores"),
-        *("CodedQuery", "MatchIndex", "Nearest", "StationCodes", "distinct_poses"),
+        *("CodedQuery", "StationCodes", "distinct_poses"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
         *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unit_columns"),
         "warm_up",

@@ -11,7 +11,6 @@ from coview_kernels.reference.distinct import distinct_poses
 from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
 from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
-from coview_kernels.reference.matching_bounds import best_correlations
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
 from coview_kernels.reference.station_codes import best_codes, code_products, codes_at
@@ -20,7 +19,6 @@ from coview_kernels.reference.voxel_filter import transform_unique
 __all__ = [
     "align_planes",
     "best_codes",
-    "best_correlations",
     "code_products",
     "codes_at",
     "coview",
