@@ -1,0 +1,283 @@
+"""How the vote of a keyframe grows with the map: a thousand to a million stations, on one core.
+
+A keyframe's descriptors are compared with all stations, and the places that ten keyframes agree on are named: the
+search by descriptors as the product runs it, without registration. The map is a simulated town (or campus), and beside
+it on the same grid synthetic stations: halves of two of its own, each turned, so that they look like stations and
+repeat what stands near the drive. The keyframes are those of a drive through the scene. Each size has processes of its
+own: one makes the map, one votes, one searches exhaustively, which adds up the z-scores of all stations at all turns
+and keyframes and names as many places. Kept is what both name of what the exhaustive search names rightly (within 3 m
+and 9 degrees).
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+import coview_kernels as kernels
+from bench.accuracy.stages import Seen, keyframes_of, right
+from bench.harness.files import folder, isolated, peak_megabytes
+from bench.harness.rows import Row, against, bounded, informs, reached
+from bench.harness.worlds import WORLDS, opened, prepare, world_name
+from bench.speed.search import last_core
+from coview_stream import BaseMap
+from coview_stream.basemap.station_grid import StationGrid
+from coview_stream.basemap.station_index import StationIndex
+from coview_stream.config import ConsensusConfig
+from coview_stream.descriptors.coview import describe
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.transforms import Pose, pose_from, rot_z
+from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
+from coview_stream.localization.search.coview_vote import CoViewVote
+from coview_stream.localization.search.votes import argsmallest, robust_zscore
+
+SIZES = (1_000, 10_000, 100_000, 1_000_000)
+CHECKED = {10_000: 1, 100_000: 3, 1_000_000: 9}
+"""Sizes that are searched exhaustively too, there every so many keyframes."""
+
+MOST_SLOPE, LEAST_KEPT = 1.0, 99.9
+"""The targets: growth from a hundred thousand to a million stations, and per cent of right places."""
+
+BOTH = (10_000, 100_000)
+"""Sizes at which the campus is searched too."""
+
+_LAST = {1_000_000: 30}  # keyframes of the drive that are searched exhaustively, where not all are
+_BLOCK = 8192
+_SHORTLIST = 20_000  # of the exhaustive search, among which distinct places are sought
+_SEED = 1
+
+
+def make(size: int, scene: str, out: Path) -> None:
+    """Write stations, descriptors and index of a map of ``size`` stations."""
+    site, _, _ = opened(WORLDS[scene])
+    seen = drive(scene)
+    middle = np.mean([(each.T_map_odom @ np.append(each.position, 1.0))[:3] for each in seen], axis=0)
+    own = np.argsort(np.linalg.norm(site.stations - middle, axis=1), kind="stable")[:size]
+    known = [site.descriptors(name)[own] for name in site.descriptor_config.channels]
+    _save_queries(site, seen, out)
+    np.save(out / "stations.npy", widened(site.stations[own], size, site.config.block))
+    shape = (size, *known[0].shape[1:])
+    files = [np.lib.format.open_memmap(out / f"{k}.npy", "w+", np.float16, shape) for k in range(len(known))]
+    for file, values in zip(files, known, strict=True):
+        file[: len(own)] = values
+    rng = np.random.default_rng(_SEED)
+    for start in range(len(own), size, _BLOCK):
+        stop = min(start + _BLOCK, size)
+        one, other = rng.integers(len(own), size=(2, stop - start))
+        turn, half = int(rng.integers(shape[2])), shape[2] // 2
+        for file, values in zip(files, known, strict=True):  # the channels of a station belong together
+            made = np.roll(values[one], turn, axis=2)
+            made[:, :, :half] = values[other][:, :, :half]
+            file[start:stop] = made
+    descriptors: dict[Any, npt.NDArray[Any]] = dict(zip(site.descriptor_config.channels, files, strict=True))
+    begin = time.perf_counter()
+    index = StationIndex.of(descriptors)
+    seconds = time.perf_counter() - begin
+    np.savez(out / "index.npz", seconds=seconds, **index.arrays())  # type: ignore[arg-type]
+
+
+def widened(stations: Floats32, count: int, block: float) -> Floats32:
+    """Return ``count`` stations (count, 3): these, and the others on a square grid east of them."""
+    missing = count - len(stations)
+    side = int(np.ceil(np.sqrt(max(missing, 1))))
+    column, row = np.divmod(np.arange(missing), side)
+    # on the same grid: its stations stand in the middle of blocks
+    east = (np.floor(stations[:, 0].max() / block) + 2 + column + 0.5) * block
+    north = (np.floor(stations[:, 1].min() / block) + row + 0.5) * block
+    height = np.full(missing, np.median(stations[:, 2]))
+    return np.concatenate([stations, np.column_stack([east, north, height])]).astype(np.float32)
+
+
+def drive(scene: str) -> list[Seen]:
+    """Return the keyframes of a drive."""
+    site, _, _ = opened(WORLDS[scene])
+    return list(keyframes_of(folder() / world_name(WORLDS[scene]), site.origin, site.descriptor_config))
+
+
+class Query(NamedTuple):
+    """Keyframe with the zero of its descriptors (3,), and these by channel."""
+
+    seen: Seen
+    centre: Floats
+    described: dict[Any, Floats32]
+
+
+def _save_queries(site: BaseMap, seen: Sequence[Seen], out: Path) -> None:
+    """Write the keyframes' positions, grounds, truths and descriptors: what votes need not read scans for."""
+    centres = [np.array([*each.position[:2], each.ground]) for each in seen]
+    described = [describe(each.scan, at, site.descriptor_config) for each, at in zip(seen, centres, strict=True)]
+    np.savez(
+        out / "queries.npz", channels=list(site.descriptor_config.channels), block=site.config.block,
+        position=[each.position for each in seen], ground=[each.ground for each in seen],
+        truth=[each.T_map_odom for each in seen],
+        descriptors=[list(each.values()) for each in described],
+    )  # fmt: skip
+
+
+def _opened(out: Path) -> tuple[float, Floats32, dict[Any, npt.NDArray[Any]], list[Query]]:
+    """Return the block in metres, the stations, their descriptors by channel, memory-mapped, and the keyframes."""
+    kept = np.load(out / "queries.npz")
+    names = kept["channels"].tolist()
+    queries = []
+    for position, ground, truth, described in zip(
+        kept["position"], kept["ground"], kept["truth"], kept["descriptors"], strict=True
+    ):
+        seen = Seen(np.zeros((0, 3), dtype=np.float32), position, float(ground), truth)
+        centre = np.array([*position[:2], ground])
+        queries.append(Query(seen, centre, dict(zip(names, described, strict=True))))
+    mapped = {name: np.load(out / f"{k}.npy", mmap_mode="r") for k, name in enumerate(names)}
+    return float(kept["block"]), np.load(out / "stations.npy"), mapped, queries
+
+
+def voted(out: Path) -> dict[str, Any]:
+    """Milliseconds of every keyframe's vote, the ranks of the right places, and the memory that all took."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {last_core()})
+    block, stations, descriptors, queries = _opened(out)
+    kept = np.load(out / "index.npz")
+    index = StationIndex.from_arrays({name: kept[name] for name in kept.files}, descriptors)
+    if index is None:
+        raise RuntimeError("the index is not one of these descriptors")
+    consensus = Consensus(StationGrid(stations, block), ConsensusConfig())
+    kernels.warm_up()
+    index.prepare()
+    times, ranks = [], []
+    for seen, centre, described in queries:
+        begin = time.perf_counter()
+        consensus.vote(CoViewVote(centre, index, described))
+        found = consensus.hypotheses()
+        times.append(1e3 * (time.perf_counter() - begin))
+        ranks.append(_rank([each.T_map_odom for each in found], seen))
+    size = sum(values.nbytes for values in index.arrays().values())
+    return {
+        "ms": times, "ranks": ranks, "megabytes": peak_megabytes(), "index_bytes": size,
+        "build_s": float(kept["seconds"]),
+    }  # fmt: skip
+
+
+def _rank(poses: Sequence[Pose], seen: Seen) -> int | None:
+    """Rank of the first right pose, None without one."""
+    return next((k for k, T in enumerate(poses) if right(T, seen)), None)
+
+
+def exhaustive(out: Path, every: int, last: int | None) -> dict[str, Any]:
+    """Ranks of the right places by adding up all z-scores; milliseconds of one keyframe's."""
+    block, stations, descriptors, queries = _opened(out)
+    cells, at = _cells(stations, block)
+    config, ranks, times = ConsensusConfig(), {}, []
+    window: list[tuple[Floats, Floats32]] = []
+    for number, (seen, centre, described) in enumerate(queries):
+        if last is not None and number >= last:
+            break
+        begin = time.perf_counter()
+        window = [*window[1 - config.window :], (centre, _scores(described, descriptors))]
+        total = window[-1][1][:, :-1].copy()
+        yaw = yaw_of_shift(np.arange(len(total)), len(total))
+        if number % every:
+            continue
+        for older, scores in window[:-1]:
+            step = older - centre
+            turned = np.column_stack([np.cos(yaw) * step[0] - np.sin(yaw) * step[1],
+                                      np.sin(yaw) * step[0] + np.cos(yaw) * step[1]])  # fmt: skip
+            for n, (right_by, up_by) in enumerate(np.rint(turned / block).astype(int).tolist()):
+                total[n] += scores[n].take(cells.take(at + up_by * cells.shape[1] + right_by, mode="clip"))
+        best = argsmallest(total.ravel(), _SHORTLIST)
+        shift, station = np.divmod(best, len(stations))
+        chosen = _distinct(stations[station].astype(np.float64), yaw[shift], config)
+        times.append(1e3 * (time.perf_counter() - begin))
+        poses = [
+            pose_from(rot_z(float(yaw[shift[k]])), stations[station[k]].astype(np.float64))
+            @ pose_from(np.eye(3), -centre)
+            for k in chosen
+        ]
+        ranks[number] = _rank(poses, seen)
+    return {"ms": times, "ranks": ranks}
+
+
+def _distinct(positions: Floats, yaw: Floats, config: ConsensusConfig) -> list[int]:
+    """Choose the first of places (N, 3) with headings (N,) that differ from all chosen before."""
+    free, chosen = np.ones(len(yaw), dtype=bool), list[int]()
+    while len(chosen) < config.peaks and free.any():
+        chosen.append(int(free.argmax()))
+        near = np.linalg.norm(positions - positions[chosen[-1]], axis=1) < config.distinct_distance
+        turn = np.abs((yaw - yaw[chosen[-1]] + np.pi) % (2 * np.pi) - np.pi)
+        free &= ~(near & (turn < config.distinct_yaw))
+    return chosen
+
+
+def _scores(described: dict[Any, Floats32], descriptors: dict[Any, npt.NDArray[Any]]) -> Floats32:
+    """Mean z-scores of the channels (S, M + 1), 0 for no station."""
+    total: Floats32 | None = None
+    for name, stored in descriptors.items():
+        parts = []
+        for start in range(0, len(stored), _BLOCK):
+            spectra = kernels.column_spectra(stored[start : start + _BLOCK].astype(np.float32))
+            parts.append(kernels.all_shift_distance(described[name], spectra, described[name].shape[-1]))
+        score = robust_zscore(np.concatenate(parts))
+        total = score if total is None else total + score
+    assert total is not None
+    mean = (total / np.float32(len(descriptors))).T
+    return np.concatenate([mean, np.zeros((len(mean), 1), dtype=np.float32)], axis=1)
+
+
+def _cells(stations: Floats32, block: float, margin: int = 60) -> tuple[Ints, Ints]:
+    """Station of every cell of the grid with a margin, M for none, and the flat cell (M,) of every station."""
+    index = np.floor(stations[:, :2].astype(np.float64) / block).astype(np.int64)
+    column, row = (index - index.min(axis=0) + margin).T
+    cells = np.full((int(row.max()) + margin + 1, int(column.max()) + margin + 1), len(stations))
+    cells[row, column] = np.arange(len(stations))
+    return cells, row * cells.shape[1] + column
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Time, memory and kept places of every size, then how they grow."""
+    found: dict[int, dict[str, Any]] = {}
+    for scene in WORLDS:
+        isolated(prepare, folder(), WORLDS[scene])  # a child starts with its parent's peak memory: let that be small
+    for size in SIZES[:2] if asked.quick else SIZES:
+        for scene in WORLDS if size in BOTH else ["town"]:
+            with tempfile.TemporaryDirectory(dir=folder()) as scratch:
+                isolated(make, size, scene, Path(scratch))
+                votes = isolated(voted, Path(scratch))
+                if scene == "town":
+                    found[size] = votes
+                    yield from _figures(size, votes)
+                if size in CHECKED:
+                    whole = isolated(exhaustive, Path(scratch), CHECKED[size], _LAST.get(size))
+                    yield from _beside(f"scale/{size} stations, {scene}", votes, whole)
+    if not asked.quick:
+        few, many = (found[size] for size in SIZES[-2:])
+        decades = np.log10(SIZES[-1] / SIZES[-2])
+        growth = np.log10(np.median(many["ms"]) / np.median(few["ms"])) / decades
+        yield bounded("scale/slope of the time, 100000 to 1000000 stations", float(growth), "", MOST_SLOPE)
+        growth = np.log10(many["megabytes"] / few["megabytes"]) / decades
+        yield bounded("scale/slope of the memory, 100000 to 1000000 stations", float(growth), "", MOST_SLOPE)
+
+
+def _figures(size: int, votes: dict[str, Any]) -> Iterator[Row]:
+    name = f"scale/{size} stations"
+    p50, p95 = np.percentile(votes["ms"], [50, 95])
+    yield informs(f"{name}: vote and places, p50", p50, "ms", {"size": size} | votes)
+    yield informs(f"{name}: vote and places, p95", p95, "ms")
+    yield informs(f"{name}: memory of the process, peak", votes["megabytes"], "MB")
+    yield informs(f"{name}: index per station", votes["index_bytes"] / size, "B")
+    yield informs(f"{name}: making the index", votes["build_s"], "s")
+
+
+def _beside(name: str, votes: dict[str, Any], whole: dict[str, Any]) -> Iterator[Row]:
+    """Rows of the time, and of the places that the exhaustive search names rightly."""
+    ours, ranks = votes["ranks"], whole["ranks"]
+    good = [number for number, rank in ranks.items() if rank is not None]
+    kept = 100 * float(np.mean([ours[number] is not None for number in good])) if good else np.nan
+    yield against(f"{name}: beside the sum", float(np.median(votes["ms"])), float(np.median(whole["ms"])), "ms", None)
+    yield reached(f"{name}: right places kept, of {len(good)}", kept, "%", LEAST_KEPT)
+    first, before = (100 * float(np.mean([named[k] == 0 for k in ranks])) for named in (ours, ranks))
+    yield Row(f"{name}: right place first, beside the sum", first, before, "%")
