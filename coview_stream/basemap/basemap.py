@@ -181,6 +181,11 @@ class BaseMap:
             arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
         return kernels.FieldMap(*(arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")))
 
+    def cut(self, cut: kernels.Cut) -> kernels.Crop | None:
+        """Cut out the points around a place, sorted for searching; None where there are none."""
+        spans = tiles.spans(self._arrays["tile_index"], self.config.tile, np.array([cut.x, cut.y]), cut.radius)
+        return kernels.crop_points(self.points, self._arrays["normals"], spans, cut)
+
     @cached_property
     def survey(self) -> kernels.Raster:
         """Cells that the map has points around, above zero; relative to :attr:`origin`."""

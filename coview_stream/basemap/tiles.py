@@ -29,21 +29,25 @@ def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, 
     return points[order], packed, np.column_stack([cells[begin], begin, end])
 
 
+def spans(index: Ints, tile: float, centre: Floats, radius: float) -> Ints:
+    """Return begin and end (S, 2) of the tiles that ``radius`` metres around ``centre`` touch."""
+    low = np.floor((centre[:2] - radius) / tile)
+    high = np.floor((centre[:2] + radius) / tile)
+    return np.asarray(index[((index[:, :2] >= low) & (index[:, :2] <= high)).all(axis=1), 2:])
+
+
 def crop(
     points: npt.NDArray[Any], normals: npt.NDArray[Any], index: Ints, tile: float, centre: Floats, radius: float
 ) -> tuple[Points, Points]:
     """Return points and unit normals (K, 3) float32 within ``radius`` metres (horizontal) of ``centre``."""
-    low = np.floor((centre[:2] - radius) / tile)
-    high = np.floor((centre[:2] + radius) / tile)
-    wanted = ((index[:, :2] >= low) & (index[:, :2] <= high)).all(axis=1)
-    if not wanted.any():
+    stretches = [slice(int(begin), int(end)) for begin, end in spans(index, tile, centre, radius)]
+    if not stretches:
         return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.float32)
-    spans = [slice(int(begin), int(end)) for begin, end in index[wanted, 2:]]
-    near_points = np.concatenate([points[span] for span in spans])
+    near_points = np.concatenate([points[stretch] for stretch in stretches])
     dx, dy = near_points[:, 0] - np.float64(centre[0]), near_points[:, 1] - np.float64(centre[1])
     inside = dx * dx + dy * dy < radius * radius
     # compress: a boolean index of rows takes five times as long
-    packed = np.concatenate([normals[span] for span in spans]).compress(inside, axis=0)
+    packed = np.concatenate([normals[stretch] for stretch in stretches]).compress(inside, axis=0)
     near_normals = packed.astype(np.float32)
     near_normals /= _NORMAL_SCALE
     return near_points.compress(inside, axis=0), near_normals

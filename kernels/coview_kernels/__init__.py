@@ -10,6 +10,7 @@ from __future__ import annotations
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview
 from coview_kernels.distinct import distinct_poses
+from coview_kernels.crop import Crop, Cut, crop_points
 from coview_kernels.evidence import (
     Beams,
     Distances,
@@ -38,6 +39,8 @@ __all__ = [
     "Beams",
     "Belief",
     "CodedQuery",
+    "Crop",
+    "Cut",
     "Distances",
     "FieldMap",
     "FieldScan",
@@ -58,6 +61,7 @@ __all__ = [
     "beam_cells",
     "column_spectra",
     "coview",
+    "crop_points",
     "describe_points",
     "distinct_poses",
     "field_scores",

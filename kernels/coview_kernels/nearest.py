@@ -10,34 +10,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, F64, I32, I64, as_finite64, as_float32
+from coview_kernels.arrays import F32, F64, I64, as_finite64, as_float32
+from coview_kernels.cells import CELL, Cells, grid_frame
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_CELL = 1.0  # metres; 0.5 to 1.5 are as fast for clouds of a point every 0.25 m, and small cells cost memory
-_MAX_LAYERS = 128  # higher points share the topmost: a stray point in the sky must not make all cells larger
-_MAX_CELLS = 1 << 22  # 16 MB; a wider cloud has larger cells
 _EYE = np.eye(4)
-
-
-class Cells(NamedTuple):
-    """A cloud sorted by cell; cell (i, j, k) along x, y, z is number (i * ny + j) * nz + k."""
-
-    frame: F64
-    """(8,) lowest corner (3) and edge of the cells, metres, the reciprocal of that, and nx, ny, nz."""
-    starts: I32
-    """(cells + 1,) first row in ``rows`` of each cell."""
-    rows: I32
-    """(4 K,) row by row, the bits of x, y, z as float32 and the point's index in the cloud: one cache line for all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +40,7 @@ class PointGrid:
     """
 
     points: F32
-    cell: float = _CELL
+    cell: float = CELL
 
     def __post_init__(self) -> None:
         cloud = as_float32("points", self.points, None, 3)
@@ -62,6 +49,15 @@ class PointGrid:
         if not (math.isfinite(self.cell) and self.cell > 0):
             raise ValueError(f"cell must be finite and positive, got {self.cell}")
         object.__setattr__(self, "points", cloud)
+
+    @classmethod
+    def sorted(cls, points: F32, cells: Cells) -> PointGrid:
+        """Return the grid of finite points (K, 3) that have been sorted already."""
+        grid = cls.__new__(cls)
+        for name, value in (("points", points), ("cell", float(cells.frame[3]))):
+            object.__setattr__(grid, name, value)
+        vars(grid)["cells"] = cells
+        return grid
 
     @cached_property
     def cells(self) -> Cells:
@@ -128,14 +124,8 @@ def _sort_by_cell(points: F32, edge: float) -> Cells:
         return Cells(np.array([0.0, 0, 0, edge, 1 / edge, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32))
     # by columns: twenty times as fast as along the first axis
     low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
-    while True:
-        shape = np.floor((high - low) / edge) + 1
-        shape[2] = min(shape[2], _MAX_LAYERS)
-        if shape.prod() <= _MAX_CELLS:
-            break
-        edge *= 1.5
-    frame = np.array([*low, edge, 1.0 / edge, *shape])
-    starts = np.zeros(int(shape.prod()) + 1, dtype=np.int32)
+    frame = grid_frame(low, high, edge)
+    starts = np.zeros(int(frame[5:].prod()) + 1, dtype=np.int32)
     cell = np.empty(len(points), dtype=np.int32)
     rows = np.empty(4 * len(points), dtype=np.int32)
     runtime.kernels("nearest").sort(points, frame, cell, starts, rows)

@@ -39,6 +39,7 @@ def test_public_names():
         *("Alignment", "Belief", "Scale", "align_planes"),
         *("VoxelFilter", "describe_points"),
         *("Beams", "Distances", "PointCounts", "PointKind", "Raster", "RayCounts", "Sight"),
+        *("Crop", "Cut", "crop_points"),
         *("match_points", "match_rays", "sort_beams"),
         *("FieldMap", "FieldScan", "FieldScores", "field_scores"),
         *("CodedQuery", "StationCodes", "distinct_poses"),

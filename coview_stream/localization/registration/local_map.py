@@ -17,7 +17,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationMethod
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Floats32
 from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 from coview_stream.localization.registration.result import MIN_PAIRS
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 # set by hand
 _MAX_CROPS = 12  # cached
 _CROP_STEP = 16.0  # metres between the centres of cached crops
+_SAMPLE_EVERY = 3  # of the points
 _CELL = 0.5  # metres, of the raster of roof edges
 _DROP = 2.0  # metres: what falls less is no wall
 _REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
@@ -43,15 +44,26 @@ class LocalMap:
     Attributes:
         points: (K, 3) map frame, metres.
         normals: (K, 3) unit normals.
+        crop: the same points with what came of them when they were cut out of the map, if they were.
     """
 
     points: Points
     normals: Points
+    crop: kernels.Crop | None = None
 
     @cached_property
     def grid(self) -> kernels.PointGrid:
         """The points, to be searched by :func:`coview_kernels.nearest`."""
-        return kernels.PointGrid(self.points)
+        return (
+            kernels.PointGrid(self.points)
+            if self.crop is None
+            else kernels.PointGrid.sorted(self.points, self.crop.cells)
+        )
+
+    @property
+    def sample(self) -> Points:
+        """One (S, 3) of three points: enough for shares of them."""
+        return self.points[::_SAMPLE_EVERY] if self.crop is None else self.crop.sample
 
     def prepare(self, method: RegistrationMethod = "trimmed-icp") -> None:
         """Make now what registration by ``method`` and verification would make when they ask for it."""
@@ -67,7 +79,7 @@ class LocalMap:
     @cached_property
     def edges(self) -> kernels.Raster:
         """The walls that the map must have though it may not show them."""
-        return roof_edges(self.points)
+        return roof_edges(self.points) if self.crop is None else _edges(self.crop.top, self.crop.corner)
 
     @cached_property
     def surfaces(self) -> Surfaces | None:
@@ -91,9 +103,10 @@ class LocalMaps:
         key = (round(position[0] / _CROP_STEP), round(position[1] / _CROP_STEP))
         if key not in self._crops:
             centre = np.array([key[0], key[1]]) * _CROP_STEP
-            points, normals = self._map.crop(centre, self._radius + 0.75 * _CROP_STEP)
-            enough = len(points) >= MIN_PAIRS
-            self._crops[key] = LocalMap(points, normals) if enough else None
+            radius = self._radius + 0.75 * _CROP_STEP
+            crop = self._map.cut(kernels.Cut(float(centre[0]), float(centre[1]), radius, _SAMPLE_EVERY, _CELL))
+            few = crop is None or len(crop.points) < MIN_PAIRS
+            self._crops[key] = None if crop is None or few else LocalMap(crop.points, crop.normals, crop)
             if len(self._crops) > self._max_crops:
                 self._crops.popitem(last=False)
         self._crops.move_to_end(key)
@@ -113,6 +126,10 @@ def roof_edges(points: Points) -> kernels.Raster:
     rows, columns = int(i.max()) + 3, int(j.max()) + 3
     flat = np.full(rows * columns, _NOTHING, dtype=np.float32)
     np.maximum.at(flat, i * columns + j, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
-    top = flat.reshape(rows, columns)
+    return _edges(flat.reshape(rows, columns), corner)
+
+
+def _edges(top: Floats32, corner: Floats) -> kernels.Raster:
+    """Edges (H, W) of the highest points of the cells, ``_NOTHING`` where there is none."""
     edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
     return kernels.Raster(max_filter(edge, _OVERHANG), corner, _CELL)

@@ -49,7 +49,6 @@ PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is l
 # free space
 FREE_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
 _MIN_RANGE = 1.0  # metres: nearer returns are the robot's own
-_FREE_EVERY = 3  # of the map's points: a share needs no more
 FREE_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
 _BEAM = math.radians(2.0)  # cell of the range image
 _BEAM_HITS = 2  # returns in a cell: fewer say nothing
@@ -114,7 +113,7 @@ def verify(
     few = found.high < MIN_STRUCTURE
     near, covered = (0.0, 0.0) if few else (found.near / found.high, found.covered / found.high)
     ground = (found.grounded + 0.5 * PSEUDO) / (found.low + PSEUDO)
-    met, passed = free_space(seen, T_map_body, target.points)
+    met, passed = free_space(seen, T_map_body, target.sample)
     free = (met + 0.5 * PSEUDO) / (met + passed + PSEUDO)
     return Evidence(near, covered, ground, free, found.surveyed / len(kinds) if len(kinds) else 0.0)
 
@@ -179,7 +178,7 @@ def free_space(seen: RangeImage, T_map_body: Pose, points: Points) -> tuple[int,
         points: (K, 3) map points, map frame.
     """
     lowest = float(T_map_body[2, 3]) + seen.floor + FREE_HEIGHT
-    return kernels.match_rays(seen.limits, points, T_map_body, lowest, _SIGHT, _FREE_EVERY)
+    return kernels.match_rays(seen.limits, points, T_map_body, lowest, _SIGHT)
 
 
 def _kinds(source: RegistrationCloud) -> npt.NDArray[np.uint8]:

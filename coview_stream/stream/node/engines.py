@@ -51,7 +51,9 @@ class Engine(Protocol):
 class TrackEngine:
     """Localizers of all robots: deskewing, keyframes, registration around a known place."""
 
-    kernels = ("transform_unique", "nearest", "align_planes", "match_points", "match_rays", "sort_beams")
+    kernels = (
+        "transform_unique", "crop_points", "nearest", "align_planes", "match_points", "match_rays", "sort_beams",
+    )  # fmt: skip
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
@@ -108,7 +110,10 @@ class TrackEngine:
 class SearchEngine:
     """Global searches of all robots, which share the map's spectra and networks."""
 
-    kernels = ("transform_unique", "describe_points", "align_planes", "match_points", "match_rays", "sort_beams")
+    kernels = (
+        "transform_unique", "describe_points", "align_planes",
+        "crop_points", "match_points", "match_rays", "sort_beams",
+    )  # fmt: skip
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map

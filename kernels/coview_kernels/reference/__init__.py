@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
 from coview_kernels.reference.distinct import distinct_poses
+from coview_kernels.reference.crop import crop_points
 from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
 from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
@@ -22,6 +23,7 @@ __all__ = [
     "code_products",
     "codes_at",
     "coview",
+    "crop_points",
     "describe_points",
     "distinct_poses",
     "field_scores",

@@ -10,7 +10,7 @@ from se3 import exp_se3
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle, transform
-from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.registration.result import Prior
@@ -131,12 +131,11 @@ class FakeMap:
     """Counts the crops asked for."""
 
     def __init__(self, points, normals):
-        self.cloud, self.asked = (points, normals), []
+        self.cloud, self.asked = (points, np.rint(127 * normals).astype(np.int8)), []
 
-    def crop(self, centre, radius):
-        self.asked.append((tuple(centre[:2]), radius))
-        near = np.hypot(*(self.cloud[0][:, :2] - centre[:2]).T) < radius
-        return self.cloud[0][near], self.cloud[1][near]
+    def cut(self, cut):
+        self.asked.append(cut)
+        return kernels.crop_points(*self.cloud, [[0, len(self.cloud[0])]], cut)
 
 
 def test_local_maps_hold_all_points_within_radius_and_are_cached(target):
@@ -148,7 +147,17 @@ def test_local_maps_hold_all_points_within_radius_and_are_cached(target):
         inside = np.hypot(*(found.points[:, :2] - position[:2]).T) < 6.0
         assert inside.sum() == wanted.sum()
         assert len(found.points) == len(found.normals)
-    assert len(fake.asked) == len({centre for centre, _ in fake.asked}) <= 9
+    assert len(fake.asked) == len(set(fake.asked)) <= 9
+
+
+def test_crop_has_the_edges_and_the_sample_of_its_points(target):
+    """What comes of a crop while it is cut is what would come of its points."""
+    found = LocalMaps(FakeMap(target.points, target.normals), radius=6.0).around(np.zeros(3))
+    same = LocalMap(np.ascontiguousarray(found.points), found.normals)
+    np.testing.assert_array_equal(found.edges.values, same.edges.values)
+    np.testing.assert_array_equal(found.edges.corner, same.edges.corner)
+    assert found.sample.shape == same.sample.shape
+    assert kernels.nearest(same.grid, found.sample, 0.1)[0].max() == 0
 
 
 def test_local_map_cache_drops_the_oldest(target):

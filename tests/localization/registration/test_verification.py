@@ -10,6 +10,7 @@ from courtyard import local_map, parts, plane
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
 from coview_stream.geometry.transforms import pose_from, rot_z, transform
+from coview_stream.localization.registration import local_map as local_map_module
 from coview_stream.localization.registration import verification
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import RegistrationCloud, prepare_scan
@@ -21,7 +22,7 @@ CONFIG = RegistrationConfig()
 @pytest.fixture(autouse=True)
 def every_map_point(monkeypatch):
     """Count every map point, not every third."""
-    monkeypatch.setattr(verification, "_FREE_EVERY", 1)
+    monkeypatch.setattr(local_map_module, "_SAMPLE_EVERY", 1)
 
 
 @pytest.fixture(scope="module")

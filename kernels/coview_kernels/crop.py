@@ -1,0 +1,115 @@
+"""Points around a place, cut out of a map and sorted for searching in the same pass.
+
+A crop is some 250,000 points, 10 MB with what belongs to them: memory that the system hands out page by page, at a
+millisecond for each 4 MB. So all of it is one piece, for which it has larger pages.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import F32, I8, I32
+from coview_kernels.cells import CELL, Cells, grid_frame
+from coview_kernels.launch import Launch
+from coview_kernels.reference.crop import LOWEST, Crop, Cut
+from coview_kernels.warm_up import compiled_by
+
+__all__ = ["Crop", "Cut", "crop_points"]
+
+
+def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Crop | None:
+    """Cut the points around a place out of a map.
+
+    Args:
+        points: (N, 3) float32, contiguous, metres; rows with NaN or inf are left out.
+        normals: (N, 3) int8, contiguous, unit normals times 127.
+        spans: (S, 2) first row and row after the last of each stretch of the map to look at.
+        cut: what to cut out and what to make of it.
+
+    Returns:
+        The crop, or None where there is no point.
+
+    Raises:
+        ValueError: an array has the wrong shape or type, a span leaves the map, or a setting is out of its range.
+    """
+    for name, array, kind in (("points", points, np.float32), ("normals", normals, np.int8)):
+        if array.shape != (len(points), 3) or array.dtype != kind or not array.flags.c_contiguous:
+            raise ValueError(f"{name} must be a contiguous ({len(points)}, 3) array of {np.dtype(kind)}")
+    stretches = np.ascontiguousarray(spans, dtype=np.int32).reshape(-1, 2)
+    if len(stretches) and not (stretches.min() >= 0 and stretches.max() <= len(points)):
+        raise ValueError(f"spans must lie in the map's {len(points)} points")
+    if not (all(math.isfinite(v) for v in cut) and cut.radius > 0 and cut.every >= 1 and cut.cell > 0):
+        raise ValueError(f"cut must have a positive radius, every and cell, got {cut}")
+
+    def ready() -> bool:
+        return _measure.ready() and _sort.ready()
+
+    return runtime.dispatch_here(ready, _crop, reference.crop_points, points, normals, stretches, cut)
+
+
+_NO: dict[type, npt.NDArray[Any]] = {kind: np.zeros(1, dtype=kind) for kind in (np.float32, np.int32, np.int8)}
+_measure = Launch(
+    "crop", "measure", _NO[np.float32], _NO[np.int32], np.zeros(3), np.zeros(6, np.float32), _NO[np.int32]
+)
+_sort = Launch(
+    *("crop", "sort", _NO[np.float32], _NO[np.int8], _NO[np.int32], np.zeros(14), 1, 1),
+    *(_NO[np.int32], _NO[np.int32], _NO[np.int32], _NO[np.float32], _NO[np.float32], _NO[np.float32]),
+)
+_cells: I32 = np.empty(1 << 16, dtype=np.int32)  # of a crop's points, to work with
+
+
+def _crop(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
+    global _cells
+    flat, around = points.reshape(-1), np.array([cut.x, cut.y, cut.radius**2])
+    bounds, count = np.empty(6, dtype=np.float32), np.empty(1, dtype=np.int32)
+    _launch(_measure, flat, spans.reshape(-1), around, bounds, count)
+    number = int(count[0])
+    if not number:
+        return None
+    low, high = bounds[:3].astype(np.float64), bounds[3:].astype(np.float64)
+    frame = grid_frame(low, high, CELL)
+    corner, shape = cut.raster(low, high)
+    starts, rows, planes, sample, top = _arena(
+        (int(frame[5:].prod()) + 1, np.int32), (4 * number, np.int32), (3 * number, np.float32),
+        (3 * -(-number // cut.every), np.float32), (shape[0] * shape[1], np.float32),
+    )  # fmt: skip
+    starts.fill(0)
+    top.fill(LOWEST)
+    candidates = int((spans[:, 1] - spans[:, 0]).sum())
+    if candidates > len(_cells):
+        _cells = np.empty(1 << (candidates - 1).bit_length(), dtype=np.int32)
+    settings = np.concatenate((around, frame, corner, [1.0 / cut.cell]))
+    _launch(
+        _sort, flat, normals.reshape(-1), spans.reshape(-1), settings, cut.every, shape[1],
+        _cells, starts, rows, planes, sample, top,
+    )  # fmt: skip
+    sorted_points = rows.view(np.float32).reshape(-1, 4)[:, :3]
+    cells = Cells(frame, starts, rows)
+    return Crop(sorted_points, planes.reshape(-1, 3), cells, sample.reshape(-1, 3), top.reshape(shape), corner)
+
+
+def _arena(*parts: tuple[int, Any]) -> list[npt.NDArray[Any]]:
+    """Return arrays of so many numbers of a kind of four bytes each, all in one piece of memory."""
+    ends = np.cumsum([-(-number // 16) * 16 for number, _ in parts])  # each begins a cache line
+    memory = np.empty(int(ends[-1]), dtype=np.int32)
+    begins = (0, *ends[:-1])
+    return [memory[b : b + number].view(kind) for b, (number, kind) in zip(begins, parts, strict=True)]
+
+
+def _launch(launch: Launch, *arguments: Any) -> None:
+    for index, value in enumerate(arguments):
+        launch.put(index, value)
+    launch()
+
+
+def _compile() -> None:
+    cloud = np.zeros((1, 3), dtype=np.float32)
+    crop_points(cloud, np.zeros((1, 3), dtype=np.int8), [[0, 1]], Cut(0.0, 0.0, 1.0, 1, 1.0))
+
+
+compiled_by("crop_points", _compile)
