@@ -7,7 +7,7 @@ Square cells of half a metre, in tiles of 16 m that are stored only where the ma
 * ground: height of the lowest surface at the cell's middle.
 * edge: height of the roof edges that walls must stand below (:func:`roof_edges`).
 
-It is made with the map, memory-mapped with it, and takes 44 MB per km2.
+It is made with the map, memory-mapped with it, and takes 48 MB per km2.
 """
 
 from __future__ import annotations
