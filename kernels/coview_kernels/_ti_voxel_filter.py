@@ -53,6 +53,7 @@ def number_voxels(
     T = ti.Vector([settings[k] for k in ti.static(range(12))])
     inverse, nearest, farthest = settings[12], settings[13], settings[14]
     limit = ti.cast(settings[15], f32)
+    u, v, w = settings[19], settings[20], settings[21]
     middle = ti.Vector([ti.cast(settings[16 + k], i32) - FAR for k in ti.static(range(3))])
     infinite, far = 0, 0
     for j in range(BLOCK):
@@ -65,7 +66,7 @@ def number_voxels(
         # NaN and inf reach every image, even through a zero (0 * inf is NaN)
         finite = ti.cast(ti.abs(p) <= FINITE, i32) & ti.cast(ti.abs(q) <= FINITE, i32)
         finite &= ti.cast(ti.abs(r) <= FINITE, i32)
-        r2 = x * x + y * y + z * z
+        r2 = (x - u) * (x - u) + (y - v) * (y - v) + (z - w) * (z - w)
         inside = finite & ti.cast(r2 >= nearest, i32) & ti.cast(r2 < farthest, i32)
         ip = voxel_of(p, limit, inverse, middle[0])
         iq = voxel_of(q, limit, inverse, middle[1])
@@ -143,8 +144,8 @@ def voxel_filter(
     """Append the kept rows to ``moved``.
 
     ``merge``: -1, or 0 to keep every point. ``settings``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
-    and r_max, a coordinate beyond reach, the sensor's voxel. ``totals``: kept, not finite, out of reach, cubes;
-    they go on from call to call. One slot behind the table's own receives what is not kept.
+    and r_max, a coordinate beyond reach, the sensor's voxel, what ranges are measured from. ``totals``: kept, not finite,
+    out of reach, cubes; they go on from call to call. One slot behind the table's own receives what is not kept.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -31,7 +31,12 @@ _POINTS, _BLOCKS, _CALL, _MERGE = 0, 1, 2, 4  # arguments of the kernel that cha
 
 
 def transform_unique(
-    points: npt.ArrayLike, T: npt.ArrayLike, voxel: float, r_min: float = 0.0, r_max: float = math.inf
+    points: npt.ArrayLike,
+    T: npt.ArrayLike,
+    voxel: float,
+    r_min: float = 0.0,
+    r_max: float = math.inf,
+    centre: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[F32, int]:
     """Move a cloud into another frame and keep the first point of each voxel there.
 
@@ -43,17 +48,19 @@ def transform_unique(
             voxel))``. Zero or negative: keep every point.
         r_min: least range in the source frame that is kept, metres (inclusive).
         r_max: range in the source frame from which on points are dropped, metres (exclusive).
+        centre: (3,) source-frame point that ranges are measured from.
 
     Returns:
         (K, 3) float32 target-frame coordinates, in input order, and the number of rows dropped because they,
         or their images, are NaN or infinite.
 
     Raises:
-        ValueError: an array has the wrong shape, ``T`` is not finite, or a range is negative or NaN.
+        ValueError: an array has the wrong shape, ``T`` or ``centre`` is not finite, or a range is negative or NaN.
     """
     cloud, pose = as_float32("points", points, None, 3), as_finite64("T", T, 4, 4)
     limits = _checked_limits(voxel, r_min, r_max)
-    return runtime.dispatch(_transform_unique, reference.transform_unique, cloud, pose, *limits)
+    middle = tuple(as_finite64("centre", centre, 3).tolist())
+    return runtime.dispatch(_transform_unique, reference.transform_unique, cloud, pose, *limits, middle)
 
 
 class VoxelFilter:
@@ -105,14 +112,16 @@ def _checked_limits(voxel: float, r_min: float, r_max: float) -> tuple[float, fl
 _shared_pass: _KernelPass | None = None  # used on the owner thread only
 
 
-def _transform_unique(points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int]:
+def _transform_unique(
+    points: F32, T: F64, voxel: float, r_min: float, r_max: float, centre: tuple[float, ...]
+) -> tuple[F32, int]:
     global _shared_pass
     shared, _shared_pass = _shared_pass or _KernelPass(), None
-    found = shared(points, T, voxel, r_min, r_max)
+    found = shared(points, T, voxel, r_min, r_max, centre)
     if shared.nbytes <= _MAX_KEPT_BYTES:
         _shared_pass = shared
     if found is None:
-        return reference.transform_unique(points, T, voxel, r_min, r_max)
+        return reference.transform_unique(points, T, voxel, r_min, r_max, centre)
     moved, dropped = found
     return moved.copy(), dropped
 
@@ -126,7 +135,7 @@ class _KernelPass:
 
     def __init__(self) -> None:
         self._call = 0
-        self._settings = np.zeros(19)
+        self._settings = np.zeros(22)
         self._totals = np.zeros(4, dtype=np.int32)
         self._tail = np.empty((_BLOCK, 3), dtype=np.float32)
         self._moved: F32 = np.empty((_MIN_ROWS, 3), dtype=np.float32)
@@ -137,7 +146,9 @@ class _KernelPass:
         """Bytes of table and results."""
         return self._moved.nbytes + (16 << self._bits)
 
-    def __call__(self, points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int] | None:
+    def __call__(
+        self, points: F32, T: F64, voxel: float, r_min: float, r_max: float, centre: tuple[float, ...] = (0.0, 0.0, 0.0)
+    ) -> tuple[F32, int] | None:
         """Return the points kept, in a buffer that the next call overwrites, and the number of rows not finite.
 
         None if the cloud is out of reach, farther than 2^15 voxels from the sensor or 2^29 from the origin.
@@ -152,7 +163,8 @@ class _KernelPass:
         farthest = min(_MAX_COORDINATE / inverse, _MAX_FLOAT32) if inverse else _MAX_FLOAT32
         self._settings[:12] = T[:3].reshape(-1)
         self._settings[12:16] = (inverse, min(r_min * r_min, _NO_LIMIT), min(r_max * r_max, _NO_LIMIT), farthest)
-        np.floor(sensor, out=self._settings[16:])
+        np.floor(sensor, out=self._settings[16:19])
+        self._settings[19:] = centre
         while True:
             kept, infinite, far, cubes = self._run(points, -1 if inverse else 0)
             if far:

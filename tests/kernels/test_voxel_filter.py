@@ -18,10 +18,11 @@ from coview_kernels import VoxelFilter, backend, reference, shutdown, transform_
     st.sampled_from([-1.0, 0.0, 0.1, 0.5, 2.5]),
     st.sampled_from([0.0, 5.0]),
     st.sampled_from([0.0, 30.0, np.inf]),
+    st.sampled_from([(0.0, 0.0, 0.0), (7.5, -20.0, 3.1)]),
 )
-def test_transform_unique_agrees_with_numpy(points, T, voxel, r_min, r_max):
-    moved, dropped = transform_unique(points, T, voxel, r_min, r_max)
-    expected, expected_dropped = reference.transform_unique(points, T, voxel, r_min, r_max)
+def test_transform_unique_agrees_with_numpy(points, T, voxel, r_min, r_max, centre):
+    moved, dropped = transform_unique(points, T, voxel, r_min, r_max, centre)
+    expected, expected_dropped = reference.transform_unique(points, T, voxel, r_min, r_max, centre)
     np.testing.assert_array_equal(moved, expected)
     assert dropped == expected_dropped
     assert moved.dtype == np.float32

@@ -12,7 +12,7 @@ import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig, RegistrationConfig
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import min_filter
-from coview_stream.geometry.transforms import Points, Pose, norms
+from coview_stream.geometry.transforms import Points, Pose
 
 if TYPE_CHECKING:
     from coview_stream.localization.registration.gicp import Surfaces
@@ -80,8 +80,7 @@ def thinned(points: Points, position: Floats, config: RegistrationConfig) -> Poi
 
     Arguments are those of :func:`prepare_scan`, which makes the same of the result as of ``points``.
     """
-    near = points.compress(norms(points, position.astype(np.float32)) < config.source_range, axis=0)
-    return kernels.transform_unique(near, np.eye(4), config.source_voxel)[0]
+    return kernels.transform_unique(points, np.eye(4), config.source_voxel, 0.0, config.source_range, position)[0]
 
 
 def height_above_lowest(points: Points) -> Floats32:

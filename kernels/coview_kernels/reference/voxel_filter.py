@@ -9,12 +9,19 @@ import numpy as np
 from coview_kernels.arrays import F32, F64, I64
 
 
-def transform_unique(points: F32, T: F64, voxel: float, r_min: float = 0.0, r_max: float = math.inf) -> tuple[F32, int]:
+def transform_unique(
+    points: F32,
+    T: F64,
+    voxel: float,
+    r_min: float = 0.0,
+    r_max: float = math.inf,
+    centre: tuple[float, ...] = (0, 0, 0),
+) -> tuple[F32, int]:
     """See :func:`coview_kernels.transform_unique`."""
     x, y, z = points.astype(np.float64).T
     # written out, not a BLAS product: the order of the roundings is part of the contract with the kernel
     with np.errstate(over="ignore", invalid="ignore"):
-        r2 = x * x + y * y + z * z
+        r2 = (x - centre[0]) * (x - centre[0]) + (y - centre[1]) * (y - centre[1]) + (z - centre[2]) * (z - centre[2])
         moved = np.stack([row[0] * x + row[1] * y + row[2] * z + row[3] for row in T[:3]], axis=1)
         moved = moved.astype(np.float32)
     finite = np.isfinite(points).all(axis=1) & np.isfinite(moved).all(axis=1)
