@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import fft
 
-from bench.forest.query import APART, Chain, distinct, errors, of_places, of_volume, query_of
+from bench.forest.query import APART, BEST, Chain, distinct, of_places, of_volume, query_of
 from bench.forest.worlds import Drive
 from bench.harness.clock import Clock
 from coview_stream.basemap.basemap import BaseMap
@@ -20,9 +20,9 @@ from coview_stream.geometry.transforms import Points, Pose, rot_z, to_local, tra
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.votes import TableVote, robust_zscore
+from coview_stream.localization.search.votes import robust_zscore
 
-METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "keypoints", "verified")
+METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "verified")
 """In the tables' order."""
 
 BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
@@ -95,23 +95,20 @@ class Methods:
         with clock("network"):
             view = self._learned.encode(query.surroundings, centre)
         with clock("correlation"):
-            volume = self._learned.distances(view)
-            peaks = replace(self.config.consensus, mode="consensus", peaks=self.config.learned.peaks)
+            vote = self._learned.vote(view)
+            peaks = replace(self.config.consensus, mode="consensus", peaks=BEST)
             consensus = Consensus(self.base_map.station_grid, peaks)
-            consensus.vote(TableVote.of_distances(centre, [volume]))
+            consensus.vote(vote)
             voted = [replace(each, learned=True) for each in consensus.hypotheses()]
-        with clock("keypoints"):
-            sharpened = self._learned.refine(voted, view)
         with clock("registration"):
-            candidates = self._chain.register(sharpened, self._chain.scan(query))
+            candidates = self._chain.register(voted, self._chain.scan(query))
         verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in candidates]
         features = self._learned.features
         places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
-        places["dense"] = distinct(stations[:, :2], -volume.min(axis=1))
-        places["keypoints"], places["verified"] = (_in_turn(each, query) for each in (sharpened, verified))
-        moved = not np.array_equal(sharpened[0].T_map_odom, voted[0].T_map_odom)
-        metric = self._chain.metric(sharpened, candidates, truth, query)
-        return {"dense": errors(voted[0].T_map_odom, truth, query)[:2], "moved": moved, **metric}
+        named, shifts = vote.candidates()
+        places["dense"] = distinct(stations[named, :2], -vote.at(named, shifts))
+        places["verified"] = _in_turn(verified, query)
+        return self._chain.metric(voted, candidates, truth, query)
 
 
 def _milliseconds(clock: Clock) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """How long a whole query takes on maps of 0.1 and 1 km2: one drawn forest's features and stations, laid side by side.
 
-All that depends on a map's size (correlation, reading the stations, votes, keypoints of the map) works on the large
+All that depends on a map's size (correlation, votes) works on the large
 map: the middle 128 m of a drawn stand, repeated. Registration looks at the surroundings of five places, the same on
 any map, so each place is registered where its likeness in the original stand is. The limits are for two cores; BLAS
 takes the threads of OPENBLAS_NUM_THREADS, the kernels those of COVIEW_THREADS, transforms and network one.
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.forest.methods import on_ground
-from bench.forest.query import Chain, query_of
+from bench.forest.query import BEST, Chain, query_of
 from bench.forest.worlds import drawn, noted, place
 from bench.harness.clock import Clock
 from bench.harness.rows import Row, bounded
@@ -33,12 +33,11 @@ from coview_stream.geometry.transforms import pose_from, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.votes import TableVote
 
 LIMITS = {10: 0.4, 32: 3.0}  # seconds allowed to a query, by tiles of 32 m along the edge: 0.10 and 1.05 km2
 CUT = 4  # tiles along the edge of what is repeated
 _SEED, _QUERIES, _REPEAT = 20_001, 4, 3
-_PARTS = ("view", "correlation", "consensus", "keypoint refinement", "registration")
+_PARTS = ("view", "correlation", "consensus", "registration")
 
 
 class Enlarged(BaseMap):
@@ -100,7 +99,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         learned = SearchIndex.of(large, config).learned
         assert learned is not None
         learned.prepare()
-        peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
+        peaks = replace(config.consensus, mode="consensus", peaks=BEST)
         consensus = Consensus(StationGrid(large.stations, base_map.config.block), peaks)
         prepared = time.perf_counter() - begin
         spent: list[list[float]] = []
@@ -111,12 +110,10 @@ def rows(asked: Namespace) -> Iterator[Row]:
                 centre = on_ground(query.surroundings, query)
                 view = learned.encode(query.surroundings, centre)
             with clock("correlation"):
-                volume = learned.distances(view)
+                vote = learned.vote(view)
             with clock("consensus"):
-                consensus.vote(TableVote.of_distances(centre, [volume]))
+                consensus.vote(vote)
                 named = consensus.hypotheses()
-            with clock("keypoint refinement"):
-                named = learned.refine(named, view)
             with clock("registration"):
                 chain.register([large.home(each, query) for each in named], chain.scan(query))
             spent.append([clock.seconds[part] for part in _PARTS])

@@ -24,11 +24,10 @@ STEPS = {
     "descriptors": "Scan Context and co-view: describing, all stations and shifts",
     "canopy": "canopy heights: drawing, all places and 72 headings",
     "network": "learned: bird view and ground network",
-    "correlation": "learned: dense correlation, 36 headings, five peaks",
-    "keypoints": "learned: keypoints and cliques at five places",
+    "correlation": "learned: coarse correlation, the best places at 36 headings",
     "registration": "registration and verification of five places",
 }
-LEARNED = ("network", "correlation", "keypoints", "registration")
+LEARNED = ("network", "correlation", "registration")
 """What a search by learned features alone takes."""
 
 
@@ -114,13 +113,12 @@ def _percent(share: float) -> str:
 
 
 def metric_table(answers: Sequence[Answer]) -> str:
-    """Poses by learned features: of dense correlation, after keypoints, and after registration."""
+    """Poses by learned features: of correlation, and after registration."""
     rows = [
-        [name, str(len(some)), *medians(some, "dense", (2, 1)),
-         _percent(float(np.mean([answer["moved"] for answer in some]))), *_poses(some)]
+        [name, str(len(some)), *_poses(some)]
         for name, some in groups(answers)
     ]  # fmt: skip
-    head = ("", "n", "dense: m", "deg", "moved by keypoints, %", f"keypoints: {_POSES[0]}", *_POSES[1:])
+    head = ("", "n", f"correlation: {_POSES[0]}", *_POSES[1:])
     return table(head, rows)
 
 

@@ -89,11 +89,10 @@ class LearnedConfig:
     Attributes:
         reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.
         cell: metres from place to place at which their features are compared with the map's.
-        yaws: headings at each.
+        yaws: headings at each, an even number.
         dense_area: square metres up to which a map is searched all over.
         shortlist: tiles of a larger one, those that look most alike, around which it is searched.
-        peaks: best places that go on to registration, made exact by keypoints that match first; and as many of the
-            descriptors' while both vote.
+        peaks: best places that are scored by the likelihood field.
     """
 
     reach: float = 30.0
@@ -101,7 +100,7 @@ class LearnedConfig:
     yaws: int = 36
     dense_area: float = 2.0e6
     shortlist: int = 50
-    peaks: int = 5
+    peaks: int = 64
 
     def __post_init__(self) -> None:
         positive(self, "dense_area")
@@ -109,6 +108,7 @@ class LearnedConfig:
         require(self.cell in (1.0, 2.0, 4.0), self, "cell", "1, 2 or 4 m")
         counts(self, "yaws", minimum=4)
         require(self.yaws <= 360, self, "yaws", "360 at most: memory and time grow with it")
+        require(self.yaws % 2 == 0, self, "yaws", "an even number")
         counts(self, "shortlist", "peaks")
 
 

@@ -109,17 +109,25 @@ class FeatureMap:
         vectors = np.ascontiguousarray(dequantized(local).transpose(2, 0, 1))
         return Patch(vectors, dequantized_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
 
-    def coarse(self, cell: float = 2.0) -> tuple[Floats32, Floats]:
+    def sample(self, tiles: int) -> Floats32:
+        """Return the features (C, N) of all cells that have any, of that many tiles or fewer, spread evenly."""
+        chosen = self._local[:: -(-len(self._local) // tiles) or 1]
+        cells = np.asarray(chosen).reshape(-1, self.dimensions)
+        return np.ascontiguousarray(dequantized(cells[cells.any(axis=1)]).T)
+
+    def coarse(self, cell: float = 2.0, axes: Floats32 | None = None) -> tuple[Floats32, Floats]:
         """Return means (C, H, W) over cells of ``cell`` metres, a divisor of 32, and their lower corner (2,), metres.
 
-        Cells without features count as zero.
+        Cells without features count as zero. With ``axes`` (D, C) their components along these are returned: (D, H, W).
         """
         ratio, side = round(cell / LOCAL_CELL), round(TILE * LOCAL_CELL / cell)
-        shape = (self.dimensions, self.index.rows * side, self.index.columns * side)
+        dimensions = self.dimensions if axes is None else len(axes)
+        shape = (dimensions, self.index.rows * side, self.index.columns * side)
         whole = np.zeros(shape, dtype=np.float32)
         for (column, row), tile in zip(self.index.tiles - self.index.low, self._local, strict=True):
             rows, columns = (slice(n * side, (n + 1) * side) for n in (int(row), int(column)))
-            whole[:, rows, columns] = means(np.asarray(tile), ratio)
+            cells = means(np.asarray(tile), ratio)
+            whole[:, rows, columns] = cells if axes is None else np.tensordot(axes, cells, 1)
         return whole, np.asarray(self.index.low * (TILE * LOCAL_CELL), dtype=np.float64)
 
     def check(self) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from coview_kernels.arrays import PolarGrid
 from coview_kernels.covisibility import coview
-from coview_kernels.distinct import distinct_poses
 from coview_kernels.crop import Crop, Cut, crop_points
+from coview_kernels.distinct import distinct_poses
 from coview_kernels.evidence import (
     Beams,
     Distances,
@@ -33,6 +33,7 @@ from coview_kernels.similarity import all_shift_distance, column_spectra, unit_c
 from coview_kernels.station_codes import CodedQuery, StationCodes
 from coview_kernels.voxel_filter import VoxelFilter, transform_unique
 from coview_kernels.warm_up import warm_up
+from coview_kernels.windows import WindowImages, WindowRaster, window_products
 
 __all__ = [
     "Alignment",
@@ -55,6 +56,8 @@ __all__ = [
     "Sight",
     "StationCodes",
     "VoxelFilter",
+    "WindowImages",
+    "WindowRaster",
     "align_planes",
     "all_shift_distance",
     "backend",
@@ -76,4 +79,5 @@ __all__ = [
     "transform_unique",
     "unit_columns",
     "warm_up",
+    "window_products",
 ]

@@ -7,8 +7,8 @@ Functions here trust their arguments; the public twins in :mod:`coview_kernels` 
 from __future__ import annotations
 
 from coview_kernels.reference.covisibility import coview, visible
-from coview_kernels.reference.distinct import distinct_poses
 from coview_kernels.reference.crop import crop_points
+from coview_kernels.reference.distinct import distinct_poses
 from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
 from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
@@ -16,6 +16,7 @@ from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
 from coview_kernels.reference.station_codes import best_codes, code_products, codes_at
 from coview_kernels.reference.voxel_filter import transform_unique
+from coview_kernels.reference.windows import window_products
 
 __all__ = [
     "align_planes",
@@ -35,4 +36,5 @@ __all__ = [
     "station_bins",
     "transform_unique",
     "visible",
+    "window_products",
 ]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import small_world
@@ -16,6 +14,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.votes import TableVote
 from coview_stream.localization.state import State
 from coview_stream.stream.node.engines import SearchEngine
 from coview_stream.stream.node.jobs import SearchJob
@@ -33,17 +32,16 @@ def knowing(monkeypatch, world_drive):
     local = pose_from(np.eye(3), -first[:3, 3]) @ first  # as the localizer has it, about its anchor
     T_map_local = world_drive.T_map_body[0] @ inverse(local)
 
-    def distances(self, view, near):
+    def vote(self, view, near):
         rng = np.random.default_rng(0)
         found = rng.normal(1.0, 0.1, (len(self.stations), self.config.yaws)).astype(np.float32)
         there = transform(T_map_local, view.centre[None])[0, :2]
         station = np.hypot(*(self.stations[:, :2] - there).T).argmin()
         shift = round(-yaw_of(T_map_local) / (2 * np.pi / self.config.yaws)) % self.config.yaws
         found[station, shift] = -1.0
-        return found
+        return TableVote.of_distances(view.centre, [found])
 
-    monkeypatch.setattr(FeatureMatcher, "distances", distances)
-    monkeypatch.setattr(FeatureMatcher, "refine", lambda self, hypotheses, view: hypotheses)
+    monkeypatch.setattr(FeatureMatcher, "vote", vote)
 
 
 def follow(localizer, drive):
@@ -84,11 +82,9 @@ def test_learned_recognizer_refuses_map_without_features(world_map):
         LocalizerConfig(reloc="guesswork")
 
 
-def test_recognizers_share_the_hypothesis_limit(learned_map):
-    assert search_of(learned_map, peaks=2).coview.consensus.config.peaks == 2
+def test_each_recognizer_has_its_own_limit_of_hypotheses(learned_map):
     assert search_of(learned_map, peaks=2).learned.consensus.config.peaks == 2
-    usual = LocalizerConfig().consensus.peaks
-    assert search_of(learned_map, "coview", peaks=2).coview.consensus.config.peaks == usual
+    assert search_of(learned_map, peaks=2).coview.consensus.config.peaks == LocalizerConfig().consensus.peaks
 
 
 # ---- what they name
@@ -117,35 +113,20 @@ def test_coview_recognizer_finds_what_learned_misses(learned_map, world_drive, w
     """Wrong places are named, registered and refused: wherever the robot is, features say that it is elsewhere."""
     named = []
 
-    def distances(self, view, near):
+    def vote(self, view, near):
         found = np.random.default_rng(0).normal(1.0, 0.1, (len(self.stations), self.config.yaws))
         away = np.hypot(*(self.stations[:, :2] - self.stations[:, :2].mean(axis=0)).T)
         wrong = np.argsort(-away, kind="stable")[:: max(1, len(away) // 20)][:5]  # at the rim and farther in
         found[wrong, np.arange(5) * 7] = -1.0
         named.append(wrong)
-        return found.astype(np.float32)
+        return TableVote.of_distances(view.centre, [found.astype(np.float32)])
 
-    monkeypatch.setattr(FeatureMatcher, "distances", distances)
+    monkeypatch.setattr(FeatureMatcher, "vote", vote)
     fixes = follow(Localizer(learned_map), world_drive)
     assert right(fixes, world_drive)
     assert named
     states = [f.state for f in fixes]
     assert states.index(State.TRACKING) <= [f.state for f in world_fixes].index(State.TRACKING) + 2
-
-
-def test_hypothesis_of_both_recognizers_is_registered_once(learned_map, world_drive, knowing, monkeypatch):
-    localizer = Localizer(learned_map)
-    search = localizer._search
-    request = localizer.add_frame(world_drive.clouds[0], world_drive.T_odom_body[0], 0.0)
-    search.update(request)
-    rough = search.learned.hypotheses()[0]
-    exact = replace(rough, exact=True)
-    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [rough])
-    monkeypatch.setattr(search.learned, "hypotheses", lambda: [exact])
-    assert search._propose(request)[0] == [exact, *search._remembered]
-    monkeypatch.setattr(search.learned, "hypotheses", lambda: [rough])
-    # neither is better, so neither makes way
-    assert search._propose(request)[0] == [rough, rough, *search._remembered]
 
 
 def test_too_few_points_cast_no_vote(learned_map, world_drive):

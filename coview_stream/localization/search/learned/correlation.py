@@ -51,10 +51,41 @@ def correlate(
     """
     headings = np.asarray(yaws, dtype=np.float64)
     _check(query, weight, index, headings)
-    transforms = _query_spectra(query, weight, index, headings)
+    size = len(headings) // 2
+    in_pairs = len(headings) == 2 * size and np.allclose(
+        np.exp(1j * headings[:size]), -np.exp(1j * headings[size:]), atol=1e-9
+    )
+    images = rotate_images(np.concatenate([query, weight[None]]), headings[:size] if in_pairs else headings)
+    return correlate_turned(images, index, in_pairs, blocks, min_coverage)
+
+
+def correlate_turned(
+    images: Floats32,
+    index: FeatureIndex,
+    opposite: bool,
+    blocks: Ints | None = None,
+    min_coverage: float | None = MIN_COVERAGE,
+) -> Floats32:
+    """Do what :func:`correlate` does with a query that has been turned.
+
+    Args:
+        images: (h + 1, h + 1, K, C + 1), the query at K headings; the weight comes last.
+        index: as for :func:`correlate`.
+        opposite: whether each image is also compared turned by half a turn.
+        blocks: as for :func:`correlate`.
+        min_coverage: as for :func:`correlate`.
+
+    Returns:
+        (K, H, W), or (2 K, H, W): all images turned by half a turn come behind the others.
+
+    Raises:
+        ValueError: no cell has a weight.
+    """
+    transforms = _query_spectra(images, index, opposite)
+    headings = len(transforms) * images.shape[2]
     chosen = np.arange(len(index)) if blocks is None else np.unique(blocks)
-    scores = np.full((index.height, index.width, len(headings)), -np.inf, dtype=np.float32)
-    per_block = 8 * len(transforms[0].spectra) * len(headings)
+    scores = np.full((index.height, index.width, headings), -np.inf, dtype=np.float32)
+    per_block = 8 * len(transforms[0].spectra) * headings
     for group in np.array_split(chosen, max(1, -(-len(chosen) * per_block // _BATCH_BYTES))):
         if len(group):
             for each, part in zip(transforms, np.split(scores, len(transforms), axis=2), strict=True):
@@ -71,20 +102,17 @@ class _QuerySpectra:
 
 
 def _query_spectra(
-    query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats
+    images: Floats32, index: FeatureIndex, opposite: bool
 ) -> tuple[_QuerySpectra] | tuple[_QuerySpectra, _QuerySpectra]:
     """Transform the query at each heading, over the sum of the weights; the weight's spectrum comes last."""
-    half, size = len(weight) // 2, len(yaws) // 2
-    # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
-    in_pairs = len(yaws) == 2 * size and np.allclose(np.exp(1j * yaws[:size]), -np.exp(1j * yaws[size:]), atol=1e-9)
-    images = rotate_images(np.concatenate([query, weight[None]]), yaws[:size] if in_pairs else yaws)
+    half = images.shape[0] // 2
     total = images[..., -1].sum(axis=(0, 1), dtype=np.float64).astype(np.float32)
     if not (total > _EPSILON).all():
         raise ValueError("no cell of the query has a weight")
-    images *= (1.0 / total)[:, None]
-    spectra = half_spectra(images, index.block)
+    spectra = half_spectra(images * (1.0 / total)[:, None], index.block)
     before = _QuerySpectra(np.conjugate(spectra), index.margin - half)
-    return (before, _QuerySpectra(spectra, index.margin + half)) if in_pairs else (before,)
+    # a correlation with an image rotated by 180 degrees is a convolution: the same spectra, not conjugate
+    return (before, _QuerySpectra(spectra, index.margin + half)) if opposite else (before,)
 
 
 def _check(query: Floats32, weight: Floats32, index: FeatureIndex, yaws: Floats) -> None:

@@ -14,13 +14,12 @@ from coview_stream.geometry.transforms import pose_from, transform, wrap_angle, 
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.votes import TableVote
 
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other; set by hand
 
 
 class LearnedRecognizer:
-    """Recognizer by learned features; keypoints of the newest keyframe that voted refine its peaks."""
+    """Recognizer by learned features."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, learned: FeatureMatcher) -> None:
         self.config = config
@@ -36,10 +35,10 @@ class LearnedRecognizer:
         centre = on_ground(request.surroundings, request.position)
         self._query = self.learned.encode(request.surroundings, centre)
         hinted = [transform(T, request.position[None])[0, :2] for T in request.hints]
-        self.consensus.vote(TableVote.of_distances(centre, [self.learned.distances(self._query, hinted)]))
+        self.consensus.vote(self.learned.vote(self._query, hinted))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks on every storey that they may be on, refined by keypoints."""
+        """Return the consensus' peaks on every storey that they may be on."""
         peaks = [replace(each, learned=True) for each in self.consensus.hypotheses()]
         if self._query is None or not peaks:
             return peaks
@@ -51,8 +50,7 @@ class LearnedRecognizer:
         for peak in peaks:
             for each in self._storeys(peak):
                 found.setdefault((each.station, each.shift), each)
-        named = list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
-        return self.learned.refine(named, self._query)
+        return list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
     def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
         """Return a peak, and the same at the stations above and below: from above they look alike."""

@@ -12,6 +12,7 @@ from coview_stream.config import LearnedConfig, LocalizerConfig
 from coview_stream.geometry.transforms import transform
 from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.votes import TableVote
 
 HERE, THERE, SHIFT = (5.0, -7.0), (-15.0, 11.0), 7
 
@@ -27,8 +28,7 @@ def named(heights, peaks=5):
     flat[(xy == THERE).all(axis=1), SHIFT] = 0.2
     learned = SimpleNamespace(
         encode=lambda points, centre: SimpleNamespace(centre=centre),
-        distances=lambda view, suggested: np.tile(flat, (len(heights), 1)),
-        refine=lambda hypotheses, view: hypotheses,
+        vote=lambda view, near: TableVote.of_distances(view.centre, [np.tile(flat, (len(heights), 1))]),
     )
     source = LearnedRecognizer(SimpleNamespace(station_grid=StationGrid(stations, 2.0)), config, learned)
     ground = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32) * (1, 1, 0)

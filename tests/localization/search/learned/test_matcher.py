@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-
 import numpy as np
 import pytest
 from planted_features import LOW, SECTORS, TILES, Planted
@@ -15,9 +13,9 @@ from coview_stream.descriptors.feature_build import feature_arrays
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
 from coview_stream.descriptors.network import Features
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
-from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.learned.matcher import FeatureMatcher, principal_axes
-from coview_stream.localization.search.votes import TableVote
+from coview_stream.localization.search.consensus import Consensus
+from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.learned.rasters import principal_axes
 
 
 @pytest.fixture(scope="module")
@@ -42,20 +40,44 @@ def known(planted, stations):
 PLACES = [((21.0, 33.0), 0), ((-41.0, 75.0), 7), ((61.0, -15.0), 30)]
 
 
+def scores_of(vote, stations):
+    """z-scores (M, S) of all stations at all shifts."""
+    station, shift = np.divmod(np.arange(len(stations) * SECTORS), SECTORS)
+    return vote.at(station, shift).reshape(-1, SECTORS)
+
+
 @pytest.mark.parametrize(("xy", "shift"), PLACES)
 def test_true_station_and_shift_score_best(planted, known, stations, xy, shift):
     yaw = -2 * np.pi * shift / SECTORS
-    distances = known.distances(planted.seen(xy, yaw, np.array([4.0, -7.0, 1.0])))
-    assert distances.shape == (len(stations), SECTORS)
-    station, found = np.unravel_index(distances.argmin(), distances.shape)
+    vote = known.vote(planted.seen(xy, yaw, np.array([4.0, -7.0, 1.0])))
+    scores = scores_of(vote, stations)
+    station, found = np.unravel_index(scores.argmin(), scores.shape)
     np.testing.assert_allclose(stations[station, :2], xy)
     assert found == shift
+    named, shifts = vote.candidates()
+    assert (named[0], shifts[0]) == (station, shift)
+    assert len(named) >= 64
+    assert len(set(zip(named.tolist(), shifts.tolist(), strict=True))) == len(named)
+    assert (np.diff(vote.at(named, shifts)) >= 0).all()  # best first
 
 
-def test_uncompared_stations_get_the_median_distance(planted, known):
-    distances = known.distances(planted.seen((21.0, 33.0), 0.4, np.zeros(3)))
-    assert (distances[-1] == 1.0).all()  # the station off the map
-    assert np.median(distances[:-1][distances[:-1] != 1.0]) == pytest.approx(1.0, abs=0.01)
+def test_votes_are_standard_scores_and_nothing_where_nothing_is_compared(planted, known, stations):
+    vote = known.vote(planted.seen((21.0, 33.0), 0.4, np.zeros(3)))
+    scores = scores_of(vote, stations)
+    assert (scores[-1] == 0.0).all()  # the station off the map
+    assert (vote.at(np.array([-1, -1]), np.array([0, 5])) == 0.0).all()
+    compared = scores[:-1][scores[:-1] != 0.0]
+    assert np.median(compared) == pytest.approx(0.0, abs=0.1)
+    assert np.median(np.abs(compared)) * 1.4826 == pytest.approx(1.0, abs=0.1)
+
+
+def test_query_beyond_the_edge_scores_by_what_is_surveyed(planted, known, stations):
+    """At the edge a third of the query lies off the map; at the corner more than is allowed."""
+    edge, corner = (np.array([-95.0, 33.0]), np.array([-95.0, -63.0]))
+    for xy, compared in ((edge, False), (np.array([-85.0, 33.0]), True), (corner, False)):
+        vote = known.vote(planted.seen(xy, 0.0, np.zeros(3), noise=0.1))
+        station = int(np.hypot(*(stations[:, :2] - xy).T).argmin())
+        assert (vote.at(np.array([station]), np.array([0]))[0] < -4.0) == compared
 
 
 def test_votes_of_keyframes_add_up_at_the_newest(planted, known, stations):
@@ -66,66 +88,37 @@ def test_votes_of_keyframes_add_up_at_the_newest(planted, known, stations):
     for k in range(5):
         centre = np.array([4.0 * k, 1.0 * k, 0.0])
         there = transform(T, centre[None])[0]
-        view = planted.seen(there[:2], yaw, centre, noise=3.0, seed=k)
-        consensus.vote(TableVote.of_distances(centre, [known.distances(view)[:-1]]))
+        consensus.vote(known.vote(planted.seen(there[:2], yaw, centre, noise=3.0, seed=k)))
     best = consensus.hypotheses()[0]
     assert np.linalg.norm(transform(best.T_map_odom, centre[None])[0] - there)[None] < 2.0
     assert abs(wrap_angle(yaw_of(best.T_map_odom) - yaw)) < np.radians(6)
 
 
-def test_large_maps_are_searched_around_place_matches(planted, stations):
-    config = LearnedConfig(dense_area=1000.0, shortlist=1)
-    known = FeatureMatcher(planted.features, stations, config)
+def test_large_maps_are_searched_around_place_matches_and_hints(planted, stations):
+    known = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0, shortlist=1))
     assert not known.dense
     assert FeatureMatcher(planted.features, stations, LearnedConfig()).dense
-    distances = known.distances(planted.seen((-77.0, -43.0), 0.0, np.zeros(3)))
-    searched = (distances != 1.0).any(axis=1)
-    assert 0.05 < searched.mean() < 0.8
-    assert np.hypot(*(stations[distances.min(axis=1).argmin(), :2] - (-77.0, -43.0))) < 2.0
-    far = distances[np.hypot(*(stations[:, :2] - (80.0, 110.0)).T) < 10.0]
-    assert (far == 1.0).all()
-
-
-def test_large_maps_are_searched_around_pose_hints(planted, stations):
-    known = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0, shortlist=1))
-    view = planted.seen((-77.0, -43.0), 0.0, np.zeros(3))
-    near = np.hypot(*(stations[:, :2] - (50.0, 70.0)).T) < 10.0
-    assert (known.distances(view)[near] == 1.0).all()
-    assert (known.distances(view, [[50.0, 70.0]])[near] != 1.0).any(axis=1).all()
+    view, hint = planted.seen((-77.0, -43.0), 0.0, np.zeros(3)), (70.0, 90.0)
+    for near, beyond in (((), False), ([hint], True)):
+        vote = known.vote(view, near)
+        named = stations[vote.candidates()[0], :2]
+        assert np.hypot(*(named[0] - (-77.0, -43.0))) < 2.0
+        assert (named > (32.0, 64.0)).all(axis=1).any() == beyond  # the block that the hint lies in
+    there = int(np.hypot(*(stations[:, :2] - hint).T).argmin())
+    assert vote.at(np.array([there]), np.array([3]))[0] != 0.0  # what other keyframes name is looked at anywhere
 
 
 def test_only_small_maps_are_prepared_for_full_search(planted, stations):
     large = FeatureMatcher(planted.features, stations, LearnedConfig(dense_area=1000.0))
     small = FeatureMatcher(planted.features, stations, LearnedConfig())
-    for known, prepared in ((large, {"index"}), (small, {"index", "_feature_blocks"})):
+    for known, prepared in ((large, {"rasters"}), (small, {"rasters", "_feature_blocks"})):
         known.prepare()
-        assert {"index", "_feature_blocks"} & set(vars(known)) == prepared
+        assert {"rasters", "_feature_blocks"} & set(vars(known)) == prepared
 
 
 def at(xy, yaw, centre, z=0.0):
     """``T_map_odom`` of a robot at ``centre`` in its odometry."""
     return pose_from(rot_z(yaw), [*xy, z]) @ pose_from(np.eye(3), -centre)
-
-
-def test_keypoints_refine_a_hypothesis(planted, known):
-    xy, yaw, centre = np.array([13.4, 27.8]), 0.83, np.array([40.0, -3.0, 1.5])
-    view = planted.seen(xy, yaw, centre, noise=0.2)
-    rough = Hypothesis(at(xy + np.array([1.5, -2.0]), yaw + np.radians(5), centre, 2.5), 17, 4, -3.0, learned=True)
-    (exact,) = known.refine([rough], view)
-    there = transform(exact.T_map_odom, centre[None])[0]
-    assert np.hypot(*(there[:2] - xy)) < 0.4
-    assert there[2] == pytest.approx(0.02 * 13.0)  # the nearest station's: keypoints know no heights
-    assert abs(wrap_angle(yaw_of(exact.T_map_odom) - yaw)) < np.radians(1.0)
-    assert exact.exact
-    same = replace(exact, T_map_odom=rough.T_map_odom, exact=False)
-    assert all(getattr(same, f.name) is getattr(rough, f.name) for f in fields(same))  # all else is as it was
-
-
-def test_disagreeing_keypoints_leave_hypothesis_unchanged(planted, known):
-    view = planted.seen((13.4, 27.8), 0.83, np.zeros(3))
-    wrong = Hypothesis(at((-50.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
-    beyond = Hypothesis(at((950.0, 80.0), 2.0, np.zeros(3)), 17, 4, -3.0, learned=True)
-    assert [id(each) for each in known.refine([wrong, beyond], view)] == [id(wrong), id(beyond)]
 
 
 def pointwise(image):
@@ -144,7 +137,7 @@ def pointwise(image):
     ("xy", "degrees"), [((5.6, -8.8), 100.0), ((5.6, -8.8), -57.0), ((6.0, -9.0), 90.0), ((6.0, -9.0), 0.0)]
 )
 def test_clouds_to_pose_end_to_end(map_points, monkeypatch, xy, degrees):
-    """Drawing, features, correlation, stations and keypoints mean the same by x, y and heading."""
+    """Drawing, features, correlation and stations mean the same by x, y and heading."""
     monkeypatch.setattr("coview_stream.descriptors.feature_build.network", lambda *_: pointwise)
     cloud, place, yaw = map_points.astype(np.float32), np.array([*xy, 0.0]), np.radians(degrees)
     axis = np.arange(-31.0, 32.0, 2.0)
@@ -161,15 +154,10 @@ def test_clouds_to_pose_end_to_end(map_points, monkeypatch, xy, degrees):
         return np.hypot(*gap[:2]), np.degrees(abs(wrap_angle(yaw_of(hypothesis.T_map_odom) - yaw)))
 
     consensus = Consensus(StationGrid(stations, 2.0), ConsensusConfig())
-    consensus.vote(TableVote.of_distances(centre, [known.distances(view)]))
+    consensus.vote(known.vote(view))
     metres, turn = errors(consensus.hypotheses()[0])
     assert metres < 2.0
     assert turn < 8.0
-    if degrees % 90 == 0:  # then cells lie on cells, and such simple descriptors are alike enough
-        rough = Hypothesis(at(place[:2] + np.array([1.5, -1.0]), yaw + np.radians(6), centre), 3, 4, -3.0)
-        metres, turn = errors(*known.refine([rough], view))
-        assert metres < 0.2
-        assert turn < 0.5
 
 
 def test_query_features_of_a_cloud(known):
@@ -187,8 +175,9 @@ def test_principal_axes_keep_inner_products_with_what_they_were_found_in():
     rng = np.random.default_rng(3)
     mixing = rng.normal(size=(32, 4)).astype(np.float32)
     vectors = mixing @ rng.normal(size=(4, 500)).astype(np.float32) + rng.normal(0, 1e-3, (32, 500)).astype(np.float32)
-    axes = principal_axes(vectors, 0.999)
+    axes = principal_axes(vectors, 0.999, 7)
     assert axes.shape == (4, 32)
     np.testing.assert_allclose(axes @ axes.T, np.eye(4), atol=1e-5)
     query = rng.normal(size=32).astype(np.float32)
     np.testing.assert_allclose((axes @ query) @ (axes @ vectors), query @ vectors, atol=0.1)
+    assert principal_axes(vectors, 0.999, 3).shape == (3, 32)

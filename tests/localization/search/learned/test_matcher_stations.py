@@ -1,4 +1,4 @@
-"""What stations read of the scores around them, and how high a place stands that keypoints have moved."""
+"""Cells of the stations: all in a station's block, or the one around it."""
 
 from __future__ import annotations
 
@@ -18,23 +18,21 @@ def planted():
 
 @pytest.mark.parametrize("block", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
 @pytest.mark.parametrize("cell", [2.0, 4.0])
-def test_station_takes_best_score_of_its_block(planted, block, cell):
+def test_station_has_the_cells_of_its_block(planted, block, cell):
     count = int(TILES * TILE / block)
     xy = np.stack(np.meshgrid(*[(np.arange(count) + 0.5) * block + low * TILE for low in LOW]), -1)
     places = np.column_stack([xy.reshape(-1, 2), np.zeros(count**2)]).astype(np.float32)
-    known = FeatureMatcher(planted.features, places, LearnedConfig(cell=cell), block=block)
-    side = int(TILES * TILE / cell)
-    scores = np.random.default_rng(0).normal(size=(3, side, side)).astype(np.float32)
-    found = known._at_stations(scores)
-    middles = (np.arange(side) + 0.5) * cell
+    cells = FeatureMatcher(planted.features, places, LearnedConfig(cell=cell), block=block).cells
+    assert cells.shape == (int(TILES * TILE / cell),) * 2
+    middles = (np.arange(int(TILES * TILE / cell)) + 0.5) * cell
     for k in np.random.default_rng(1).permutation(len(places))[:200]:
         low = places[k, :2] - LOW * TILE - 0.5 * block
-        columns, rows = (np.flatnonzero((middles >= m) & (middles < m + block)) for m in low)
-        if not len(rows) or not len(columns):  # a block smaller than cells
-            x, y = ((low + 0.5 * block) // cell).astype(int)
-            columns = columns if len(columns) else [x]
-            rows = rows if len(rows) else [y]
-        np.testing.assert_array_equal(found[k], scores[:, rows][:, :, columns].max(axis=(1, 2)))
+        for axis, number in ((1, 0), (0, 1)):  # rows are along y
+            inside = np.flatnonzero((middles >= low[axis]) & (middles < low[axis] + block))
+            if not len(inside):  # a block smaller than cells
+                inside = np.array([(low[axis] + 0.5 * block) // cell])
+            assert cells.first[k, number] == inside[0]
+            assert cells.size[k, number] == len(inside)
 
 
 def test_four_metre_blocks_find_a_place_anywhere_inside(planted):
@@ -43,23 +41,5 @@ def test_four_metre_blocks_find_a_place_anywhere_inside(planted):
     places = np.column_stack([xy, np.zeros(len(xy))]).astype(np.float32)
     known = FeatureMatcher(planted.features, places, LearnedConfig(), block=4.0)
     for place in ((21.0, 33.0), (23.0, 33.0), (21.0, 35.0), (23.0, 35.0)):
-        distances = known.distances(planted.seen(place, 0.0, np.zeros(3)))
-        np.testing.assert_allclose(places[distances.min(axis=1).argmin(), :2], (22.0, 34.0))
-
-
-def test_hypothesis_moved_by_keypoints_keeps_its_storey(planted):
-    """Two storeys 3 m apart on a slope, the upper one with a hole; beyond, no stations at all."""
-    axis = np.arange(-19.0, 20.0, 2.0)
-    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    lower = np.column_stack([xy, 0.2 * xy[:, 0]])
-    upper = lower[np.hypot(*xy.T) > 5.0] + (0.0, 0.0, 3.0)
-    known = FeatureMatcher(planted.features, np.vstack([lower, upper]).astype(np.float32), LearnedConfig())
-
-    def ground(xy, before):
-        return known._ground(np.array(xy), np.array(before))
-
-    assert ground((13.0, 9.0), (9.0, 9.0, 1.8)) == pytest.approx(2.6)
-    assert ground((13.0, 9.0), (9.0, 9.0, 4.8)) == pytest.approx(5.6)
-    assert ground((13.2, 9.4), (13.0, 9.0, 5.6)) == pytest.approx(5.6)
-    assert ground((1.0, 1.0), (1.5, 1.0, 3.3)) == 3.3  # nothing there on this storey
-    assert ground((60.0, 1.0), (56.0, 1.0, 7.0)) == 7.0
+        stations, _ = known.vote(planted.seen(place, 0.0, np.zeros(3))).candidates()
+        np.testing.assert_allclose(places[stations[0], :2], (22.0, 34.0))

@@ -1,0 +1,128 @@
+"""Feature rasters: a map's features in the few dimensions that matter, fine and coarse, and a query turned to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_kernels import WindowImages, WindowRaster
+from coview_stream.descriptors.feature_map import FeatureMap
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.localization.search.learned.correlation import downsample, rotate_images
+from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.feature_vote import WEIGHT
+
+_ENERGY = 0.995  # of the features on a map that the dimensions in which they are compared hold; set by hand
+_TILES = 64  # of a map from which those are found; set by hand
+_COARSE = 2  # fine cells along the edge of a coarse one
+_BLOCK = 6  # edge of a coarse block over its margin: two thirds of it are answers
+_BYTE = 127.0
+
+
+@dataclass(frozen=True)
+class FeatureRasters:
+    """A map's features, ready to be searched.
+
+    Attributes:
+        axes: (D, C) orthonormal directions in which features are compared.
+        corner: (2,) x and y of the lower corner of cell (0, 0), metres.
+        cell: edge of a fine cell, metres.
+        shape: fine rows and columns.
+        fine: the features times 127; the last dimension is 127 where there are any.
+        coarse: the features' means over cells twice as large, with their spectra.
+    """
+
+    axes: Floats32
+    corner: Floats
+    cell: float
+    shape: tuple[int, int]
+    fine: WindowRaster
+    coarse: FeatureIndex
+
+    @classmethod
+    def of(cls, features: FeatureMap, cell: float, half: int) -> FeatureRasters:
+        """Make them of a map, in cells of ``cell`` metres, for queries that reach ``half`` cells from their middle."""
+        axes = principal_axes(features.sample(_TILES), _ENERGY, WEIGHT)
+        fine, corner = features.coarse(cell, axes)
+        known = np.asarray((fine != 0).any(axis=0))
+        raster = np.zeros((*known.shape, WEIGHT + 1), dtype=np.int8)
+        raster[..., : len(axes)] = np.rint(_BYTE * fine).transpose(1, 2, 0)
+        raster[..., WEIGHT] = _BYTE * known
+        count = _pooled(known[None].astype(np.float32))
+        coarse = _pooled(fine) / np.maximum(count, 1.0)
+        margin = -(-half // _COARSE)
+        block = _BLOCK * margin
+        index = FeatureIndex(coarse, corner, _COARSE * cell, surveyed=count[0] > 0, block=block, margin=margin)
+        return cls(axes, corner, cell, known.shape, WindowRaster(raster, half), index)
+
+
+@dataclass(frozen=True)
+class TurnedQuery:
+    """A query turned to S headings, half a turn and more by symmetry.
+
+    Attributes:
+        images: (S, h + 1, h + 1, 8) int8 the weighted features, and the weight in the last dimension.
+        coarse: (g, g, K, D + 1) float32 the same in coarse cells at some headings of the first half turn.
+        headings: (K,) their numbers.
+    """
+
+    images: WindowImages
+    coarse: Floats32
+    headings: Ints
+
+
+def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio: int, yaws: Floats) -> TurnedQuery:
+    """Turn a query to headings.
+
+    Args:
+        local: (C, H, W) features.
+        weight: (H, W) of each cell.
+        rasters: of the map that it is compared with.
+        ratio: of its cells along the edge of a fine cell of the map.
+        yaws: (S,) even in number; the second half is that of the first half a turn on.
+    """
+    reduced, shares = downsample(np.tensordot(rasters.axes, local, 1), weight, ratio)
+    half = len(yaws) // 2
+    turned = rotate_images(np.concatenate([reduced, shares[None]]), yaws[:half])
+    side, dimensions = len(turned), len(rasters.axes)
+    images = np.zeros((2 * half, side, side, WEIGHT + 1), dtype=np.int8)
+    scaled = np.rint(turned * np.float32(_BYTE / max(float(turned[..., -1].max()), 1e-9))).transpose(2, 0, 1, 3)
+    images[:half, ..., :dimensions], images[:half, ..., WEIGHT] = scaled[..., :-1], scaled[..., -1]
+    images[half:] = images[:half, ::-1, ::-1]
+    every = 2 if half >= 12 else 1  # 20 degrees are enough for coarse cells
+    return TurnedQuery(WindowImages(images), _halved(turned[:, :, ::every]), np.arange(0, half, every))
+
+
+def _pooled(values: Floats32) -> Floats32:
+    """Add up squares of fine cells (C, H, W): (C, H / 2, W / 2)."""
+    channels, height, width = values.shape
+    parts = values.reshape(channels, height // _COARSE, _COARSE, width // _COARSE, _COARSE)
+    return np.asarray(parts.sum(axis=(2, 4)))
+
+
+def _halved(images: Floats32) -> Floats32:
+    """Add up images (h, h, ...), h odd, in cells twice as large about the same middle cell's centre."""
+    out = images
+    for axis in (0, 1):
+        padded = np.moveaxis(out, axis, 0)
+        if len(padded) // 2 % 2:  # the middle stays in the middle of a coarse cell
+            padded = np.pad(padded, [(1, 1)] + [(0, 0)] * (padded.ndim - 1))
+        between = 0.5 * padded[1::2]
+        coarse = padded[::2].copy()
+        coarse[:-1] += between
+        coarse[1:] += between
+        out = np.moveaxis(coarse, 0, axis)
+    return np.ascontiguousarray(out)
+
+
+def principal_axes(vectors: Floats32, energy: float, most: int) -> Floats32:
+    """Find the fewest orthonormal directions (D, C) that hold a share of the energy of vectors (C, N), best first.
+
+    Inner products with the vectors change little where a query is reduced to them: what they leave out of a vector of
+    unit norm is ``1 - energy`` of its square in the mean. There are ``most`` directions at most.
+    """
+    values, directions = np.linalg.eigh((vectors @ vectors.T).astype(np.float64))
+    share = np.cumsum(values[::-1]) / max(float(values.sum()), 1e-30)
+    count = min(int(np.searchsorted(share, energy)) + 1, len(values), most)
+    return np.ascontiguousarray(directions[:, ::-1][:, :count].T, dtype=np.float32)

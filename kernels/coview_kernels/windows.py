@@ -1,0 +1,161 @@
+"""Products of small images with windows of a raster: a correlation, but only at the places that are asked for.
+
+All are signed bytes, eight to a cell, and the eight dimensions are summed apart, so that one of them may be the weight
+of a mean of the others. A window of 33 x 33 cells takes a microsecond; all of them at once are a matter for a Fourier
+transform.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_kernels import reference, runtime
+from coview_kernels.arrays import I8, I32, Mask, as_int32
+from coview_kernels.launch import Launch
+from coview_kernels.warm_up import compiled_by
+
+DIMENSIONS = 8
+"""Numbers in a cell."""
+
+_LANES = 32  # as in _ti_windows.py
+_MAX_CELLS = (2**31 - 1) // (128 * 128)  # whose sum of products an int32 holds
+
+
+class WindowImages:
+    """K images of one size, prepared to be compared with windows of a raster.
+
+    Attributes:
+        padded: (K, h, stride) int8, rows in whole registers.
+        spans: (h, 2) int32 the first register of each row that any image uses, and the one behind the last.
+    """
+
+    def __init__(self, images: I8) -> None:
+        """Prepare images (K, h, h, 8); ValueError for another shape or type."""
+        if images.ndim != 4 or images.shape[1] != images.shape[2] or images.shape[3] != DIMENSIONS:
+            raise ValueError(f"images have shape {images.shape}, expected (K, h, h, {DIMENSIONS})")
+        if images.dtype != np.int8 or not 0 < images.shape[1] ** 2 <= _MAX_CELLS:
+            raise ValueError(
+                f"images of {images.dtype} with {images.shape[1]} cells a side, expected int8 and 1 to 362"
+            )
+        count, side = images.shape[:2]
+        stride = -(-side * DIMENSIONS // _LANES) * _LANES
+        self.padded = np.zeros((count, side, stride), dtype=np.int8)
+        self.padded[..., : side * DIMENSIONS] = images.reshape(count, side, -1)
+        used = np.asarray(self.padded != 0).reshape(count, side, -1, _LANES)
+        self.spans = np.stack(_span(np.asarray(used.any(axis=(0, 3)))), axis=1)
+
+    def __len__(self) -> int:
+        """Return the number of images K."""
+        return len(self.padded)
+
+    @property
+    def side(self) -> int:
+        """Cells h along an image's edge."""
+        return int(self.padded.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that they take."""
+        return int(self.padded.nbytes)
+
+    @property
+    def images(self) -> I8:
+        """(K, h, h, 8) without what fills the registers."""
+        return self.padded[..., : self.side * DIMENSIONS].reshape(len(self), self.side, self.side, DIMENSIONS)
+
+
+def _span(used: Mask) -> tuple[I32, I32]:
+    """Return first used column of each row of a mask (h, n), and the one behind the last; equal where none is."""
+    some, columns = used.any(axis=1), used.shape[1]
+    first, last = used.argmax(axis=1), columns - used[:, ::-1].argmax(axis=1)
+    return np.where(some, first, 0).astype(np.int32), np.where(some, last, 0).astype(np.int32)
+
+
+class WindowRaster:
+    """A raster, prepared to be compared with images up to a size.
+
+    Attributes:
+        flat: int8, the raster with a margin of zeros, row by row, and zeros behind it.
+        margin: cells.
+    """
+
+    def __init__(self, raster: I8, margin: int) -> None:
+        """Prepare a raster (H, W, 8) for windows that reach up to ``margin`` cells beyond it.
+
+        Raises:
+            ValueError: another shape or type, or more than 2 GB of it.
+        """
+        if raster.ndim != 3 or raster.shape[2] != DIMENSIONS or raster.dtype != np.int8:
+            raise ValueError(f"a raster of {raster.dtype} {raster.shape}, expected int8 (H, W, {DIMENSIONS})")
+        height, width = (n + 2 * margin for n in raster.shape[:2])
+        if height * width * DIMENSIONS >= 2**31 - _LANES:
+            raise ValueError(f"a raster of {height} x {width} cells is too large")
+        # what fills the images' registers is multiplied with what follows the last row
+        self.flat = np.zeros(height * width * DIMENSIONS + _LANES, dtype=np.int8)
+        self.margin = margin
+        self._shape = height, width
+        self.padded[margin : height - margin, margin : width - margin] = raster
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it takes."""
+        return int(self.flat.nbytes)
+
+    @property
+    def padded(self) -> I8:
+        """(H + 2 margin, W + 2 margin, 8) with its margin."""
+        height, width = self._shape
+        return self.flat[:-_LANES].reshape(height, width, DIMENSIONS)
+
+
+def window_products(raster: WindowRaster, images: WindowImages, corners: npt.ArrayLike, which: npt.ArrayLike) -> I32:
+    """Sum the products of images with windows of a raster, each of the eight dimensions by itself.
+
+    Args:
+        raster: to be looked at.
+        images: K of them.
+        corners: (N, 2) row and column of the raster's cell at a window's first one; within its margin or inside.
+        which: (N,) image to compare each window with.
+
+    Returns:
+        (N, 8) int32.
+
+    Raises:
+        ValueError: a shape is wrong, a window leaves the margin, or there is no such image.
+    """
+    at, image = as_int32("corners", corners, None, 2), as_int32("which", which, None)
+    at = np.ascontiguousarray(at + np.int32(raster.margin))
+    if len(at) != len(image):
+        raise ValueError(f"{len(at)} corners and {len(image)} images")
+    if not len(at):
+        return np.zeros((0, DIMENSIONS), dtype=np.int32)
+    if at.min() < 0 or (at.max(axis=0) + images.side > raster.padded.shape[:2]).any():
+        raise ValueError("a window leaves the raster's margin")
+    if image.min() < 0 or image.max() >= len(images):
+        raise ValueError(f"images {image.min()} to {image.max()} of {len(images)}")
+    return runtime.dispatch(_native, _plain, raster, images, at, image)
+
+
+def _plain(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:
+    return reference.window_products(raster.padded, images.images, at, which)
+
+
+def _native(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:
+    width = raster.padded.shape[1]
+    first = (at[:, 0] * width + at[:, 1]) * DIMENSIONS
+    out = np.zeros((len(at), DIMENSIONS), dtype=np.int32)
+    Launch(
+        "windows", "products",
+        raster.flat, width * DIMENSIONS, images.padded.reshape(-1), images.padded.shape[2], images.spans.reshape(-1),
+        first, which, out.reshape(-1),
+    )()  # fmt: skip
+    return out
+
+
+def _compile() -> None:
+    cell = np.zeros((1, 1, 1, DIMENSIONS), dtype=np.int8)
+    window_products(WindowRaster(cell[0], 0), WindowImages(cell), np.zeros((1, 2)), np.zeros(1))
+
+
+compiled_by("window_products", _compile)
