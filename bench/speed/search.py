@@ -120,11 +120,11 @@ def _judged(world: str, sides: dict[str, Searcher]) -> Iterator[Row]:
     for label, share, most in (("p50", 50, P50_MS), ("p95", 95, P95_MS)):
         yield bounded(f"{name}: step {label}", ours.percentile(share), "ms", most)
     if other is not None:
+        earlier = f"beside commit {COMMIT[:7]}"
         for label, share, least in (("p50", 50, LEAST_RATIO), ("p95", 95, None)):
-            figures = ours.percentile(share), other.percentile(share)
-            yield against(f"{name}: step {label} beside commit {COMMIT[:7]}", *figures, "ms", least)
-    # what the core spent on it: the same on a busy machine
-    yield informs(f"{name}: step p50, processor time", ours.percentile(50, "cpu_ms"), "ms")
-    yield informs(f"{name}: step p95, processor time", ours.percentile(95, "cpu_ms"), "ms")
+            both = [side.percentile(share) for side in (ours, other)]
+            yield against(f"{name}: step {label} {earlier}", both[0], both[1], "ms", least)
+        both = [side.percentile(50, "cpu_ms") for side in (ours, other)]  # nearly the same on a busy machine
+        yield against(f"{name}: step p50 {earlier}, processor time", both[0], both[1], "ms", None)
     yield reached(f"{name}: rivals scored per step, median", ours.rivals(), "", LEAST_RIVALS)
     yield informs(f"{name}: memory of the searching process, peak", ours.megabytes, "MB", details)
