@@ -144,8 +144,8 @@ def voxel_filter(
     """Append the kept rows to ``moved``.
 
     ``merge``: -1, or 0 to keep every point. ``settings``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
-    and r_max, a coordinate beyond reach, the sensor's voxel, what ranges are measured from. ``totals``: kept, not finite,
-    out of reach, cubes; they go on from call to call. One slot behind the table's own receives what is not kept.
+    and r_max, a coordinate beyond reach, the sensor's voxel, where ranges are measured from. ``totals``: kept, not
+    finite, out of reach, cubes; they go on from call to call. One slot behind the table receives what is not kept.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
