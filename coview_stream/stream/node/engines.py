@@ -40,19 +40,30 @@ class Engine(Protocol):
 
     @property
     def kernels(self) -> tuple[str, ...]:
-        """Kernels that its jobs launch, to be compiled before the first."""
+        """Kernels that its first jobs launch, to be compiled before them."""
+        ...
+
+    @property
+    def later_kernels(self) -> tuple[str, ...]:
+        """Kernels that only later jobs launch, to be compiled between jobs."""
         ...
 
     def prepare(self) -> None:
-        """Do what would make the first job slow; called when there may be time."""
+        """Do what would make the first job slow; called before it."""
+        ...
+
+    def prepare_later(self) -> None:
+        """Do what would make a later job slow; called between jobs."""
         ...
 
 
 class TrackEngine:
     """Localizers of all robots: deskewing, keyframes, registration around a known place."""
 
-    kernels = (
-        "transform_unique", "crop_points", "nearest", "align_planes", "match_points", "match_rays", "sort_beams",
+    kernels = ("transform_unique",)
+    # of robots that have a place to be tracked from, which takes a search longer than it does to load them
+    later_kernels: tuple[str, ...] = (
+        "crop_points", "nearest", "align_planes", "match_points", "match_rays", "sort_beams",
     )  # fmt: skip
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
@@ -93,7 +104,10 @@ class TrackEngine:
         self._robots.pop(robot, None)
 
     def prepare(self) -> None:
-        """Import what the graph of poses runs on; the map is cropped where robots are."""
+        """Do nothing: the map is cropped where robots are."""
+
+    def prepare_later(self) -> None:
+        """Import what the graph of poses runs on."""
         PoseGraph(self.config.graph)
 
     def _localizer(self, job: FrameJob) -> Localizer:
@@ -111,9 +125,10 @@ class SearchEngine:
     """Global searches of all robots, which share the map's spectra and networks."""
 
     kernels = (
-        "transform_unique", "describe_points", "align_planes",
+        "transform_unique", "describe_points", "field_scores", "align_planes",
         "crop_points", "match_points", "match_rays", "sort_beams",
     )  # fmt: skip
+    later_kernels: tuple[str, ...] = ()
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
         self.base_map = base_map
@@ -137,15 +152,20 @@ class SearchEngine:
         self._searches.pop(robot, None)
 
     def prepare(self) -> None:
-        """Make the stations' spectra, and those of the map's learned features."""
+        """Make what the first query would: of the stations' index, of the learned features, and of the field."""
         self._index.prepare()
+        _ = self.base_map.field.layers
+
+    def prepare_later(self) -> None:
+        """Do nothing: all jobs are alike."""
 
 
-def kernels_of(kind: str) -> tuple[str, ...]:
-    """Return the kernels of the engine ``track``, ``search`` or ``odometry``."""
+def kernels_of(kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return first and later kernels of the engine ``track``, ``search`` or ``odometry``, which need not be open."""
     if kind == "odometry":
-        return ()
-    return TrackEngine.kernels if kind == "track" else SearchEngine.kernels
+        return (), ()
+    engine = TrackEngine if kind == "track" else SearchEngine
+    return engine.kernels, engine.later_kernels
 
 
 def open_engine(kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None) -> Engine:

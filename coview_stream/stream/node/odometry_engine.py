@@ -22,6 +22,7 @@ class OdometryEngine:
     """
 
     kernels: tuple[str, ...] = ()
+    later_kernels: tuple[str, ...] = ()
 
     def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration
@@ -53,6 +54,9 @@ class OdometryEngine:
 
     def prepare(self) -> None:
         """Do nothing: local maps grow with the frames."""
+
+    def prepare_later(self) -> None:
+        """Do nothing."""
 
     def _lidar(self, job: OdometryJob) -> LidarOdometry:
         """Return the robot's lidar odometry, which begins again with a new epoch."""

@@ -120,8 +120,10 @@ def open_node(
         )  # fmt: skip
         node.start()
     except BaseException as error:
-        for opened in (*engines.values(), *children.values()):
-            opened.close()
+        for engine in engines.values():
+            engine.close()
+        for child in children.values():
+            child.close()
         if transport is not None:
             transport.close()
         if isinstance(error, DiedError):

@@ -9,12 +9,19 @@ import contextlib
 import gc
 import os
 import sys
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 
 def main(argv: list[str]) -> int:
-    """Load the kernels, open the engine, then answer jobs until the parent closes the pipe."""
+    """Load the kernels, open the engine, then answer jobs until the parent closes the pipe.
+
+    What the first jobs do not need is loaded while no job waits, one kernel after the other: a job that comes meanwhile
+    waits for that one, a quarter of a second at most.
+    """
     descriptor, kind, nice = int(argv[0]), argv[1], int(argv[2])
     pipe = Connection(descriptor)
     _stand_back(nice)
@@ -24,9 +31,17 @@ def main(argv: list[str]) -> int:
     from coview_stream.stream.node.engine_process import attempt
     from coview_stream.stream.node.engines import kernels_of, open_engine
 
-    if kernels := kernels_of(kind):
-        warm_up(*kernels)
+    first, later = kernels_of(kind)
+    if first:
+        warm_up(*first)
+    steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in later)
+
+    def use_pause() -> None:
+        while steps and not pipe.poll():
+            steps.popleft()()
+
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
+        use_pause()
         opening = pipe.recv()
         try:
             method = RegistrationConfig(method=opening.registration)  # any text; it checks
@@ -41,7 +56,9 @@ def main(argv: list[str]) -> int:
             gc.freeze()  # what is there stays; to look through it again and again would cost every job
             gc.enable()
         pipe.send(("prepared", None))
+        steps.append(engine.prepare_later)
         while True:
+            use_pause()
             pipe.send(attempt(engine, pipe.recv()))
     return 0
 

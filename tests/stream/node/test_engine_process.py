@@ -190,7 +190,7 @@ def test_engine_that_cannot_prepare_reports_why_each_time(monkeypatch):
             return None, Connection(self.ours.detach())
 
     monkeypatch.setattr(engine_process, "EngineChild", Thread)
-    monkeypatch.setattr("coview_stream.stream.node.engines.kernels_of", lambda kind: ())
+    monkeypatch.setattr("coview_stream.stream.node.engines.kernels_of", lambda kind: ((), ()))
     process = EngineProcess("search", "unused", "0" * 64)
     for times in (1, 2):
         with pytest.raises(DiedError, match=r"no weights of the ground network; train them"):
