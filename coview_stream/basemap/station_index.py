@@ -22,7 +22,7 @@ from coview_stream.geometry.arrays import Complexes, Floats32, Ints
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
-_SAMPLE = 256  # stations at all whose shifts medians are taken; set by hand
+_SAMPLE = 128  # stations at all whose shifts medians are taken; set by hand
 _PREFIX = "station_codes"
 
 
@@ -93,8 +93,10 @@ class StationIndex:
         }
 
     def prepare(self) -> None:
-        """Make what the first query would."""
-        _ = self._sample
+        """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
+        if len(self):
+            query = self.query({name: values[0].astype(np.float32) for name, values in self._descriptors.items()})
+            _ = self.best(query), self.at(query, [0], [0])
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""

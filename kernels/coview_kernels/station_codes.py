@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -78,11 +78,11 @@ class CodedQuery:
     @cached_property
     def table(self) -> F32:
         """(S, 16, 2, 16) of a station's numbers, for the correlation at every shift."""
-        angle = (2.0 * np.pi / self.sectors) * np.arange(self.sectors)[:, None, None] * _frequencies()[_GROUP]
-        turned = self.numbers * np.exp(1j * angle).astype(np.complex64)
-        return np.ascontiguousarray(
-            np.stack([turned.real * self.real, turned.imag * self.imaginary], axis=2), dtype=np.float32
-        )
+        turned = self.numbers * _turns(self.sectors)
+        table = np.empty((self.sectors, _ROWS, 2, _LANES), dtype=np.float32)
+        np.multiply(turned.real, self.real, out=table[:, :, 0])
+        np.multiply(turned.imag, self.imaginary, out=table[:, :, 1])
+        return table
 
 
 class StationCodes:
@@ -284,6 +284,13 @@ class _Kernels:
 def _frequencies() -> I64:
     """Frequency of each lane of both groups (2, 16)."""
     return np.stack([_LANE, _LANE + _LANES])
+
+
+@lru_cache(maxsize=4)
+def _turns(sectors: int) -> C64:
+    """(S, 16, 16) factors that turn a query's numbers by each shift."""
+    angle = (2.0 * np.pi / sectors) * np.arange(sectors)[:, None, None] * _frequencies()[_GROUP]
+    return np.exp(1j * angle).astype(np.complex64)
 
 
 def _columns(descriptors: Sequence[npt.NDArray[Any]]) -> F32:

@@ -21,7 +21,8 @@ from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.search.votes import Vote
 
-_PLACES = 4096  # that are kept from keyframe to keyframe: the best; set by hand
+_PLACES = 2048  # that are kept from keyframe to keyframe: the best; set by hand
+_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of what makes places distinct: bins that keep the best place each; set by hand
 
 
 @dataclass(frozen=True)
@@ -109,9 +110,7 @@ class Consensus:
         known = self._moved(self._places, column, vote)
         places = known + self._named(column, vote)
         order = np.argsort(places.votes.sum(axis=1), kind="stable")
-        # places that have become the same, as far as the newest keyframe can tell, stay one: the best
-        same = (self.grid.cell(self._seen(places, vote)) * (len(self.grid) + 1) + places.station) * vote.sectors
-        _, first = np.unique((same + places.shift)[order], return_index=True)
+        _, first = np.unique(self._bins(places, vote)[order], return_index=True)
         self._places = places[order[np.sort(first)[:_PLACES]]]
 
     def hypotheses(self) -> list[Hypothesis]:
@@ -132,6 +131,14 @@ class Consensus:
         poses[:, :3, 3] = places.offset[chosen]
         numbers = (values[chosen].tolist() for values in (places.station, places.shift, scores))
         return [Hypothesis(*each) for each in zip(poses, *numbers, strict=True)]
+
+    def _bins(self, places: _Places, vote: Vote) -> Ints:
+        """Give places (N,) numbers by where they put a keyframe; those that share one are not distinct."""
+        rule, there = self.config, self._seen(places, vote)
+        edge = np.array([_BIN * rule.distinct_distance] * 2 + [0.5 * rule.distinct_distance])
+        sectors = max(1, int(_BIN_YAW * rule.distinct_yaw * vote.sectors / (2.0 * np.pi)))
+        x, y, z = np.floor(there / edge).astype(np.int64).T % 2**18  # more than any map has
+        return np.asarray(((x * 2**18 + y) * 2**18 + z) * 2**9 + places.shift // sectors)
 
     def _seen(self, places: _Places, vote: Vote) -> Floats:
         """Return where the places put a keyframe, (N, 3) in the map's frame."""

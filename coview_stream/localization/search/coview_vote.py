@@ -11,7 +11,7 @@ from coview_stream.config import Channel
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.localization.search.votes import argsmallest
 
-_MIN_STATIONS = 4096  # whose shifts are looked at one by one: the best; set by hand
+_MIN_STATIONS = 2048  # whose shifts are looked at one by one: the best; set by hand
 _SHARE = 16  # on large maps it is one in so many; set by hand
 _PER_STATION = 0.5  # candidates for each station looked at; set by hand
 
@@ -38,9 +38,12 @@ class CoViewVote:
         count = max(_MIN_STATIONS, len(self._index) // _SHARE)
         stations = argsmallest(self._index.best(self._query), count)
         scores = self._index.all_shifts(self._query, stations)
-        last, after = np.roll(scores, 1, axis=1), np.roll(scores, -1, axis=1)
-        station, shift = np.nonzero((scores < last) & (scores <= after))
-        chosen = argsmallest(scores[station, shift], int(count * _PER_STATION))
+        # every one of them has a heading that is no worse than the last one's best
+        station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)
+        found = scores[station, shift]
+        beside = scores[station, shift - 1], scores[station, (shift + 1) % self.sectors]
+        peaks = np.flatnonzero((found < beside[0]) & (found <= beside[1]))
+        chosen = peaks[argsmallest(found[peaks], int(count * _PER_STATION))]
         return stations[station[chosen]], shift[chosen]
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
