@@ -290,7 +290,8 @@ def _frequencies() -> I64:
 def _turns(sectors: int) -> C64:
     """(S, 16, 16) factors that turn a query's numbers by each shift."""
     angle = (2.0 * np.pi / sectors) * np.arange(sectors)[:, None, None] * _frequencies()[_GROUP]
-    return np.exp(1j * angle).astype(np.complex64)
+    turns: C64 = np.exp(1j * angle).astype(np.complex64)
+    return turns
 
 
 def _columns(descriptors: Sequence[npt.NDArray[Any]]) -> F32:
