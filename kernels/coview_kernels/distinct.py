@@ -10,6 +10,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, I64, as_finite64
 from coview_kernels.launch import Launch
+from coview_kernels.warm_up import SAMPLE, compiled_by
 
 
 def distinct_poses(positions: npt.ArrayLike, yaw: npt.ArrayLike, count: int, distance: float, turn: float) -> I64:
@@ -70,3 +71,6 @@ def _native(poses: F32, count: int, square: float, cosine: float) -> I64:
         kernel.launch.put(index, value)
     kernel.launch()
     return kernel.chosen[: int(kernel.found[0])].astype(np.int64)
+
+
+compiled_by("distinct_poses", lambda: distinct_poses(SAMPLE, np.zeros(2), 1, 1.0, 1.0))

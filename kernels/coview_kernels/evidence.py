@@ -12,7 +12,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, U8, as_finite64, as_float32, as_uint8, check_same_shape
 from coview_kernels.launch import Launch
-from coview_kernels.nearest import PointGrid
+from coview_kernels.nearest import SAMPLE_GRID, PointGrid
 from coview_kernels.reference.evidence import (
     Beams,
     Distances,
@@ -204,7 +204,7 @@ def _plain_match_rays(limits: F32, points: F32, T_map_body: F64, lowest: float, 
 def _compile_points() -> None:
     walls = Raster(np.ones((1, 1), dtype=np.float32), np.zeros(2), 1.0)
     survey = walls._replace(values=np.ones((1, 1), dtype=np.uint8))
-    match_points(PointGrid(SAMPLE), SAMPLE, SAMPLE, np.ones(2), np.eye(4), walls, survey, Distances(1.0, 1.0, 1.0, 1.0))
+    match_points(SAMPLE_GRID, SAMPLE, SAMPLE, np.ones(2), np.eye(4), walls, survey, Distances(1.0, 1.0, 1.0, 1.0))
 
 
 _ANY = Sight(1.0, 1.0, 1.0, 1.0, 1.0)

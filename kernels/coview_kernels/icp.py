@@ -19,7 +19,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I64, Mask, as_finite64, as_float32, check_same_shape
 from coview_kernels.launch import Launch
-from coview_kernels.nearest import PointGrid
+from coview_kernels.nearest import SAMPLE_GRID, PointGrid
 from coview_kernels.reference.icp import Alignment, Plan, Scale
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
@@ -176,7 +176,7 @@ def _settings(frame: F64, plan: Plan, numbers: I64) -> F64:
 
 
 def _compile() -> None:
-    arguments = PointGrid(SAMPLE), SAMPLE, SAMPLE, np.ones(2), np.eye(4), np.zeros(3), [Scale(1.0, 1.0)]
+    arguments = SAMPLE_GRID, SAMPLE, SAMPLE, np.ones(2), np.eye(4), np.zeros(3), [Scale(1.0, 1.0)]
     align_planes(*arguments, keep=1.0, iterations=1, min_pairs=1)
 
 

@@ -132,4 +132,7 @@ def _sort_by_cell(points: F32, edge: float) -> Cells:
     return Cells(frame, starts, rows)
 
 
-compiled_by("nearest", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))
+SAMPLE_GRID = PointGrid.sorted(SAMPLE, Cells(np.ones(8), np.array([0, 2], np.int32), np.zeros(8, np.int32)))
+"""A sorted cloud for the calls of :func:`compiled_by`: few clouds are sorted here, most come so from the map."""
+
+compiled_by("nearest", lambda: nearest(SAMPLE_GRID, SAMPLE, 1.0))

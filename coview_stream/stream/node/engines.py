@@ -125,7 +125,7 @@ class SearchEngine:
     """Global searches of all robots, which share the map's spectra and networks."""
 
     kernels = (
-        "transform_unique", "describe_points", "field_scores", "align_planes",
+        "transform_unique", "describe_points", "distinct_poses", "field_scores", "align_planes",
         "crop_points", "match_points", "match_rays", "sort_beams",
     )  # fmt: skip
     later_kernels: tuple[str, ...] = ()

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from coview_kernels import warm_up
 from coview_stream.config import LearnedConfig
 from coview_stream.descriptors.birds_eye_view import CELL, birds_eye_view
 from coview_stream.descriptors.feature_map import TILE, FeatureMap
@@ -128,6 +129,7 @@ class FeatureMatcher:
         """
         import scipy.ndimage  # noqa: F401  # a quarter of a second, which the first image would take
 
+        warm_up("window_products")
         _ = self.network, self._feature_blocks if self.dense else self.index, self.cells, self._by_coarse_cell
 
     def encode(self, points: Points, centre: Floats) -> QueryFeatures:
