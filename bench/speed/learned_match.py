@@ -1,158 +1,155 @@
-"""Where a learned query fits: dense correlation with a map, and the pairs of keypoints that agree.
+"""The vote of a keyframe by learned features on a map of 0.1 km2, as the search runs it, beside the dense comparison.
 
-Dense correlation: 32 dimensions on cells of 2 m, a query of 64 m at 36 headings, maps of random features. Turning the
-query is part of every side; ``fftconvolve`` is timed at one heading and multiplied by 36. The clique: 300 pairs of
-which 10 % are right, at 0.3 m noise, as in a forest; and pairs that are all wrong. All sides must agree
-(docs/performance.md). BLAS has the threads of OPENBLAS_NUM_THREADS, the transforms one.
+The search encodes what is around the robot, compares coarse cells of the map with it at some headings, in the few
+dimensions that hold nearly all of the features, and then single places, fine and at every heading, where one was named.
+The dense comparison is what that replaced: all 32 dimensions on cells of 2 m at 36 headings all over the map, by FFT in
+blocks with spectra kept (``correlate``). The map's features do not come into its time any more than into ours. Both
+have the same features of a keyframe and add up their votes in the same way; kept is what both name of what the dense
+one names rightly (within 3 m and 9 degrees).
 """
 
 from __future__ import annotations
 
+import time
 from argparse import Namespace
+from collections import defaultdict
 from collections.abc import Iterator
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import fft
-from scipy.signal import fftconvolve
 
-from bench.harness.rows import Row, against, bounded, informs, medians
-from coview_stream.config.search import LearnedMatchConfig
-from coview_stream.geometry.arrays import Bools, Floats, Floats32
-from coview_stream.geometry.transforms import rot_z
-from coview_stream.localization.search.learned import consistent_pairs as pairs
-from coview_stream.localization.search.learned.correlation import correlate, rotate_images
+import coview_kernels
+from bench.accuracy.stages import Seen, right
+from bench.harness.files import folder
+from bench.harness.pinned import today
+from bench.harness.rows import Row, against, bounded, informs, reached
+from bench.harness.worlds import prepare
+from coview_stream import BaseMap, Localizer, LocalizerConfig
+from coview_stream.clouds import read_tum
+from coview_stream.config import ConsensusConfig
+from coview_stream.descriptors.coview import on_ground
+from coview_stream.descriptors.network import LOCAL_CELL
+from coview_stream.geometry.arrays import Floats32
+from coview_stream.geometry.transforms import inverse, to_local
+from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
+from coview_stream.localization.search.learned.correlation import correlate, downsample
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
+from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
+from coview_stream.localization.search.recognizers import SearchIndex
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.votes import TableVote
+from coview_stream.recordings.open_run import open_run
+from coview_stream.sim import SimulationConfig
 
-CHANNELS, HEADINGS, QUERY = 32, 36, 32
-SIDES = {"0.1 km2": (158, 250.0), "1 km2": (500, 1500.0)}  # cells on a side and the milliseconds allowed
-PAIRS = 300
+WORLDS = {
+    "town": SimulationConfig("town", "vlp16", seed=2221, size=320.0, length=90.0),
+    "campus": SimulationConfig("campus", "os64", seed=2222, size=320.0, length=90.0),
+}
+"""0.1 km2 each; seeds that nothing was tuned on."""
 
-
-class OneFft:
-    """Baseline: per channel over the whole map, its spectra kept."""
-
-    def __init__(self, features: Floats32) -> None:
-        self._shape = features.shape[1:]
-        self._size = tuple(fft.next_fast_len(side + QUERY, real=True) for side in self._shape)
-        self._spectra = fft.rfft2(features, self._size)
-
-    def __call__(self, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
-        """Return sums (K, H, W) over all weights."""
-        half, (height, width) = QUERY // 2, self._shape
-        out = np.empty((len(yaws), height, width), dtype=np.float32)
-        for k, grid in enumerate(_turned(query, weight, yaws)):
-            product = (np.conj(fft.rfft2(grid, self._size)) * self._spectra).sum(axis=0)
-            out[k] = np.roll(fft.irfft2(product, self._size), (half, half), axis=(0, 1))[:height, :width]
-        return out
+MOST_MS, LEAST_KEPT = 40.0, 99.9
+"""The targets: of the whole vote, with one thread, and per cent of right places."""
 
 
-def _convolved(features: Floats32, query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
-    """Baseline: ``scipy.signal.fftconvolve`` along the map's axes, then the sum over dimensions (K, H, W)."""
-    grids = _turned(query, weight, yaws)[..., ::-1, ::-1]
-    return np.stack([fftconvolve(features, grid, mode="same", axes=(1, 2)).sum(axis=0) for grid in grids])
+class Dense:
+    """Baseline: all dimensions at all cells and headings."""
 
+    def __init__(self, matcher: FeatureMatcher) -> None:
+        whole, corner = matcher.features.coarse(matcher.config.cell)
+        surveyed = (whole != 0).any(axis=0)
+        self._matcher, margin = matcher, round(32.0 / matcher.config.cell)
+        self._index = FeatureIndex(whole, corner, matcher.config.cell, surveyed=surveyed, margin=margin)
+        at = np.floor((matcher.stations[:, :2] - corner) / matcher.config.cell).astype(np.int64)
+        self._inside = np.asarray(((at >= 0) & (at < whole.shape[:0:-1])).all(axis=1))
+        self._column, self._row = np.where(self._inside[:, None], at, 0).T
 
-def _turned(query: Floats32, weight: Floats32, yaws: Floats) -> Floats32:
-    """Turn a query (K, C, h + 1, h + 1), over the sum of its weights."""
-    images = rotate_images(np.concatenate([query, weight[None]]), yaws).transpose(2, 3, 0, 1)
-    return np.ascontiguousarray(images[:, :-1] / images[:, -1:].sum(axis=(2, 3), keepdims=True))
+    def __call__(self, query: QueryFeatures) -> TableVote:
+        """Return the vote of one keyframe."""
+        config = self._matcher.config
+        local, weight = downsample(query.features.local, query.weight, round(config.cell / LOCAL_CELL))
+        found = correlate(local, weight, self._index, yaw_of_shift(np.arange(config.yaws), config.yaws))
+        scores: Floats32 = found.transpose(1, 2, 0)[self._row, self._column]
+        scores[~self._inside] = -np.inf
+        known = np.isfinite(scores)
+        distance = np.float32(1.0 + np.median(scores[known])) - scores
+        distance[~known] = 1.0  # no evidence
+        return TableVote.of_distances(query.centre, [distance])
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Dense correlation, then cliques."""
-    yield from _dense(asked.quick)
-    yield from _cliques(5 if asked.quick else 15)
+    """Both worlds."""
+    coview_kernels.warm_up()
+    for name in list(WORLDS)[: 1 if asked.quick else None]:
+        yield from _world(name, WORLDS[name])
 
 
-def _dense(quick: bool) -> Iterator[Row]:
-    rng = np.random.default_rng(0)
-    query, weight = _unit(rng, QUERY), np.ones((QUERY, QUERY), dtype=np.float32)
-    yaws = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
-    for label, (side, most) in list(SIDES.items())[: 1 if quick else None]:
-        features = _unit(rng, side)
-        known, one = FeatureIndex(features, (0.0, 0.0)), OneFft(features)
-        near = known.blocks_near([known.corner + (side // 2 + 0.5) * known.cell], 50.0)
-        plain = partial(correlate, query, weight, known, yaws, min_coverage=None)
-        _same(plain(), one(query, weight, yaws))
-        _same(plain()[:1], _convolved(features, query, weight, yaws[:1]))
-        mean, ours, restricted, whole, single = medians(
-            partial(correlate, query, weight, known, yaws),
-            plain,
-            partial(correlate, query, weight, known, yaws, near),
-            partial(one, query, weight, yaws),
-            partial(_convolved, features, query, weight, yaws[:1]),
-            repeat=3 if quick or side > 200 else 7,
-            warm_up=0,  # they have just run
-        )
-        yield bounded(f"learned_match/dense correlation, {label}, 36 headings", mean, "ms", most)
-        yield against(f"learned_match/sums only, beside one FFT per channel, {label}", ours, whole, "ms", 2.0)
-        yield against(f"learned_match/the same beside fftconvolve, {label}", ours, single * HEADINGS, "ms", 5.0)
-        yield informs(f"learned_match/within 50 m of a place, {label}", restricted, "ms")
-        yield informs(f"learned_match/spectra kept, {label}", known.nbytes / 1e6, "MB")
+def _world(name: str, config: SimulationConfig) -> Iterator[Row]:
+    world = prepare(folder(), config)
+    site = BaseMap.load(today().built([world / "base.laz"], world / "ours.coview"))
+    matcher = SearchIndex.of(site, LocalizerConfig(reloc="learned")).learned
+    if matcher is None:
+        raise RuntimeError("the map has no learned features")
+    begin = time.perf_counter()
+    matcher.prepare()
+    prepared = time.perf_counter() - begin
+    dense, settings = Dense(matcher), replace(ConsensusConfig(), peaks=matcher.config.peaks)
+    votes = {side: Consensus(site.station_grid, settings) for side in ("ours", "dense")}
+    times: dict[str, list[float]] = defaultdict(list)
+    found: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
+    for request, seen in _keyframes(world, site):
+        clock = [time.perf_counter()]
+
+        def lap(stage: str, clock: list[float] = clock) -> None:
+            clock.append(time.perf_counter())
+            times[stage].append(1e3 * (clock[-1] - clock[-2]))
+
+        query = matcher.encode(request.surroundings, on_ground(request.surroundings, request.position))
+        lap("encode")
+        vote = matcher.vote(query)
+        lap("compare")
+        _voted(votes["ours"], vote, seen, found["ours"])
+        lap("places")
+        other = dense(query)
+        lap("dense")
+        _voted(votes["dense"], other, seen, found["dense"])
+    yield from _judged(
+        f"learned_match/{name}, {site.learned.tile_area / 1e6 if site.learned else 0:.2g} km2", times, found
+    )
+    yield informs(f"learned_match/{name}: making what the search keeps", prepared, "s")
 
 
-def _cliques(repeat: int) -> Iterator[Row]:
-    config = LearnedMatchConfig()
-    for label, share in (("1 in 10 right", 0.1), ("none right", 0.0)):
-        here, there = _pairs(np.random.default_rng(1), share)
-        weights = pairs.consistency_graph(here, there, config)
-        found, most = pairs.maximum_clique(weights, config.nodes), enumerated(weights > 0)
-        if found.exact and len(found) != most:
-            raise RuntimeError(f"a clique of {len(found)}, there is one of {most}")
-        nothing = np.empty(0, dtype=np.int64)
-        graph, relaxing, ours, search, listing = medians(
-            partial(pairs.consistency_graph, here, there, config),
-            partial(pairs.relaxed_clique, weights),
-            partial(pairs.maximum_clique, weights, config.nodes),
-            partial(pairs.largest_clique, weights > 0, nothing, config.nodes),
-            partial(enumerated, weights > 0),
-            repeat=repeat,
-        )
-        name = f"{PAIRS} pairs, {label}"
-        yield informs(f"learned_match/consistency graph, {name}", graph, "ms")
-        yield informs(f"learned_match/relaxed clique, {name}", relaxing, "ms")
-        # where nothing is planted the relaxation has nothing to find, and listing a thin graph is quick as well
-        yield against(f"learned_match/maximum clique, {name}", ours, listing, "ms", 1.0 if share else None)
-        yield against(f"learned_match/search from nothing, {name}", search, listing, "ms", None)
+def _keyframes(world: Any, site: BaseMap) -> Iterator[tuple[SearchRequest, Seen]]:
+    """Yield the requests of a drive that never finds its place, and the truth of each."""
+    run, (_, truth) = open_run(world / "run"), read_tum(world / "truth.tum")
+    localizer = Localizer(site)
+    for frame in run:
+        request = localizer.add_frame(frame.points, frame.T_odom_body, frame.stamp)
+        if request is not None and len(request.surroundings) >= localizer.config.keyframe.min_points:
+            T = to_local(truth[frame.index], site.origin) @ inverse(request.T_odom_body)
+            yield request, Seen(request.scan, request.position, 0.0, T)
 
 
-def enumerated(adjacent: Bools) -> int:
-    """Baseline: size of the largest of all maximal cliques, listed by Bron and Kerbosch with Tomita's pivots."""
-    near = [set(np.flatnonzero(row).tolist()) - {i} for i, row in enumerate(adjacent)]
-    most = 0
-
-    def extend(size: int, free: set[int], done: set[int]) -> None:
-        nonlocal most
-        if not free and not done:
-            most = max(most, size)
-            return
-        pivot = max(free | done, key=lambda node: len(near[node] & free))
-        for node in list(free - near[pivot]):
-            extend(size + 1, free & near[node], done & near[node])
-            free.remove(node)
-            done.add(node)
-
-    extend(0, set(range(len(near))), set())
-    return most
+def _voted(consensus: Consensus, vote: Any, seen: Seen, found: list[tuple[bool, bool]]) -> None:
+    """Add a vote, and whether a right place is named, and named first."""
+    consensus.vote(vote)
+    named = [right(each.T_map_odom, seen) for each in consensus.hypotheses()]
+    found.append((any(named), bool(named) and named[0]))
 
 
-def _unit(rng: np.random.Generator, side: int) -> Floats32:
-    values = rng.standard_normal((CHANNELS, side, side), dtype=np.float32)
-    return np.asarray(values / np.linalg.norm(values, axis=0))
-
-
-def _pairs(rng: np.random.Generator, share: float) -> tuple[Floats, ...]:
-    """Points of pairs in a disk's square, ``share`` of them the same from either side but for the heading."""
-    here, there = rng.uniform(-30.0, 30.0, (2, PAIRS, 2))
-    right = round(share * PAIRS)
-    there[:right] = here[:right] @ rot_z(0.7)[:2, :2].T + rng.normal(0.0, 0.3, (right, 2))
-    return here, there
-
-
-def _same(ours: Any, other: Any) -> None:
-    """Raise ``RuntimeError`` where the sides of a comparison do not agree."""
-    apart = float(np.abs(ours - other).max())
-    if not apart < 1e-4:
-        raise RuntimeError(f"the formulations differ by {apart:g}")
+def _judged(name: str, times: dict[str, list[float]], found: dict[str, list[tuple[bool, bool]]]) -> Iterator[Row]:
+    taken = {stage: np.array(values[1:]) for stage, values in times.items()}  # the first keyframe warms up
+    whole = taken["encode"] + taken["compare"] + taken["places"]
+    yield bounded(f"{name}: whole vote, p50", float(np.median(whole)), "ms", MOST_MS)
+    yield informs(f"{name}: whole vote, p95", float(np.percentile(whole, 95)), "ms")
+    yield informs(f"{name}: network", float(np.median(taken["encode"])), "ms")
+    both = [float(np.median(taken[side])) for side in ("compare", "dense")]
+    yield against(f"{name}: comparison beside the dense one", both[0], both[1], "ms", None)
+    yield informs(f"{name}: places that keyframes agree on", float(np.median(taken["places"])), "ms")
+    ours, dense = np.array(found["ours"]), np.array(found["dense"])
+    good = dense[:, 0]
+    kept = 100.0 * float(ours[good, 0].mean()) if good.any() else np.nan
+    yield reached(f"{name}: right places kept, of {int(good.sum())}", kept, "%", LEAST_KEPT)
+    yield Row(
+        f"{name}: right place first, beside the dense one", 100 * ours[:, 1].mean(), 100 * dense[:, 1].mean(), "%"
+    )

@@ -27,12 +27,14 @@ from bench.harness.tables import number, table
 from bench.harness.worlds import prepare
 from bench.speed.search import DRIVES, KEYFRAMES, WORLDS, last_core
 from bench.speed.search_worker import prepared, requests
+from coview_stream.basemap.station_index import StationIndex
 from coview_stream.descriptors.network import weights_directory, weights_name
 from coview_stream.localization.registration import local_map
 from coview_stream.localization.registration import register as registration
 from coview_stream.localization.search import global_search, recognizers
 from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Consensus
+from coview_stream.localization.search.learned import feature_vote, matcher
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
 from coview_stream.report.style import ACCENT, TRUTH, figure
 
@@ -78,6 +80,17 @@ def _network(arguments: tuple[Any, ...], result: Any) -> float:
     return float(weights + size(arguments[1], result.features.local, result.features.sigma))
 
 
+def _coarse(arguments: tuple[Any, ...], result: Any) -> float:
+    images, index = arguments[:2]
+    return float(size(images, result) + index.nbytes)
+
+
+def _windows(arguments: tuple[Any, ...], result: Any) -> float:
+    raster, images = arguments[:2]
+    looked_at = len(result) * images.nbytes / len(images)  # a window is as large as an image
+    return float(min(raster.nbytes, looked_at) + images.nbytes + size(result))
+
+
 def _field(arguments: tuple[Any, ...], result: Any) -> float:
     """Cells within reach of a scan around each place, each once, but no more than there are."""
     field, hypotheses, scan = arguments[:3]
@@ -96,30 +109,45 @@ def _verified(arguments: tuple[Any, ...], result: Any) -> float:
     return size(arguments[0].points, arguments[4].points)
 
 
+def _nothing(arguments: tuple[Any, ...], result: Any) -> float:
+    return 0.0
+
+
 _REACH, _CELL = 50.0, 0.5  # metres, of a scan and of the field's cells
+_CODE = 512  # bytes of a station
 
 STAGES = (
     Stage("points to register", global_search, "prepare_scan", lambda a, r: size(a[0], r), "submap, what is kept"),
     Stage("descriptors", recognizers, "describe", lambda a, r: size(a[0], r), "the local scan, both channels"),
+    Stage("co-view: query", StationIndex, "query", _nothing, ""),
+    Stage("co-view: screen", StationIndex, "best", lambda a, r: _CODE * len(r), "512 bytes of every station"),
+    Stage("co-view: shifts", StationIndex, "all_shifts", lambda a, r: _CODE * len(r) + size(r), "the best stations"),
+    Stage("co-view: single scores", StationIndex, "at", lambda a, r: _CODE * len(r), "a station's 512 bytes a score"),
     Stage("learned: network", FeatureMatcher, "encode", _network, "weights, points, features"),
-    Stage("learned: compare", FeatureMatcher, "distances", lambda a, r: size(r), "spectra of the map"),
-    Stage("consensus: votes", Consensus, "vote", lambda a, r: 0.0, ""),
-    Stage("consensus: places", Consensus, "hypotheses", lambda a, r: 0.0, ""),
-    Stage("field scores", global_search, "score_hypotheses", _field, "cells of the field around the places, the scan"),
-    Stage("crops of the map", local_map.LocalMaps, "around", lambda a, r: 0.0, "none once they are kept"),
+    Stage("learned: turns", matcher, "turn_query", lambda a, r: size(a[:2], r.coarse) + r.images.nbytes, "images"),
+    Stage("learned: coarse", matcher, "correlate_turned", _coarse, "spectra of the map, scores"),
+    Stage("learned: single scores", feature_vote, "window_products", _windows, "cells of the map, images"),
+    Stage("learned: rest of the vote", FeatureMatcher, "vote", _nothing, ""),
+    Stage("consensus", Consensus, "vote", lambda a, r: 2 * size(a[0]._places.votes), "votes on the kept places"),
+    Stage(
+        "distinct places", Consensus, "hypotheses", lambda a, r: size(a[0]._places.votes), "votes on the kept places"
+    ),
+    Stage("field scores", global_search, "score_hypotheses", _field, "cells around the places, the scan"),
+    Stage("crops of the map", local_map.LocalMaps, "around", _nothing, ""),
     Stage("registration", registration, "register", _registered, "crop and scan, once a place"),
     Stage("verification", registration, "verify", _verified, "crop and scan, once a place"),
     Stage("decision", AcceptanceTest, "decide", lambda a, r: size(r.rivals), "the rivals"),
-)  # fmt: skip
+)
 
 Record = dict[str, tuple[float, float, int]]  # seconds, bytes and calls of each stage of one step
 
 
 class Recorder:
-    """Stages of a step as they are called: those below another are not taken out of it."""
+    """Stages of a step as they are called; the time of one does not count for that in which it is called."""
 
     def __init__(self) -> None:
         self.step: Record = {}
+        self._inner = [0.0]  # seconds of the stages below each that runs
 
     @contextmanager
     def around(self, stages: Sequence[Stage]) -> Iterator[None]:
@@ -133,12 +161,16 @@ class Recorder:
         run = getattr(stage.owner, stage.name)
 
         def recorded(*arguments: Any, **options: Any) -> Any:
+            self._inner.append(0.0)
             begin = perf_counter()
             result = run(*arguments, **options)
             seconds = perf_counter() - begin
+            below = self._inner.pop()
+            self._inner[-1] += seconds
+            own = seconds if stage.label == STEP else seconds - below
             before = self.step.get(stage.label, (0.0, 0.0, 0))
             moved = stage.bytes((*arguments, *options.values()), result)
-            self.step[stage.label] = before[0] + seconds, before[1] + moved, before[2] + 1
+            self.step[stage.label] = before[0] + own, before[1] + moved, before[2] + 1
             return result
 
         return recorded
@@ -211,7 +243,7 @@ def draw(shown: Sequence[Row], path: Path) -> None:
     with figure(path, figsize=(7.2, 4.6)) as (drawing, axes):
         axes.barh([row.details["stage"] for row in stages], [row.ours for row in stages], color=ACCENT, height=0.6)
         for k, row in enumerate(stages):
-            axes.text(row.ours * 1.08, k, f"{row.ours:.2g} ms", va="center", fontsize=8)
+            axes.text(row.ours * 1.08, k, f"{row.ours:.{1 if row.ours < 10 else 0}f} ms", va="center", fontsize=8)
         marks = [(row.details["floor"], k) for k, row in enumerate(stages) if row.details["floor"]]
         axes.plot(
             *zip(*marks, strict=True), "|", color=TRUTH, markersize=16, markeredgewidth=2, label="its bytes from memory"
