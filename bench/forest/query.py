@@ -118,7 +118,7 @@ class Chain:
 
     def register(self, named: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
         """Return verified candidates, best first."""
-        places = score_hypotheses(self._base_map.field, named, scan)[:REGISTERED]
+        places = score_hypotheses(self._base_map.field, named, scan, REGISTERED).places
         return verify_places(register_places(places, scan, self._base_map, self.config, self._local_maps))
 
     def metric(

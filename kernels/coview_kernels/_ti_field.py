@@ -120,6 +120,19 @@ def fine_hits(
 
 
 @ti.func
+def hits_at(table: ti.template(), down, across, bits: ti.template(), structure: ti.template(), x, y, z, yaw) -> ti.i32:
+    """Count at a pose points on structure and points near it."""
+    c, s = ti.cos(yaw), ti.sin(yaw)
+    hits = 0
+    for p in range(structure.shape[0] // 3):
+        u, v = structure[3 * p], structure[3 * p + 1]
+        at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
+        level = z + structure[3 * p + 2]
+        hits += bit(bits[at], level) + bit(bits[at + 1], level)
+    return hits
+
+
+@ti.func
 def rise(
     table: ti.template(), down, across, base: ti.template(), surface: ti.template(), low: ti.template(),
     x, y, z, yaw, reach,
@@ -164,19 +177,21 @@ def score(
                         z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
                     for _ in range(levels):
-                        # the shift first, then the heading, with the shifts around the one that was best before
+                        # the shift first, then the heading there: a third of what all pairs of them would cost
+                        hits = ti.Vector.zero(ti.i32, 9)
+                        fine_hits(table, down, across, bits, some, x, y, z, yaw, step, hits)
                         best, bi, bj, bk = -1, 0, 0, 0
-                        for k in range(3):
-                            turned = yaw + angle * ((k + 1) % 3 - 1)
-                            hits = ti.Vector.zero(ti.i32, 9)
-                            fine_hits(table, down, across, bits, some, x, y, z, turned, step, hits)
-                            for i in ti.static(range(3)):
-                                for j in ti.static(range(3)):
-                                    value = 4 * hits[3 * i + j] - abs(i - 1) - abs(j - 1) - ti.min(k, 1)
-                                    if value > best:
-                                        best, bi, bj, bk = value, i - 1, j - 1, (k + 1) % 3 - 1
+                        for i in ti.static(range(3)):
+                            for j in ti.static(range(3)):
+                                value = 4 * hits[3 * i + j] - abs(i - 1) - abs(j - 1)
+                                if value > best:
+                                    best, bi, bj = value, i - 1, j - 1
                         x += step * bj
                         y += step * bi
+                        for k in range(2):
+                            value = 4 * hits_at(table, down, across, bits, some, x, y, z, yaw + angle * (2 * k - 1)) - 1
+                            if value > best:
+                                best, bk = value, 2 * k - 1
                         yaw += angle * bk
                         step *= 0.5
                         angle *= 0.5

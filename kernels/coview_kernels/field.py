@@ -7,8 +7,8 @@ what of the scan the map explains there (:class:`FieldScores`). All is looking u
 1. coarse: some of the scan's structure on cells of a metre, at all shifts of up to three metres and seven headings up
    to six degrees off: one pass over the points for each heading, as the shifts are neighbouring cells.
 2. height: the mean difference of the map's ground and the scan's, twice.
-3. fine: the eight neighbours half a metre away, and two headings a degree off; then the same at half these steps. A
-   point counts twice on cells of half a metre that have structure, once within half a metre of it.
+3. fine: the eight neighbours half a metre away, and at the best two headings a degree off; then the same at half these
+   steps. A point counts twice on cells of half a metre that have structure, once within half a metre of it.
 4. counts, with all points.
 """
 

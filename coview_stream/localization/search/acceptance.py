@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from coview_stream.config import LocalizerConfig
@@ -11,7 +10,7 @@ from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.refinement import Candidate
 from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest, same_place
-from coview_stream.localization.search.scoring import Rivals, ScoredPlace
+from coview_stream.localization.search.scoring import Rivals, Scored, ScoredPlace
 from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"
@@ -34,7 +33,7 @@ class SearchResult:
     evidence: KeyframeEvidence
     travelled: float = 0.0
     epoch: Epoch = FIRST_EPOCH
-    rivals: Rivals = field(default_factory=lambda: Rivals.of(()))
+    rivals: Rivals = field(default_factory=Rivals.none)
 
 
 class AcceptanceTest:
@@ -51,7 +50,7 @@ class AcceptanceTest:
         self._evidence_sum = 0.0
 
     def decide(
-        self, candidates: list[Candidate], request: SearchRequest, votes: int, places: Sequence[ScoredPlace] = ()
+        self, candidates: list[Candidate], request: SearchRequest, votes: int, scored: Scored | None = None
     ) -> SearchResult:
         """Judge a keyframe.
 
@@ -59,9 +58,9 @@ class AcceptanceTest:
             candidates: registered and verified, best first.
             request: the keyframe.
             votes: how many keyframes have voted for them.
-            places: all that were scored, best first, from which the candidates come.
+            scored: all places that were scored, from which the candidates come.
         """
-        rivals = Rivals.of(places)
+        rivals = Rivals.none() if scored is None else scored.rivals
         if not candidates:
             self.clear()
             reason = "no hypothesis fits the map" if votes else "too few points to search with"
@@ -70,7 +69,8 @@ class AcceptanceTest:
         best = candidates[0]
         here = [same_place(c.T_map_odom, best.T_map_odom, request) for c in candidates]
         rival = max((c.evidence.score for c, same in zip(candidates, here, strict=True) if not same), default=0.0)
-        rival = max(rival, _best_other(best, candidates, places, request))
+        if scored is not None:
+            rival = max(rival, _best_other(best, candidates, scored.places, request))
         lead = max(c.hypothesis.lead for c, same in zip(candidates, here, strict=True) if same)
         if not self._agrees(best, request):
             self.clear()
@@ -147,7 +147,7 @@ class AcceptanceTest:
 
 
 def _best_other(
-    best: Candidate, candidates: list[Candidate], places: Sequence[ScoredPlace], request: SearchRequest
+    best: Candidate, candidates: list[Candidate], places: list[ScoredPlace], request: SearchRequest
 ) -> float:
     """Return the rank of the best place that was scored but not registered; 0 if there is none."""
     registered = {id(c.place) for c in candidates}

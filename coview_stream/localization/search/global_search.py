@@ -16,7 +16,7 @@ from coview_stream.localization.search.pose_hints import HintSchedule, robot_pos
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import Candidate, RegisteredPlace, register_places, verify_places
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest
-from coview_stream.localization.search.scoring import ScoredPlace, score_hypotheses
+from coview_stream.localization.search.scoring import Scored, score_hypotheses
 
 _REMEMBERED = 40  # best places that the next keyframe scores again; set by hand
 REGISTERED = 3  # best places that are registered and verified, beside the hints; set by hand
@@ -87,11 +87,11 @@ class GlobalSearch:
         )
         votes = self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         hypotheses, hints = self._propose(request)  # eq. 12: peaks of the consensus as T_map_odom
-        places = self._score(hypotheses, hints, scan)  # the likelihood field, at the best pose near each
-        registered = self._register(places, scan)  # eq. 13, the best few
+        scored = self._score(hypotheses, hints, scan)  # the likelihood field, at the best pose near each
+        registered = self._register(scored, scan)  # eq. 13, the best few
         candidates = self._verify(registered)  # the evidence there
-        self._remember(places, candidates, hints, request)
-        return self._decide(candidates, request, votes, places)
+        self._remember(scored, candidates, hints, request)
+        return self._decide(candidates, request, votes, scored)
 
     def _vote(self, request: SearchRequest) -> int:
         """Let every recognizer compare the keyframe with the map; return how many keyframes have voted."""
@@ -105,13 +105,13 @@ class GlobalSearch:
         coview = [] if self.coview is None else self.coview.hypotheses()
         return [*coview, *learned, *self._remembered], self._hints.due(request.hints)
 
-    def _score(self, hypotheses: list[Hypothesis], hints: list[Hypothesis], scan: ScanInput) -> list[ScoredPlace]:
-        """Score all of them by the map's likelihood field; the places that they come to, best first."""
-        return score_hypotheses(self.base_map.field, [*hypotheses, *hints], scan, len(hints))
+    def _score(self, hypotheses: list[Hypothesis], hints: list[Hypothesis], scan: ScanInput) -> Scored:
+        """Score all of them by the map's likelihood field, at the places that they come to."""
+        return score_hypotheses(self.base_map.field, [*hypotheses, *hints], scan, _REMEMBERED, len(hints))
 
-    def _register(self, places: list[ScoredPlace], scan: ScanInput) -> list[RegisteredPlace]:
+    def _register(self, scored: Scored, scan: ScanInput) -> list[RegisteredPlace]:
         """Register the best places, and those that hints came to."""
-        chosen = [place for rank, place in enumerate(places) if rank < REGISTERED or place.hinted]
+        chosen = [place for rank, place in enumerate(scored.places) if rank < REGISTERED or place.hinted]
         return register_places(chosen, scan, self.base_map, self.config, self._local_maps)
 
     def _verify(self, registered: list[RegisteredPlace]) -> list[Candidate]:
@@ -119,7 +119,7 @@ class GlobalSearch:
         return verify_places(registered)
 
     def _remember(
-        self, places: list[ScoredPlace], candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest
+        self, scored: Scored, candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest
     ) -> None:
         """Keep what the next keyframe tries again: the best places, and hints that were not refuted."""
         if hints:
@@ -128,13 +128,11 @@ class GlobalSearch:
             # where the map knows nothing, a keyframe does not speak against a hint
             surveyed = all(self.base_map.surveyed(position).all() for position in positions)
             self._hints.tried(refuted=surveyed and best < self.config.acceptance.score)
-        self._remembered = [replace(place.hypothesis, lead=0.0) for place in places[:_REMEMBERED]]
+        self._remembered = [replace(place.hypothesis, lead=0.0) for place in scored.places[:_REMEMBERED]]
 
-    def _decide(
-        self, candidates: list[Candidate], request: SearchRequest, votes: int, places: list[ScoredPlace]
-    ) -> SearchResult:
+    def _decide(self, candidates: list[Candidate], request: SearchRequest, votes: int, scored: Scored) -> SearchResult:
         """Accept the best candidate, or say why not yet."""
-        result = self._acceptance.decide(candidates, request, votes, places)
+        result = self._acceptance.decide(candidates, request, votes, scored)
         if result.accepted is not None:
             self.clear()
         return result

@@ -79,40 +79,56 @@ class Rivals:
         return len(self.scores)
 
     @classmethod
-    def of(cls, places: Sequence[ScoredPlace]) -> Rivals:
-        """Gather them from places, which are in this order already."""
-        poses = np.array([p.hypothesis.T_map_odom for p in places]).reshape(-1, 4, 4)
-        scores, inside = (np.array([getattr(p, n) for p in places], dtype=np.float32) for n in ("score", "inside"))
-        return cls(poses, scores, inside)
+    def none(cls) -> Rivals:
+        """Return no places."""
+        nothing = np.empty(0, dtype=np.float32)
+        return cls(np.empty((0, 4, 4)), nothing, nothing)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What a keyframe's hypotheses came to.
+
+    Attributes:
+        rivals: all places.
+        places: the best of them, and those that hints came to, best first.
+    """
+
+    rivals: Rivals
+    places: list[ScoredPlace]
 
 
 def score_hypotheses(
-    field: kernels.FieldMap, hypotheses: Sequence[Hypothesis], scan: ScanInput, hints: int = 0
-) -> list[ScoredPlace]:
-    """Score hypotheses of ``T_map_odom``, of which the last ``hints`` are pose hints; return the places, best first.
+    field: kernels.FieldMap, hypotheses: Sequence[Hypothesis], scan: ScanInput, best: int, hints: int = 0
+) -> Scored:
+    """Score hypotheses of ``T_map_odom``, of which the last ``hints`` are pose hints.
 
-    Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them.
+    Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them. The ``best`` places are returned
+    as hypotheses again.
     """
     if not hypotheses:
-        return []
+        return Scored(Rivals.none(), [])
     pivot = scan.T_odom_body[:3, 3]
     T = np.array([each.T_map_odom for each in hypotheses])
     yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
     compared, every = _field_scan(scan)
     found = kernels.field_scores(field, compared, np.column_stack([T[:, :3, :3] @ pivot + T[:, :3, 3], yaw]))
     score, inside = _scores(found, compared, every)
-    hinted = [k >= len(hypotheses) - hints for k in range(len(hypotheses))]
-    poses = _poses(found.pose, pivot)
-    out = []
-    for first, members in _places(found.pose, score * inside):
-        voted = [hypotheses[k] for k in members if not hinted[k]]
-        # its own votes, if it has any; a hint that came to a place with votes adds nothing to them
-        own = hypotheses[first] if not hinted[first] or not voted else voted[0]
-        lead = max((each.lead for each in voted), default=0.0)
-        own = replace(own, T_map_odom=poses[first], lead=lead)
-        hint = len(voted) < len(members)
-        out.append(ScoredPlace(own, float(score[first]), float(inside[first]), hint))
-    return out
+    T = _poses(found.pose, pivot)
+    members = _places(found.pose, score * inside)
+    firsts = np.array([each[0] for each in members])
+    rivals = Rivals(T[firsts], score[firsts].astype(np.float32), inside[firsts].astype(np.float32))
+    last = len(hypotheses) - hints  # what follows are hints
+    places = []
+    for rank, numbers in enumerate(members):
+        hinted = hints > 0 and max(numbers) >= last
+        if rank < best or hinted:
+            first, voted = numbers[0], [hypotheses[k] for k in numbers if k < last]
+            # its own votes, if it has any; a hint that came to a place with votes adds nothing to them
+            own = hypotheses[first] if first < last or not voted else voted[0]
+            own = replace(own, T_map_odom=T[first], lead=max((each.lead for each in voted), default=0.0))
+            places.append(ScoredPlace(own, float(score[first]), float(inside[first]), hinted))
+    return Scored(rivals, places)
 
 
 def _scores(found: kernels.FieldScores, scan: kernels.FieldScan, every: tuple[float, float]) -> tuple[Floats, Floats]:
@@ -128,20 +144,24 @@ def _scores(found: kernels.FieldScores, scan: kernels.FieldScan, every: tuple[fl
     return score, (structure + low) / max(whole, 1.0)
 
 
-def _places(pose: Floats, rank: Floats) -> list[tuple[int, list[int]]]:
-    """Group poses (H, 4): the best one of each place, best first, and all that are there."""
+def _places(pose: Floats, rank: Floats) -> list[list[int]]:
+    """Group poses (H, 4): those at each place, its best first, the best place first."""
     order = np.argsort(-rank, kind="stable")
     x, y, z, yaw = pose[order].astype(np.float32).T
-    gap = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 + (z[:, None] - z) ** 2
-    turn = np.abs((yaw[:, None] - yaw + np.pi) % (2.0 * np.pi) - np.pi)
-    same = (gap < SAME_DISTANCE**2) & (turn < SAME_ANGLE)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    gap = np.square(x[:, None] - x)
+    gap += np.square(y[:, None] - y)
+    gap += np.square(z[:, None] - z)
+    along = np.outer(cos, cos)
+    along += np.outer(sin, sin)
+    same = (gap < SAME_DISTANCE**2) & (along > np.cos(SAME_ANGLE))
     free = np.ones(len(order), dtype=bool)
     out = []
     for k, row in enumerate(same):
         if free[k]:
             members = np.flatnonzero(row & free)
             free[members] = False
-            out.append((int(order[k]), order[members].tolist()))
+            out.append(order[members].tolist())
     return out
 
 

@@ -19,8 +19,6 @@ ON_GROUND, UNDER_EDGE, UPPER_FLOOR, EDGE_STEP = 0.15, 0.5, 1.5, 0.25
 """Metres: off the ground that still are on it; above a roof edge that still are below it; above the lowest surface from
 which on the bits alone tell a floor; a unit of the stored edges."""
 
-_TURN_BACK = (0, 1, -1)
-
 
 class FieldLayers(NamedTuple):
     """Rasters of a map as they are looked up; tile 0 is empty and stands for what has not been surveyed."""
@@ -79,13 +77,18 @@ def _refine(layers: FieldLayers, plan: Plan, pose: F64) -> None:
     step, angle = 0.5, 0.5 * TURN
     for _ in range(plan.levels):
         best, move = -1, np.zeros(4)
-        for k in _TURN_BACK:
-            for i, j in np.ndindex(3, 3):
-                there = pose + np.array([step * (j - 1), step * (i - 1), 0.0, angle * k])
-                value = 4 * _fine_hits(layers, plan.some, there) - abs(i - 1) - abs(j - 1) - abs(k)
-                if value > best:
-                    best, move = value, there - pose
+        for i, j in np.ndindex(3, 3):
+            there = np.array([step * (j - 1), step * (i - 1), 0.0, 0.0])
+            value = 4 * _fine_hits(layers, plan.some, pose + there) - abs(i - 1) - abs(j - 1)
+            if value > best:
+                best, move = value, there
         pose += move
+        turn = 0.0
+        for k in (-1, 1):
+            value = 4 * _fine_hits(layers, plan.some, pose + np.array([0.0, 0.0, 0.0, angle * k])) - 1
+            if value > best:
+                best, turn = value, angle * k
+        pose[3] += turn
         step, angle = 0.5 * step, 0.5 * angle
     pose[2] += _rise(layers, plan.lows, pose, 0.5)
 

@@ -29,7 +29,7 @@ from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import KeyframeBuffer
 from coview_stream.localization.search.refinement import Candidate, gravity_information
 from coview_stream.localization.search.request import RequestSpec, SearchRequest
-from coview_stream.localization.search.scoring import ScoredPlace
+from coview_stream.localization.search.scoring import Rivals, Scored, ScoredPlace
 from coview_stream.localization.state import State
 
 RULE = AcceptanceConfig()
@@ -300,7 +300,7 @@ def test_place_that_was_only_scored_is_a_rival_too(search):
     for place, state in ((close, State.AMBIGUOUS), (beyond, State.TRACKING)):
         search.clear()
         for _ in range(3 * RULE.confirmations):
-            result = search._acceptance.decide([best], REQUEST, 5, [best.place, place])
+            result = search._acceptance.decide([best], REQUEST, 5, Scored(Rivals.none(), [best.place, place]))
         assert result.evidence.state is state
 
 
