@@ -143,8 +143,9 @@ class BaseMap:
     @cached_property
     def station_index(self) -> StationIndex:
         """Index of the descriptors, from the file; a file without it costs a second for 10,000 stations here."""
-        descriptors = {name: self.descriptors(name) for name in self.config.descriptor.channels}
-        return StationIndex.from_arrays(self._arrays, descriptors) or StationIndex.of(descriptors)
+        channels = self.config.descriptor.channels
+        known = StationIndex.from_arrays(self._arrays, channels)
+        return known or StationIndex.of({name: self.descriptors(name) for name in channels})
 
     @property
     def points(self) -> Floats32:

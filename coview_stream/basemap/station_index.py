@@ -6,7 +6,7 @@ query nor the memory of a search then needs the descriptors, which take ten time
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -46,33 +46,35 @@ class StationIndex:
     (eqs 7-9) exceeds the median; negative is better. It is the mean of the channels'.
     """
 
-    def __init__(self, codes: StationCodes, descriptors: Descriptors) -> None:
+    def __init__(self, codes: StationCodes, sample: Descriptors) -> None:
         self.codes = codes
-        self._descriptors = descriptors
+        self._descriptors = sample
 
     @classmethod
     def of(cls, descriptors: Descriptors) -> StationIndex:
         """Make the index of stations by their descriptors."""
-        return cls(StationCodes.of(list(descriptors.values())), descriptors)
+        chosen = _chosen(len(next(iter(descriptors.values()))))
+        sample = {name: np.array(values[chosen]) for name, values in descriptors.items()}
+        return cls(StationCodes.of(list(descriptors.values())), sample)
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], descriptors: Descriptors) -> StationIndex | None:
-        """Return the index that a map's file holds, None if it holds none of these descriptors."""
-        known = [arrays.get(name) for name in _NAMES]
-        codes, basis, step, norm = known
-        if codes is None or basis is None or step is None or norm is None:
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:
+        """Return the index of these channels that a map's file holds, None if it holds none."""
+        if any(name not in arrays for name in _NAMES):
             return None
-        count, rings, sectors = next(iter(descriptors.values())).shape
-        if codes.shape[0] != count or basis.shape[2] != rings * len(descriptors):
+        codes, basis, step, norm, sample = (arrays[name] for name in _NAMES)
+        count, _, rings, sectors = sample.shape
+        if count != len(channels) or basis.shape[2] != rings * count:
             return None
         vectors = (basis[..., 0] + 1j * basis[..., 1]).astype(np.complex64)
-        return cls(StationCodes(codes, vectors, step, norm, sectors), descriptors)
+        by_channel = dict(zip(channels, np.array(sample), strict=True))
+        return cls(StationCodes(codes, vectors, np.array(step), np.array(norm), sectors), by_channel)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return what a map's file holds of it."""
-        basis = self.codes.basis
-        parts = self.codes.codes, np.stack([basis.real, basis.imag], axis=-1), self.codes.step, self.codes.norm
-        return dict(zip(_NAMES, parts, strict=True))
+        codes, sample = self.codes, np.stack(list(self._descriptors.values()))
+        parts = np.stack([codes.basis.real, codes.basis.imag], axis=-1), codes.step, codes.norm, sample
+        return dict(zip(_NAMES, (codes.codes, *parts), strict=True))
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -86,11 +88,8 @@ class StationIndex:
     @cached_property
     def _sample(self) -> tuple[Ints, dict[Channel, Complexes]]:
         """Every so many stations (K,), and the spectra of their descriptors by channel."""
-        chosen = np.arange(0, len(self), -(-len(self) // _SAMPLE))
-        return chosen, {
-            name: kernels.column_spectra(values[chosen].astype(np.float32))
-            for name, values in self._descriptors.items()
-        }
+        known = self._descriptors.items()
+        return _chosen(len(self)), {name: kernels.column_spectra(each.astype(np.float32)) for name, each in known}
 
     def prepare(self) -> None:
         """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
@@ -130,4 +129,9 @@ class StationIndex:
         return found
 
 
-_NAMES = (_PREFIX, f"{_PREFIX}.basis", f"{_PREFIX}.step", f"{_PREFIX}.norm")
+_NAMES = (_PREFIX, f"{_PREFIX}.basis", f"{_PREFIX}.step", f"{_PREFIX}.norm", f"{_PREFIX}.sample")
+
+
+def _chosen(stations: int) -> Ints:
+    """Choose the stations (K,) of the sample, as evenly as they come."""
+    return np.arange(0, stations, max(1, -(-stations // _SAMPLE)))

@@ -1,0 +1,63 @@
+"""Station index: z-scores near the exact ones, the same from a map's file, and made anew where the file lacks it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.station_index import StationIndex
+from coview_stream.config import RetrievalConfig
+from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.votes import TableVote
+
+
+@pytest.fixture(scope="module")
+def query(world_map):
+    """Descriptors of a place between two stations."""
+    channels = world_map.descriptor_config.channels
+    both = {name: world_map.descriptors(name)[40:42].astype(np.float32) for name in channels}
+    return {
+        name: np.roll(one, 7, axis=1) * 0.7 + np.roll(other, 7, axis=1) * 0.3 for name, (one, other) in both.items()
+    }
+
+
+def test_scores_are_near_those_of_the_exact_distances(world_map, query):
+    index = world_map.station_index
+    asked = index.query(query)
+    exact = Retrieval(world_map, RetrievalConfig()).distances(query)
+    expected = TableVote.of_distances(np.zeros(3), exact.values()).scores
+    found = index.all_shifts(asked, np.arange(len(index)))
+    assert (
+        np.unravel_index(found.argmin(), found.shape) == np.unravel_index(expected.argmin(), expected.shape) == (40, 7)
+    )
+    assert abs(np.median(found - expected)) < 0.1
+    assert np.std(found - expected) < 0.25
+    np.testing.assert_allclose(index.best(asked), found.min(axis=1), atol=0.2)
+    np.testing.assert_allclose(index.at(asked, [40, -1, 3], [7, 7, 0]), [found[40, 7], 0.0, found[3, 0]], atol=1e-4)
+
+
+def test_index_of_a_file_is_that_of_the_descriptors(world_map, query, tmp_path):
+    world_map.save(tmp_path / "site.coview")
+    loaded = BaseMap.load(tmp_path / "site.coview")
+    assert isinstance(loaded.station_index.codes.codes, np.memmap)
+    anew = StationIndex.of({name: loaded.descriptors(name) for name in loaded.descriptor_config.channels})
+    for one, other in zip(loaded.station_index.arrays().values(), anew.arrays().values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    found, expected = (index.best(index.query(query)) for index in (loaded.station_index, anew))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_map_without_index_makes_it(world_map, query):
+    arrays = {name: each for name, each in world_map._arrays.items() if not name.startswith("station_codes")}
+    old = BaseMap(arrays, world_map.parameters)
+    index = world_map.station_index
+    np.testing.assert_array_equal(
+        old.station_index.best(old.station_index.query(query)), index.best(index.query(query))
+    )
+
+
+def test_codes_begin_with_a_cache_line(world_map, tmp_path):
+    world_map.save(tmp_path / "site.coview")
+    codes = BaseMap.load(tmp_path / "site.coview").station_index.codes.codes
+    assert codes.__array_interface__["data"][0] % 64 == 0
