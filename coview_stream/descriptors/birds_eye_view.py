@@ -7,7 +7,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.arrays import Floats32, Ints, Reals
+import coview_kernels as kernels
+from coview_kernels import OverheadGrid
+from coview_stream.geometry.arrays import Floats32, Reals
 from coview_stream.geometry.rasters import filled
 from coview_stream.geometry.transforms import Points
 
@@ -35,6 +37,7 @@ _MAX_SLOPE = 0.7  # metres per metre: what rises faster stands on the ground
 _REACH = 10  # ground cells to either side that bound a cell's height from above: half a large building
 _RELIEF_SIGMA = 8.0  # metres: relief is measured from the ground's mean under a Gaussian of this width
 _MAX_RELIEF = 1.5  # metres, at which the layer saturates
+_BOUNDS = SLABS[0], SLABS[-1], _MAX_GROUND_HEIGHT
 
 
 def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Image:
@@ -51,53 +54,39 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
         then how far the ground lies above its surroundings' mean, 128 for not at all or unknown.
     """
     height, width = shape
-    x, y, z = points.T
-    x, y = x - points.dtype.type(corner[0]), y - points.dtype.type(corner[1])
-    column, row = (np.floor(each * np.float32(1.0 / CELL)).astype(np.int64) for each in (x, y))
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    if not inside.all():
-        x, y, z, column, row = (each[inside] for each in (x, y, z, column, row))
-    image = np.zeros((LAYERS, height * width), dtype=np.float32)
-    image[-1] = 128.0
-    if not len(z):
-        return image.astype(np.uint8).reshape(LAYERS, height, width)
+    cloud = np.ascontiguousarray(points, dtype=np.float32)
     ratio = round(_GROUND_CELL / CELL)
-    coarse = (row // ratio) * (width // ratio) + column // ratio
-    ground, relief = _ground(z, coarse, (height // ratio, width // ratio))
-    _layers(image, row * width + column, z - _interpolate(ground, x / _GROUND_CELL - 0.5, y / _GROUND_CELL - 0.5))
+    x, y = (float(each) for each in corner)
+    lowest = kernels.lowest_heights(cloud, OverheadGrid(x, y, _GROUND_CELL, (height // ratio, width // ratio)))
+    if not np.isfinite(lowest).any():
+        nothing = np.zeros((LAYERS, height, width), dtype=np.uint8)
+        nothing[-1] = 128
+        return nothing
+    ground, relief = _ground(cloud, OverheadGrid(x, y, _GROUND_CELL, lowest.shape), lowest)
+    image = np.zeros((LAYERS, height * width), dtype=np.float32)
+    _layers(image, *kernels.height_columns(cloud, OverheadGrid(x, y, CELL, shape), ground, ratio, _LEVEL, _BOUNDS))
     u, v = ((np.arange(n) + 0.5) / ratio - 0.5 for n in (width, height))
     curved = _interpolate(relief, np.tile(u, height), np.repeat(v, width))
     image[-1] = np.clip(128.0 + curved * (127.0 / _MAX_RELIEF), 1.0, 255.0)
     return image.astype(np.uint8).reshape(LAYERS, height, width)
 
 
-def _layers(image: Floats32, cell: Ints, above: Reals) -> None:
-    """Fill all layers of a flat image but the last from points in ``cell`` (N,), ``above`` (N,) metres high."""
-    size, levels = image.shape[1], int(SLABS[-1] / _LEVEL)
-    standing = np.flatnonzero((above >= SLABS[0]) & (above < SLABS[-1]))
-    level = (above[standing] * np.float32(1.0 / _LEVEL)).astype(np.int64)
-    occupied = np.zeros((levels, size), dtype=np.uint8)
-    occupied.reshape(-1)[level * size + cell[standing]] = 1
+def _layers(image: Floats32, occupied: npt.NDArray[np.uint8], top: Floats32, seen: npt.NDArray[np.uint8]) -> None:
+    """Fill all layers of a flat image but the last from the columns above its cells."""
     for k, (low, high) in enumerate(pairwise(SLABS)):
         slab = occupied[int(low / _LEVEL) : int(high / _LEVEL)]  # no more than 255 levels
-        share = slab.sum(axis=0, dtype=np.uint8) * np.float32(1.0 / len(slab))
-        image[k] = 255.0 * np.sqrt(share)
-    top = np.zeros(size, dtype=np.float32)
-    np.maximum.at(top, cell, np.clip(above, 0.0, SLABS[-1]).astype(np.float32))
+        image[k] = 255.0 * np.sqrt(slab.sum(axis=0, dtype=np.uint8) * np.float32(1.0 / len(slab)))
     image[-3] = top * (255.0 / SLABS[-1])
-    image[-2, cell[above < _MAX_GROUND_HEIGHT]] = 255.0
+    image[-2] = seen * np.float32(255.0)
 
 
-def _ground(z: Reals, cell: Ints, shape: tuple[int, int]) -> tuple[Floats32, Floats32]:
+def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Floats32, Floats32]:
     """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 where it was not seen.
 
-    Points are ``z`` (N,) metres high and lie in ``cell`` (N,), flat.
+    ``lowest`` (h, w) is the lowest point of each cell, inf for none.
     """
     from scipy import ndimage  # takes a quarter of a second, and not all who load a map draw images
 
-    lowest = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
-    np.minimum.at(lowest, cell, z)
-    lowest = lowest.reshape(shape)
     seen = np.isfinite(lowest)
     # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
     offsets = np.arange(-_REACH, _REACH + 1) * _GROUND_CELL
@@ -106,11 +95,7 @@ def _ground(z: Reals, cell: Ints, shape: tuple[int, int]) -> tuple[Floats32, Flo
     ground = filled(np.where(np.isfinite(eroded), eroded, np.nan).astype(np.float32))
     ground = ndimage.median_filter(ground, 3)
     # the lowest point of a sloping cell lies below its middle: the mean of the points near it corrects that
-    rest = z - ground.ravel()[cell]
-    near = np.flatnonzero(np.abs(rest) < _GROUND_BAND)
-    there = cell[near]
-    count = np.bincount(there, minlength=ground.size).reshape(shape)
-    total = np.bincount(there, weights=rest[near], minlength=ground.size).reshape(shape)
+    count, total = kernels.offsets_near(points, grid, ground, _GROUND_BAND)
     ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
     level = seen & (count > 0)
     weight = ndimage.gaussian_filter(level.astype(np.float32), _RELIEF_SIGMA / _GROUND_CELL)

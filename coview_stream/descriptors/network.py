@@ -27,6 +27,9 @@ OUTPUTS = ("local", "sigma", "place")
 CARD = "card.json"
 """Name of the file beside the weights that records how they were made."""
 
+ORIGIN = "of"
+"""Name under which quantised weights keep the sha256 of those that they were made of."""
+
 LOCAL_CELL = 1.0
 """Edge of a cell of local descriptors, metres."""
 
@@ -54,29 +57,32 @@ class Features:
 
 
 class Network:
-    """Encoder of one view.
+    """Encoder of one view; quantised weights beside its own are taken if they were made of these (``exact``: never).
+
+    Attributes:
+        quantized: whether they were.
 
     Raises:
         InputError: there are no weights in the directory, they are not of this version, or of the other view.
         DependencyError: onnxruntime is not installed, or cannot be loaded.
     """
 
-    def __init__(self, view: ViewName, directory: Path | None = None, threads: int = 1) -> None:
+    def __init__(self, view: ViewName, directory: Path | None = None, threads: int = 1, *, exact: bool = False) -> None:
         runtime = _runtime()
         path = weights_file(view, directory)
         _check_hash(path)
         options = runtime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
-        try:
-            self._session: Any = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-            (image,) = self._session.get_inputs()
-            layers = image.shape[1]
-            outputs = tuple(output.name for output in self._session.get_outputs())
-        except Exception as error:  # onnxruntime's errors have no common base that is public
-            raise InputError(f"{path}: cannot be loaded as weights; {_REMEDY}") from error
-        if (image.name, layers, outputs) != (_INPUT, LAYERS, OUTPUTS):
-            raise InputError(f"{path}: weights of another version ({layers} layers); {_REMEDY}")
+        small = path.with_name(quantized_name(view))
+        self.quantized = not exact and small.is_file()
+        if self.quantized:
+            _check_hash(small)
+            self._session = _session(runtime, small, options)
+            origin = self._session.get_modelmeta().custom_metadata_map.get(ORIGIN)
+            self.quantized = origin == file_sha256(path)
+        if not self.quantized:
+            self._session = _session(runtime, path, options)
 
     def __call__(self, image: Image) -> Features:
         """Encode an image (LAYERS, H, W); H and W are multiples of 8 cells, i.e. 4 m.
@@ -125,6 +131,11 @@ def weights_name(view: str) -> str:
     return f"{view}.onnx"
 
 
+def quantized_name(view: str) -> str:
+    """Return the file name of a view's quantised weights."""
+    return f"{view}.int8.onnx"
+
+
 def file_sha256(path: Path) -> str:
     """Return the sha256 of a small file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -137,6 +148,20 @@ def _runtime() -> Any:
             "learned re-localization: onnxruntime is not complete; pip install --force-reinstall 'onnxruntime>=1.18'"
         )
     return runtime
+
+
+def _session(runtime: Any, path: Path, options: Any) -> Any:
+    """Load weights, and check that they are of an encoder of this version."""
+    try:
+        session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        (image,) = session.get_inputs()
+        layers = image.shape[1]
+        outputs = tuple(output.name for output in session.get_outputs())
+    except Exception as error:  # onnxruntime's errors have no common base that is public
+        raise InputError(f"{path}: cannot be loaded as weights; {_REMEDY}") from error
+    if (image.name, layers, outputs) != (_INPUT, LAYERS, OUTPUTS):
+        raise InputError(f"{path}: weights of another version ({layers} layers); {_REMEDY}")
+    return session
 
 
 def _check_hash(path: Path) -> None:

@@ -20,6 +20,7 @@ from coview_stream.version import __version__
 
 # set by hand
 _REPORT_STEPS = 20  # from one line of progress to the next
+_CALIBRATED = 120  # queries from which the ranges of the quantised network are taken; set by hand
 _HELD_OUT = 19_000  # first seed of the worlds that training never sees
 
 Say = Callable[[str], None]
@@ -109,6 +110,7 @@ def train_session(
     require_library("onnx", "onnx>=1.16", "training (extra learn-train)")
     from coview_stream.training.loop import train
     from coview_stream.training.networks import encoder, export
+    from coview_stream.training.quantization import quantize
 
     if threads > 0:
         torch.set_num_threads(threads)
@@ -147,6 +149,9 @@ def train_session(
         "validation": recall,
     }
     export(net, out, card)
+    images = [image for world in worlds[: plan.worlds] for image in world.queries]
+    note = f"on {_CALIBRATED} queries of the worlds trained on, or fewer"
+    quantize(out, images[:: -(-len(images) // _CALIBRATED)], note)
     return card
 
 

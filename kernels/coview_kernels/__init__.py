@@ -7,7 +7,7 @@ can be called from any thread. Importing this package does not import Taichi; th
 
 from __future__ import annotations
 
-from coview_kernels.arrays import PolarGrid
+from coview_kernels.arrays import OverheadGrid, PolarGrid
 from coview_kernels.covisibility import coview
 from coview_kernels.crop import Crop, Cut, crop_points
 from coview_kernels.distinct import distinct_poses
@@ -27,6 +27,7 @@ from coview_kernels.evidence import (
 from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
+from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
 from coview_kernels.polar import describe_points, polar_bin, station_bins
 from coview_kernels.runtime import backend, shutdown, submit
 from coview_kernels.similarity import all_shift_distance, column_spectra, unit_columns
@@ -46,6 +47,7 @@ __all__ = [
     "FieldMap",
     "FieldScan",
     "FieldScores",
+    "OverheadGrid",
     "PointCounts",
     "PointGrid",
     "PointKind",
@@ -68,9 +70,12 @@ __all__ = [
     "describe_points",
     "distinct_poses",
     "field_scores",
+    "height_columns",
+    "lowest_heights",
     "match_points",
     "match_rays",
     "nearest",
+    "offsets_near",
     "polar_bin",
     "shutdown",
     "sort_beams",

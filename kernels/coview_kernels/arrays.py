@@ -36,6 +36,19 @@ class PolarGrid(NamedTuple):
     """(..., R, S) number of points; alone tells occupied bins from empty ones, since 0 is a valid height."""
 
 
+class OverheadGrid(NamedTuple):
+    """Square cells seen from above; row along y, column along x."""
+
+    x: float
+    """of the lower corner of cell (0, 0), metres; float32 in use."""
+    y: float
+    """likewise."""
+    cell: float
+    """Edge of a cell, metres."""
+    shape: tuple[int, int]
+    """Rows and columns."""
+
+
 def as_float32(name: str, value: npt.ArrayLike, *shape: int | None) -> F32:
     """Return ``value`` as a C-contiguous float32 array of ``shape`` (None: any length); ValueError otherwise."""
     return _as_array(name, value, np.float32, shape)

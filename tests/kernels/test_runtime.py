@@ -42,6 +42,7 @@ def test_public_names():
         *("beam_cells", "match_points", "match_rays", "sort_beams"),
         *("Crop", "Cut", "crop_points"),
         *("WindowImages", "WindowRaster", "window_products"),
+        *("OverheadGrid", "height_columns", "lowest_heights", "offsets_near"),
         *("FieldMap", "FieldScan", "FieldScores", "field_scores"),
         *("CodedQuery", "StationCodes", "distinct_poses"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),

@@ -13,6 +13,7 @@ from coview_kernels.reference.evidence import match_points, match_rays, sort_bea
 from coview_kernels.reference.field import field_scores
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
+from coview_kernels.reference.overhead import height_columns, lowest_heights, offsets_near
 from coview_kernels.reference.polar import describe_points, polar_bin, station_bins
 from coview_kernels.reference.station_codes import best_codes, code_products, codes_at
 from coview_kernels.reference.voxel_filter import transform_unique
@@ -28,9 +29,12 @@ __all__ = [
     "describe_points",
     "distinct_poses",
     "field_scores",
+    "height_columns",
+    "lowest_heights",
     "match_points",
     "match_rays",
     "nearest",
+    "offsets_near",
     "polar_bin",
     "sort_beams",
     "station_bins",
