@@ -21,7 +21,7 @@ from typing import Any
 
 from bench.harness.rows import RUNS, Row, failed
 from bench.harness.suite import BENCHMARKS, counted, run
-from bench.harness.tables import HEAD, WIDTHS, benchmark_of, cells, filled, line, machine, rule, suite_tables
+from bench.harness.tables import HEAD, WIDTHS, benchmark_of, cells, filled, line, machine, missed, rule, suite_tables
 from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import CoViewError, InputError
 
@@ -141,6 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 part.write_text(f"{text}\n")
         if asked.write:
             places = {"machine": machine()} | suite_tables(rows) | own
+            if not name:  # a single benchmark knows nothing of the others
+                places |= {"missed": missed(rows)}
             asked.write.write_text(filled(asked.write.read_text(), places))
     except KeyboardInterrupt:
         print(f"\n{label}: interrupted, nothing written", file=sys.stderr)

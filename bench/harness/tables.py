@@ -75,6 +75,13 @@ def suite_tables(rows: Sequence[Row]) -> dict[str, str]:
     return out
 
 
+def missed(rows: Sequence[Row]) -> str:
+    """List the rows whose targets do not hold."""
+    found = [f"* {row.name}: {row.said or _figure(row.ours)} {row.unit}".rstrip() for row in rows if row.holds is False]
+    held = sum(row.holds is True for row in rows)
+    return "\n".join([f"{held} of {held + len(found)} targets hold.", *[""] * bool(found), *found])
+
+
 def filled(page: str, tables: Mapping[str, str]) -> str:
     """Put tables into their places, ``<!-- table: NAME -->`` to ``<!-- end -->``; ``InputError`` without any place."""
     if not {match[2] for match in _PLACE.finditer(page)} & set(tables):

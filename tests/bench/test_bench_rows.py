@@ -13,7 +13,7 @@ from bench.harness import rows
 from bench.harness.files import fingerprint
 from bench.harness.rows import Row, against, bounded, failed, informs, judged, medians, reached
 from bench.harness.suite import BENCHMARKS, Benchmark, run, thread_settings
-from bench.harness.tables import filled, suite_tables
+from bench.harness.tables import filled, missed, suite_tables
 from bench.harness.worlds import MAPPER
 from coview_stream.errors import InputError
 
@@ -128,6 +128,12 @@ def test_only_tables_that_were_measured_change_a_page():
     assert filled(PLACED, {"bench match": "new"}) == PLACED.replace("old", "new")
     with pytest.raises(InputError, match="no place for bench start"):
         filled(PLACED, suite_tables(ROWS[1:]))
+
+
+def test_targets_that_do_not_hold_are_listed():
+    slow = bounded("start/serve", 3.0, "s", 2.0)
+    assert missed(ROWS) == "2 of 2 targets hold."
+    assert missed([*ROWS, slow, informs("c", 1.0, "MB")]) == "2 of 3 targets hold.\n\n* start/serve: 3 s"
 
 
 def test_rows_are_shown_under_their_benchmark():
