@@ -126,13 +126,17 @@ class EngineProcess:
         if "ready" in self._awaited:
             self._await("ready", cancelled)
 
+    def wait_prepared(self) -> None:
+        """Wait until a job would not wait any more; raises what :meth:`wait_ready` does."""
+        for message in list(self._awaited):
+            self._await(message)
+
     def run(self, job: Job) -> Result:
         """Do one job; a child that died before is started again first."""
         if self._pipe is None:
             self.start()
         try:
-            for message in list(self._awaited):
-                self._await(message)
+            self.wait_prepared()
         except CoViewError as error:
             self._end()
             raise DiedError(str(error)) from error
