@@ -17,7 +17,7 @@ import coview_kernels
 from bench.harness.worlds import Place
 from coview_stream import BaseMap
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform
+from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import register
@@ -103,8 +103,7 @@ class Tracking:
         if found is None:
             return Answer(None, False)
         T = found.T_map_source
-        surveyed = self._site.surveyed(transform(T, source.points)[:, :2])
         T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
-        evidence = verify(source, T, RangeImage.of(newest.cloud), T_map_body, target, surveyed)
+        evidence = verify(source, T, RangeImage.of(newest.cloud), T_map_body, target, self._site.survey)
         cause, _ = EvidenceBaseline().judge(evidence, LocalizerConfig().acceptance)
         return Answer(T, cause is RejectionReason.VERIFIED)

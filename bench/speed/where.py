@@ -36,7 +36,7 @@ STAGES = (
     ("  registration", registration, "register"),
     ("  rays of the newest frame", registration.RangeImage, "of"),
     ("  verification", registration, "verify"),
-    ("    nearest map points", verification.kernels, "nearest"),
+    ("    points against the map", verification.kernels, "match_points"),
     ("    rays against the map", verification, "free_space"),
 )
 """Name in the table, and where the function is looked up."""
