@@ -18,13 +18,14 @@ import numpy as np
 import psutil
 
 from bench.harness import worlds
-from bench.harness.files import folder
+from bench.harness.files import fingerprint, folder, remembered
 from bench.harness.rows import Row
 from bench.stream import scores
 from bench.stream.drive import RobotPlan
 from bench.stream.processes import wait_until
 from bench.stream.scores import Told
 from bench.stream.stage import MAX_JITTER, Findings, Setting, Stage
+from coview_stream import BaseMap
 from coview_stream.geometry.arrays import Floats
 from coview_stream.sim import SimulationConfig
 
@@ -48,7 +49,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
     for config in (home, stranger):
         worlds.prepare(folder(), config)
     main, other = (folder() / worlds.world_name(config) for config in (home, stranger))
-    setting = Setting(main, other, worlds.map_of(folder(), home), asked.quick)
+    site, made = main / "learned.coview", {"learned": True, "code": fingerprint(*worlds.MAPPER)}
+    remembered(main / "learned.json", made, lambda: BaseMap.build(main / "base.laz", learned=True).save(site))
+    setting = Setting(main, other, site, asked.quick)
     found = Findings("many")
     names = [f"r{k + 1}" for k in range(HOME + AWAY)]
     with Stage(setting, found, names) as stage:
