@@ -52,7 +52,7 @@ def quantize(directory: Path, images: Iterable[Image], note: str) -> Path:
         tools.quantize_static(
             str(prepared), str(part), Images(), quant_format=tools.QuantFormat.QDQ, per_channel=True,
             reduce_range=True, op_types_to_quantize=list(_LAYERS), activation_type=tools.QuantType.QUInt8,
-            weight_type=tools.QuantType.QInt8, nodes_to_exclude=_behind_powers(onnx.load(str(prepared)).graph),
+            weight_type=tools.QuantType.QInt8, nodes_to_exclude=_delicate(onnx.load(str(prepared)).graph),
         )  # fmt: skip
         model = onnx.load(str(part))
         onnx.helper.set_model_props(model, {ORIGIN: file_sha256(weights)})
@@ -64,12 +64,15 @@ def quantize(directory: Path, images: Iterable[Image], note: str) -> Path:
     return written
 
 
-def _behind_powers(graph: Any) -> list[str]:
-    """Name the nodes that depend on a power: it spreads the numbers over too many magnitudes for eight bits."""
+def _delicate(graph: Any) -> list[str]:
+    """Name the nodes behind a power or a softplus, and what a softplus is of: numbers of too many magnitudes."""
     names: list[str] = []
     tensors: set[str] = set()
+    steep = {name for node in graph.node if node.op_type == "Softplus" for name in node.input}
     for node in graph.node:  # in order
-        if node.op_type == "Pow" or tensors.intersection(node.input):
-            names.append(str(node.name))
+        if node.op_type in ("Pow", "Softplus") or tensors.intersection(node.input):
             tensors.update(node.output)
+            names.append(str(node.name))
+        elif steep.intersection(node.output):
+            names.append(str(node.name))
     return names

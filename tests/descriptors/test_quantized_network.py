@@ -27,7 +27,8 @@ def test_quantized_features_are_nearly_the_same(image: np.ndarray) -> None:
     assert likeness.mean() > 0.99
     assert np.quantile(likeness, 0.05) > 0.95
     assert (ours.place * known.place).sum(axis=0).mean() > 0.99
-    assert np.median(np.abs(ours.sigma / known.sigma - 1.0)) < 0.1
+    assert ours.sigma.min() > 0.04
+    assert np.quantile(np.abs(ours.sigma / known.sigma - 1.0), 0.95) < 0.2
 
 
 def test_maps_are_built_with_exact_weights() -> None:
