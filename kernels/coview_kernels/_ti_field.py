@@ -173,8 +173,9 @@ def score(
                         x += ti.cast(at % WINDOW - REACH, ti.f32)
                         y += ti.cast(at // WINDOW - REACH, ti.f32)
                         yaw += TURN * (turn - TURNS // 2)
-                        z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 2.0)
-                        z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
+                        for k in range(2):  # a loop: each call in the source is compiled by itself
+                            reach = ti.select(k == 0, ti.cast(2.0, ti.f32), ti.cast(0.5, ti.f32))
+                            z += rise(table, down, across, base, surface, lows, x, y, z, yaw, reach)
                     step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
                     for _ in range(levels):
                         # the shift first, then the heading there: a third of what all pairs of them would cost

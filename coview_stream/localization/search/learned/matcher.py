@@ -129,7 +129,7 @@ class FeatureMatcher:
         """
         import scipy.ndimage  # noqa: F401  # a quarter of a second, which the first image would take
 
-        warm_up("window_products")
+        warm_up("height_columns", "window_products")
         _ = self.network, self._feature_blocks if self.dense else self.index, self.cells, self._by_coarse_cell
 
     def encode(self, points: Points, centre: Floats) -> QueryFeatures:
