@@ -105,6 +105,15 @@ class Localizer:
         """Descriptors (R, S) of the newest keyframe that searched, by channel; empty before the first."""
         return self._search.last_query
 
+    def prepare(self) -> None:
+        """Compile and load now what the first search would: some seconds on a large map, once.
+
+        Raises:
+            InputError, DependencyError: the network of the learned features cannot be loaded.
+        """
+        kernels.warm_up(*GlobalSearch.KERNELS)
+        self._search.prepare()
+
     # ---- one frame
 
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:

@@ -104,6 +104,7 @@ def locate(
     if len(run) == 1:
         config = replace(config, stationary=True)
     localizer = Localizer(base_map, config)
+    localizer.prepare()
     located = RunResult(len(run), sources=localizer.sources)
     for index in range(len(run)):
         try:

@@ -31,6 +31,12 @@ class GlobalSearch:
         learned: the recognizer by learned features; None if it is not used.
     """
 
+    KERNELS = (
+        "transform_unique", "describe_points", "distinct_poses", "field_scores", "align_planes",
+        "crop_points", "match_points", "match_rays", "sort_beams",
+    )  # fmt: skip
+    """Names of the kernels that it runs, for :func:`coview_kernels.warm_up`."""
+
     def __init__(
         self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, index: SearchIndex | None = None
     ) -> None:
@@ -42,6 +48,7 @@ class GlobalSearch:
         self.coview, self.learned = _recognizers(base_map, config, index)
         self._recognizers = [each for each in (self.coview, self.learned) if each is not None]
         self._local_maps = local_maps
+        self._index = index
         self._acceptance = AcceptanceTest(self.config)
         self._epoch = Epoch()
         self.clear()
@@ -63,6 +70,15 @@ class GlobalSearch:
     def last_query(self) -> dict[Channel, Descriptor]:
         """Descriptors (R, S) of the newest keyframe that voted by them, by channel."""
         return {} if self.coview is None else self.coview.last_query
+
+    def prepare(self) -> None:
+        """Make now what the first update would: of the stations' index, of the learned features, of the field.
+
+        Raises:
+            InputError, DependencyError: the network of the learned features cannot be loaded.
+        """
+        self._index.prepare()
+        _ = self.base_map.field.layers
 
     def clear(self) -> None:
         """Forget all votes and confirmations."""

@@ -124,10 +124,7 @@ class TrackEngine:
 class SearchEngine:
     """Global searches of all robots, which share the map's spectra and networks."""
 
-    kernels = (
-        "transform_unique", "describe_points", "distinct_poses", "field_scores", "align_planes",
-        "crop_points", "match_points", "match_rays", "sort_beams",
-    )  # fmt: skip
+    kernels = GlobalSearch.KERNELS
     later_kernels: tuple[str, ...] = ()
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
@@ -153,8 +150,7 @@ class SearchEngine:
 
     def prepare(self) -> None:
         """Make what the first query would: of the stations' index, of the learned features, and of the field."""
-        self._index.prepare()
-        _ = self.base_map.field.layers
+        GlobalSearch(self.base_map, self.config, self._local_maps, self._index).prepare()
 
     def prepare_later(self) -> None:
         """Do nothing: all jobs are alike."""
