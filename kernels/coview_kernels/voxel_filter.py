@@ -60,7 +60,10 @@ def transform_unique(
     cloud, pose = as_float32("points", points, None, 3), as_finite64("T", T, 4, 4)
     limits = _checked_limits(voxel, r_min, r_max)
     middle = tuple(as_finite64("centre", centre, 3).tolist())
-    return runtime.dispatch(_transform_unique, reference.transform_unique, cloud, pose, *limits, middle)
+    return runtime.dispatch_here(
+        lambda: _shared_pass is not None and _shared_pass.ready(), _transform_unique, reference.transform_unique,
+        cloud, pose, *limits, middle,
+    )  # fmt: skip
 
 
 class VoxelFilter:
@@ -92,7 +95,10 @@ class VoxelFilter:
     def __call__(self, points: npt.ArrayLike, T: npt.ArrayLike) -> tuple[F32, int]:
         """Filter a frame; arguments, results and errors are those of :func:`transform_unique`."""
         cloud, pose = as_float32("points", points, None, 3), as_finite64("T", T, 4, 4)
-        return runtime.dispatch(self._native, reference.transform_unique, cloud, pose, *self._limits)
+        return runtime.dispatch_here(self._ready, self._native, reference.transform_unique, cloud, pose, *self._limits)
+
+    def _ready(self) -> bool:
+        return self._pass is not None and self._pass.ready()
 
     def _native(self, points: F32, T: F64, voxel: float, r_min: float, r_max: float) -> tuple[F32, int]:
         if self._pass is None:
@@ -109,7 +115,7 @@ def _checked_limits(voxel: float, r_min: float, r_max: float) -> tuple[float, fl
     return float(voxel), float(r_min), float(r_max)
 
 
-_shared_pass: _KernelPass | None = None  # used on the owner thread only
+_shared_pass: _KernelPass | None = None  # of one caller at a time: only one call of native code runs
 
 
 def _transform_unique(
@@ -127,7 +133,7 @@ def _transform_unique(
 
 
 class _KernelPass:
-    """One pass of the kernel over a cloud, with its hash table and results; for the owner thread only.
+    """One pass of the kernel over a cloud, with its hash table and results; for native code only.
 
     Table and results stay from call to call and grow, by doubling, when they have to. The table is never cleared: its
     entries carry the number of their call.
@@ -145,6 +151,10 @@ class _KernelPass:
     def nbytes(self) -> int:
         """Bytes of table and results."""
         return self._moved.nbytes + (16 << self._bits)
+
+    def ready(self) -> bool:
+        """Tell whether any thread may call it, by :func:`coview_kernels.runtime.dispatch_here`."""
+        return self._launch.ready()
 
     def __call__(
         self, points: F32, T: F64, voxel: float, r_min: float, r_max: float, centre: tuple[float, ...] = (0.0, 0.0, 0.0)
