@@ -140,7 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 text = json.dumps([row.to_dict() for row in rows], indent=1, allow_nan=False)
                 part.write_text(f"{text}\n")
         if asked.write:
-            places = {"machine": machine()} | suite_tables(rows) | own
+            figures = [row for row in rows if row.target != RUNS]  # what came to none leaves its table as it was
+            places = {"machine": machine()} | suite_tables(figures) | own
             if not name:  # a single benchmark knows nothing of the others
                 places |= {"missed": missed(rows)}
             asked.write.write_text(filled(asked.write.read_text(), places))
