@@ -52,6 +52,10 @@ class StationGrid:
         each = np.arange(levels.shape[1])
         return np.where(gap[best, each] < _LEVEL_GAP, levels[best, each], -1).astype(np.intp)
 
+    def storeys(self, station: int) -> list[int]:
+        """Return the stations of a station's cell, lowest first, itself among them."""
+        return [k for k in self._levels[:, self.cell(self.stations[station][None])[0]].tolist() if k >= 0]
+
     def cell(self, positions: Reals) -> Indices:
         """Return the number of the cell (N,) that holds each of (N, 2 or 3) positions; off the grid, the last."""
         index = np.floor(np.asarray(positions[:, :2], dtype=np.float64) * (1.0 / self.block)).astype(np.int64)

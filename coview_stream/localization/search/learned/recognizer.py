@@ -10,7 +10,8 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import on_ground
-from coview_stream.geometry.transforms import pose_from, transform, wrap_angle, yaw_of
+from coview_stream.geometry.arrays import Bools
+from coview_stream.geometry.transforms import Pose, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
 from coview_stream.localization.search.request import SearchRequest
@@ -38,38 +39,43 @@ class LearnedRecognizer:
         self.consensus.vote(self.learned.vote(self._query, hinted))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks on every storey that they may be on."""
-        peaks = [replace(each, learned=True) for each in self.consensus.hypotheses()]
+        """Return the consensus' peaks on every storey that they may be on: from above these look alike."""
+        peaks = self.consensus.hypotheses()
         if self._query is None or not peaks:
             return peaks
-        same = [self._same_but_height(each, peaks[0], self._query) for each in peaks]
-        if not all(same):
-            lead = (peaks[same.index(False)].score - peaks[0].score) / math.sqrt(len(self.consensus))
-            peaks = [replace(each, lead=lead * own) for each, own in zip(peaks, same, strict=True)]
+        same = self._same_but_height([each.T_map_odom for each in peaks], self._query)
+        lead = 0.0
+        if not same.all():
+            lead = (peaks[int(same.argmin())].score - peaks[0].score) / math.sqrt(len(self.consensus))
         found: dict[tuple[int | None, int | None], Hypothesis] = {}
-        for peak in peaks:
-            for each in self._storeys(peak):
+        for peak, own in zip(peaks, same.tolist(), strict=True):
+            for each in self._storeys(replace(peak, learned=True, lead=lead * own)):
                 found.setdefault((each.station, each.shift), each)
         return list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
     def _storeys(self, peak: Hypothesis) -> list[Hypothesis]:
-        """Return a peak, and the same at the stations above and below: from above they look alike."""
-        if peak.station is None:
+        """Return a peak, and the same at the stations above and below."""
+        grid = self.consensus.grid
+        storeys = [] if peak.station is None else grid.storeys(peak.station)
+        if len(storeys) < 2:
             return [peak]
-        stations = self.consensus.grid.stations
-        own = stations[peak.station]
-        others = np.flatnonzero((np.abs(stations[:, :2] - own[:2]) < 0.25 * self.consensus.grid.block).all(axis=1))
-        rises = {int(k): float(stations[k, 2] - own[2]) for k in others if k != peak.station}
-        return [peak] + [
-            replace(peak, T_map_odom=pose_from(np.eye(3), np.array([0.0, 0.0, rise])) @ peak.T_map_odom, station=k)
-            for k, rise in rises.items()
-        ]
+        out = [peak]
+        for station in storeys:
+            if station != peak.station:
+                T = peak.T_map_odom.copy()
+                T[2, 3] += float(grid.stations[station, 2] - grid.stations[peak.station, 2])
+                out.append(replace(peak, T_map_odom=T, station=station))
+        return out
 
-    def _same_but_height(self, one: Hypothesis, other: Hypothesis, query: QueryFeatures) -> bool:
-        here, there = (transform(each.T_map_odom, query.centre[None])[0, :2] for each in (one, other))
-        turn = abs(wrap_angle(yaw_of(one.T_map_odom) - yaw_of(other.T_map_odom)))
+    def _same_but_height(self, poses: list[Pose], query: QueryFeatures) -> Bools:
+        """Tell which of ``T_map_odom`` (4, 4) put the query at the place of the first, at any height."""
+        T = np.array(poses)
+        there = (T[:, :3, :3] @ query.centre + T[:, :3, 3])[:, :2]
+        yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+        turn = np.abs((yaw - yaw[0] + np.pi) % (2.0 * np.pi) - np.pi)
         rule = self.consensus.config
-        return math.dist(here, there) < rule.distinct_distance and turn < rule.distinct_yaw
+        near = np.hypot(*(there - there[0]).T) < rule.distinct_distance
+        return np.asarray(near & (turn < rule.distinct_yaw))
 
     def clear(self) -> None:
         """Forget all votes."""
