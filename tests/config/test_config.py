@@ -23,12 +23,11 @@ from coview_stream.config import (
 )
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.config.search import LearnedMatchConfig
 from coview_stream.errors import ConfigError
 
 CONFIGS = [
     AcceptanceConfig, ConsensusConfig, DescriptorConfig, GraphConfig, KeyframeConfig, LearnedConfig,
-    LearnedMatchConfig, LidarOdometryConfig, LocalizerConfig, MapConfig, NodeConfig, RegistrationConfig,
+    LidarOdometryConfig, LocalizerConfig, MapConfig, NodeConfig, RegistrationConfig,
     RetrievalConfig, TrackingConfig,
 ]  # fmt: skip
 

@@ -37,7 +37,6 @@ class Hypothesis:
         learned: whether the votes are those of learned features.
         lead: how much the mean keyframe's votes prefer it to the next place, in robust standard deviations; 0 where it
             is not the first.
-        exact: whether matched keypoints have refined it.
     """
 
     T_map_odom: Pose
@@ -46,7 +45,6 @@ class Hypothesis:
     score: float
     learned: bool = False
     lead: float = 0.0
-    exact: bool = False
 
 
 @dataclass(frozen=True)
