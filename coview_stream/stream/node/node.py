@@ -156,14 +156,12 @@ class Node:
     def next_job(self, engine: str) -> tuple[Session, Job] | None:
         """Return whose turn it is at an engine, and the job; None if there is nothing to do."""
         turns = self._turns[engine]
+        order = turns.order()
         if engine == "search":
             order = search_order([session.search_demand for session in self.sessions], time.monotonic())
-        else:
-            order = [k for k in turns.order() if self.sessions[k].has_job(engine)]
         for k in order:
             session = self.sessions[k]
-            job = _take_job(session, engine)
-            if job is not None:
+            if session.has_job(engine) and (job := _take_job(session, engine)) is not None:
                 turns.serve(k)
                 return session, job
         return None

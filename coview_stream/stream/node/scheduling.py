@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 # of searches; set by hand
-_PATIENCE = 2.0  # seconds that a keyframe waits before it comes before all that have waited less
+_PATIENCE = 1.5  # seconds that a keyframe waits before it comes before all that have waited less
 _NEW = 8  # searches in which a robot counts as newly lost; most are found within them
 _MAX_SUPPORT = 16  # searches in a row that propose a place: with more, the map has another one like it
 
@@ -50,8 +50,8 @@ class SearchDemand:
 def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
     """Return which robots of ``demands`` want a search, in the order in which they are to have it.
 
-    A keyframe that has waited for two seconds comes first, the oldest of them before the others: so nobody waits much
-    longer, unless the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been
+    A keyframe that has waited for 1.5 s comes first, the oldest of them before the others: so nobody waits much longer,
+    unless the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been
     proposed comes before those that are newly lost, for it needs the fewest searches until it needs none, and these
     before those that have searched in vain for long.
 
