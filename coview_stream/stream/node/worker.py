@@ -20,7 +20,7 @@ def main(argv: list[str]) -> int:
     """Load the kernels, open the engine, then answer jobs until the parent closes the pipe.
 
     What the first jobs do not need is loaded while no job waits, one kernel after the other: a job that comes meanwhile
-    waits for that one, a quarter of a second at most.
+    waits for that one: a quarter of a second at most from the cache, some seconds on the first run ever.
     """
     descriptor, kind, nice = int(argv[0]), argv[1], int(argv[2])
     pipe = Connection(descriptor)
