@@ -1,7 +1,9 @@
-"""Station index: the descriptors of all stations in 512 bytes each, and z-scores of a query by them.
+"""Station index: the descriptors of all stations in two tiers of 512 bytes each, and z-scores of a query by them.
+
+The first tier, of what varies most, screens all stations; the second is added where single scores are asked for.
 
 It is made when a map is built, and kept in its file; a map without it makes it when it is first searched. Neither the
-query nor the memory of a search then needs the descriptors, which take ten times as much.
+query nor the memory of a search then needs the descriptors, which take five times as much.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
 _SAMPLE = 128  # stations at all whose shifts medians are taken; set by hand
-_PREFIX = "station_codes"
+_TIERS, _SAMPLED = ("station_codes", "station_codes.rest"), "station_codes.sample"
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,14 @@ class ScoredQuery:
 
     Attributes:
         coded: the query, its channels weighted by how far they spread.
-        zero: z-score of no correlation at all.
+        rest: the same, for the second tier.
+        screen_zero: z-score of no correlation at all by the first tier alone.
+        zero: that by both.
     """
 
     coded: CodedQuery
+    rest: CodedQuery
+    screen_zero: float
     zero: float
 
 
@@ -46,8 +52,9 @@ class StationIndex:
     (eqs 7-9) exceeds the median; negative is better. It is the mean of the channels'.
     """
 
-    def __init__(self, codes: StationCodes, sample: Descriptors) -> None:
+    def __init__(self, codes: StationCodes, rest: StationCodes, sample: Descriptors) -> None:
         self.codes = codes
+        self.rest = rest
         self._descriptors = sample
 
     @classmethod
@@ -55,26 +62,31 @@ class StationIndex:
         """Make the index of stations by their descriptors."""
         chosen = _chosen(len(next(iter(descriptors.values()))))
         sample = {name: np.array(values[chosen]) for name, values in descriptors.items()}
-        return cls(StationCodes.of(list(descriptors.values())), sample)
+        return cls(*StationCodes.tiers(list(descriptors.values()), 2), sample)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:
         """Return the index of these channels that a map's file holds, None if it holds none."""
-        if any(name not in arrays for name in _NAMES):
+        if any(name not in arrays for tier in _TIERS for name in _names(tier)) or _SAMPLED not in arrays:
             return None
-        codes, basis, step, norm, sample = (arrays[name] for name in _NAMES)
+        sample = arrays[_SAMPLED]
         count, _, rings, sectors = sample.shape
-        if count != len(channels) or basis.shape[2] != rings * count:
+        if count != len(channels) or arrays[f"{_TIERS[0]}.basis"].shape[2] != rings * count:
             return None
-        vectors = (basis[..., 0] + 1j * basis[..., 1]).astype(np.complex64)
-        by_channel = dict(zip(channels, np.array(sample), strict=True))
-        return cls(StationCodes(codes, vectors, np.array(step), np.array(norm), sectors), by_channel)
+        tiers = []
+        for tier in _TIERS:
+            codes, basis, step, norm = (arrays[name] for name in _names(tier))
+            vectors = (basis[..., 0] + 1j * basis[..., 1]).astype(np.complex64)
+            tiers.append(StationCodes(codes, vectors, np.array(step), np.array(norm), sectors))
+        return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)))
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return what a map's file holds of it."""
-        codes, sample = self.codes, np.stack(list(self._descriptors.values()))
-        parts = np.stack([codes.basis.real, codes.basis.imag], axis=-1), codes.step, codes.norm, sample
-        return dict(zip(_NAMES, (codes.codes, *parts), strict=True))
+        found = {_SAMPLED: np.stack(list(self._descriptors.values()))}
+        for tier, codes in zip(_TIERS, (self.codes, self.rest), strict=True):
+            basis = np.stack([codes.basis.real, codes.basis.imag], axis=-1)
+            found |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
+        return found
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -108,30 +120,36 @@ class StationIndex:
             weight = np.float32(1.0 / (len(spectra) * (1.4826 * np.median(np.abs(distance - median)) + 1e-6)))
             mean += (distance - median) * weight
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
-        coded = self.codes.query(np.concatenate(columns))
+        stacked = np.concatenate(columns)
+        coded, rest = self.codes.query(stacked), self.rest.query(stacked)
         # the codes leave parts out that no query lacks: what that adds on the mean is made up for here
-        zero = float(np.median(mean + self.codes.all_shifts(coded, chosen)))
-        return ScoredQuery(coded, zero)
+        mean += self.codes.all_shifts(coded, chosen)
+        screen_zero = float(np.median(mean))
+        mean += self.rest.all_shifts(rest, chosen)
+        return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:
-        """Return the best z-score (M,) of each station at any heading."""
-        return np.float32(query.zero) - self.codes.best(query.coded)
+        """Return the best z-score (M,) of each station at any heading, by the first tier."""
+        return np.float32(query.screen_zero) - self.codes.best(query.coded)
 
     def all_shifts(self, query: ScoredQuery, stations: Ints) -> Floats32:
-        """Return z-scores (K, S) of stations (K,) at all shifts."""
-        return np.float32(query.zero) - self.codes.all_shifts(query.coded, stations)
+        """Return z-scores (K, S) of stations (K,) at all shifts, by the first tier."""
+        return np.float32(query.screen_zero) - self.codes.all_shifts(query.coded, stations)
 
     def at(self, query: ScoredQuery, stations: npt.ArrayLike, shifts: npt.ArrayLike) -> Floats32:
-        """Return z-scores (K,) of stations (K,) at shifts (K,); 0 for station -1."""
+        """Return z-scores (K,) of stations (K,) at shifts (K,), by both tiers; 0 for station -1."""
         index = np.asarray(stations)
         found = np.float32(query.zero) - self.codes.at(query.coded, index, shifts)
+        found -= self.rest.at(query.rest, index, shifts)
         found[index < 0] = 0.0
         return found
-
-
-_NAMES = (_PREFIX, f"{_PREFIX}.basis", f"{_PREFIX}.step", f"{_PREFIX}.norm", f"{_PREFIX}.sample")
 
 
 def _chosen(stations: int) -> Ints:
     """Choose the stations (K,) of the sample, as evenly as they come."""
     return np.arange(0, stations, max(1, -(-stations // _SAMPLE)))
+
+
+def _names(tier: str) -> tuple[str, str, str, str]:
+    """Return the names of a tier's arrays in a file."""
+    return tier, f"{tier}.basis", f"{tier}.step", f"{tier}.norm"

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,9 +41,24 @@ _FREQUENCIES = 32
 _BATCH = 512  # stations transformed at a time
 _SAMPLE = 2048  # stations from which transform and steps are learned
 _INT8_RANGE = 6.0  # standard deviations that int8 spans: 5 to 8 differ by a tenth in error on simulated sites
+_MARGIN = 1.1  # beyond the greatest number of the sample
 _MAX_SUM = 32_500.0  # of int16, with room for what rounding adds
 _MIN_PARALLEL = 4096  # stations from which other threads are worth waking
 _CHUNK = 16_384  # pairs of station and shift at a time
+
+
+class Screen(NamedTuple):
+    """A query in integers.
+
+    Attributes:
+        integers: (2, 16, 2, 16) int16 for real and imaginary products.
+        turn: (65, 16) int16 table of rotations.
+        unit: value of one unit of the turned products.
+    """
+
+    integers: I16
+    turn: I16
+    unit: float
 
 
 @dataclass(frozen=True)
@@ -52,27 +67,42 @@ class CodedQuery:
 
     Attributes:
         numbers: (16, 16) complex64 its transform.
-        real: (16, 16) float32 what a station's real part counts in units of its integers.
-        imaginary: (16, 16) float32 what its imaginary part does, in units of the whole number.
-        integers: (2, 16, 2, 16) int16 for real and imaginary products.
-        turn: (65, 16) int16 table of rotations.
-        unit: value of one unit of the turned products.
+        step: (16, 2, 16) float32, of the stations.
+        norm: (33,) float32, of the stations.
         sectors: number of shifts S.
     """
 
     numbers: C64
-    real: F32
-    imaginary: F32
-    integers: I16
-    turn: I16
-    unit: float
+    step: F32
+    norm: F32
     sectors: int
+
+    @cached_property
+    def screen(self) -> Screen:
+        """The query in integers."""
+        p, s = self.numbers.real, self.numbers.imag
+        pair = np.stack([np.stack([p, s], axis=1), np.stack([s, -p], axis=1)]) * self.step
+        size = np.sqrt(np.stack([(pair[:, g == _GROUP] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
+        limit = np.minimum((_MAX_SUM - 4.0 * _ROWS) * 256.0 / np.maximum(self.norm[:-1].reshape(2, -1), 1.0), 32_000.0)
+        gain = limit / np.maximum(size, 1e-30)
+        scale = np.where(size > 0, 256.0 / gain, 0.0)  # of one unit of a product
+        span = float(self.norm[-1]) * float(np.linalg.norm(self.numbers)) + _ROWS * float(scale.sum())
+        unit = max(2.01 * float(scale.max()), span / 31_000.0, 1e-30)
+        angle = (2.0 * np.pi / ANGLES) * _frequencies()[:, :, None] * np.arange(_LANES)
+        factor = (65_536.0 / unit * scale)[:, :, None]
+        turn = np.concatenate([np.cos(angle) * factor, -np.sin(angle) * factor]).reshape(-1, _LANES)
+        return Screen(
+            np.rint(pair * gain[_GROUP][:, None]).astype(np.int16),
+            np.rint(np.concatenate([np.zeros((1, _LANES)), turn])).astype(np.int16),
+            unit,
+        )
 
     @cached_property
     def factors(self) -> F32:
         """(16, 4, 16) of a station's numbers, for real and imaginary products without rounding."""
         p, s = self.numbers.real, self.numbers.imag
-        each = p * self.real, s * self.imaginary, s * self.real, -p * self.imaginary
+        real, whole = self.step[:, 0], self.step[:, 1] * np.float32(1.0 / 256.0)
+        each = p * real, s * whole, s * real, -p * whole
         return np.ascontiguousarray(np.stack(each, axis=1), dtype=np.float32)
 
     @cached_property
@@ -80,8 +110,8 @@ class CodedQuery:
         """(S, 16, 2, 16) of a station's numbers, for the correlation at every shift."""
         turned = self.numbers * _turns(self.sectors)
         table = np.empty((self.sectors, _ROWS, 2, _LANES), dtype=np.float32)
-        np.multiply(turned.real, self.real, out=table[:, :, 0])
-        np.multiply(turned.imag, self.imaginary, out=table[:, :, 1])
+        np.multiply(turned.real, self.step[:, 0], out=table[:, :, 0])
+        np.multiply(turned.imag, self.step[:, 1] * np.float32(1.0 / 256.0), out=table[:, :, 1])
         return table
 
 
@@ -111,27 +141,39 @@ class StationCodes:
         Raises:
             ValueError: the channels' shapes differ.
         """
-        count, rings, sectors = descriptors[0].shape
-        if any(each.shape != (count, rings, sectors) for each in descriptors):
+        return cls.tiers(descriptors, 1)[0]
+
+    @classmethod
+    def tiers(cls, descriptors: Sequence[npt.NDArray[Any]], count: int) -> list[StationCodes]:
+        """Code stations several times, each time what the codes before leave out: the correlations add up.
+
+        Raises:
+            ValueError: the channels' shapes differ.
+        """
+        stations, rings, sectors = descriptors[0].shape
+        if any(each.shape != (stations, rings, sectors) for each in descriptors):
             raise ValueError(f"descriptors have shapes {[each.shape for each in descriptors]}, expected one for all")
-        sample = _spectra(_columns([each[:: -(-count // _SAMPLE) or 1] for each in descriptors]))
-        basis = _eigenvectors(sample)
-        square = (_parts(_projected(sample, basis)) ** 2).mean(axis=0) if count else np.zeros((_ROWS, 2, _LANES))
-        least = 1e-3 * square.max(initial=0.0) + 1e-12  # numbers that are empty in the sample
-        step = np.sqrt(np.maximum(square, least)).astype(np.float32) * np.float32(_INT8_RANGE / 127.0)
-        codes = np.empty((count, _ROWS, _LANES), dtype=np.int16)
-        norm = np.zeros(2 * _LANES + 1, dtype=np.float32)
-        for start in range(0, count, _BATCH):
+        sample = _spectra(_columns([each[:: -(-stations // _SAMPLE) or 1] for each in descriptors]))
+        empty = np.empty((stations, _ROWS, _LANES), dtype=np.int16)
+        made = [
+            cls(empty.copy(), basis, _steps(sample, basis), np.zeros(2 * _LANES + 1, dtype=np.float32), sectors)
+            for basis in _eigenvectors(sample, count)
+        ]
+        for start in range(0, stations, _BATCH):
             part = slice(start, start + _BATCH)
-            numbers = _parts(_projected(_spectra(_columns([each[part] for each in descriptors])), basis)) / step
-            codes[part] = _pack(numbers)
-            whole = _unpack(codes[part])
-            square = np.concatenate(
-                [(whole[:, rows] ** 2).sum(axis=(1, 2)) for rows in (slice(0, _LOW), slice(_LOW, _ROWS))], axis=1
-            )
-            norm[:-1] = np.maximum(norm[:-1], square.max(axis=0))
-            norm[-1] = max(norm[-1], ((whole * step) ** 2).sum(axis=(1, 2, 3)).max())
-        return cls(codes, basis, step, np.sqrt(norm), sectors)
+            spectra = _spectra(_columns([each[part] for each in descriptors]))
+            for each in made:
+                each._encode(part, spectra)
+        return made
+
+    def _encode(self, part: slice, spectra: C64) -> None:
+        """Code some stations by their spectra (32, m, D)."""
+        self.codes[part] = _pack(_parts(_projected(spectra, self.basis)) / self.step)
+        whole = _unpack(self.codes[part])
+        groups = whole[:, :_LOW], whole[:, _LOW:]
+        blocks = np.concatenate([(each * each).sum(axis=(1, 2)) for each in groups], axis=1)
+        self.norm[:-1] = np.maximum(self.norm[:-1], np.sqrt(blocks.max(axis=0)))
+        self.norm[-1] = max(self.norm[-1], np.sqrt(((whole * self.step) ** 2).sum(axis=(1, 2, 3)).max()))
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -149,31 +191,12 @@ class StationCodes:
         """
         stacked = as_float32("columns", columns, self.basis.shape[2], self.sectors)
         numbers = _projected(_spectra(stacked[None]), self.basis)[0]
-        p, s = numbers.real, numbers.imag
-        pair = np.stack([np.stack([p, s], axis=1), np.stack([s, -p], axis=1)]) * self.step
-        size = np.sqrt(np.stack([(pair[:, g == _GROUP] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
-        limit = np.minimum((_MAX_SUM - 4.0 * _ROWS) * 256.0 / np.maximum(self.norm[:-1].reshape(2, -1), 1.0), 32_000.0)
-        gain = limit / np.maximum(size, 1e-30)
-        scale = np.where(size > 0, 256.0 / gain, 0.0)  # of one unit of a product
-        span = float(self.norm[-1]) * float(np.linalg.norm(numbers)) + _ROWS * float(scale.sum())
-        unit = max(2.01 * float(scale.max()), span / 31_000.0, 1e-30)
-        angle = (2.0 * np.pi / ANGLES) * _frequencies()[:, :, None] * np.arange(_LANES)
-        factor = (65_536.0 / unit * scale)[:, :, None]
-        turn = np.concatenate([np.cos(angle) * factor, -np.sin(angle) * factor]).reshape(-1, _LANES)
-        return CodedQuery(
-            numbers,
-            self.step[:, 0],
-            self.step[:, 1] * np.float32(1.0 / 256.0),
-            np.rint(pair * gain[_GROUP][:, None]).astype(np.int16),
-            np.rint(np.concatenate([np.zeros((1, _LANES)), turn])).astype(np.int16),
-            unit,
-            self.sectors,
-        )
+        return CodedQuery(numbers, self.step, self.norm, self.sectors)
 
     def best(self, query: CodedQuery) -> F32:
         """Return the greatest correlation (M,) with each station over 60 angles; of 60 sectors, all shifts."""
         found = runtime.dispatch_here(self._ready, self._native_best, self._plain_best, query)
-        return found * np.float32(query.unit)
+        return found * np.float32(query.screen.unit)
 
     def all_shifts(self, query: CodedQuery, stations: npt.ArrayLike) -> F32:
         """Return the correlations (K, S) with stations (K,) at all shifts."""
@@ -201,10 +224,10 @@ class StationCodes:
         return self._kernels
 
     def _native_best(self, query: CodedQuery) -> I32:
-        return self._prepared().best(query.integers, query.turn)
+        return self._prepared().best(query.screen.integers, query.screen.turn)
 
     def _plain_best(self, query: CodedQuery) -> I32:
-        return reference.best_codes(self.codes, query.integers, query.turn)
+        return reference.best_codes(self.codes, query.screen.integers, query.screen.turn)
 
     def _native_products(self, query: CodedQuery, stations: I32) -> F32:
         return self._prepared().products(query.factors, stations)
@@ -311,15 +334,28 @@ def _spectra(columns: F32) -> C64:
     return spectra
 
 
-def _eigenvectors(sample: C64) -> C64:
-    """(16, 16, D) of the second moments of spectra (32, m, D), greatest first; beyond D there are zeros."""
+def _eigenvectors(sample: C64, tiers: int) -> list[C64]:
+    """(16, 16, D) each of the second moments of spectra (32, m, D), greatest first; beyond D there are zeros."""
     moments = np.matmul(sample.transpose(0, 2, 1).astype(np.complex128), sample.conj())
     vectors = np.linalg.eigh(moments)[1][:, :, ::-1]  # (32, D, D)
-    basis = np.zeros((_ROWS, _LANES, sample.shape[2]), dtype=np.complex64)
-    for group, (first, rows) in enumerate(((0, _LOW), (_LOW, _HIGH))):
-        kept = vectors[_frequencies()[group], :, :rows].transpose(2, 0, 1)
-        basis[first : first + len(kept)] = kept
-    return basis
+    found = np.zeros((tiers, _ROWS, _LANES, sample.shape[2]), dtype=np.complex64)
+    for tier in range(tiers):
+        for group, (first, rows) in enumerate(((0, _LOW), (_LOW, _HIGH))):
+            kept = vectors[_frequencies()[group], :, tier * rows : (tier + 1) * rows].transpose(2, 0, 1)
+            found[tier, first : first + len(kept)] = kept
+    return list(found)
+
+
+def _steps(sample: C64, basis: C64) -> F32:
+    """(16, 2, 16) what one unit of int8 stands for; what exceeds the range is clipped."""
+    if not sample.shape[1]:
+        return np.ones((_ROWS, 2, _LANES), dtype=np.float32)
+    parts = _parts(_projected(sample, basis))
+    square = (parts * parts).mean(axis=0)
+    least = 1e-3 * square.max(initial=0.0) + 1e-12  # numbers that are empty in the sample
+    # what never is far from its mean, as a column's sum, is spread over more of the integers
+    reach = np.minimum(_INT8_RANGE * np.sqrt(square), _MARGIN * np.abs(parts).max(axis=0))
+    return np.asarray(np.maximum(reach, np.sqrt(least)) * (1.0 / 127.0), dtype=np.float32)
 
 
 def _projected(spectra: C64, basis: C64) -> C64:

@@ -84,7 +84,7 @@ def test_any_number_of_sectors_finds_the_station_and_its_heading(sectors):
     query = codes.query(stacked([np.roll(each[50], turn, axis=1) for each in descriptors]))
     assert codes.best(query).argmax() == 50
     assert codes.all_shifts(query, [50]).argmax() == turn
-    assert codes.query(np.zeros_like(stacked([each[0] for each in descriptors]))).unit > 0
+    assert codes.query(np.zeros_like(stacked([each[0] for each in descriptors]))).screen.unit > 0
 
 
 @NATIVE
@@ -97,8 +97,8 @@ def test_kernels_agree_with_numpy(known, monkeypatch, parallel):
     query = native.query(columns)
     if ck.backend() == "numpy":
         pytest.skip("no kernels here")
-    best = reference.best_codes(codes.codes, query.integers, query.turn)
-    np.testing.assert_array_equal(native.best(query), best * np.float32(query.unit))
+    best = reference.best_codes(codes.codes, query.screen.integers, query.screen.turn)
+    np.testing.assert_array_equal(native.best(query), best * np.float32(query.screen.unit))
     monkeypatch.setattr(station_codes, "_CHUNK", 64)
     native = StationCodes(codes.codes, codes.basis, codes.step, codes.norm, S)
     station, shift = rng.integers(-1, M, 150).astype(np.int32), rng.integers(0, S, 150).astype(np.int32)
@@ -128,8 +128,24 @@ def test_copies_and_pickles_compute_the_same(known):
         np.testing.assert_array_equal(other.best(other.query(columns)), codes.best(query))
 
 
+def test_second_tier_adds_what_the_first_leaves_out(known):
+    _, columns, expected = known
+    first, second = StationCodes.tiers(scene()[0], 2)
+    alone = first.all_shifts(first.query(columns), np.arange(M))
+    np.testing.assert_array_equal(alone, known[0].all_shifts(known[0].query(columns), np.arange(M)))
+    both = alone + second.all_shifts(second.query(columns), np.arange(M))
+    assert (both - expected).std() < 0.95 * (alone - expected).std()
+
+
 def test_a_station_takes_512_bytes(known):
     assert known[0].codes.nbytes == 512 * M
+
+
+def test_two_tiers_keep_few_rings_whole():
+    descriptors, _ = scene(6, r=8, s=24, channels=2)  # 16 rings, of which the first tier keeps 12
+    columns = stacked([each[9] for each in descriptors])
+    found = sum(each.all_shifts(each.query(columns), np.arange(M)) for each in StationCodes.tiers(descriptors, 2))
+    np.testing.assert_allclose(found, exact(columns, descriptors), atol=0.02)
 
 
 def test_channels_of_different_shapes_raise():

@@ -12,7 +12,7 @@ from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.localization.search.votes import argsmallest
 
 _MIN_STATIONS = 2048  # whose shifts are looked at one by one: the best; set by hand
-_SHARE = 16  # on large maps it is one in so many; set by hand
+_SHARE = 32  # on large maps it is one in so many; set by hand
 _PER_STATION = 0.5  # candidates for each station looked at; set by hand
 
 

@@ -107,7 +107,7 @@ def test_vote_is_that_of_the_exact_distances(stations, query):
 def test_candidates_are_the_best_headings_of_the_best_stations(stations, query):
     vote = Retrieval(stations, RetrievalConfig()).vote(np.zeros(3), query)
     station, shift = vote.candidates()
-    scores = vote.at(*(each.ravel() for each in np.indices((M, S)))).reshape(M, S)
+    scores = stations.station_index.all_shifts(stations.station_index.query(query), np.arange(M))
     assert len(set(zip(station.tolist(), shift.tolist(), strict=True))) == len(station)
     best = scores[station, shift]
     assert (np.diff(best) >= 0).all()
