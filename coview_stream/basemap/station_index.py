@@ -62,7 +62,8 @@ class StationIndex:
         """Make the index of stations by their descriptors."""
         chosen = _chosen(len(next(iter(descriptors.values()))))
         sample = {name: np.array(values[chosen]) for name, values in descriptors.items()}
-        return cls(*StationCodes.tiers(list(descriptors.values()), 2), sample)
+        codes, rest = StationCodes.tiers(list(descriptors.values()), 2)
+        return cls(codes, rest, sample)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # set by hand; of onnxruntime, the network and what else is imported, in two processes
 _NETWORK_MEMORY = 0.2 * GB
-_INDEX_MEMORY = 600.0  # bytes per station: 512 of the index, and what a search says of each; set by hand
+_INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, and what a search says of each; set by hand
 _SPECTRA_MEMORY = 80.0  # bytes per square metre, set by hand
 
 
