@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -190,20 +191,26 @@ def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
     dimensions, size, width = images.shape
     if size != width or size % 2:
         raise ValueError(f"a query of {size} x {width} cells: it has to be square, its sides even")
+    padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).transpose(1, 2, 0).reshape(-1, dimensions)
+    corners, shares = _corners(size, tuple(np.asarray(yaws, dtype=np.float64).tolist()))
+    out = padded.take(corners[0], axis=0) * shares[0]
+    for corner, share in zip(corners[1:], shares[1:], strict=True):
+        out += padded.take(corner, axis=0) * share
+    return np.asarray(out.reshape(size + 1, size + 1, len(yaws), dimensions))
+
+
+@lru_cache(maxsize=4)
+def _corners(size: int, yaws: tuple[float, ...]) -> tuple[Ints, Floats32]:
+    """Return the four cells (4, N) between which each sample of a turned image lies, and their shares (4, N, 1)."""
     half = size // 2
     v, u = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1), indexing="ij")
     c, s = np.cos(yaws), np.sin(yaws)
     # one more cell of zeros on every side takes the values beyond the image
     col = u[..., None] * c + v[..., None] * s + (half + 0.5)
     row = v[..., None] * c - u[..., None] * s + (half + 0.5)
-    inside = np.hypot(u, v) <= half
-    padded = np.pad(images, ((0, 0), (1, 1), (1, 1))).transpose(1, 2, 0).reshape(-1, dimensions)
-    i, j = (np.clip(np.floor(each), 0, size).astype(np.intp) for each in (row, col))
-    down, right = (row - i).astype(np.float32)[..., None], (col - j).astype(np.float32)[..., None]
-    at = i * (size + 2) + j
-    out = padded[at] * ((1 - down) * (1 - right))
-    out += padded[at + 1] * ((1 - down) * right)
-    out += padded[at + size + 2] * (down * (1 - right))
-    out += padded[at + size + 3] * (down * right)
-    out *= inside[..., None, None]
-    return np.asarray(out)
+    inside = (np.hypot(u, v) <= half)[..., None]
+    i, j = (np.clip(np.floor(each), 0, size).astype(np.int64) for each in (row, col))
+    down, right = row - i, col - j
+    at = (i * (size + 2) + j).ravel()
+    shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]) * inside
+    return at + np.array([[0], [1], [size + 2], [size + 3]]), shares.reshape(4, -1, 1).astype(np.float32)
