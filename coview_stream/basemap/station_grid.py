@@ -54,6 +54,8 @@ class StationGrid:
 
     def storeys(self, station: int) -> list[int]:
         """Return the stations of a station's cell, lowest first, itself among them."""
+        if len(self._levels) == 1:
+            return [station]
         return [k for k in self._levels[:, self.cell(self.stations[station][None])[0]].tolist() if k >= 0]
 
     def cell(self, positions: Reals) -> Indices:
