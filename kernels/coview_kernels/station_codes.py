@@ -17,7 +17,7 @@ either takes no unpacking but one shift.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -44,6 +44,7 @@ _INT8_RANGE = 6.0  # standard deviations that int8 spans: 5 to 8 differ by a ten
 _MARGIN = 1.1  # beyond the greatest number of the sample
 _MAX_SUM = 32_500.0  # of int16, with room for what rounding adds
 _MIN_PARALLEL = 4096  # stations from which other threads are worth waking
+_BEST, _PRODUCTS, _AT = range(3)  # launches
 _CHUNK = 16_384  # pairs of station and shift at a time
 
 
@@ -195,19 +196,21 @@ class StationCodes:
 
     def best(self, query: CodedQuery) -> F32:
         """Return the greatest correlation (M,) with each station over 60 angles; of 60 sectors, all shifts."""
-        found = runtime.dispatch_here(self._ready, self._native_best, self._plain_best, query)
+        found = runtime.dispatch_here(self._ready(_BEST), self._native_best, self._plain_best, query)
         return found * np.float32(query.screen.unit)
 
     def all_shifts(self, query: CodedQuery, stations: npt.ArrayLike) -> F32:
         """Return the correlations (K, S) with stations (K,) at all shifts."""
         index = np.ascontiguousarray(stations, dtype=np.int32)
-        products = runtime.dispatch_here(self._ready, self._native_products, self._plain_products, query, index)
+        products = runtime.dispatch_here(
+            self._ready(_PRODUCTS), self._native_products, self._plain_products, query, index
+        )
         return np.asarray(products.reshape(len(index), -1) @ self._rotations)
 
     def at(self, query: CodedQuery, stations: npt.ArrayLike, shifts: npt.ArrayLike) -> F32:
         """Return the correlations (K,) with stations (K,) at shifts (K,); 0 for station -1."""
         index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
-        return runtime.dispatch_here(self._ready, self._native_at, self._plain_at, query, index, turned)
+        return runtime.dispatch_here(self._ready(_AT), self._native_at, self._plain_at, query, index, turned)
 
     @cached_property
     def _rotations(self) -> F32:
@@ -215,8 +218,8 @@ class StationCodes:
         angle = (2.0 * np.pi / self.sectors) * _frequencies()[:, :, None] * np.arange(self.sectors)
         return np.stack([np.cos(angle), -np.sin(angle)], axis=1).reshape(4 * _LANES, -1).astype(np.float32)
 
-    def _ready(self) -> bool:
-        return self._kernels is not None and self._kernels.ready()
+    def _ready(self, launch: int) -> Callable[[], bool]:
+        return lambda: self._kernels is not None and self._kernels.ready(launch)
 
     def _prepared(self) -> _Kernels:
         if self._kernels is None:
@@ -269,13 +272,13 @@ class _Kernels:
             ),
         )
 
-    def ready(self) -> bool:
-        """Tell whether all may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
-        return all(launch.ready() for launch in self._launches)
+    def ready(self, launch: int) -> bool:
+        """Tell whether a launch may run on any thread, by :func:`coview_kernels.runtime.dispatch_here`."""
+        return self._launches[launch].ready()
 
     def best(self, query: I16, turn: I16) -> I32:
         self._query[:], self._turn[:] = query, turn
-        self._launches[0]()
+        self._launches[_BEST]()
         copied: I32 = self._best.copy()
         return copied
 
@@ -285,21 +288,21 @@ class _Kernels:
         for start in range(0, len(stations), _CHUNK):
             part = stations[start : start + _CHUNK]
             self._stations[: len(part)] = part
-            self._launches[1].put(4, len(part))
-            self._launches[1]()
+            self._launches[_PRODUCTS].put(4, len(part))
+            self._launches[_PRODUCTS]()
             found[start : start + len(part)] = self._products[: len(part)]
         return found
 
     def at(self, table: F32, stations: I32, shifts: I32) -> F32:
-        self._launches[2].put(1, table.reshape(-1))
+        self._launches[_AT].put(1, table.reshape(-1))
         found = np.zeros(len(stations), dtype=np.float32)
         for start in range(0, len(stations), _CHUNK):
             part = slice(start, min(start + _CHUNK, len(stations)))
             count = part.stop - part.start
             self._stations[:count], self._shifts[:count] = stations[part], shifts[part]
             self._values[:count] = 0.0
-            self._launches[2].put(5, count)
-            self._launches[2]()
+            self._launches[_AT].put(5, count)
+            self._launches[_AT]()
             found[part] = self._values[:count]
         return found
 

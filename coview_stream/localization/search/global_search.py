@@ -18,10 +18,10 @@ from coview_stream.localization.search.refinement import Candidate, RegisteredPl
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest
 from coview_stream.localization.search.scoring import Scored, score_hypotheses
 
-_REMEMBERED = 40  # best places that the next keyframe scores again; set by hand
+_REMEMBERED = 32  # best places that the next keyframe scores again; set by hand
 REGISTERED = 3  # best places that are registered and verified, beside the hints; set by hand
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough; set by hand
-_MIN_SHARE = 0.5  # of the best one's rank: below that no more than the best rival is registered; set by hand
+_MIN_SHARE = 0.5  # of the best one's rank: what is below that stays a rival as it has been scored; set by hand
 
 
 class GlobalSearch:
@@ -128,9 +128,9 @@ class GlobalSearch:
         return score_hypotheses(self.base_map.field, [*hypotheses, *hints], scan, _REMEMBERED, len(hints))
 
     def _register(self, scored: Scored, scan: ScanInput) -> list[RegisteredPlace]:
-        """Register the best place, its rival, one more if that is not far below, and those that hints came to."""
+        """Register the best place, its rivals if they are not far below, and those that hints came to."""
         enough = _MIN_SHARE * scored.places[0].rank if scored.places else 0.0
-        best = [p for k, p in enumerate(scored.places[:REGISTERED]) if k < 2 or p.rank >= enough]
+        best = [place for place in scored.places[:REGISTERED] if place.rank >= enough]
         chosen = best + [p for p in scored.places[len(best) :] if p.hinted]
         return register_places(chosen, scan, self.base_map, self.config, self._local_maps)
 

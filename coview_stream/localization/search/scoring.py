@@ -30,9 +30,9 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 # set by hand
-_STRUCTURE, _LOW = 800, 400  # points of a scan that are looked up: twice as many rank places no better
+_STRUCTURE, _LOW = 640, 320  # points of a scan that are looked up: twice as many rank places no better
 _PATCH = 4.0  # metres: points of one patch are looked up one after the other, for they lie in the same memory
-_SAMPLES = 4000  # points in the space around the robot, of which those that rays passed through are looked up
+_SAMPLES = 3000  # points in the space around the robot, of which those that rays passed through are looked up
 _DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
 _MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle: a ray has passed only what lies before that
 _LAYERS = 2  # cells that a surface fills on the way through it
@@ -123,10 +123,10 @@ def score_hypotheses(
     for rank, numbers in enumerate(members):
         hinted = hints > 0 and max(numbers) >= last
         if rank < best or hinted:
-            first, voted = numbers[0], [hypotheses[k] for k in numbers if k < last]
-            # its own votes, if it has any; a hint that came to a place with votes adds nothing to them
-            own = hypotheses[first] if first < last or not voted else voted[0]
-            own = replace(own, T_map_odom=T[first], lead=max((each.lead for each in voted), default=0.0))
+            first, here = numbers[0], [hypotheses[k] for k in numbers]
+            # the votes for the place, if it has any: a hint that came to it, now or before, takes none away
+            own = next((each for each in here if each.station is not None), here[0])
+            own = replace(own, T_map_odom=T[first], lead=max(each.lead for each in here))
             places.append(ScoredPlace(own, float(score[first]), float(inside[first]), hinted))
     return Scored(rivals, places)
 

@@ -120,15 +120,16 @@ def test_new_hint_is_tried_at_once():
 
 
 def counted(localizer, monkeypatch):
-    """Hints that went through registration, keyframe by keyframe."""
+    """Hints that were scored and registered, keyframe by keyframe."""
     made = []
-    whole = localizer._search._refinement.coarse
+    whole = localizer._search._register
 
-    def coarse(hypotheses, scan):
-        made.append(sum(h.station is None for h in hypotheses))
-        return whole(hypotheses, scan)
+    def register(scored, scan):
+        registered = whole(scored, scan)
+        made.append(sum(place.hinted for place in scored.places))
+        return registered
 
-    monkeypatch.setattr(localizer._search._refinement, "coarse", coarse)
+    monkeypatch.setattr(localizer._search, "_register", register)
     return made
 
 
@@ -165,7 +166,8 @@ def test_hint_is_accepted_only_after_rivals_had_votes(world_map, votes):
     for _ in range(votes):
         search.coview.consensus._votes.append(None)
     best = candidate(0.7)
-    alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
+    hint = replace(best.hypothesis, station=None, shift=None)
+    alone = replace(best, place=replace(best.place, hypothesis=hint))
     assert same_place(HERE, HERE, REQUEST)
     results = judged(search, *[[alone, candidate(0.2, BESIDE @ HERE)]] * 5)
     accepted = [result.accepted is not None for result in results]
@@ -179,7 +181,8 @@ def test_hint_is_accepted_only_after_rivals_had_votes(world_map, votes):
 def test_single_scan_never_accepts_hint_without_votes(world_map):
     search = GlobalSearch(world_map, LocalizerConfig(stationary=True), LocalMaps(world_map, 50.0))
     best = candidate(0.9)
-    alone = replace(best, hypothesis=replace(best.hypothesis, station=None, shift=None))
+    hint = replace(best.hypothesis, station=None, shift=None)
+    alone = replace(best, place=replace(best.place, hypothesis=hint))
     (unsupported, supported) = judged(search, [alone], [alone, best])
     assert unsupported.accepted is None
     assert supported.accepted is not None

@@ -21,7 +21,7 @@ MIN_COVERAGE = 0.6
 WEIGHT = 7
 """Number of the dimension, of the eight of a cell, that is the query's weight, and whether the map knows the cell."""
 
-_SAMPLE = 2048  # stations and shifts that scores are standardised by: median and MAD are good to 3 %; set by hand
+_SAMPLE = 1024  # stations and shifts that scores are standardised by: median and MAD are good to 4 %; set by hand
 _STRIDE = 7  # shifts from one of them to the next
 
 
