@@ -58,17 +58,15 @@ def ground_below(points: Points, position: Floats) -> float:
     The median of the lowest points of the 1 m cells within 6 m: robust to clutter, and independent of the sensor's
     mounting height. Without points below the sensor there, the sensor's own height.
     """
-    near = points[
-        (np.hypot(points[:, 0] - position[0], points[:, 1] - position[1]) < _GROUND_RADIUS)
-        & (points[:, 2] < position[2])
-    ]
+    x, y = points[:, 0] - position[0], points[:, 1] - position[1]
+    near = np.flatnonzero((x * x + y * y < _GROUND_RADIUS**2) & (points[:, 2] < position[2]))
     if not len(near):
         return float(position[2])
-    cells = np.floor(near[:, :2] - position[:2]).astype(np.int64)
-    key = cells[:, 0] * 1000 + cells[:, 1]
-    order = np.lexsort((near[:, 2], key))
-    _, first = np.unique(key[order], return_index=True)
-    return float(np.median(near[order[first], 2]))
+    reach = int(np.ceil(_GROUND_RADIUS))
+    column, row = (np.floor(each[near]).astype(np.int64) + reach for each in (x, y))
+    lowest = np.full((2 * reach) ** 2, np.inf, dtype=np.float32)
+    np.minimum.at(lowest, column * 2 * reach + row, points[near, 2])
+    return float(np.median(lowest[np.isfinite(lowest)]))
 
 
 def on_ground(points: Points, position: Floats) -> Floats:

@@ -30,9 +30,10 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 # set by hand
-_STRUCTURE, _LOW = 640, 320  # points of a scan that are looked up: twice as many rank places no better
+_FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
+_PROMISING = 64  # best hypotheses that are looked up with the many
 _PATCH = 4.0  # metres: points of one patch are looked up one after the other, for they lie in the same memory
-_SAMPLES = 3000  # points in the space around the robot, of which those that rays passed through are looked up
+_SAMPLES = 6000  # points in the space around the robot, of which those that rays passed through are looked up
 _DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
 _MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle: a ray has passed only what lies before that
 _LAYERS = 2  # cells that a surface fills on the way through it
@@ -111,9 +112,14 @@ def score_hypotheses(
     pivot = scan.T_odom_body[:3, 3]
     T = np.array([each.T_map_odom for each in hypotheses])
     yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
-    compared, every = _field_scan(scan)
-    found = kernels.field_scores(field, compared, np.column_stack([T[:, :3, :3] @ pivot + T[:, :3, 3], yaw]))
-    score, inside = _scores(found, compared, every)
+    few, many = _field_scans(scan)
+    found = kernels.field_scores(field, few.scan, np.column_stack([T[:, :3, :3] @ pivot + T[:, :3, 3], yaw]))
+    score, inside = few.scores(found)
+    # some points tell what is far below the best; what is not is told apart by more
+    promising = np.argsort(-score * inside, kind="stable")[:_PROMISING]
+    score[promising], inside[promising] = many.scores(
+        kernels.field_scores(field, many.scan, found.pose[promising], refine=False)
+    )
     T = _poses(found.pose, pivot)
     members = _places(found.pose, score * inside)
     firsts = np.array([each[0] for each in members])
@@ -131,17 +137,37 @@ def score_hypotheses(
     return Scored(rivals, places)
 
 
-def _scores(found: kernels.FieldScores, scan: kernels.FieldScan, every: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Return evidence scores (H,) and shares inside (H,); ``every`` says how many points each one stands for."""
-    structure, low, near = found.structure * every[0], found.low * every[1], found.near * every[0]
-    some = np.maximum(found.structure, 1)
-    ground = (found.grounded * every[1] + 0.5 * PSEUDO) / (low + PSEUDO)
-    passed = found.passed * _points_passed()
-    free = (near + 0.5 * PSEUDO) / (near + passed + PSEUDO)
-    score = np.sqrt(found.near / some * (found.covered / some) * ground * free)
-    score[structure < MIN_STRUCTURE] = 0.0
-    whole = len(scan.structure) * every[0] + len(scan.low) * every[1]
-    return score, (structure + low) / max(whole, 1.0)
+@dataclass(frozen=True)
+class _Compared:
+    """A part of a scan that is compared with the field.
+
+    Attributes:
+        scan: points.
+        every: how many of the scan's each of its structure, ground and free points stands for.
+    """
+
+    scan: kernels.FieldScan
+    every: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, kinds: tuple[Points, Points, Points], counts: tuple[int, int, int]) -> _Compared:
+        """Take at most ``counts`` points of each kind."""
+        some = [_evenly(points, count) for points, count in zip(kinds, counts, strict=True)]
+        structure, low, free = (len(p) / max(len(s), 1) for p, s in zip(kinds, some, strict=True))
+        return cls(kernels.FieldScan(*some), (structure, low, free))
+
+    def scores(self, found: kernels.FieldScores) -> tuple[Floats, Floats]:
+        """Return evidence scores (H,) and shares inside (H,)."""
+        each_high, each_low, each_free = self.every
+        structure, low, near = found.structure * each_high, found.low * each_low, found.near * each_high
+        some = np.maximum(found.structure, 1)
+        ground = (found.grounded * each_low + 0.5 * PSEUDO) / (low + PSEUDO)
+        passed = found.passed * each_free * _points_passed()
+        free = (near + 0.5 * PSEUDO) / (near + passed + PSEUDO)
+        score = np.sqrt(found.near / some * (found.covered / some) * ground * free)
+        score[structure < MIN_STRUCTURE] = 0.0
+        whole = len(self.scan.structure) * each_high + len(self.scan.low) * each_low
+        return score, (structure + low) / max(whole, 1.0)
 
 
 def _places(pose: Floats, rank: Floats) -> list[list[int]]:
@@ -174,17 +200,15 @@ def _poses(pose: Floats, pivot: Floats) -> Floats:
     return T
 
 
-def _field_scan(scan: ScanInput) -> tuple[kernels.FieldScan, tuple[float, float]]:
-    """Return what is looked up of a scan, relative to the body, and how many points each of structure and ground is."""
+def _field_scans(scan: ScanInput) -> tuple[_Compared, _Compared]:
+    """Return few and many points of a scan, relative to the body."""
     cloud, T = scan.cloud, scan.T_odom_body
     points = cloud.points - T[:3, 3].astype(np.float32)
     order = _by_patch(points)
     points, height, above = points[order], cloud.height[order], cloud.above[order]
-    structure, low = points[height > STRUCTURE_HEIGHT], points[~above]
     free = (_seen_through(scan.range_image) @ T[:3, :3].T).astype(np.float32)
-    some = _evenly(structure, _STRUCTURE), _evenly(low, _LOW)
-    every = len(structure) / max(len(some[0]), 1), len(low) / max(len(some[1]), 1)
-    return kernels.FieldScan(*some, free[_by_patch(free)]), every
+    kinds = points[height > STRUCTURE_HEIGHT], points[~above], free[_by_patch(free)]
+    return _Compared.of(kinds, _FEW), _Compared.of(kinds, _MANY)
 
 
 def _evenly(points: Points, count: int) -> Points:
