@@ -142,9 +142,14 @@ class BaseMap:
 
     @cached_property
     def station_index(self) -> StationIndex:
-        """Index of the descriptors, from the file; a file without it costs a second for 10,000 stations here."""
+        """Index of the descriptors, from the file; a file without it costs a second for 10,000 stations here.
+
+        Raises :class:`MapError` if the file's is not of these stations.
+        """
         channels = self.config.descriptor.channels
         known = StationIndex.from_arrays(self._arrays, channels)
+        if known is not None and len(known) != len(self):
+            raise MapError(f"the map's index is of {len(known)} stations, not {len(self)}; build it again")
         return known or StationIndex.of({name: self.descriptors(name) for name in channels})
 
     @property
@@ -174,13 +179,19 @@ class BaseMap:
 
     @cached_property
     def field(self) -> kernels.FieldMap:
-        """Likelihood field; relative to :attr:`origin`. A map that was built before there was one has it made now."""
+        """Likelihood field; relative to :attr:`origin`. A map that was built before there was one has it made now.
+
+        Raises :class:`MapError` if the file's cannot be used.
+        """
         arrays = self._arrays
         if "field.tiles" not in arrays:
             normals = arrays["normals"] * np.float32(1.0 / 127.0)
             surveyed, corner = arrays["surveyed"] > 0, arrays["surveyed_corner"]
             arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
-        return kernels.FieldMap(*(arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")))
+        try:
+            return kernels.FieldMap(*(arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")))
+        except (KeyError, ValueError) as error:
+            raise MapError(f"the map's likelihood field cannot be used ({error}); build it again") from error
 
     def cut(self, cut: kernels.Cut) -> kernels.Crop | None:
         """Cut out the points around a place, sorted for searching; None where there are none."""

@@ -67,16 +67,20 @@ class StationIndex:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:
-        """Return the index of these channels that a map's file holds, None if it holds none."""
+        """Return the index of these channels that a map's file holds, None if it holds none that can be used."""
         if any(name not in arrays for tier in _TIERS for name in _names(tier)) or _SAMPLED not in arrays:
             return None
-        sample = arrays[_SAMPLED]
-        count, _, rings, sectors = sample.shape
-        if count != len(channels) or arrays[f"{_TIERS[0]}.basis"].shape[2] != rings * count:
+        sample, stations = arrays[_SAMPLED], len(arrays[_TIERS[0]])
+        if sample.ndim != 4 or sample.shape[:2] != (len(channels), len(_chosen(stations))):
             return None
+        count, _, rings, sectors = sample.shape
+        # kernels look up what the shapes promise
+        shapes = (stations, 16, 16), (16, 16, rings * count, 2), (16, 2, 16), (33,)
         tiers = []
         for tier in _TIERS:
             codes, basis, step, norm = (arrays[name] for name in _names(tier))
+            if codes.dtype != np.int16 or (codes.shape, basis.shape, step.shape, norm.shape) != shapes:
+                return None
             vectors = (basis[..., 0] + 1j * basis[..., 1]).astype(np.complex64)
             tiers.append(StationCodes(codes, vectors, np.array(step), np.array(norm), sectors))
         return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)))

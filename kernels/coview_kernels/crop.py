@@ -41,8 +41,9 @@ def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Cro
         if array.shape != (len(points), 3) or array.dtype != kind or not array.flags.c_contiguous:
             raise ValueError(f"{name} must be a contiguous ({len(points)}, 3) array of {np.dtype(kind)}")
     stretches = np.ascontiguousarray(spans, dtype=np.int32).reshape(-1, 2)
-    if len(stretches) and not (stretches.min() >= 0 and stretches.max() <= len(points)):
-        raise ValueError(f"spans must lie in the map's {len(points)} points")
+    begin, end = stretches.T
+    if not ((begin >= 0) & (begin <= end) & (end <= len(points))).all():
+        raise ValueError(f"spans must lie in the map's {len(points)} points and not end before they begin")
     if not (all(math.isfinite(v) for v in cut) and cut.radius > 0 and cut.every >= 1 and cut.cell > 0):
         raise ValueError(f"cut must have a positive radius, every and cell, got {cut}")
 

@@ -31,6 +31,8 @@ COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
 """Points of the coarse level, of a fine one, and for the height; fine levels. ``python -m bench field`` prints how
 often the right place comes first with them; with a third fewer points one of 24 places was lost on one world."""
 
+_MAX_TILES, _MAX_TABLE = 1 << 20, 1 << 21  # tiles with layers, and all of them: 268 and 537 km2; kernels count in int32
+
 
 class FieldScores(NamedTuple):
     """Numbers of a scan's points that the map explains at each of H hypotheses, at the best pose near it."""
@@ -75,12 +77,32 @@ class FieldMap:
         occupied: (T, 32, 32) int64; bit ``floor(2 z) mod 64`` is set where the cell has a point at height z.
         ground: (T, 32, 32) int16 centimetres above the tile's height, or one of the two values below.
         edge: (T, 32, 32) uint8 quarter metres above the tile's height, 0 for none.
+
+    Raises:
+        ValueError: an array has another shape or type, or the map is too large for the indices of a kernel.
     """
 
     tiles: I32
     occupied: I64
     ground: I16
     edge: U8
+
+    def __post_init__(self) -> None:
+        shape = (len(self.tiles), TILE, TILE)
+        for name, kind, wanted in (
+            ("tiles", np.int32, (len(self.tiles), 3)),
+            ("occupied", np.int64, shape),
+            ("ground", np.int16, shape),
+            ("edge", np.uint8, shape),
+        ):
+            array = getattr(self, name)
+            if array.shape != wanted or array.dtype != kind:
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected {np.dtype(kind)} {wanted}")
+        low, high = (
+            np.asarray(each, dtype=np.int64) for each in (self.corner, self.tiles[:, :2].max(axis=0, initial=0))
+        )
+        if len(self.tiles) >= _MAX_TILES or (len(self.tiles) and float(np.prod(high - low + 2.0)) >= _MAX_TABLE):
+            raise ValueError(f"{len(self.tiles)} tiles from {low} to {high} are too many for one map")
 
     @cached_property
     def corner(self) -> I64:

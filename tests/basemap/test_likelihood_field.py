@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.likelihood_field import field_arrays, roof_edges
+from coview_stream.errors import MapError
 
 NO_GROUND, NOT_SURVEYED = -32768, -32767
 
@@ -76,3 +78,18 @@ def test_file_keeps_the_field_and_an_older_map_makes_its_own(world_map, tmp_path
         np.testing.assert_array_equal(getattr(made, name), getattr(kept, name))
     # of its normals the file keeps a byte a number
     assert np.abs(made.ground.astype(int) - kept.ground).max() <= 2
+
+
+def test_field_of_other_shapes_is_refused(world_map):
+    arrays = world_map._arrays
+    for name, damaged in (
+        ("tiles", arrays["field.tiles"][:-1]),
+        ("occupied", arrays["field.occupied"][:, :16]),
+        ("ground", arrays["field.ground"].astype(np.int32)),
+        ("edge", arrays["field.edge"][1:]),
+        ("tiles", arrays["field.tiles"] * np.int32(100_000)),
+    ):
+        with pytest.raises(MapError, match="field cannot be used"):
+            _ = BaseMap(arrays | {f"field.{name}": damaged}, world_map.parameters).field
+    with pytest.raises(MapError, match="field cannot be used"):
+        _ = BaseMap({name: a for name, a in arrays.items() if name != "field.edge"}, world_map.parameters).field

@@ -8,6 +8,7 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import RetrievalConfig
+from coview_stream.errors import MapError
 from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.votes import TableVote
 
@@ -57,6 +58,24 @@ def test_map_without_index_makes_it(world_map, query):
     np.testing.assert_array_equal(
         old.station_index.best(old.station_index.query(query)), index.best(index.query(query))
     )
+
+
+def test_index_of_other_shapes_is_made_anew_or_refused(world_map, query):
+    arrays = world_map._arrays
+    for name, damaged in (
+        ("station_codes", arrays["station_codes"][:, :8]),
+        ("station_codes", arrays["station_codes"].astype(np.int32)),
+        ("station_codes.rest", arrays["station_codes.rest"][1:]),
+        ("station_codes.step", arrays["station_codes.step"][:4]),
+        ("station_codes.sample", arrays["station_codes.sample"][:, 1:]),
+    ):
+        index = BaseMap(arrays | {name: damaged}, world_map.parameters).station_index
+        np.testing.assert_array_equal(
+            index.best(index.query(query)), world_map.station_index.best(world_map.station_index.query(query))
+        )
+    fewer = StationIndex.of({name: world_map.descriptors(name)[:50] for name in query}).arrays()
+    with pytest.raises(MapError, match="index is of 50 stations"):
+        _ = BaseMap(arrays | fewer, world_map.parameters).station_index
 
 
 def test_codes_begin_with_a_cache_line(world_map, tmp_path):
