@@ -39,7 +39,11 @@ def distinct_poses(positions: npt.ArrayLike, yaw: npt.ArrayLike, count: int, dis
     poses[:, :3] = place - place[0]  # float32 near its own zero
     poses[:, 3], poses[:, 4] = np.cos(heading), np.sin(heading)
     square, cosine = float(distance) ** 2, math.cos(turn)
-    return runtime.dispatch_here(_ready, _native, reference.distinct_poses, poses, count, square, cosine)
+
+    def ready() -> bool:
+        return _kernel is not None and _kernel.fits(len(poses), count) and _kernel.launch.ready()
+
+    return runtime.dispatch_here(ready, _native, reference.distinct_poses, poses, count, square, cosine)
 
 
 class _Distinct:
@@ -53,18 +57,17 @@ class _Distinct:
         arrays = self.poses.reshape(-1), kept, self.chosen, self.found
         self.launch = Launch("distinct", "distinct", *arrays, 0, count, 0.0, 0.0)
 
+    def fits(self, size: int, count: int) -> bool:
+        return size <= len(self.poses) and count == len(self.chosen)
+
 
 _kernel: _Distinct | None = None
-
-
-def _ready() -> bool:
-    return _kernel is not None and _kernel.launch.ready()
 
 
 def _native(poses: F32, count: int, square: float, cosine: float) -> I64:
     global _kernel
     kernel = _kernel
-    if kernel is None or len(kernel.poses) < len(poses) or len(kernel.chosen) != count:
+    if kernel is None or not kernel.fits(len(poses), count):
         kernel = _kernel = _Distinct(2 * len(poses), count)
     kernel.poses[: len(poses)] = poses
     for index, value in ((4, len(poses)), (6, square), (7, cosine)):
