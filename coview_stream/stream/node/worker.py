@@ -38,7 +38,8 @@ def main(argv: list[str]) -> int:
 
     def use_pause() -> None:
         while steps and not pipe.poll():
-            steps.popleft()()
+            with contextlib.suppress(CoViewError):  # the job that needs it will say so
+                steps.popleft()()
 
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
         use_pause()

@@ -1,12 +1,17 @@
-"""Environment of the engines' processes."""
+"""Environment of the engines' processes, and what they do while no job waits."""
 
 from __future__ import annotations
 
 import os
+import socket
+import threading
+from multiprocessing.connection import Connection
 
 import pytest
 
-from coview_stream.stream.node.engine_child import _environment
+from coview_stream.errors import DependencyError
+from coview_stream.stream.node import engines, worker
+from coview_stream.stream.node.engine_child import Opening, _environment
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, "1"), (2, "1"), (8, "7")])
@@ -21,3 +26,39 @@ def test_threads_that_the_user_asks_for_are_given(monkeypatch):
     monkeypatch.setenv("COVIEW_THREADS", "5")
     assert {_environment(kind)["COVIEW_THREADS"] for kind in ("search", "track")} == {"5"}
     assert _environment("search")["OPENBLAS_NUM_THREADS"] == "1"
+
+
+class LackingEngine:
+    """An engine without a library that only its jobs need."""
+
+    def __init__(self):
+        self.asked = threading.Event()
+
+    def prepare(self):
+        """Do nothing."""
+
+    def prepare_later(self):
+        self.asked.set()
+        raise DependencyError("no gtsam")
+
+    def run(self, job):
+        raise DependencyError("no gtsam")
+
+
+def test_library_that_is_missing_is_the_jobs_error(monkeypatch):
+    engine = LackingEngine()
+    monkeypatch.setattr(engines, "open_engine", lambda *args: engine)
+    monkeypatch.setattr(worker, "_stand_back", lambda nice: None)
+    ours, theirs = socket.socketpair()
+    with Connection(ours.detach()) as pipe:
+        child = threading.Thread(target=worker.main, args=([str(theirs.detach()), "odometry", "0"],), daemon=True)
+        child.start()
+        pipe.send(Opening("map", "hash", "trimmed-icp", "auto"))
+        assert pipe.recv() == ("ready", None)
+        assert pipe.recv() == ("prepared", None)
+        assert engine.asked.wait(10.0)
+        pipe.send("job")
+        assert pipe.poll(10.0)
+        assert pipe.recv() == ("rejected", "no gtsam")
+    child.join(10.0)
+    assert not child.is_alive()
