@@ -47,7 +47,7 @@ class FeatureRasters:
         fine, corner = features.coarse(cell, axes)
         known = np.asarray((fine != 0).any(axis=0))
         raster = np.zeros((*known.shape, WEIGHT + 1), dtype=np.int8)
-        raster[..., : len(axes)] = np.rint(_BYTE * fine).transpose(1, 2, 0)
+        raster[..., : len(axes)] = _bytes(_BYTE * fine).transpose(1, 2, 0)
         raster[..., WEIGHT] = _BYTE * known
         count = _pooled(known[None].astype(np.float32))
         coarse = _pooled(fine) / np.maximum(count, 1.0)
@@ -87,11 +87,16 @@ def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio
     turned = rotate_images(np.concatenate([reduced, shares[None]]), yaws[:half])
     side, dimensions = len(turned), len(rasters.axes)
     images = np.zeros((2 * half, side, side, WEIGHT + 1), dtype=np.int8)
-    scaled = np.rint(turned * np.float32(_BYTE / max(float(turned[..., -1].max()), 1e-9))).transpose(2, 0, 1, 3)
+    scaled = _bytes(turned * np.float32(_BYTE / max(float(turned[..., -1].max()), 1e-9))).transpose(2, 0, 1, 3)
     images[:half, ..., :dimensions], images[:half, ..., WEIGHT] = scaled[..., :-1], scaled[..., -1]
     images[half:] = images[:half, ::-1, ::-1]
     every = 2 if half >= 12 else 1  # 20 degrees are enough for coarse cells
     return TurnedQuery(WindowImages(images), _halved(turned[:, :, ::every]), np.arange(0, half, every))
+
+
+def _bytes(values: Floats32) -> Floats32:
+    """Round to what a signed byte holds: features of norm 1 that were rounded before may come to more."""
+    return np.rint(np.clip(values, -_BYTE, _BYTE))
 
 
 def _pooled(values: Floats32) -> Floats32:
