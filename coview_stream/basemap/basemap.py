@@ -157,6 +157,15 @@ class BaseMap:
         """(N, 3) voxel cloud sorted by tile, relative to :attr:`origin`; memory-mapped when loaded."""
         return self._arrays["points"]
 
+    def sampled_points(self, count: int) -> Points:
+        """Return at most ``count`` of :attr:`points`, evenly spread over them; a copy."""
+        return np.array(self.points[:: max(1, -(-len(self.points) // count))])
+
+    def release(self) -> None:
+        """Let the memory go that the file's pages take; what is used again is read again."""
+        for array in self._arrays.values():
+            file_format.release(array)
+
     def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
         """Return the descriptors (M, R, S) of one channel."""
         return self._arrays[f"descriptor.{name}"]
@@ -189,7 +198,12 @@ class BaseMap:
             surveyed, corner = arrays["surveyed"] > 0, arrays["surveyed_corner"]
             arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
         try:
-            return kernels.FieldMap(*(arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")))
+            kept = [arrays[f"field.{name}"] for name in ("tiles", "occupied", "ground", "edge")]
+            field = kernels.FieldMap(*kept)
+            _ = field.layers
+            for array in kept:  # only the layers are looked up
+                file_format.release(array)
+            return field
         except (KeyError, ValueError) as error:
             raise MapError(f"the map's likelihood field cannot be used ({error}); build it again") from error
 

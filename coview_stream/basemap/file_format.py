@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import mmap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -168,6 +169,13 @@ def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
     data = array.reshape(-1).view(np.uint8)
     for begin in range(0, len(data), _CHUNK):
         yield data[begin : begin + _CHUNK].data
+
+
+def release(array: npt.NDArray[Any]) -> None:
+    """Let the memory of a memory-mapped array go; it is read from the file again when it is touched."""
+    mapped = getattr(array, "_mmap", None)
+    if mapped is not None and hasattr(mmap, "MADV_DONTNEED"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[bytes | memoryview]]) -> str:

@@ -10,6 +10,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Reals
 from coview_stream.localization.offline import DESCRIPTORS_PNG, TRAJECTORY_PNG, RunResult
 from coview_stream.report.plots import plot_descriptor_pair, plot_trajectory
+from coview_stream.report.style import MAX_BASE_POINTS
 
 
 def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | None = None) -> None:
@@ -22,7 +23,9 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
     """
     no_position = np.full(3, np.nan)
     positions = np.array([no_position if f.T_map_body is None else f.T_map_body[:3, 3] for f in result.fixes])
-    points = base_map.points.astype(np.float64) + base_map.origin
+    base_map.release()  # of what searching took, before pictures take as much
+    points = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
+    base_map.release()
     states = [fix.state.reported for fix in result.fixes]
     plot_trajectory(points, positions, states, folder / TRAJECTORY_PNG, truth)
     winner = result.winner

@@ -34,6 +34,9 @@ often the right place comes first with them; with a third fewer points one of 24
 _MAX_TILES, _MAX_TABLE = 1 << 20, 1 << 21  # tiles with layers, and all of them: 268 and 537 km2; kernels count in int32
 
 
+_BATCH = 512  # tiles at a time, so that intermediate arrays stay small
+
+
 class FieldScores(NamedTuple):
     """Numbers of a scan's points that the map explains at each of H hypotheses, at the best pose near it."""
 
@@ -119,11 +122,11 @@ class FieldMap:
         tiles = len(self.tiles) + 1
         bits = np.zeros((tiles, TILE, TILE, 2), dtype=np.int64)
         bits[1:, ..., 1] = self.occupied
-        bits[..., 0] = _near(bits[..., 1], table)
+        _fill_near(bits, table)
         surface = np.full((tiles, TILE, TILE), NOT_SURVEYED & 0xFFFF, dtype=np.int32)
         surface[1:] = (self.edge.astype(np.int32) << 16) | (self.ground.astype(np.int32) & 0xFFFF)
         base = np.concatenate([[0.0], self.tiles[:, 2]]).astype(np.float32)
-        return FieldLayers(table, base, bits, surface, _coarse(bits[..., 1], table))
+        return FieldLayers(table, base, bits, surface, _coarse(bits, table))
 
 
 def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine: bool = True) -> FieldScores:
@@ -167,31 +170,34 @@ def _spread(points: F32, count: int) -> F32:
     return points[np.arange(count) * len(points) // count] if len(points) > count else points
 
 
-def _near(occupied: I64, table: I32) -> I64:
-    """Return (T + 1, 32, 32) bits set within half a metre of what is occupied: in the six neighbours as well."""
-    padded = np.zeros((len(occupied), TILE + 2, TILE + 2), dtype=np.int64)
-    padded[:, 1:-1, 1:-1] = occupied
+def _fill_near(bits: I64, table: I32) -> None:
+    """Set the first bits of (T + 1, 32, 32, 2) within half a metre of the second ones: also in the six neighbours."""
     row, column = np.nonzero(table)
-    tile = table[row, column]
-    for down, across, to, of in (
-        (-1, 0, np.s_[0, 1:-1], np.s_[-1, :]),
-        (1, 0, np.s_[-1, 1:-1], np.s_[0, :]),
-        (0, -1, np.s_[1:-1, 0], np.s_[:, -1]),
-        (0, 1, np.s_[1:-1, -1], np.s_[:, 0]),
-    ):
-        padded[(tile, *to)] = occupied[(table[row + down, column + across], *of)]
-    words = occupied.view(np.uint64)
-    one, rest = np.uint64(1), np.uint64(63)
-    near = (words | (words << one) | (words >> rest) | (words >> one) | (words << rest)).view(np.int64)
-    near |= padded[:, :-2, 1:-1] | padded[:, 2:, 1:-1] | padded[:, 1:-1, :-2] | padded[:, 1:-1, 2:]
-    return np.asarray(near)
+    for start in range(0, len(row), _BATCH):
+        rows, columns = row[start : start + _BATCH], column[start : start + _BATCH]
+        here = bits[table[rows, columns], ..., 1]
+        padded = np.zeros((len(here), TILE + 2, TILE + 2), dtype=np.int64)
+        padded[:, 1:-1, 1:-1] = here
+        padded[:, 0, 1:-1] = bits[table[rows - 1, columns], -1, :, 1]
+        padded[:, -1, 1:-1] = bits[table[rows + 1, columns], 0, :, 1]
+        padded[:, 1:-1, 0] = bits[table[rows, columns - 1], :, -1, 1]
+        padded[:, 1:-1, -1] = bits[table[rows, columns + 1], :, 0, 1]
+        words = here.view(np.uint64)
+        one, rest = np.uint64(1), np.uint64(63)
+        near = (words | (words << one) | (words >> rest) | (words >> one) | (words << rest)).view(np.int64)
+        near |= padded[:, :-2, 1:-1] | padded[:, 2:, 1:-1] | padded[:, 1:-1, :-2] | padded[:, 1:-1, 2:]
+        bits[table[rows, columns], ..., 0] = near
 
 
-def _coarse(occupied: I64, table: I32) -> U16:
+def _coarse(bits: I64, table: I32) -> U16:
     """Return (32, W / 8, H) uint16 planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
     half = TILE // 2
-    cells = occupied.view(np.uint64).reshape(-1, half, 2, half, 2)
-    folded = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
+    folded = np.zeros((len(bits), half, half), dtype=np.uint32)
+    for start in range(0, len(bits), _BATCH):
+        cells = np.ascontiguousarray(bits[start : start + _BATCH, ..., 1]).view(np.uint64).reshape(-1, half, 2, half, 2)
+        folded[start : start + _BATCH] = _pairs(
+            cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1]
+        )
     rows, columns = table.shape
     metres = folded[table].transpose(0, 2, 1, 3).reshape(rows * half, columns * half)
     one, rest = np.uint32(1), np.uint32(31)
