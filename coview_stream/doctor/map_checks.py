@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 # set by hand; of onnxruntime, the network and what else is imported, in two processes
 _NETWORK_MEMORY = 0.2 * GB
 _INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, and what a search says of each; set by hand
-_SPECTRA_MEMORY = 80.0  # bytes per square metre, set by hand
+_FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 a cell, and 8 of the coarse level; set by hand
+_FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on cells of 2 m, spectra, a query's scores; set by hand
 
 
 def open_map(path: Path) -> tuple[BaseMap | None, Finding]:
@@ -61,21 +62,16 @@ def _features_finding(base_map: BaseMap) -> Finding:
 
 
 def node_memory(base_map: BaseMap) -> float:
-    """Return a node's own bytes: processes, the station index, and what a search of it takes."""
-    return MIN_MEMORY + len(base_map) * _INDEX_MEMORY + _learned_memory(base_map)
+    """Return a node's own bytes: processes, the station index, the likelihood field, and what a search takes."""
+    surveyed = int((base_map.survey.values > 0).sum()) * base_map.config.block**2
+    return MIN_MEMORY + len(base_map) * _INDEX_MEMORY + surveyed * _FIELD_MEMORY + _learned_memory(base_map)
 
 
 def _learned_memory(base_map: BaseMap) -> float:
-    """Return the bytes that learned features add: libraries, spectra as far as they are cached, volumes.
+    """Return the bytes that learned features add: libraries, features, their spectra, and a query's scores.
 
-    Coarse features and a query's scores fill the rectangle around the map, however little of it has points.
+    They fill the rectangle around the map, however little of it has points.
     """
     if base_map.require_features("auto") is not None or base_map.learned is None:
         return 0.0
-    from coview_stream.config import LearnedConfig
-    from coview_stream.localization.search.learned.feature_index import MAX_BYTES
-
-    features, config = base_map.learned, LearnedConfig()
-    spectra = min(features.box_area * _SPECTRA_MEMORY, MAX_BYTES)
-    coarse = features.box_area / config.cell**2 * (2 * features.dimensions + 4 * config.yaws)
-    return _NETWORK_MEMORY + spectra + coarse + 3 * len(base_map) * config.yaws * 4
+    return _NETWORK_MEMORY + base_map.learned.box_area * _FEATURE_MEMORY
