@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import coview_kernels as kernels
+from coview_stream.basemap import likelihood_field
 from coview_stream.config import RegistrationMethod
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 from coview_stream.localization.registration.result import MIN_PAIRS
 
@@ -31,10 +31,7 @@ _MAX_CROPS = 12  # cached
 _CROP_STEP = 16.0  # metres between the centres of cached crops
 _SAMPLE_EVERY = 3  # of the points
 _CELL = 0.5  # metres, of the raster of roof edges
-_DROP = 2.0  # metres: what falls less is no wall
-_REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
-_OVERHANG = 3  # cells, odd: a wall stands this close to the edge
-_NOTHING = -1e6
+_NOTHING = -1e6  # metres: height of a cell without points
 
 
 @dataclass(frozen=True)
@@ -131,5 +128,4 @@ def roof_edges(points: Points) -> kernels.Raster:
 
 def _edges(top: Floats32, corner: Floats) -> kernels.Raster:
     """Edges (H, W) of the highest points of the cells, ``_NOTHING`` where there is none."""
-    edge = np.where(top - min_filter(top, _REACH) > _DROP, top, np.float32(_NOTHING))
-    return kernels.Raster(max_filter(edge, _OVERHANG), corner, _CELL)
+    return kernels.Raster(likelihood_field.roof_edges(top), corner, _CELL)

@@ -2,7 +2,7 @@
 
 The score is the mean inner product of a query's features with a map's, over the cells that the map has been surveyed
 in, each with the weight that the query gives it. A query that reaches beyond the map so scores what it would score
-anywhere; only where less than :data:`MIN_COVERAGE` of its weight is compared there is no score, for the mean of few
+anywhere; only where less than ``MIN_COVERAGE`` of its weight is compared there is no score, for the mean of few
 cells scatters.
 """
 
@@ -14,9 +14,7 @@ import numpy as np
 
 from coview_kernels import WindowImages, WindowRaster, window_products
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-
-MIN_COVERAGE = 0.6
-"""Share of a query's weight that has to lie on surveyed cells; set by hand: at it, scatter has grown by 1.3."""
+from coview_stream.localization.search.learned.correlation import MIN_COVERAGE
 
 WEIGHT = 7
 """Number of the dimension, of the eight of a cell, that is the query's weight, and whether the map knows the cell."""
