@@ -81,7 +81,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     wall, tracking = done.wall * 1e3, done.tracking
     p50, p99 = np.percentile(wall, [50, 99])
     yield bounded(f"{name}: step p50", p50, "ms", 8.0)
-    yield bounded(f"{name}: step p99", p99, "ms", 40.0)
+    yield bounded(f"{name}: step p99", p99, "ms", 25.0)
     yield informs(f"{name}: longest step while tracking", wall[tracking].max(), "ms")
     searched = wall[~tracking & (wall > 5 * np.median(wall))]
     yield informs(f"{name}: step while searching", float(np.median(searched)) if len(searched) else np.nan, "ms")
