@@ -55,7 +55,7 @@ def columns_of(
 ):  # fmt: skip
     """Fill columns; ``frame``: and ground cells per metre, levels per metre, lower and upper bound, bound of ground."""
     ti.loop_config(serialize=True)
-    high = ground.shape[0] // wide
+    high, top_level = ground.shape[0] // wide, occupied.shape[0] // (rows * columns) - 1
     for k in range(points.shape[0] // 3):
         x, y, cell = cell_of(points, k, frame, rows, columns)
         if cell >= 0:
@@ -70,7 +70,8 @@ def columns_of(
             lower = ti.cast(ground[down * wide + j], f64) * (one - u) + ti.cast(ground[down * wide + right], f64) * u
             above = points[3 * k + 2] - ti.cast(upper * (one - v) + lower * v, f32)
             if above >= frame[5] and above < frame[6]:
-                occupied[ti.cast(above * frame[4], i32) * (rows * columns) + cell] = ti.cast(1, ti.u8)
+                at = ti.min(ti.cast(above * frame[4], i32), top_level)  # a product may be rounded up to the bound
+                occupied[at * (rows * columns) + cell] = ti.cast(1, ti.u8)
             top[cell] = ti.max(top[cell], ti.min(above, frame[6]))
             if above < frame[7]:
                 seen[cell] = ti.cast(1, ti.u8)

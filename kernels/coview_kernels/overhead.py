@@ -51,10 +51,13 @@ def height_columns(
         [0, highest], metres; (H * W) uint8, 1 where ground was seen.
 
     Raises:
-        ValueError: an array has another shape.
+        ValueError: an array has another shape or no cells, or the highest height is not a whole number of levels.
     """
     cloud = as_float32("points", points, None, 3)
     level = as_float32("ground", ground, *(n // ratio for n in grid.shape))
+    levels = bounds[1] / step
+    if not level.size or bounds[0] < 0 or abs(levels - round(levels)) > 1e-6:
+        raise ValueError(f"ground of {level.shape} cells and levels of {step} m from {bounds[0]} to {bounds[1]} m")
     return runtime.dispatch(_columns, reference.height_columns, cloud, grid, level, ratio, step, bounds)
 
 

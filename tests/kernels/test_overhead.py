@@ -61,3 +61,20 @@ def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="level"):
         offsets_near(np.zeros((4, 3)), COARSE, np.zeros((4, 4), np.float32), 0.5)
     assert np.isinf(lowest_heights(np.zeros((0, 3)), GRID)).all()
+    for ground, ratio, bounds in (
+        (np.zeros((0, 0), np.float32), 40, BOUNDS),
+        (np.zeros(COARSE.shape, np.float32), 4, (0.5, 8.1, 0.4)),
+    ):
+        with pytest.raises(ValueError, match="levels of"):
+            height_columns(np.zeros((4, 3)), GRID, ground, ratio, 0.25, bounds)
+
+
+def test_height_just_below_the_bound_is_of_the_highest_level() -> None:
+    step, most = 0.3, 0.3 * 40
+    highest = np.nextafter(np.float32(most), np.float32(0))
+    points = np.array([[0.0, 8.0, highest]], dtype=np.float32)
+    given = points, GRID, np.zeros(COARSE.shape, np.float32), 4, step, (0.0, most, 0.4)
+    for columns in (height_columns, reference.height_columns):
+        occupied = columns(*given)[0]
+        assert len(occupied) == 40
+        assert occupied[39].sum() == 1

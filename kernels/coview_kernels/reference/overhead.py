@@ -45,7 +45,7 @@ def height_columns(
     standing = (above >= np.float32(low)) & (above < np.float32(high))
     level = (above[standing] * np.float32(1.0 / step)).astype(np.int64)
     occupied = np.zeros((round(high / step), size), dtype=np.uint8)
-    occupied[level, cell[standing]] = 1
+    occupied[np.minimum(level, len(occupied) - 1), cell[standing]] = 1
     top = np.zeros(size, dtype=np.float32)
     np.maximum.at(top, cell, np.clip(above, np.float32(0.0), np.float32(high)))
     seen = np.zeros(size, dtype=np.uint8)
