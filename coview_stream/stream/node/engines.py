@@ -1,6 +1,6 @@
 """Engines of many robots on one map: the quick one tracks, the slow one searches.
 
-They share nothing but the map's file, so each can have a process of its own: a search of 0.3 s must delay neither the
+They share nothing but the map's file, so each can have a process of its own: a search must delay neither the
 frames of other robots nor the pose clock. A third one, :mod:`coview_stream.stream.node.odometry_engine`, needs no map.
 """
 
