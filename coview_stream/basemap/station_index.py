@@ -19,6 +19,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_kernels import CodedQuery, StationCodes
 from coview_stream.config import Channel
+from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Complexes, Floats32, Ints
 
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
@@ -59,8 +60,16 @@ class StationIndex:
 
     @classmethod
     def of(cls, descriptors: Descriptors) -> StationIndex:
-        """Make the index of stations by their descriptors."""
-        chosen = _chosen(len(next(iter(descriptors.values()))))
+        """Make the index of stations by their descriptors.
+
+        Raises:
+            MapError: they are too many.
+        """
+        stations = len(next(iter(descriptors.values())))
+        if stations > StationCodes.MAX_STATIONS:
+            limit = StationCodes.MAX_STATIONS
+            raise MapError(f"{stations} stations, {limit} at most: build the map in parts, or with a larger block size")
+        chosen = _chosen(stations)
         sample = {name: np.array(values[chosen]) for name, values in descriptors.items()}
         codes, rest = StationCodes.tiers(list(descriptors.values()), 2)
         return cls(codes, rest, sample)

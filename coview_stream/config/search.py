@@ -67,7 +67,7 @@ class ConsensusConfig:
 
     mode: Literal["consensus", "single"] = "consensus"
     window: int = 10
-    peaks: int = 192
+    peaks: int = 184
     distinct_distance: float = 6.0
     distinct_yaw: float = math.radians(20)
 

@@ -127,7 +127,13 @@ class StationCodes:
         sectors: number of shifts S.
     """
 
+    MAX_STATIONS = 2**31 // (_ROWS * _LANES) - 1
+    """More could not be numbered by the kernels' 32 bits."""
+
     def __init__(self, codes: I16, basis: C64, step: F32, norm: F32, sectors: int) -> None:
+        """Keep the codes (M, 16, 16) of stations and what queries are coded by; ValueError for too many stations."""
+        if len(codes) > self.MAX_STATIONS:
+            raise ValueError(f"{len(codes)} stations, {self.MAX_STATIONS} at most")
         self.codes = codes
         self.basis = basis
         self.step = step

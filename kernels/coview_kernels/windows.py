@@ -134,22 +134,35 @@ def window_products(raster: WindowRaster, images: WindowImages, corners: npt.Arr
         raise ValueError("a window leaves the raster's margin")
     if image.min() < 0 or image.max() >= len(images):
         raise ValueError(f"images {image.min()} to {image.max()} of {len(images)}")
-    return runtime.dispatch(_native, _plain, raster, images, at, image)
+    return runtime.dispatch_here(_ready, _native, _plain, raster, images, at, image)
 
 
 def _plain(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:
     return reference.window_products(raster.padded, images.images, at, which)
 
 
+_launch: Launch | None = None
+
+
+def _ready() -> bool:
+    return _launch is not None and _launch.ready()
+
+
 def _native(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:
+    global _launch
     width = raster.padded.shape[1]
     first = (at[:, 0] * width + at[:, 1]) * DIMENSIONS
     out = np.zeros((len(at), DIMENSIONS), dtype=np.int32)
-    Launch(
-        "windows", "products",
+    arguments = (
         raster.flat, width * DIMENSIONS, images.padded.reshape(-1), images.padded.shape[2], images.spans.reshape(-1),
         first, which, out.reshape(-1),
-    )()  # fmt: skip
+    )  # fmt: skip
+    if _launch is None:
+        _launch = Launch("windows", "products", *arguments)
+    else:
+        for index, value in enumerate(arguments):
+            _launch.put(index, value)
+    _launch()
     return out
 
 

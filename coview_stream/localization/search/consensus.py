@@ -21,7 +21,7 @@ from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.search.votes import Vote
 
-_PLACES = 2048  # that are kept from keyframe to keyframe: the best; set by hand
+_KEPT = 8  # places are kept from keyframe to keyframe for each hypothesis that is asked for: the best; set by hand
 _BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of what makes places distinct: bins that keep the best place each; set by hand
 
 
@@ -109,7 +109,7 @@ class Consensus:
         places = known + self._named(column, vote)
         order = np.argsort(places.votes.sum(axis=1), kind="stable")
         _, first = np.unique(self._bins(places, vote)[order], return_index=True)
-        self._places = places[order[np.sort(first)[:_PLACES]]]
+        self._places = places[order[np.sort(first)[: _KEPT * self.config.peaks]]]
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""

@@ -67,7 +67,7 @@ class Rivals:
 
     Attributes:
         T_map_odom: (N, 4, 4).
-        scores: (N,) float32 evidence scores in [0, 1].
+        scores: (N,) float32 evidence scores in [0, 1]; those of the best 64 hypotheses from four times as many points.
         inside: (N,) float32 shares of the scan that lie where the map has been surveyed.
     """
 

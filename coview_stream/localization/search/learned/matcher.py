@@ -169,7 +169,7 @@ class FeatureMatcher:
         heading = halves.argmax(axis=1)
         best = np.take_along_axis(halves, heading[:, None], axis=1)[:, 0]
         best[:, begin[1:] == begin[:-1]] = -np.inf  # cells without stations
-        count = max(_NAMED, int(_NAMED_SHARE * best.size))
+        count = max(_NAMED, int(_NAMED_SHARE * np.isfinite(best).sum()))
         chosen = argsmallest(-best.ravel(), count)
         chosen = chosen[np.isfinite(best.ravel()[chosen])]
         half, cell = np.divmod(chosen, best.shape[1])
