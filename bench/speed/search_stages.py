@@ -122,7 +122,7 @@ STAGES = (
     Stage("co-view: query", StationIndex, "query", _nothing, ""),
     Stage("co-view: screen", StationIndex, "best", lambda a, r: _CODE * len(r), "512 bytes of every station"),
     Stage("co-view: shifts", StationIndex, "all_shifts", lambda a, r: _CODE * len(r) + size(r), "the best stations"),
-    Stage("co-view: single scores", StationIndex, "at", lambda a, r: 2 * _CODE * len(r), "a station's 1,024 bytes a score"),
+    Stage("co-view: single scores", StationIndex, "at", lambda a, r: 2 * _CODE * len(r), "1,024 bytes a score"),
     Stage("learned: network", FeatureMatcher, "encode", _network, "weights, points, features"),
     Stage("learned: turns", matcher, "turn_query", lambda a, r: size(a[:2], r.coarse) + r.images.nbytes, "images"),
     Stage("learned: coarse", matcher, "correlate_turned", _coarse, "spectra of the map, scores"),
