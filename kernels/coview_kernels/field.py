@@ -27,7 +27,7 @@ from coview_kernels.launch import Launch
 from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-COARSE, FINE, LOW, LEVELS = 96, 128, 64, 2
+COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
 """Points of the coarse level, of a fine one, and for the height; fine levels. ``python -m bench field`` prints how
 often the right place comes first with them; with a third fewer points one of 24 places was lost on one world."""
 

@@ -168,7 +168,7 @@ def test_node_memory_counts_bounding_rectangle_of_features(learned_map, world_ma
     sparse = BaseMap(arrays, learned_map.parameters)
     near, far = node_memory(learned_map), node_memory(sparse)
     assert near > node_memory(world_map)
-    assert far - near == pytest.approx(1.08e9, rel=0.05)  # 101 x 101 tiles, 208 bytes on 4 m2, and spectra
+    assert far - near == pytest.approx(2.09e8, rel=0.05)  # 101 x 101 tiles of 1,024 m2, 20 bytes on each
 
 
 def test_foreign_network_is_refused(weights, monkeypatch):
