@@ -19,13 +19,16 @@ and takes its work from a queue; callers, on any thread, wait for their result.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import importlib
 import importlib.util
 import os
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
@@ -36,6 +39,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _BACKENDS = ("taichi", "quadrants", "numpy")
+_STALE_LOCK = 60.0  # seconds; the cache is locked for milliseconds; set by hand
 _MAX_WORKERS = 16  # the kernels are bound by memory; more threads only add private bins to merge
 
 
@@ -104,6 +108,7 @@ def _init(library: Any) -> None:
     # there: redirecting sys.stdout would swallow what other threads print meanwhile.
     misc = library.lang.misc
     misc.print = lambda *args, **kwargs: None
+    _remove_stale_lock(library)
     try:
         library.init(
             arch=library.cpu,
@@ -114,6 +119,18 @@ def _init(library: Any) -> None:
     finally:
         del misc.print
     front_end.shorten(library)
+
+
+def _remove_stale_lock(library: Any) -> None:
+    """Remove the lock of the cache of compiled kernels where a process that was killed has left it.
+
+    The library holds it for an instant, and goes without the cache where it finds one: every start would compile.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or library.lang.impl.default_cfg().offline_cache_file_path
+        lock = Path(folder) / "ticache.lock"
+        if time.time() - lock.stat().st_mtime > _STALE_LOCK:
+            lock.unlink()
 
 
 def cores() -> int:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -242,3 +243,14 @@ def test_invalid_coview_threads_raises(monkeypatch, asked):
     monkeypatch.setenv("COVIEW_THREADS", asked)
     with pytest.raises(ValueError, match=r"COVIEW_THREADS is .+ whole number"):
         runtime.workers()
+
+
+@pytest.mark.parametrize(("age", "left"), [(0.0, True), (3600.0, False)])
+def test_lock_that_a_killed_process_left_on_the_cache_is_removed(tmp_path, monkeypatch, age, left):
+    lock = tmp_path / "ticache.lock"
+    lock.touch()
+    os.utime(lock, (time.time() - age,) * 2)
+    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path))
+    runtime._remove_stale_lock(None)
+    assert lock.exists() == left
+    runtime._remove_stale_lock(None)

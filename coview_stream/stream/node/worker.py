@@ -24,7 +24,9 @@ def main(argv: list[str]) -> int:
     """
     descriptor, kind, nice = int(argv[0]), argv[1], int(argv[2])
     pipe = Connection(descriptor)
-    _stand_back(nice)
+    with contextlib.suppress(OSError):
+        os.nice(nice)
+    _set_group_nice(nice)
     from coview_kernels import warm_up
     from coview_stream.config import LocalizerConfig, RegistrationConfig
     from coview_stream.errors import CoViewError
@@ -32,8 +34,10 @@ def main(argv: list[str]) -> int:
     from coview_stream.stream.node.engines import kernels_of, open_engine
 
     first, later = kernels_of(kind)
-    if first:
-        warm_up(*first)
+    for name in first:
+        if pipe.poll():  # the node waits for its engines, or soon a robot for its search: no more standing back
+            _set_group_nice(0)
+        warm_up(name)
     steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in later)
 
     def use_pause() -> None:
@@ -44,6 +48,7 @@ def main(argv: list[str]) -> int:
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
         use_pause()
         opening = pipe.recv()
+        _set_group_nice(0)
         try:
             method = RegistrationConfig(method=opening.registration)  # any text; it checks
             config = LocalizerConfig(registration=method, reloc=opening.reloc)  # likewise
@@ -57,6 +62,7 @@ def main(argv: list[str]) -> int:
             gc.freeze()  # what is there stays; to look through it again and again would cost every job
             gc.enable()
         pipe.send(("prepared", None))
+        _set_group_nice(nice)
         steps.append(engine.prepare_later)
         while True:
             use_pause()
@@ -64,16 +70,13 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _stand_back(nice: int) -> None:
-    """Lower the priority of this process, where Linux groups tasks by session also that of its session's group.
+def _set_group_nice(nice: int) -> None:
+    """Set the niceness of this process's session, where Linux groups tasks by session.
 
-    The niceness alone would only count among the processes of one session, which this one has for itself.
+    There the process's own niceness only counts among the processes of one session, which this one has for itself.
     """
     with contextlib.suppress(OSError):
-        os.nice(nice)
-    group = Path("/proc/self/autogroup")
-    with contextlib.suppress(OSError, ValueError):
-        group.write_text(str(min(int(group.read_text().split()[-1]) + nice, 19)))
+        Path("/proc/self/autogroup").write_text(str(nice))
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ class LackingEngine:
 def test_library_that_is_missing_is_the_jobs_error(monkeypatch):
     engine = LackingEngine()
     monkeypatch.setattr(engines, "open_engine", lambda *args: engine)
-    monkeypatch.setattr(worker, "_stand_back", lambda nice: None)
+    monkeypatch.setattr(worker, "_set_group_nice", lambda nice: None)
     ours, theirs = socket.socketpair()
     with Connection(ours.detach()) as pipe:
         child = threading.Thread(target=worker.main, args=([str(theirs.detach()), "odometry", "0"],), daemon=True)
