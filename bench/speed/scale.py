@@ -81,7 +81,7 @@ def make(size: int, scene: str, out: Path) -> None:
     begin = time.perf_counter()
     index = StationIndex.of(descriptors)
     seconds = time.perf_counter() - begin
-    np.savez(out / "index.npz", seconds=seconds, **index.arrays())  # type: ignore[arg-type]
+    np.savez(out / "index.npz", seconds=seconds, **index.arrays())  # type: ignore[arg-type]  # arrays by name
 
 
 def widened(stations: Floats32, count: int, block: float) -> Floats32:

@@ -4,7 +4,7 @@
 that the first of them launch. ``search prepared`` is a search engine alone, until a keyframe would be searched for at
 once: all its kernels loaded, the map's index and features read. The first run ever is the same with an empty cache of
 compiled kernels; what the tracking engine compiles between its first frames takes seconds then. The map is a small
-simulated one: opening maps a file, whatever its size.
+simulated one: opening maps a file of any size.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ kept that vary most: c_f is projected on the first 12 eigenvectors of its second
 stations, 4 from frequency 16 on (Karhunen-Loeve transform), and stored as int8 with a step for each number. The query
 gets the same treatment, at higher precision; its channels may be weighted.
 
-What is lost is the same whatever the shift: right places keep about nine tenths of what sets them apart, and ``python
+What is lost is the same at every shift: right places keep about nine tenths of what sets them apart, and ``python
 -m bench scale`` counts how many right places the search loses by it.
 
 Layout: a station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold the frequencies 0 to 15, rows 12 to 15 those

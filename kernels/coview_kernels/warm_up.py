@@ -4,7 +4,7 @@ A module of kernels names what is to be compiled before its function runs, besid
 
     compiled_by("nearest", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))
 
-and whoever has a first call that must not wait calls ``warm_up("nearest")`` before.
+and a caller whose first call must not wait calls ``warm_up("nearest")`` before.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def test_filled_line_is_that_of_textwrap(line):
 
 @needs_taichi
 def test_what_the_shortcuts_replace_is_there_and_replaced():
-    """Else kernels take twice as long to load, which nobody would see."""
+    """Without it kernels take twice as long to load, and no result differs."""
     kernel = importlib.import_module("taichi.lang.kernel_impl")
     assert kernel in front_end._replaced
     for name in ("getsourcelines", "getsourcefile"):

@@ -63,7 +63,7 @@ class ScoredPlace:
 
 @dataclass(frozen=True)
 class Rivals:
-    """All places that one keyframe was scored at, best first; no two are the same. For whom decides between them.
+    """All places that one keyframe was scored at, best first; no two are the same.
 
     Attributes:
         T_map_odom: (N, 4, 4).

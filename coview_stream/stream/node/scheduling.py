@@ -50,7 +50,7 @@ class SearchDemand:
 def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
     """Return which robots of ``demands`` want a search, in the order in which they are to have it.
 
-    A keyframe that has waited for 1.5 s comes first, the oldest of them before the others: so nobody waits much longer,
+    A keyframe that has waited for 1.5 s comes first, the oldest of them before the others: no robot waits much longer,
     unless the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been
     proposed comes before those that are newly lost, for it needs the fewest searches until it needs none, and these
     before those that have searched in vain for long.

@@ -1,4 +1,4 @@
-"""Order of searches: nobody starves, and who can be found soon is found soon. Time is played."""
+"""Order of searches: no robot waits without end, and one that may be found soon comes first. Time is played."""
 
 from __future__ import annotations
 
