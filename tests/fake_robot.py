@@ -82,13 +82,13 @@ def search_result(seconds=0.0, reason="two places fit", accepted=None):
     return SearchResult(accepted, KeyframeEvidence(seconds, State.AMBIGUOUS, reason))
 
 
-def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT, covariance=None):
+def tracking(job, T_map_odom=T_MAP_ODOM, sigma=0.1, drift=DRIFT, covariance=None, protection=None):
     """The engine's answer: here you are."""
     evidence = KeyframeEvidence(job.stamp_ns * 1e-9, State.TRACKING, "verified", 0.8)
     covariance = np.eye(6) * sigma**2 if covariance is None else covariance
     stamp = job.stamp_ns * 1e-9
     T = T_map_odom @ job.T_odom_body
-    fix = Fix(stamp, State.TRACKING, T, T_map_odom, covariance, 0.8, evidence, drift)
+    fix = Fix(stamp, State.TRACKING, T, T_map_odom, covariance, 0.8, evidence, drift, protection)
     return FrameResult(fix, None, 0.01, EVENTS[State.TRACKING])
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from coview_stream.cli import build_parser
 from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.localization import localizer
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search import global_search
@@ -121,13 +122,13 @@ def test_documented_encodings_match_codecs():
 
 
 def test_documented_fields_missing_in_smaller_pose_formats():
-    full = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32, 0.25)
+    full = PoseMessage(1, "r", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab" * 32, 0.25, "map", ProtectionLevel(0.1, 1.0))
     missing = {}
     for name in ("cdr", "foxglove"):
         encoded = encode_pose(full, name)
         record = pose_record(decode_pose(Sample("k", encoded.payload, encoded.encoding)), Sample("k", encoded.payload))
         missing[name] = {field for field, value in record.items() if not value} | {"state"}
-    assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s"}
+    assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s", "protection_level"}
     assert missing["foxglove"] == missing["cdr"] | {"covariance"}
     said = re.search(r"These leave out .*?`covariance`", TEXT, re.DOTALL)[0]
     assert set(re.findall(r"`(\w+)`", said)) == missing["foxglove"]

@@ -29,11 +29,13 @@ class Told:
     poses: Floats  # (N, 4, 4) map <- body, NaN where there was none
     covariances: Floats  # (N, 6, 6) over (x, y, z, roll, pitch, yaw), NaN where there was no pose
     seconds: Floats  # that each step took
+    levels: Floats  # (N, 2) protection levels, metres and degrees, likewise
 
     @classmethod
     def of(cls, fixes: Sequence[Fix | str], stamps: Floats, seconds: Floats) -> Told:
         """Collect what was said at the ``stamps``; a frame that was refused has the reason in place of its fix."""
         poses, covariances = np.full((len(fixes), 4, 4), np.nan), np.full((len(fixes), 6, 6), np.nan)
+        levels = np.full((len(fixes), 2), np.nan)
         states, reasons = [], []
         for k, fix in enumerate(fixes):
             if isinstance(fix, str):
@@ -46,7 +48,9 @@ class Told:
                 poses[k] = fix.T_map_body
             if fix.covariance is not None:
                 covariances[k] = fix.covariance
-        return cls(stamps, states, reasons, poses, covariances, seconds)
+            if fix.protection is not None:
+                levels[k] = fix.protection.metres, fix.protection.degrees
+        return cls(stamps, states, reasons, poses, covariances, seconds, levels)
 
     @property
     def tracking(self) -> Bools:

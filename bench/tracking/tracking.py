@@ -5,7 +5,7 @@ scores. NAME picks the scenarios whose names contain it; worlds, maps and answer
 be made in portions and an unchanged engine is not asked twice.
 
 Coverage is the share of the poses whose error lies within 1, 2, 3 sigma of the reported covariance: of one axis by
-itself, of several by their squared Mahalanobis distance.
+itself, of several by their squared Mahalanobis distance. Protection levels are judged by one pose per ten metres.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Told, errors, score
 from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, draw, honest, pooled, shares, spread
 from bench.tracking.drives import Drive, drift_share, seen
+from bench.tracking.levels import Sample, level_table, misleading
 from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
 from bench.tracking.worlds import Recorded, map_of, open_world
 from coview_stream import BaseMap, Localizer
@@ -41,8 +42,8 @@ _COLUMNS = {
     "drift %": ("drift_percent", 1), "driven m": ("driven_m", 0), "right %": ("right_percent", 1),
     "first m": ("first_fix_m", 1), "rmse m": ("rmse_m", 3), "max m": ("max_m", 2), "rmse deg": ("rmse_deg", 2),
     "max deg": ("max_deg", 1), "false": ("false_frames", 0), "false s": ("false_s", 1),
-    "> 0.5 m": ("doubtful_frames", 0), "lost": ("losses", 0), "back m": ("recovery_m", 1), "back s": ("recovery_s", 1),
-    "p50 ms": ("p50_ms", 1), "p99 ms": ("p99_ms", 0),
+    "HMI": ("misleading", 0), "> 0.5 m": ("doubtful_frames", 0), "lost": ("losses", 0), "back m": ("recovery_m", 1),
+    "back s": ("recovery_s", 1), "p50 ms": ("p50_ms", 1), "p99 ms": ("p99_ms", 0),
 }  # fmt: skip
 """Of the table: a drive's figure, or one of its worst event, and its decimals."""
 
@@ -63,34 +64,42 @@ def rows(asked: Namespace) -> Iterator[Row]:
     if not chosen:
         raise InputError(f"no scenario like {' or '.join(asked.names)}; there are {', '.join(s.name for s in every)}")
     drives, parts = [], []
+    samples: dict[str, list[Sample]] = {}
     for scenario in chosen:
-        figures, squared = measure(folder(), scenario)
+        figures, squared, sample = measure(folder(), scenario)
         drives.append(figures)
         parts.append(squared)
+        samples.setdefault(f"plain: {scenario.world.kind}" if scenario.plain else "events", []).append(sample)
         rmse = np.nan if figures["rmse_m"] is None else figures["rmse_m"]
         yield informs(f"tracking/{scenario.name}", rmse, "m", figures)
     together = pooled(parts)
     found = shares(together)
     yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
-    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", {"coverage": found})
+    levels = level_table({name: Sample.joined(some) for name, some in samples.items()})
+    told = {"coverage": found, "protection": levels}
+    yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", told)
     yield from verdicts(drives, found, asked.quick)
     if asked.plot:
         draw(together, asked.plot, f"python -m bench tracking: {len(drives)} drives, code {fingerprint()}")
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """Drives, coverage, and what was lost and found again."""
+    """Drives, coverage, protection levels, and what was lost and found again."""
     drives = [row.details for row in rows if "rmse_m" in row.details]
-    found = next(row.details["coverage"] for row in rows if "coverage" in row.details)
+    together = next(row.details for row in rows if "coverage" in row.details)
     return {
         "": table(("scenario", *_COLUMNS), [cells(figures) for figures in drives]),
-        "coverage": coverage_table(found),
+        "coverage": coverage_table(together["coverage"]),
+        "protection": together["protection"],
         "events": "\n".join([*_events(drives), code_line()]),
     }
 
 
-def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
-    """Return the figures of a scenario, and the squared distances of its coverage; kept until the code changes."""
+def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]:
+    """Return the figures of a scenario, the squared distances of its coverage, and poses of its protection levels.
+
+    They are kept until the code changes.
+    """
     bench = fingerprint("bench/tracking", "bench/harness/trajectory_scores.py")
     spec = {"code": fingerprint(), "bench": bench, "scenario": repr(scenario.world)}
 
@@ -100,13 +109,16 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares]:
         told = follow(map_of(folder, scenario.world, scenario.variant), recorded, drive)
         drift = scenario.drift if drive.events else drift_share(drive.truth, drive.odometry)
         about = {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift}
-        parts = spread(told, errors(told, drive.truth))
+        error = errors(told, drive.truth)
+        parts, sample = spread(told, error), Sample.of(told, error, drive.driven)
+        about["misleading"] = misleading(told, error, drive.driven)
         lists = {part: {name: values.tolist() for name, values in axes.items()} for part, axes in parts.items()}
-        return {"figures": about | score(told, drive.truth, drive.driven, drive.events), "squares": lists}
+        figures = about | score(told, drive.truth, drive.driven, drive.events)
+        return {"figures": figures, "squares": lists, "sample": sample.to_json()}
 
     kept = remembered(folder / "tracking-results" / f"{scenario.name.replace('/', '-')}.json", spec, work)
     squares = {part: {n: np.array(each, float) for n, each in axes.items()} for part, axes in kept["squares"].items()}
-    return kept["figures"], squares
+    return kept["figures"], squares, Sample.from_json(kept["sample"])
 
 
 def follow(site: Path, recorded: Recorded, drive: Drive) -> Told:
@@ -147,6 +159,8 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
             yield judged(f"tracking/rmse of plain drives, {unit}", said, f"<= {most}", mean <= most, mean)
     false, seconds = (sum(figures[key] for figures in drives) for key in ("false_frames", "false_s"))
     yield judged("tracking/false frames", f"{false} ({seconds:.1f} s)", "0", false == 0, false)
+    count = sum(figures["misleading"] for figures in drives)
+    yield judged("tracking/beyond the alert limit", f"{count} times", "0", not count, count)
     if quick:
         return
     if events := [event for figures in drives for event in figures["events"]]:

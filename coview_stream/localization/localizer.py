@@ -194,6 +194,7 @@ class Localizer:
             max(0.0, evidence.score - evidence.rival) if evidence else 0.0,
             evidence,
             self._tracker.drift,
+            self._tracker.protection_level(),
         )
 
     def take_events(self) -> tuple[Event, ...]:

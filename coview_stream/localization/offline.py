@@ -19,6 +19,7 @@ from coview_stream.clouds.trajectory import write_tum
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import CloudError, InputError, RunError
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, pose_from_tum
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
@@ -79,6 +80,7 @@ class RunResult:
         return {
             "state": self.state.reported,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
+            "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
             "frames": self.frames,
             "posed": len(self.posed),
@@ -144,7 +146,10 @@ def from_stream(
         else:
             T = pose_from_tum([*pose["position"], *pose["orientation"]])
             covariance = np.array(pose["covariance"], dtype=np.float64).reshape(6, 6)
-            located.fixes.append(Fix(stamp, State.TRACKING, T, None, covariance, float(pose["confidence"])))
+            known_level = pose.get("protection_level")  # older nodes give none
+            level = None if known_level is None else ProtectionLevel(known_level["m"], known_level["deg"])
+            confidence = float(pose["confidence"])
+            located.fixes.append(Fix(stamp, State.TRACKING, T, None, covariance, confidence, protection=level))
     for status in statuses:
         if status.get("evidence"):
             evidence = KeyframeEvidence.from_json(status["evidence"])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import State
@@ -92,6 +93,8 @@ class Fix:
         confidence: in [0, 1]: the evidence score, less what the best rival has of it.
         evidence: of the newest keyframe, None before the first.
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
+        protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:
+            see docs/tracking.md; None unless TRACKING.
     """
 
     stamp: float
@@ -102,3 +105,4 @@ class Fix:
     confidence: float = 0.0
     evidence: KeyframeEvidence | None = None
     drift: Drift | None = None
+    protection: ProtectionLevel | None = None

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from coview_stream.errors import MessageError
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 from coview_stream.messages.types import Encoded, OdometryMessage, PoseMessage, Sample
 from coview_stream.messages.validation import check_size, checked_pose, stamp_from
@@ -28,7 +29,7 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read what :func:`encode_pose` writes; ``age_s`` and ``frame_id`` may be missing."""
+    """Read what :func:`encode_pose` writes; ``age_s``, ``frame_id`` and ``protection_level`` may be missing."""
     fields = read_object(sample.payload)
     return PoseMessage(
         stamp_ns=stamp_from(fields.get("stamp_ns")),
@@ -40,6 +41,7 @@ def decode_pose(sample: Sample) -> PoseMessage:
         map_sha256=text(fields, "map_sha256"),
         age=number(fields.get("age_s", 0.0), "age_s"),
         frame_id=text(fields, "frame_id", "map"),
+        protection=_protection(fields.get("protection_level")),
     )
 
 
@@ -51,7 +53,8 @@ def encode_odometry(message: OdometryMessage) -> Encoded:
 def encode_pose(message: PoseMessage) -> Encoded:
     """Write a pose with its covariance in rows, (x, y, z, roll, pitch, yaw).
 
-    Fields: stamp_ns, robot, state, position, orientation, covariance, confidence, map_sha256, age_s, frame_id.
+    Fields: stamp_ns, robot, state, position, orientation, covariance, confidence, map_sha256, age_s, frame_id,
+    protection_level (null where it is not known).
     NaN is a MessageError.
     """
     after = {
@@ -60,6 +63,7 @@ def encode_pose(message: PoseMessage) -> Encoded:
         "map_sha256": message.map_sha256,
         "age_s": float(message.age),
         "frame_id": message.frame_id,
+        "protection_level": None if message.protection is None else message.protection.to_json(),
     }
     before = {"robot": message.robot, "state": message.state}
     return _dump(message.stamp_ns, message.T_map_body, before, after)
@@ -96,6 +100,7 @@ def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
         "map_sha256": pose.map_sha256 or None,
         "age_s": _known(pose.age),
         "frame_id": pose.frame_id,
+        "protection_level": None if pose.protection is None else pose.protection.to_json(),
     }
 
 
@@ -141,6 +146,16 @@ def text(fields: dict[str, Any], name: str, default: str | None = None) -> str:
 
 def _pose(fields: dict[str, Any]) -> Pose:
     return checked_pose(numbers(fields, "position", 3), numbers(fields, "orientation", 4))
+
+
+def _protection(value: object) -> ProtectionLevel | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise MessageError("protection_level: write m and deg")
+    return ProtectionLevel(
+        number(value.get("m"), "protection_level.m"), number(value.get("deg"), "protection_level.deg")
+    )
 
 
 def _dump(stamp_ns: int, T: Pose, before: dict[str, Any], after: dict[str, Any]) -> Encoded:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Points, Pose
 
 
@@ -101,6 +102,7 @@ class PoseMessage:
         map_sha256: hash of the base map that the pose refers to.
         age: seconds of sensor time since the lidar frame that last corrected it.
         frame_id: name of the map frame, for formats that carry one.
+        protection: metres and degrees that the error exceeds at most once in a thousand; None where a format has none.
     """
 
     stamp_ns: int
@@ -112,3 +114,4 @@ class PoseMessage:
     map_sha256: str
     age: float = 0.0
     frame_id: str = "map"
+    protection: ProtectionLevel | None = None

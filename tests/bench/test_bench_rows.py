@@ -152,7 +152,7 @@ def test_rows_are_shown_under_their_benchmark():
                          "intake", "describe", "peers worlds", "where"]),
         ("forest", [f"forest {part}" for part in ("recall", "metric", "compared", "times", "disk recall",
                     "disk metric", "disk compared")] + ["forest_scale", "forest_runs", "forest_plot"]),
-        ("tracking", ["tracking", "tracking coverage"]),
+        ("tracking", ["tracking", "tracking coverage", "tracking protection"]),
         ("accuracy", ["accuracy", "ablation", "ground"]),
     ],
 )  # fmt: skip

@@ -17,7 +17,7 @@ def way(count=1500, step=0.2):
     return np.stack([pose_from(rot_z(h) @ tilt, p) for h, p in zip(heading, places, strict=True)])
 
 
-def told(states, poses=None, reasons=None, covariance=None, stamps=None):
+def told(states, poses=None, reasons=None, covariance=None, stamps=None, level=(0.2, 1.0)):
     count = len(states)
     known = np.array([state == "TRACKING" for state in states])
     poses = np.tile(np.eye(4), (count, 1, 1)) if poses is None else poses.copy()
@@ -25,4 +25,5 @@ def told(states, poses=None, reasons=None, covariance=None, stamps=None):
     covariance = np.eye(6) if covariance is None else covariance
     stamps = 0.1 * np.arange(count) if stamps is None else np.asarray(stamps)
     reasons = [""] * count if reasons is None else reasons
-    return Told(stamps, states, reasons, poses, np.tile(covariance, (count, 1, 1)), np.full(count, 0.005))
+    covariances, levels = np.tile(covariance, (count, 1, 1)), np.tile(level, (count, 1))
+    return Told(stamps, states, reasons, poses, covariances, np.full(count, 0.005), levels)

@@ -21,6 +21,7 @@ from codec_bytes import (
 )
 
 from coview_stream import messages as codecs
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.messages.types import CloudMessage, OdometryMessage, PoseMessage, Sample
 
 ATTACHMENT = bytes.fromhex("15cd853dfe9c9717")
@@ -44,7 +45,7 @@ JSON_POSE = (
     b'{"stamp_ns":1700000000123456789,"robot":"r1","state":"TRACKING","position":[1.0,2.0,3.0],'
     b'"orientation":[0.5,0.5,0.5,0.5],"covariance":['
     + b",".join(b"%d.0" % i for i in range(36))
-    + b'],"confidence":0.75,"map_sha256":"ab","age_s":0.1,"frame_id":"map"}'
+    + b'],"confidence":0.75,"map_sha256":"ab","age_s":0.1,"frame_id":"map","protection_level":null}'
 )
 
 CLOUDS = {
@@ -130,14 +131,17 @@ def test_pose_golden_bytes(name):
 
 
 def test_json_pose_has_the_documented_fields():
-    message = PoseMessage(STAMP, "r1", "TRACKING", T_TURN, COVARIANCE, 0.75, "ab", 0.1, "utm")
+    level = ProtectionLevel(0.25, 1.5)
+    message = PoseMessage(STAMP, "r1", "TRACKING", T_TURN, COVARIANCE, 0.75, "ab", 0.1, "utm", level)
     fields = json.loads(codecs.encode_pose(message, "json").payload)
     assert list(fields) == [
         "stamp_ns", "robot", "state", "position", "orientation", "covariance", "confidence", "map_sha256",
-        "age_s", "frame_id",
+        "age_s", "frame_id", "protection_level",
     ]  # fmt: skip
     assert fields["frame_id"] == "utm"
-    assert codecs.decode_pose(Sample("k", json.dumps(fields).encode())).frame_id == "utm"
+    assert fields["protection_level"] == {"m": 0.25, "deg": 1.5}
+    again = codecs.decode_pose(Sample("k", json.dumps(fields).encode()))
+    assert (again.frame_id, again.protection) == ("utm", level)
 
 
 @pytest.mark.parametrize("name", ["xyz", "foxglove", "cdr", "keelson"])

@@ -212,6 +212,8 @@ def test_json_over_64_kib_is_oversized_and_extra_fields_are_ignored():
         {"confidence": "1"},
         {"age_s": None},
         {"map_sha256": "\ud800"},
+        {"protection_level": 0.1},
+        {"protection_level": {"m": 0.1}},
     ],
 )
 def test_malformed_json_poses_are_refused(changes):

@@ -92,6 +92,10 @@ class EvidenceBaseline:
         before, now = vars(self.usual), vars(evidence)
         self.usual = Evidence(**{n: before[n] + _NEWEST_SHARE * (now[n] - before[n]) for n in now})
 
+    def fallen(self, evidence: Evidence) -> float:
+        """Return how many times better what is usual is than ``evidence``: 1 at least."""
+        return max(1.0, self.usual.score / evidence.score) if self.usual and evidence.score > 0 else 1.0
+
     def judge(self, evidence: Evidence, rule: AcceptanceConfig) -> tuple[RejectionReason, str]:
         """Return whether evidence is good enough, and as good as usual: the cause and one clause."""
         if evidence.inside < rule.min_overlap:

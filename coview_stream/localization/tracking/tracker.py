@@ -9,6 +9,7 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, transform
 from coview_stream.localization.registration.covariance import (
     propagate,
@@ -53,6 +54,7 @@ class Tracker:
         self._scans = ScanBuffer(config.tracking)
         self._unregistered = 0  # frames since the newest registration
         self._shared_error = SharedErrorModel(config.registration)
+        self._doubt = 1.0  # by how much the newest evidence that was believed has fallen below what is usual
 
     @property
     def travelled(self) -> float:
@@ -115,6 +117,7 @@ class Tracker:
         It may not have converged yet: its own covariance is not believed.
         """
         self._baseline.clear()
+        self._doubt = 1.0
         self._displacement.clear()
         self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
@@ -186,6 +189,10 @@ class Tracker:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), what all registrations share included, map axes."""
         return swap_rotation_translation(self.predicted_covariance() + self._shared_error.covariance)
 
+    def protection_level(self) -> ProtectionLevel:
+        """Metres and degrees that the error exceeds at most once in a thousand, wider as less is seen than usual."""
+        return protection_level(self.reported_covariance(), self._doubt)
+
     # ---- inside
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
@@ -214,6 +221,7 @@ class Tracker:
         evidence, scan, target, newest = match.verdict.evidence, match.scan, match.target, self._scans.newest
         if evidence is None or scan is None or target is None or newest is None:
             raise ValueError("nothing can be learned from a match without a registration")
+        self._doubt = self._baseline.fallen(evidence)
         self._baseline.learn(evidence)
         self._odometry.learn(match.T_map_body, match.covariance)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)

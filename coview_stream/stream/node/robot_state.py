@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence
@@ -163,6 +164,12 @@ class RobotState:
         newest, correction = odometry.newest, self.correction
         return None if newest is None or correction is None else correction.age(newest.stamp_ns)
 
+    def protection_level(self, odometry: OdometryBuffer) -> ProtectionLevel | None:
+        """Protection level of the pose at the newest odometry; None unless TRACKING."""
+        correction = self.correction
+        pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
+        return None if pose is None else pose.protection
+
     def last_known_pose(self, odometry: OdometryBuffer) -> LastKnownPose:
         """Return where the robot is, if that is known, for the next start of the node."""
         correction, forgotten = self.correction, self._hint.forgotten
@@ -183,6 +190,7 @@ class OdomCorrection:
         travelled: metres that odometry had driven at the frame.
         turned: radians that it had turned.
         drift: how fast it seems to drift.
+        doubt: times as wide as the covariance alone has it is the protection level.
     """
 
     T_map_odom: Pose
@@ -193,15 +201,18 @@ class OdomCorrection:
     travelled: float
     turned: float
     drift: Drift
+    doubt: float
 
     @classmethod
     def of(cls, fix: Fix, stamp_ns: int, travelled: float, turned: float) -> OdomCorrection:
         """Make it of a fix that has a pose; ``stamp_ns`` is its frame's."""
         if fix.T_map_odom is None or fix.T_map_body is None or fix.covariance is None or fix.drift is None:
             raise ValueError("a fix without a pose corrects nothing")
+        doubt = 1.0 if fix.protection is None else fix.protection.doubt
         verified = stamp_ns if fix.evidence is None else min(stamp_ns, round(fix.evidence.stamp * _NS))
         return cls(
-            fix.T_map_odom, fix.T_map_body, fix.covariance, fix.confidence, verified, travelled, turned, fix.drift
+            fix.T_map_odom, fix.T_map_body, fix.covariance, fix.confidence, verified, travelled, turned, fix.drift,
+            doubt,
         )  # fmt: skip
 
     def age(self, stamp_ns: int) -> float:
@@ -218,15 +229,17 @@ class OdomCorrection:
         T_map_body = self.T_map_odom @ newest.T_odom_body
         shift = T_map_body[:3, 3] - self.T_map_body[:3, 3]
         carried = swap_rotation_translation(propagate(swap_rotation_translation(self.covariance), shift))
+        covariance = carried + self.drift.reported(driven, turned)
         return PoseMessage(
             stamp_ns=newest.stamp_ns,
             robot=robot,
             state=State.TRACKING.value,
             T_map_body=T_map_body,
-            covariance=carried + self.drift.reported(driven, turned),
+            covariance=covariance,
             confidence=self.confidence,
             map_sha256=map_sha256,
             age=self.age(newest.stamp_ns),
+            protection=protection_level(covariance, self.doubt),
         )
 
 

@@ -10,6 +10,7 @@ import threading
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
@@ -268,6 +269,11 @@ class Session:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
         with self._lock:
             return self.robot_state.age(self.odometry)
+
+    def protection_level(self) -> ProtectionLevel | None:
+        """Metres and degrees that the newest pose's error exceeds at most once in a thousand; None unless TRACKING."""
+        with self._lock:
+            return self.robot_state.protection_level(self.odometry)
 
     def last_known_pose(self) -> LastKnownPose:
         """Return where the robot is, if that is known, for the next start of the node."""

@@ -114,7 +114,7 @@ class Reporter:
 def status(session: Session, connection: Connection, reconnects: int, rate: float, uptime: float) -> dict[str, Any]:
     """Return the plain data of ``out/status``; its ``stamp_ns`` is the node's wall clock, all others the robot's."""
     state, reason = session.state()
-    age = session.age()
+    age, level = session.age(), session.protection_level()
     known, queue = session.robot_state, session.queue
     return {
         "robot": session.keys.robot,
@@ -128,7 +128,11 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "last_frame_ns": known.last_frame_ns,
         "evidence": None if known.evidence is None else known.evidence.to_json(),
         "transitions": session.history.to_json(),
-        "pose": {"rate_hz": rate, "age_s": None if age is None else round(age, 3)},
+        "pose": {
+            "rate_hz": rate,
+            "age_s": None if age is None else round(age, 3),
+            "protection_level": None if level is None else level.to_json(),
+        },
         "latency_ms": queue.latency.to_json(),
         "engine_ms": queue.engine_latency.to_json(),
         "longest_wait_s": round(queue.longest_wait, 3),

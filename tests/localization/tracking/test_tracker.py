@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from se3 import exp_se3
@@ -9,6 +11,7 @@ from small_world import pose_error, scan
 from trackers import OFF, Ride, add_frame, garbage, match_and_update, on_the_way, refused, registration, ride_of
 
 from coview_stream.config import AcceptanceConfig, GraphConfig, LocalizerConfig, TrackingConfig
+from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import inverse, pose_from
 from coview_stream.localization.registration.covariance import registration_covariance
 from coview_stream.localization.tracking.monitor import RejectionReason
@@ -39,6 +42,25 @@ def test_good_registration_is_accepted(world_map, world_drive):
     assert degrees < 0.2
     after = ride.tracker.predicted_covariance()
     assert np.diag(after)[3:].max() < 0.1 * np.diag(before)[3:].min()
+
+
+def test_protection_level_grows_with_the_metres_driven_and_with_evidence_that_falls(world_map, world_drive):
+    cloud, truth = world_drive.clouds[4], world_drive.T_map_body[4]
+    ride = ride_of(world_map, world_drive)
+    ride.update(cloud, truth)
+    tracker = ride.tracker
+    level = tracker.protection_level()
+    assert level == protection_level(tracker.reported_covariance())
+    assert ride.error(truth)[0] < level.metres < 1.0
+    usual = tracker._baseline.usual
+    tracker._baseline.usual = replace(usual, near=1.2 * usual.near)  # the next one will have fallen below it
+    ride.update(cloud, truth)
+    assert tracker.protection_level().doubt > 1.05
+    T_odom_body = ride.odometry(truth)
+    T_odom_body[:3, 3] += (5.0, 0.0, 0.0)
+    before = tracker.protection_level()
+    tracker.add_scan(cloud, T_odom_body)
+    assert tracker.protection_level().metres > before.metres
 
 
 @pytest.mark.slow

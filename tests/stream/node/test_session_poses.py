@@ -9,6 +9,7 @@ import pytest
 from fake_robot import DRIFT, SHA, T_MAP_ODOM, Robot, doubted, ns, pose, reason, state, tracking, unknown
 
 from coview_stream.config.node import NodeConfig
+from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.localization.state import State
 
 
@@ -57,6 +58,21 @@ def test_pose_covariance_grows_with_distance_and_turn():
     turned = robot.session.pose().covariance
     assert turned[5, 5] == pytest.approx(later[5, 5] + (0.3 * 0.95) ** 2, rel=0.05)
     assert turned[0, 0] == pytest.approx(later[0, 0], rel=0.05)
+
+
+def test_protection_level_grows_with_distance_and_keeps_its_doubt():
+    known = np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
+    robot = Robot()
+    robot.localized(0.0, covariance=known, protection=ProtectionLevel(9.0, 9.0, doubt=1.5))
+    begin = robot.session.pose()
+    assert begin.protection == protection_level(begin.covariance, 1.5)
+    robot.drive(0.05, 2.0)
+    later = robot.session.pose()
+    assert later.protection == protection_level(later.covariance, 1.5)
+    assert later.protection.metres > begin.protection.metres
+    assert robot.session.protection_level() == later.protection
+    robot.frame(2.1, doubted)
+    assert robot.session.protection_level() is None
 
 
 def test_heading_error_propagates_to_position():

@@ -1,0 +1,172 @@
+"""Protection levels against the truth: how often an error is larger than its level, with a bound, and what fits them.
+
+Neighbouring poses have nearly the same error. So of each ten metres of driving one pose counts, the first: nearly
+independent, as far as the world itself is not what they share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.harness.tables import number, table
+from bench.harness.trajectory_scores import Errors, Told
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.protection import RISK, TAILS, axes_of
+from coview_stream.report.style import TRUTH, figure
+
+EVERY = 10.0
+"""Metres of driving of which one pose counts."""
+
+ALERT = (1.0, 3.0)
+"""Alert limit: metres and degrees by which a pose that is given may be off."""
+
+TO_ALERT = (2.0, 2.0)
+"""Seconds, and metres driven, after which a pose beyond the alert limit has to have been withdrawn."""
+
+PRODUCT = tuple(TAILS.values())
+"""The tails that the product has."""
+
+Tails = Sequence[tuple[float, float]]
+
+_HEAVIEST, _LIGHTEST = 2.5, 200.0  # degrees of freedom of a tail: a finite variance; as good as a Gaussian
+
+
+class Sample(NamedTuple):
+    """Poses of which one counts per ten metres: (N, 2) each, of the position and of the rotation.
+
+    Metres and degrees; trace and axes of the covariance are in m2 and rad2. ``doubt`` is the level that was told,
+    relative to the one that the covariance alone has: so other tails can be tried on the same drives.
+    """
+
+    error: Floats
+    doubt: Floats
+    trace: Floats
+    axes: Floats
+
+    @classmethod
+    def of(cls, told: Told, error: Errors, driven: Floats) -> Sample:
+        """Pick them from a drive; (N,) metres ``driven`` at each frame."""
+        posed = np.flatnonzero(told.tracking)
+        rows = posed[np.unique(np.floor(driven[posed] / EVERY), return_index=True)[1]]
+        shape = [[axes_of(C[:3, :3]), axes_of(C[3:, 3:])] for C in told.covariances[rows]]
+        spread = np.array(shape, dtype=np.float64).reshape(-1, 2, 2)
+        errors = np.column_stack([error.metres[rows], error.degrees[rows]])
+        sample = cls(errors, np.ones_like(errors), spread[:, :, 0], spread[:, :, 1])
+        return sample._replace(doubt=told.levels[rows] / sample.level(PRODUCT))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Sample]) -> Sample:
+        """Put those of several drives together."""
+        return cls(*(np.concatenate([np.empty((0, 2)), *(part[k] for part in parts)]) for k in range(len(cls._fields))))
+
+    def to_json(self) -> dict[str, list[list[float]]]:
+        """Return the arrays as lists."""
+        return {name: values.tolist() for name, values in self._asdict().items()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Sample:
+        """Undo :meth:`to_json`."""
+        return cls(**{name: np.array(values, dtype=np.float64).reshape(-1, 2) for name, values in data.items()})
+
+    def level(self, tails: Tails) -> Floats:
+        """(N, 2) metres and degrees that tails of the errors give: factor and degrees of freedom of each."""
+        from scipy.special import fdtri
+
+        quantiles = [
+            factor * np.sqrt(self.trace[:, k] * fdtri(self.axes[:, k], freedom, 1.0 - RISK))
+            for k, (factor, freedom) in enumerate(tails)
+        ]
+        return np.asarray(self.doubt * np.column_stack([quantiles[0], np.degrees(quantiles[1])]))
+
+    def above(self, tails: Tails) -> list[int]:
+        """Count the errors that are larger than their level: in metres, in degrees."""
+        return [int(count) for count in (self.error > self.level(tails)).sum(axis=0)]
+
+
+def upper_bound(hits: int, of: int, confidence: float = 0.95) -> float:
+    """Return the one-sided upper bound of a share after Clopper and Pearson; 1 of nothing."""
+    from scipy.stats import beta
+
+    return 1.0 if hits >= of else float(beta.ppf(confidence, hits + 1, of - hits))
+
+
+def tail(sample: Sample, part: int) -> tuple[float, float]:
+    """Fit the tail of ``part`` (0: metres, 1: degrees): factor and degrees of freedom of the greatest likelihood.
+
+    The model is that of :mod:`coview_stream.geometry.protection`: error^2 / trace, less the factor, is F distributed.
+    """
+    from scipy.optimize import minimize
+    from scipy.stats import f
+
+    error = sample.error[:, part] if part == 0 else np.radians(sample.error[:, part])
+    square, axes = error**2 / sample.trace[:, part], sample.axes[:, part]
+
+    def unlikely(about: Floats) -> float:
+        log_factor, freedom = float(about[0]), float(np.clip(np.exp(about[1]), _HEAVIEST, _LIGHTEST))
+        return -float(np.sum(f.logpdf(square * np.exp(-2 * log_factor), axes, freedom) - 2 * log_factor))
+
+    found = [minimize(unlikely, (0.0, np.log(freedom)), method="Nelder-Mead") for freedom in (4.0, 10.0, 40.0)]
+    best = min(found, key=lambda each: float(each.fun)).x
+    return float(np.exp(best[0])), float(np.clip(np.exp(best[1]), _HEAVIEST, _LIGHTEST))
+
+
+def misleading(told: Told, error: Errors, driven: Floats) -> int:
+    """Count the times that a pose was given beyond the alert limit for longer, or over more metres, than allowed."""
+    beyond = told.tracking & ((error.metres > ALERT[0]) | (error.degrees > ALERT[1]))
+    edges = np.diff(np.r_[False, beyond, False].astype(int))
+    count = 0
+    for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        last = min(end, len(driven) - 1)  # where it is withdrawn, or the drive's end
+        count += bool(
+            told.stamps[last] - told.stamps[begin] > TO_ALERT[0] or driven[last] - driven[begin] > TO_ALERT[1]
+        )
+    return count
+
+
+def level_table(samples: Mapping[str, Sample]) -> str:
+    """Lay out, by name of the group: poses, how many are above their level, the bound, and how wide the levels are."""
+    head = ["poses", "one per 10 m", "> level, m", "below, %", "> level, deg", "below, %", "worst m", "worst deg"]
+    head += ["level m p50", "p99", "level deg p50", "p99"]
+    rows = []
+    for name, sample in samples.items():
+        count, cells = len(sample.error), [name]
+        cells.append(str(count))
+        level = sample.level(PRODUCT)
+        for hits in sample.above(PRODUCT):
+            cells += [str(hits), number(100 * upper_bound(hits, count), 2)]
+        worst = (sample.error / level).max(axis=0) if count else [np.nan, np.nan]
+        cells += [number(float(each), 2) for each in worst]
+        for k, digits in ((0, 2), (1, 1)):
+            wide = np.quantile(level[:, k], [0.5, 0.99]) if count else [np.nan, np.nan]
+            cells += [number(float(each), digits) for each in wide]
+        rows.append(cells)
+    return table(head, rows)
+
+
+def stanford(sample: Sample, path: Path, title: str) -> None:
+    """Draw the Stanford diagram: error against level, with the alert limit and the regions that they part."""
+    levels, above = sample.level(PRODUCT), sample.above(PRODUCT)
+    with figure(path, figsize=(10.4, 5.4), ncols=2) as (drawing, both):
+        for k, (axes, unit) in enumerate(zip(both, ("m", "degrees"), strict=True)):
+            low, high, limit = ALERT[k] / 1000, ALERT[k] * 10, ALERT[k]
+            error, level = (np.clip(each[:, k], low * 1.05, high / 1.05) for each in (sample.error, levels))
+            axes.fill_between([low, high], [low, low], [low, high], color="#F0E442", alpha=0.3, linewidth=0)
+            axes.fill_between([limit, high], [low, low], [limit, limit], color="#D55E00", alpha=0.45, linewidth=0)
+            axes.fill_between([low, high], [limit, limit], [high, high], color="#dddddd", linewidth=0)
+            axes.scatter(error, level, s=5, color="#0072B2", alpha=0.5, linewidths=0)
+            axes.plot([low, high], [low, high], color=TRUTH, linewidth=1.0)
+            axes.axhline(limit, color=TRUTH, linewidth=0.8, linestyle="--")
+            axes.axvline(limit, color=TRUTH, linewidth=0.8, linestyle="--")
+            axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), aspect="equal")
+            axes.set(xlabel=f"error, {unit}", ylabel=f"protection level, {unit}")
+            for x, y, said in (
+                (0.06, 0.55, "as promised"), (0.34, 0.06, "error > level:\nmisleading"), (0.77, 0.3, "HMI"),
+                (0.06, 0.9, "level > alert limit: unavailable"), (0.755, 0.02, f"alert limit {limit:g}"),
+            ):  # fmt: skip
+                axes.text(x, y, said, transform=axes.transAxes, fontsize=8)
+            axes.set_title(f"{unit}: {above[k]} of {len(error)} above their level")
+        drawing.supxlabel(title, fontsize=8, color="#666666", family="DejaVu Sans Mono")

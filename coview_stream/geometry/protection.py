@@ -1,0 +1,68 @@
+"""Protection level of a pose: the error in metres and in degrees that is exceeded at most once in a thousand.
+
+A covariance says how large errors usually are. Rare ones are larger than its Gaussian would have them: its scale, too,
+is an estimate, right on the average of many places and too small in some. With an unknown scale a Gaussian becomes a
+Student-t. So the error's square relative to the trace of its covariance is taken as F(h, n) distributed, times a factor
+squared: h counts the axes that the error comes from (3 for a sphere, 1 for a needle; Satterthwaite's (tr C)^2 / tr C^2)
+and n, the tail's degrees of freedom, says how well the scale is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+
+RISK = 1e-3
+"""Probability with which an error may exceed its level; metres and degrees each."""
+
+TAILS = {"metres": (1.03, 3.9), "degrees": (0.6, 2.7)}
+"""Factor on the sigma, and degrees of freedom: by ``python -m bench protection``, fitted on one family of sites."""
+
+
+@dataclass(frozen=True)
+class ProtectionLevel:
+    """Error that a pose exceeds with a probability of at most 1e-3, relative to the map.
+
+    Attributes:
+        metres: distance of the position, in space.
+        degrees: angle of the rotation.
+        doubt: times as wide as the covariance alone has them.
+    """
+
+    metres: float
+    degrees: float
+    doubt: float = 1.0
+
+    def to_json(self) -> dict[str, float]:
+        """Plain data for messages and ``result.json``."""
+        return {"m": round(self.metres, 4), "deg": round(self.degrees, 4)}
+
+
+def protection_level(covariance: Floats, doubt: float = 1.0, risk: float = RISK) -> ProtectionLevel:
+    """Return the level of a pose.
+
+    Args:
+        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2.
+        doubt: 1 or more: times as large as usual the errors may be.
+        risk: probability with which an error may exceed the level.
+    """
+    metres = _quantile(covariance[:3, :3], *TAILS["metres"], risk)
+    radians = _quantile(covariance[3:, 3:], *TAILS["degrees"], risk)
+    return ProtectionLevel(doubt * metres, min(180.0, doubt * float(np.degrees(radians))), doubt)
+
+
+def axes_of(covariance: Floats) -> tuple[float, float]:
+    """Return the trace of a covariance (3, 3), and the number of axes, 1 to 3, that its errors come from."""
+    trace, squares = float(np.trace(covariance)), float(np.sum(covariance * covariance))
+    return trace, trace**2 / squares if squares > 0 else 3.0
+
+
+def _quantile(covariance: Floats, factor: float, freedom: float, risk: float) -> float:
+    """Norm that an error with a covariance (3, 3) exceeds with the probability ``risk``."""
+    from scipy.special import fdtri
+
+    trace, axes = axes_of(covariance)
+    return factor * float(np.sqrt(trace * fdtri(axes, freedom, 1.0 - risk)))
