@@ -76,6 +76,7 @@ BENCHMARKS = {
     ),
     "plots": Benchmark("speed.plots", "the plots of docs/performance.md", limit_s=900.0, page=True),
     "tracking": Benchmark("tracking.tracking", "errors, covariance, loss and recovery while tracked"),
+    "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
     "protection": Benchmark("tracking.protection", "errors against their protection levels; what calibrates these"),
     "forest": Benchmark("forest.forest", "learned re-localization beside descriptors and canopy heights"),
     "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),

@@ -150,7 +150,7 @@ def earlier(scene: Scene, seed: int, share: float) -> Scene:
     """
     rng = np.random.default_rng([seed, 31])
     solid = scene.now.solid
-    owner = _owners(scene)
+    owner = owners(scene)
     chosen = rng.permutation(len(scene.footprints))[: round(share * len(scene.footprints))]
     vertices, gone = solid.vertices.copy(), np.zeros(len(solid.vertices), dtype=bool)
     for rank, building in enumerate(chosen):
@@ -174,7 +174,7 @@ def earlier(scene: Scene, seed: int, share: float) -> Scene:
     return replace(scene, mapped=epoch, now=scene.mapped)
 
 
-def _owners(scene: Scene, margin: float = 2.0) -> Indices:
+def owners(scene: Scene, margin: float = 2.0) -> Indices:
     """(V,) the building that each vertex of ``scene.now.solid`` belongs to, -1 for none.
 
     A mesh is of unconnected pieces (walls, roofs, porches, and the ground); a piece belongs to the building whose

@@ -1,0 +1,167 @@
+"""What is run: sites, what is driven on the map of each, and which family of runs that belongs to.
+
+A site is drawn and mapped once and serves several runs; no two of them share a drive as well. Sites of calibration
+kinds are for fitting and are never reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import count
+from typing import Literal
+
+import numpy as np
+
+Group = Literal["calibration", "reported"]
+Class = Literal["ordinary", "outside", "near copies"]
+
+LIDARS = ("vlp16", "mid360", "os64")
+FIRST_SEED = {"calibration": 31_000, "reported": 71_000}
+_CHOICES = 230  # random stream
+
+STREETS: dict[str, tuple[str, ...]] = {
+    "calibration": ("town", "campus"),
+    "reported": ("village", "industrial", "suburb", "harbour", "forest"),
+}
+"""Kinds of sites whose maps serve ordinary runs, runs outside and altered ones."""
+
+COPIES: dict[str, tuple[str, ...]] = {
+    "calibration": ("terraces", "plantation"),
+    "reported": ("yard", "rows", "boxes", "avenue", "court", "storey"),
+}
+"""Kinds of sites that are near copies of themselves."""
+
+ALTERED: dict[str, tuple[tuple[str, ...], ...]] = {
+    "calibration": (("edge",),),
+    "reported": (("mirrored", "shifted"), ("old", "scaled"), ("tilted", "edge")),
+}
+"""Families of near copies on the maps of streets, those of one site together."""
+
+_ORDINARY: tuple[Class, str] = ("ordinary", "the site, 0-40 % changed")
+
+FAMILIES: dict[str, tuple[Class, str]] = {
+    **{f"ordinary {kind}": _ORDINARY for kinds in STREETS.values() for kind in kinds},
+    "outside, same kind": ("outside", "another site of the map's kind: every fix is false"),
+    "outside, other kind": ("outside", "a site of another kind: every fix is false"),
+    "terraces": ("near copies", "identical terraces; for half of the runs with other trees, cars and poles"),
+    "plantation": ("near copies", "equal objects on a grid; for half of the runs on another grid now"),
+    "yard": ("near copies", "container yard, every stack another: right by ground and masts"),
+    "rows": ("near copies", "equal rows of houses, one house changed or swapped with one elsewhere"),
+    "boxes": ("near copies", "24 x 40 equal boxes, driven along or across"),
+    "avenue": ("near copies", "facades, trees or walls that are the same all along"),
+    "court": ("near copies", "court of 4-fold symmetry"),
+    "storey": ("near copies", "map of another storey with the same shell: every fix is false"),
+    "mirrored": ("near copies", "the map mirrored: every fix is false"),
+    "shifted": ("near copies", "all buildings 4 m off: right by ground and trees"),
+    "old": ("near copies", "50 % of buildings, trees, cars and poles others"),
+    "scaled": ("near copies", "the map 3-5 % too large or small: right under the same scaling"),
+    "tilted": ("near copies", "the map tilted by 2-4 degrees: right where it fits"),
+    "edge": ("near copies", "10-40 m from the map's border, inside or outside"),
+}  # fmt: skip
+"""Family of runs: class, and what it is."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One first fix to wait for.
+
+    Attributes:
+        group: calibration or reported.
+        family: one of ``FAMILIES``.
+        kind: of the site that the map is of.
+        seed: of that site.
+        number: of the run among those on that map.
+        sensor: the robot's lidar.
+        changed: share of the trees, cars and poles that are others now; of made-up kinds see there.
+        rebuilt: share of the buildings that are.
+        driven: kind of the site that is driven through, if it is another site.
+        beyond: of a run at an edge: outside the border.
+    """
+
+    group: Group
+    family: str
+    kind: str
+    seed: int
+    number: int
+    sensor: str
+    changed: float = 0.0
+    rebuilt: float = 0.0
+    driven: str = ""
+    beyond: bool = False
+
+    @property
+    def key(self) -> str:
+        """Name that no other run has."""
+        return f"{self.group}/{self.kind}-{self.seed}/{self.number}-{self.family}"
+
+    @property
+    def of_class(self) -> Class:
+        """What it is counted under."""
+        return FAMILIES[self.family][0]
+
+    @property
+    def drive_seed(self) -> int:
+        """Seed of its drive, and of another site that it leads through."""
+        return 16 * self.seed + self.number
+
+
+Site = tuple[Run, ...]
+"""The runs on one map."""
+
+
+def plan(group: Group, runs: int) -> list[Site]:
+    """Return the sites of the first ``runs`` runs, in the proportions of all."""
+    out: list[Site] = []
+    for site in sites(group):
+        left = runs - sum(map(len, out))
+        if left <= 0:
+            break
+        out.append(site[:left])
+    return out
+
+
+def sites(group: Group) -> Iterator[Site]:
+    """Yield sites without end, streets and near copies in turn: on two of them three runs of each class at least."""
+    kinds, altered, copies = STREETS[group], ALTERED[group], COPIES[group]
+    for k in count():
+        seed = FIRST_SEED[group] + 2 * k
+        yield _street(group, kinds[k % len(kinds)], seed, altered[k % len(altered)], k // len(altered))
+        yield _copy(group, copies[k % len(copies)], seed + 1, k // len(copies))
+
+
+def _street(group: Group, kind: str, seed: int, altered: tuple[str, ...], turn: int) -> Site:
+    """Three ordinary runs, three outside and near copies on the map of one site."""
+    rng, sensor = _choices(seed)
+    others = [each for each in STREETS[group] if each != kind]
+    shares = (0.0, *rng.uniform((0.05, 0.2), (0.2, 0.4)))
+    out = [
+        Run(group, f"ordinary {kind}", kind, seed, k, sensor(k), round(share, 3), round(share, 3))
+        for k, share in enumerate(shares)
+    ]
+    for k, other in enumerate((kind, *(str(each) for each in rng.choice(others, 2))), start=3):
+        family = f"outside, {'same' if other == kind else 'other'} kind"
+        share = round(float(rng.uniform(0.0, 0.4)), 3)
+        out.append(Run(group, family, kind, seed, k, sensor(k), share, driven=other))
+    for k, family in enumerate(altered, start=6):
+        family = "mirrored" if family == "shifted" and kind == "forest" else family  # hardly a building to shift
+        share = 0.5 if family == "old" else round(float(rng.uniform(0.0, 0.2)), 3)
+        rebuilt, beyond = share if family == "old" else 0.0, family == "edge" and turn % 2 == 1
+        out.append(Run(group, family, kind, seed, k, sensor(k), share, rebuilt, beyond=beyond))
+    return tuple(out)
+
+
+def _copy(group: Group, kind: str, seed: int, turn: int) -> Site:
+    """Two runs on the map of one near copy of itself."""
+    rng, sensor = _choices(seed)
+    shares = {
+        "terraces": (0.0, 1.0), "plantation": (float(turn % 2), 1.0 - turn % 2),
+        "yard": (1.0, 1.0), "storey": (1.0, 1.0), "rows": tuple(rng.uniform(0.0, 0.3, 2).round(3)),
+    }.get(kind, (0.0, 0.0))  # fmt: skip
+    return tuple(Run(group, kind, kind, seed, k, sensor(k), float(share)) for k, share in enumerate(shares))
+
+
+def _choices(seed: int) -> tuple[np.random.Generator, Callable[[int], str]]:
+    rng = np.random.default_rng([seed, _CHOICES])
+    order = rng.permutation(len(LIDARS))
+    return rng, lambda k: LIDARS[order[k % len(LIDARS)]]

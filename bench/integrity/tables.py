@@ -1,0 +1,143 @@
+"""Tables of results: by class, by family, and stated risk against what came of it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from bench.harness.tables import NOTHING, number, table
+from bench.integrity.bounds import lower, upper
+from bench.integrity.plan import FAMILIES
+from bench.integrity.store import Result
+
+OUTCOMES = ("right", "false", "none")
+"""What counts as a run; what failed or had no way to drive does not."""
+
+RISKS = (1e-1, 1e-2, 1e-3, 1e-4)
+"""Stated risks that the reliability table is about."""
+
+_LONG = 58  # characters of a reason that are shown
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Counts of some runs.
+
+    Attributes:
+        runs: how many count.
+        sites: on how many maps.
+        right: first fixes that are right.
+        false: first fixes that are not.
+        ambiguous: runs without a fix whose last state was AMBIGUOUS.
+        searching: those with any other last state.
+        reason: what was said most often at the end of those without a fix, numbers left out.
+        median_m: metres to the first fix if it is right.
+        most_m: 90 % of those are not longer.
+    """
+
+    runs: int
+    sites: int
+    right: int
+    false: int
+    ambiguous: int
+    searching: int
+    reason: str
+    median_m: float
+    most_m: float
+
+    @classmethod
+    def of(cls, results: Iterable[Result]) -> Tally:
+        """Count results."""
+        counted = [each for each in results if each["outcome"] in OUTCOMES]
+        outcome = Counter(each["outcome"] for each in counted)
+        without = [each for each in counted if each["outcome"] == "none"]
+        ambiguous = sum(each["state"] == "AMBIGUOUS" for each in without)
+        reasons = Counter(plain(each.get("reason", "")) for each in without).most_common(1)
+        metres = [each["metres"] for each in counted if each["outcome"] == "right"]
+        median, most = (float(np.quantile(metres, q)) if metres else np.nan for q in (0.5, 0.9))
+        return cls(
+            len(counted), len({(each["kind"], each["seed"]) for each in counted}), outcome["right"], outcome["false"],
+            ambiguous, len(without) - ambiguous, f"{reasons[0][0]} ({reasons[0][1]})" if reasons else "", median, most,
+        )  # fmt: skip
+
+    @property
+    def bound(self) -> float:
+        """Share of false first fixes that the true one is below, at 95 %."""
+        return upper(self.false, self.runs)
+
+    @property
+    def found(self) -> float:
+        """Share of the runs whose first fix is right."""
+        return self.right / self.runs if self.runs else np.nan
+
+
+def plain(reason: str) -> str:
+    """Return a reason without its numbers."""
+    short = re.sub(r"[\d,.]*\d", "N", reason)
+    return short if len(short) <= _LONG else f"{short[: _LONG - 2]} .."
+
+
+def percent(share: float, digits: int = 2) -> str:
+    """Write a share."""
+    return NOTHING if np.isnan(share) else f"{100 * share:.{digits}f} %"
+
+
+def classes(results: Sequence[Result]) -> dict[str, Tally]:
+    """Count all results, and those of each class."""
+    of_class = {name: [r for r in results if r["class"] == name] for name in ("near copies", "outside", "ordinary")}
+    # with nothing but buildings in view nothing tells that all of them have moved
+    but = [r for r in results if r["family"] != "shifted"]
+    parts = {"all": results, **of_class, "all but shifted buildings": but}
+    return {name: Tally.of(each) for name, each in parts.items() if Tally.of(each).runs}
+
+
+def class_table(results: Sequence[Result]) -> str:
+    """Lay out the counts of each class, with exact bounds."""
+    head = ("runs", "number", "sites", "right", "false", "none", "false, below (95 %)", "found", "median m", "90 % m")
+    return table(
+        head,
+        [
+            [
+                name, str(t.runs), str(t.sites), str(t.right), str(t.false), str(t.ambiguous + t.searching),
+                percent(t.bound), percent(t.found, 1), number(t.median_m, 1), number(t.most_m, 1),
+            ]
+            for name, t in classes(results).items()
+        ],
+    )  # fmt: skip
+
+
+def family_table(results: Sequence[Result]) -> str:
+    """Lay out the counts of each family, and what is said where there is no fix."""
+    head = (
+        "family", "runs", "right", "false", "AMBIGUOUS", "SEARCHING", "median m", "90 % m", "false, below",
+        "most said without a fix", "what it is",
+    )  # fmt: skip
+    lines = []
+    for family, (_, what) in FAMILIES.items():
+        t = Tally.of(each for each in results if each["family"] == family)
+        if t.runs:
+            lines.append([
+                family, str(t.runs), str(t.right), str(t.false), str(t.ambiguous), str(t.searching),
+                number(t.median_m, 1), number(t.most_m, 1), percent(t.bound, 1), t.reason, what,
+            ])  # fmt: skip
+    return table(head, lines)
+
+
+def reliability_table(results: Sequence[Result]) -> str:
+    """Lay out first fixes by the risk they state: up to each, and between two, how many were false."""
+    fixes = [(each["risk"], each["outcome"] == "false") for each in results if each.get("risk") is not None]
+    lines = []
+    steps = [(f"<= {risk:g}", 0.0, risk) for risk in RISKS]
+    steps += [(f"{low:g} to {high:g}", low, high) for high, low in pairwise(RISKS)]
+    for name, low, high in steps:
+        chosen = [(risk, false) for risk, false in fixes if (low < risk or low == 0.0) and risk <= high]
+        n, k = len(chosen), sum(false for _, false in chosen)
+        stated = float(np.mean([risk for risk, _ in chosen])) if n else np.nan
+        between = f"{percent(lower(k, n))} to {percent(upper(k, n))}" if n else NOTHING
+        lines.append([name, str(n), NOTHING if np.isnan(stated) else f"{stated:.1e}", str(k), between])
+    return table(("stated risk", "first fixes", "mean of it", "false", "observed (95 % below, 95 % above)"), lines)

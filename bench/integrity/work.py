@@ -1,0 +1,104 @@
+"""Work of one process: the runs on the map of one site, each noted as soon as it ends."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from bench.harness.files import fingerprint, remembered
+from bench.harness.suite import thread_settings
+from bench.integrity.plan import Run, Site
+from bench.integrity.store import Result, append
+from coview_stream import BaseMap
+
+SITE_CODE = ("coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds", "coview_stream/descriptors")
+"""What makes a map, besides this benchmark."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """How runs are made and where they are noted.
+
+    Attributes:
+        results: file of the results.
+        code: fingerprint that they are noted with.
+        risk: integrity risk; None for the product's own.
+        maps: folder in which maps are kept; None: they are deleted after use.
+    """
+
+    results: Path
+    code: str
+    risk: float | None = None
+    maps: Path | None = None
+
+    def key(self, run: Run) -> str:
+        """Name of a run's result."""
+        return run.key if self.risk is None else f"{run.key}@{self.risk:g}"
+
+
+def everywhere(sites: Sequence[Site], task: Task, jobs: int) -> Iterator[Result]:
+    """Yield results as they come, of ``jobs`` processes with one thread each; results are noted by then."""
+    os.environ.update(thread_settings(1))  # what is started from now on inherits it
+    with ProcessPoolExecutor(max(1, min(jobs, len(sites))), mp_context=get_context("spawn")) as pool:
+        waiting = [pool.submit(on_site, site, task) for site in sites]
+        try:
+            for done in as_completed(waiting):
+                yield from done.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def on_site(site: Site, task: Task) -> list[Result]:
+    """Make all runs on one map; what cannot be made is noted as ``failed``, and tried again another time."""
+    from bench.integrity.run import localizer_on
+
+    begin, out = time.perf_counter(), list[Result]()
+    localizer, reason = None, ""
+    try:
+        localizer = localizer_on(map_of(site[0], task.maps), task.risk)
+    except Exception as error:  # whatever it is, the other sites go on
+        reason = f"{type(error).__name__}: {error}"
+    share = round((time.perf_counter() - begin) / len(site), 2)
+    for run in site:
+        begin = time.perf_counter()
+        result: Result = {"outcome": "failed", "reason": reason}
+        try:
+            if localizer is not None:
+                result = _one(run, localizer)
+        except Exception as error:  # likewise
+            result["reason"] = f"{type(error).__name__}: {error}"
+        result = {"key": task.key(run), "code": task.code, "class": run.of_class, **asdict(run), **result}
+        result |= {"asked_risk": task.risk, "site_s": share, "cost_s": round(time.perf_counter() - begin, 2)}
+        append(task.results, result)
+        out.append(result)
+    return out
+
+
+def _one(run: Run, localizer: object) -> Result:
+    from bench.integrity.run import drive_of, first_fix
+    from coview_stream import Localizer
+
+    assert isinstance(localizer, Localizer)
+    drive = drive_of(run)
+    return {"outcome": "no way", "reason": "no such street"} if drive is None else first_fix(localizer, drive)
+
+
+def map_of(run: Run, kept: Path | None = None) -> BaseMap:
+    """Return the map that a run is made on, built now unless it is ``kept`` in a folder."""
+    from bench.integrity.kinds import draw
+    from bench.integrity.maps import built, size_of, surveyed
+
+    def build() -> BaseMap:
+        return built(surveyed(draw(run.kind, run.seed, size_of(run.kind), 0.0), run.seed))  # changes come later
+
+    if kept is None:
+        return build()
+    file = kept / f"{run.kind}-{run.seed}.coview"
+    spec = {"site": [run.kind, run.seed], "code": fingerprint(*SITE_CODE, "bench/integrity")}
+    remembered(file.with_suffix(".json"), spec, lambda: build().save(file))
+    return BaseMap.load(file)

@@ -1,0 +1,105 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from bench.integrity.bounds import lower, upper
+from bench.integrity.run import judged
+from bench.integrity.store import ANY, append, read
+from bench.integrity.tables import Tally, classes, family_table, plain, reliability_table
+from coview_stream.geometry.transforms import pose_from, rot_z
+
+
+def result(key, outcome, **more):
+    said = {"key": key, "code": "a", "kind": "village", "seed": 1, "class": "ordinary", "family": "ordinary village"}
+    return said | {"outcome": outcome, "state": "SEARCHING", "metres": 4.0} | more
+
+
+@pytest.mark.parametrize(
+    ("events", "runs", "bound"),
+    [(0, 299, 0.00997), (0, 1000, 0.002991), (0, 36, 0.0798), (1, 300, 0.0157), (1, 1000, 0.00474), (5, 5, 1.0)],
+)
+def test_upper_bound_is_clopper_pearsons(events, runs, bound):
+    assert upper(events, runs) == pytest.approx(bound, rel=5e-3)
+
+
+def test_bound_without_events_is_that_of_the_rule_of_three():
+    assert upper(0, 1000) == pytest.approx(1 - 0.05 ** (1 / 1000))
+    assert lower(1000, 1000) == pytest.approx(0.05 ** (1 / 1000))
+
+
+@pytest.mark.parametrize(("events", "runs"), [(1, 20), (7, 20), (19, 20)])
+def test_bounds_leave_five_percent_of_the_binomial_on_either_side(events, runs):
+    def at_most(k, p):
+        return sum(math.comb(runs, j) * p**j * (1 - p) ** (runs - j) for j in range(k + 1))
+
+    assert at_most(events, upper(events, runs)) == pytest.approx(0.05)
+    assert 1 - at_most(events - 1, lower(events, runs)) == pytest.approx(0.05)
+
+
+def test_bounds_of_nothing_say_nothing_and_impossible_counts_are_refused():
+    assert (lower(0, 0), upper(0, 0)) == (0.0, 1.0)
+    with pytest.raises(ValueError, match="5 events of 4 runs"):
+        upper(5, 4)
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "outcome"),
+    [(2.9, 0.0, "right"), (3.1, 0.0, "false"), (0.0, 4.9, "right"), (0.0, 5.1, "false")],
+)
+def test_a_fix_is_right_within_three_metres_and_five_degrees(metres, degrees, outcome):
+    truth = pose_from(rot_z(1.0), np.array([5.0, 6.0, 7.0]))
+    told = truth @ pose_from(rot_z(np.radians(degrees)), np.array([metres, 0.0, 0.0]))
+    assert judged(told, truth)["outcome"] == outcome
+
+
+def test_every_fix_is_false_where_no_pose_is_right():
+    assert judged(np.eye(4), None) == {"outcome": "false"}
+
+
+def test_results_are_found_again_by_key_and_code_the_newest_of_each(tmp_path):
+    files = [tmp_path / "a.jsonl", tmp_path / "b.jsonl"]
+    append(files[0], result("one", "failed"))
+    append(files[0], result("one", "right"))
+    append(files[1], result("two", "none", code="b"))
+    with files[1].open("a") as stream:
+        stream.write(json.dumps(result("three", "none"))[:30])  # as a killed process leaves it
+    assert {key: each["outcome"] for key, each in read(files, "a").items()} == {"one": "right"}
+    assert set(read([*files, tmp_path / "none.jsonl"], ANY)) == {"one", "two"}
+
+
+def test_failed_runs_and_those_without_a_way_do_not_count():
+    runs = [result("1", "right"), result("2", "failed"), result("3", "no way"), result("4", "none", reason="x")]
+    tally = Tally.of(runs)
+    assert (tally.runs, tally.right, tally.false, tally.searching) == (2, 1, 0, 1)
+    assert tally.found == 0.5
+
+
+def test_ends_without_a_fix_are_told_apart_by_state_and_commonest_reason():
+    ends = [("AMBIGUOUS", "two places fit: 1 in 12"), ("AMBIGUOUS", "two places fit: 1 in 9"), ("SEARCHING", "nothing")]
+    tally = Tally.of(result(str(k), "none", state=state, reason=said) for k, (state, said) in enumerate(ends))
+    assert (tally.ambiguous, tally.searching, tally.reason) == (2, 1, "two places fit: N in N (2)")
+
+
+def test_numbers_are_left_out_of_reasons():
+    assert plain("wrong 1 in 77,000, 0.3 of it") == "wrong N in N, N of it"
+
+
+def test_shifted_buildings_are_counted_with_the_rest_and_without():
+    runs = [result("1", "right"), result("2", "false", **{"class": "near copies", "family": "shifted"})]
+    found = classes(runs)
+    assert {name: (t.runs, t.false) for name, t in found.items()} == {
+        "all": (2, 1), "near copies": (1, 1), "ordinary": (1, 0), "all but shifted buildings": (1, 0)
+    }  # fmt: skip
+    assert "shifted" in family_table(runs)
+
+
+def test_reliability_counts_fixes_up_to_a_risk_and_between_two():
+    fixes = [result(str(k), "right", risk=5e-3) for k in range(9)] + [result("x", "false", risk=0.05)]
+    lines = {line.split("|")[1].strip(): line.split("|")[2:5] for line in reliability_table(fixes).splitlines()[2:]}
+    counts = {name: (int(cells[0]), int(cells[2])) for name, cells in lines.items()}
+    assert counts["<= 0.1"] == (10, 1)
+    assert counts["<= 0.01"] == (9, 0)
+    assert counts["0.01 to 0.1"] == (1, 1)
+    assert counts["<= 0.001"] == (0, 0)
