@@ -60,8 +60,8 @@ class Methods:
         for name in BASELINES:
             spent = Clock()
             with spent("ms"):
-                candidates = self._chain.register(named[name], scan)
-            chains[name] = self._chain.metric(named[name], candidates, truth, query) | _milliseconds(spent)
+                judged = self._chain.register(named[name], scan)
+            chains[name] = self._chain.metric(named[name], judged, truth, query) | _milliseconds(spent)
         apart = {name: np.hypot(*(at - robot).T) for name, at in places.items()}
         return {
             "sensor": drive.sensor,
@@ -101,14 +101,14 @@ class Methods:
             consensus.vote(vote)
             voted = [replace(each, learned=True) for each in consensus.hypotheses()]
         with clock("registration"):
-            candidates = self._chain.register(voted, self._chain.scan(query))
-        verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in candidates]
+            judged = self._chain.register(voted, self._chain.scan(query))
+        verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in judged[1]]
         features = self._learned.features
         places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
         named, shifts = vote.candidates()
         places["dense"] = distinct(stations[named, :2], -vote.at(named, shifts))
         places["verified"] = _in_turn(verified, query)
-        return self._chain.metric(voted, candidates, truth, query)
+        return self._chain.metric(voted, judged, truth, query)
 
 
 def _milliseconds(clock: Clock) -> dict[str, float]:

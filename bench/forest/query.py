@@ -16,16 +16,16 @@ from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, r
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import ScanInput
-from coview_stream.localization.search.acceptance import AcceptanceTest
+from coview_stream.localization.search.acceptance import decide
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
-from coview_stream.localization.search.global_search import REGISTERED
-from coview_stream.localization.search.refinement import Candidate, register_places, verify_places
+from coview_stream.localization.search.refinement import Candidate, register_place
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.scoring import score_hypotheses
+from coview_stream.localization.search.scoring import PlaceScorer, Scored
 from coview_stream.report.evaluation import driven
 
 BEST, APART = 5, 10.0  # places that each method names, and metres between two of them
 _SUBMAP = 8.0  # metres driven that are registered: four keyframes, as in the search
+_REGISTERED = 3  # most probable places that are registered; a search registers the first alone
 
 
 def query_of(drive: Drive, config: LocalizerConfig) -> tuple[SearchRequest, Pose]:
@@ -101,35 +101,37 @@ def _pose(at: Reals, yaw: float, centre: Floats) -> Pose:
 
 
 class Chain:
-    """Registration, verification and decision of one keyframe, as in a search."""
+    """Evidence, registration, verification and decision of one keyframe, as in a search."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
-        """Register with the search's own method; the decision asks for one keyframe, not for three."""
-        alone = replace(config.acceptance, confirmations=1, evidence_sum=1e-9)
+        """Register with the search's own method."""
         registration = replace(config.registration, method="trimmed-icp")
         self.config = replace(config, registration=registration)
         self._base_map, self._local_maps = base_map, LocalMaps(base_map, registration.source_range)
-        self._acceptance = AcceptanceTest(replace(self.config, acceptance=alone))
 
     def scan(self, query: SearchRequest) -> ScanInput:
         """Return what of a query is registered."""
         points = prepare_scan(query.submap, query.position, self.config.registration)
         return ScanInput(points, query.cloud, query.T_odom_body)
 
-    def register(self, named: list[Hypothesis], scan: ScanInput) -> list[Candidate]:
-        """Return verified candidates, best first."""
-        places = score_hypotheses(self._base_map.field, named, scan, REGISTERED).places
-        return verify_places(register_places(places, scan, self._base_map, self.config, self._local_maps))
+    def register(self, named: list[Hypothesis], scan: ScanInput) -> tuple[Scored, list[Candidate]]:
+        """Return the evidence of the places named, and the most probable of them registered, in that order."""
+        scored = PlaceScorer(self._base_map.field).score(named, range(len(named)), 0, scan)
+        found = [
+            register_place(place, scan, self._base_map, self.config, self._local_maps)
+            for place in scored.places[:_REGISTERED]
+        ]
+        return scored, [each for each in found if each is not None]
 
     def metric(
-        self, named: list[Hypothesis], candidates: list[Candidate], truth: Pose, query: SearchRequest
+        self, named: list[Hypothesis], judged: tuple[Scored, list[Candidate]], truth: Pose, query: SearchRequest
     ) -> dict[str, Any]:
         """Errors of the best hypothesis and the best candidate, and what would have been believed; plain values."""
-        self._acceptance.clear()
-        score = candidates[0].evidence.score if candidates else 0.0
+        scored, candidates = judged
+        leader = next((each for each in candidates if each.place is scored.places[0]), None)
         return {
             "before": errors(named[0].T_map_odom, truth, query)[:2] if named else None,
             "after": errors(candidates[0].T_map_odom, truth, query)[2:] if candidates else None,
-            "passes": bool(candidates) and score >= self.config.acceptance.score,
-            "accepted": self._acceptance.decide(candidates, query, 1).accepted is not None,
+            "passes": bool(candidates) and scored.error < 0.5,
+            "accepted": decide(scored, leader, query, self.config.acceptance).accepted is not None,
         }

@@ -47,7 +47,7 @@ def success(answers: Sequence[Answer], stage: str, metres: float, degrees: float
 
 
 def false(answer: Answer, believed: str) -> bool:
-    """Whether a wrong pose would have been ``believed``: its score ``passes``, or it is ``accepted``."""
+    """Whether a wrong pose would have been ``believed``: more probable than not (``passes``), or ``accepted``."""
     return bool(answer[believed]) and not _within(answer["after"], NEAR_METRES, NEAR_DEGREES)
 
 

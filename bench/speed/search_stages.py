@@ -29,13 +29,14 @@ from bench.speed.search import DRIVES, KEYFRAMES, WORLDS, last_core
 from bench.speed.search_worker import prepared, requests
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.descriptors.network import weights_directory, weights_name
+from coview_stream.localization.evidence.observed_scan import ObservedScan, ScanPart
 from coview_stream.localization.registration import local_map
 from coview_stream.localization.registration import register as registration
 from coview_stream.localization.search import global_search, recognizers
-from coview_stream.localization.search.acceptance import AcceptanceTest
 from coview_stream.localization.search.consensus import Consensus
 from coview_stream.localization.search.learned import feature_vote, matcher
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
+from coview_stream.localization.search.scoring import PlaceScorer
 from coview_stream.report.style import ACCENT, TRUTH, figure
 
 OUT = Path("docs/images/performance_search.png")
@@ -93,11 +94,11 @@ def _windows(arguments: tuple[Any, ...], result: Any) -> float:
 
 def _field(arguments: tuple[Any, ...], result: Any) -> float:
     """Cells within reach of a scan around each place, each once, but no more than there are."""
-    field, hypotheses, scan = arguments[:3]
+    part, field, poses = arguments[:3]
     whole = size(field.occupied, field.ground, field.edge)
     cells = field.occupied[0].size * len(field.tiles)
     reach = 4 * _REACH * _REACH / _CELL**2 * whole / cells
-    return float(min(whole, len(hypotheses) * reach) + size(scan.cloud.points))
+    return float(min(whole, len(poses) * reach) + size(tuple(part.points)))
 
 
 def _registered(arguments: tuple[Any, ...], result: Any) -> float:
@@ -132,11 +133,13 @@ STAGES = (
     Stage(
         "distinct places", Consensus, "hypotheses", lambda a, r: size(a[0]._places.votes), "votes on the kept places"
     ),
-    Stage("field scores", global_search, "score_hypotheses", _field, "cells around the places, the scan"),
+    Stage("observed scan", ObservedScan, "of", _nothing, ""),
+    Stage("field: look up", ScanPart, "look_up", _field, "cells around the places, the scan"),
+    Stage("evidence", PlaceScorer, "score", lambda a, r: size(a[0]._followed.observed), "observations of the places"),
     Stage("crops of the map", local_map.LocalMaps, "around", _nothing, ""),
     Stage("registration", registration, "register", _registered, "crop and scan, once a place"),
     Stage("verification", registration, "verify", _verified, "crop and scan, once a place"),
-    Stage("decision", AcceptanceTest, "decide", lambda a, r: size(r.rivals), "the rivals"),
+    Stage("decision", global_search, "decide", _nothing, ""),
 )
 
 Record = dict[str, tuple[float, float, int]]  # seconds, bytes and calls of each stage of one step

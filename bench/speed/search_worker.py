@@ -13,9 +13,10 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any, NamedTuple
 
-_ENDLESS = 1e9  # evidence that a place would need
+_NEVER = ({"risk": sys.float_info.min}, {"evidence_sum": 1e9})  # what no place meets, now and in earlier commits
 _CROPS = 24  # of the map that are kept, as the search engine has it
 _STARTS = 7  # a run's starts lie this share of it apart, then between those
 
@@ -39,7 +40,8 @@ def prepared(site_file: str, run_folder: str) -> Search:
     from coview_stream.localization.search.recognizers import SearchIndex
     from coview_stream.recordings.open_run import open_run
 
-    config = LocalizerConfig(acceptance=AcceptanceConfig(evidence_sum=_ENDLESS))
+    known = {field.name for field in fields(AcceptanceConfig)}
+    config = LocalizerConfig(acceptance=AcceptanceConfig(**next(each for each in _NEVER if known.issuperset(each))))
     site, run = BaseMap.load(site_file), open_run(run_folder)
     maps = LocalMaps(site, config.registration.source_range, _CROPS)
     index = SearchIndex.of(site, config)

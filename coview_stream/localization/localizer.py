@@ -93,6 +93,7 @@ class Localizer:
         self._anchor: Floats | None = None  # origin of odometry in use, so that float32 stays exact
         self._newest: _Frame | None = None
         self._evidence: KeyframeEvidence | None = None
+        self._confidence = 0.0  # of the search that found the place
         self._registered_at = 0.0  # stamp of the newest registration
 
     @property
@@ -191,7 +192,7 @@ class Localizer:
             pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
             to_map_origin(T_map_local, self._anchor, self.base_map.origin),
             self._tracker.reported_covariance(),
-            max(0.0, evidence.score - evidence.rival) if evidence else 0.0,
+            self._confidence,
             evidence,
             self._tracker.drift,
             self._tracker.protection_level(),
@@ -266,6 +267,7 @@ class Localizer:
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None
         self._handle(Event.PLACE_ACCEPTED)
+        self._confidence = result.evidence.confidence or 0.0
         self._tracker.start(result.accepted.registration, newest.T_odom_body, result.travelled)
         self._monitor.clear()
         self._hints.clear()

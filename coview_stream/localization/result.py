@@ -32,6 +32,8 @@ class KeyframeEvidence:
         cause: what decided, while tracking; None from a search.
         innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
             from the ones before; None where nothing could be registered, and from a search.
+        confidence: posterior probability that the robot is at the most probable place; None while tracking.
+        by_chance: expected number of places of the map that would fit as well by chance; None likewise.
     """
 
     stamp: float
@@ -44,6 +46,8 @@ class KeyframeEvidence:
     shift: int | None = None
     cause: RejectionReason | None = None
     innovation: float | None = None
+    confidence: float | None = None
+    by_chance: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for ``result.json`` and the status: always the same keys, None where a value is not known."""
@@ -60,6 +64,8 @@ class KeyframeEvidence:
             "shift": self.shift,
             "cause": None if self.cause is None else self.cause.value,
             "innovation": None if self.innovation is None else round(self.innovation, 2),
+            "confidence": self.confidence,
+            "by_chance": None if self.by_chance is None else float(f"{self.by_chance:.3g}"),
         }
 
     @classmethod
@@ -74,6 +80,7 @@ class KeyframeEvidence:
             float(data["stamp"]), State(data["state"]), str(data["reason"]), float(data["score"]),
             float(data["rival"]), parts, data["station"], data["shift"],
             None if data.get("cause") is None else RejectionReason(data["cause"]), data.get("innovation"),
+            data.get("confidence"), data.get("by_chance"),
         )  # fmt: skip
 
 
@@ -90,7 +97,8 @@ class Fix:
             rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
             map, whose georeferencing is not in it, and calibrated on simulated drives: see docs/tracking.md. One sigma
             of x, y and z, metres, is ``numpy.sqrt(numpy.diag(fix.covariance))[:3]``.
-        confidence: in [0, 1]: the evidence score, less what the best rival has of it.
+        confidence: in [0, 1]: probability that the robot is at this place and not at another or none, as the search
+            that found it has it: see docs/integrity.md.
         evidence: of the newest keyframe, None before the first.
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:

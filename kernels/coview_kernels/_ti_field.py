@@ -9,6 +9,8 @@ from coview_kernels import runtime
 from coview_kernels.launch import SPAN
 from coview_kernels.reference.field import (
     EDGE_STEP,
+    NEAR_STEP,
+    NEAR_TURN,
     NOT_SURVEYED,
     ON_GROUND,
     REACH,
@@ -154,7 +156,8 @@ def rise(
 def score(
     planes: PLANES, blocks: ti.i32, high: ti.i32,
     table: WHOLES, across: ti.i32, base: FLOATS, bits: BITS, surface: WHOLES,
-    few: FLOATS, some: FLOATS, lows: FLOATS, structure: FLOATS, low: FLOATS, free: FLOATS, levels: ti.i32,
+    few: FLOATS, some: FLOATS, lows: FLOATS, structure: FLOATS, low: FLOATS, free: FLOATS,
+    levels: ti.i32, coarse: ti.i32,
     poses: DOUBLES, counts: WHOLES, chunks: ti.i32,
 ):  # fmt: skip
     """Move and score poses; the coarse level, the fine ones and the height take ``few``, ``some`` and ``lows``."""
@@ -168,15 +171,17 @@ def score(
                     y = ti.cast(poses[4 * h + 1], ti.f32)
                     z = ti.cast(poses[4 * h + 2], ti.f32)
                     yaw = ti.cast(poses[4 * h + 3], ti.f32)
+                    step, angle = ti.cast(NEAR_STEP, ti.f32), ti.cast(NEAR_TURN, ti.f32)
                     if levels > 0:
-                        at, turn = coarse_best(planes, high, blocks, few, x, y, z, yaw)
-                        x += ti.cast(at % WINDOW - REACH, ti.f32)
-                        y += ti.cast(at // WINDOW - REACH, ti.f32)
-                        yaw += TURN * (turn - TURNS // 2)
+                        if coarse > 0:
+                            at, turn = coarse_best(planes, high, blocks, few, x, y, z, yaw)
+                            x += ti.cast(at % WINDOW - REACH, ti.f32)
+                            y += ti.cast(at // WINDOW - REACH, ti.f32)
+                            yaw += TURN * (turn - TURNS // 2)
+                            step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
                         for k in range(2):  # a loop: each call in the source is compiled by itself
                             reach = ti.select(k == 0, ti.cast(2.0, ti.f32), ti.cast(0.5, ti.f32))
                             z += rise(table, down, across, base, surface, lows, x, y, z, yaw, reach)
-                    step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
                     for _ in range(levels):
                         # the shift first, then the heading there: a third of what all pairs of them would cost
                         hits = ti.Vector.zero(ti.i32, 9)
@@ -199,7 +204,7 @@ def score(
                     if levels > 0:
                         z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     c, s = ti.cos(yaw), ti.sin(yaw)
-                    inside, close, covered, inside_low, grounded, passed = 0, 0, 0, 0, 0, 0
+                    inside, close, covered, inside_low, grounded, passed, on = 0, 0, 0, 0, 0, 0, 0
                     for p in range(structure.shape[0] // 3):
                         u, v = structure[3 * p], structure[3 * p + 1]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
@@ -211,6 +216,7 @@ def score(
                         top = ti.select(edge > 0, base[at >> 10] + EDGE_STEP * edge, -1e6)
                         inside += known
                         close += hit & known
+                        on += bit(bits[2 * at + 1], level) & known
                         covered += (hit | ti.cast(top > level - UNDER_EDGE, ti.i32)) & known
                     for p in range(low.shape[0] // 3):
                         u, v = low[3 * p], low[3 * p + 1]
@@ -219,10 +225,10 @@ def score(
                         known = ti.cast(height != NOT_SURVEYED, ti.i32)
                         level = z + low[3 * p + 2]
                         off = level - base[at >> 10] - CENTIMETRE * height
-                        on = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
+                        flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
                         upper = ti.cast(off > UPPER_FLOOR, ti.i32) & bit(bits[2 * at + 1], level)
                         inside_low += known
-                        grounded += (on | upper) & known
+                        grounded += (flat | upper) & known
                     for p in range(free.shape[0] // 3):
                         u, v = free[3 * p], free[3 * p + 1]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
@@ -231,9 +237,10 @@ def score(
                     poses[4 * h + 1] = y
                     poses[4 * h + 2] = z
                     poses[4 * h + 3] = yaw
-                    counts[6 * h] = inside
-                    counts[6 * h + 1] = close
-                    counts[6 * h + 2] = covered
-                    counts[6 * h + 3] = inside_low
-                    counts[6 * h + 4] = grounded
-                    counts[6 * h + 5] = passed
+                    counts[7 * h] = inside
+                    counts[7 * h + 1] = close
+                    counts[7 * h + 2] = covered
+                    counts[7 * h + 3] = inside_low
+                    counts[7 * h + 4] = grounded
+                    counts[7 * h + 5] = passed
+                    counts[7 * h + 6] = on

@@ -54,6 +54,8 @@ class FieldScores(NamedTuple):
     """(H,) of them, those on the map's ground."""
     passed: I32
     """(H,) free points on map structure."""
+    on: I32
+    """(H,) of the structure points, those in a cell of half a metre that has map structure."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,9 @@ class FieldMap:
         return FieldLayers(table, base, bits, surface, _coarse(bits, table))
 
 
-def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine: bool = True) -> FieldScores:
+def field_scores(
+    field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine: bool = True, near: bool = False
+) -> FieldScores:
     """Score hypotheses; each is moved to the best pose around it first, if ``refine``.
 
     Args:
@@ -137,6 +141,7 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine:
         scan: points to compare, relative to the pivot.
         poses: (H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians.
         refine: whether the poses are moved.
+        near: no farther than odometry drifts between two keyframes: by 0.4 m and 0.8 degrees, fine levels only.
 
     Raises:
         ValueError: a shape is wrong, or a pose not finite.
@@ -144,7 +149,7 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine:
     start = as_finite64("poses", poses, None, 4)
     structure, low, free = (as_float32(name, getattr(scan, name), None, 3) for name in ("structure", "low", "free"))
     few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
-    plan = Plan(structure, low, free, *few, LEVELS if refine else 0)
+    plan = Plan(structure, low, free, *few, LEVELS if refine else 0, not near)
     layers = field.layers
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
     # float32 resolves a tenth of a millimetre a kilometre from the corner
@@ -153,13 +158,13 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, refine:
 
 
 def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
-    poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 6), dtype=np.int32)
+    poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 7), dtype=np.int32)
     Launch(
         "field", "score",
         layers.coarse.reshape(-1), layers.coarse.shape[1], layers.coarse.shape[2],
         layers.table.reshape(-1), layers.table.shape[1], layers.base, layers.bits.reshape(-1),
         layers.surface.reshape(-1), plan.few.reshape(-1), plan.some.reshape(-1), plan.lows.reshape(-1),
-        plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1), plan.levels,
+        plan.structure.reshape(-1), plan.low.reshape(-1), plan.free.reshape(-1), plan.levels, int(plan.coarse),
         poses.reshape(-1), counts.reshape(-1), runtime.workers(),
     )()  # fmt: skip
     return poses, counts

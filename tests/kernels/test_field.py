@@ -63,15 +63,29 @@ def test_pose_is_found_from_three_metres_and_six_degrees_off(scene: tuple[FieldM
     assert (found.grounded > 0.8 * found.low).all()
 
 
+def test_near_refinement_follows_drift_and_wanders_no_farther(
+    scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray],
+):
+    field, scan, pose, others = scene
+    found = kernels.field_scores(field, scan, [pose + np.array([0.3, -0.25, 0.2, 0.01])], near=True)
+    off = np.abs(found.pose[0] - pose)
+    assert off[:2].max() < 0.2
+    assert off[2] < 0.05
+    assert off[3] < np.radians(0.6)
+    moved = np.abs(kernels.field_scores(field, scan, others, near=True).pose - others)
+    assert moved[:, :2].max() <= 0.375 + 1e-4
+    assert moved[:, 3].max() <= np.radians(0.75) + 1e-4
+
+
 def test_kernel_agrees_with_its_numpy_twin(scene: tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]):
     field, scan, pose, others = scene
     starts = np.vstack([pose, others])
     corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
     few = _spread(scan.structure, COARSE), _spread(scan.structure, FINE), _spread(scan.low, LOW)
-    for levels in (0, 2):
-        plan = Plan(scan.structure, scan.low, scan.free, *few, levels)
+    for levels, coarse in ((0, True), (2, True), (2, False)):
+        plan = Plan(scan.structure, scan.low, scan.free, *few, levels, coarse)
         poses, counts = reference.field_scores(field.layers, plan, starts - corner)
-        found = kernels.field_scores(field, scan, starts, refine=levels > 0)
+        found = kernels.field_scores(field, scan, starts, refine=levels > 0, near=not coarse)
         # a point on a cell's edge may round to either side; a few of a thousand do
         same = (np.abs(found.pose - poses - corner) < 0.02).all(axis=1)
         assert same.mean() > 0.9

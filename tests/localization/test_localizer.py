@@ -10,7 +10,7 @@ from trackers import garbage
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import RegistrationConfig
+from coview_stream.config import AcceptanceConfig, RegistrationConfig
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
@@ -53,11 +53,6 @@ def test_no_pose_unless_tracking(world_fixes):
         assert fix.evidence is not None
 
 
-def test_single_keyframe_is_not_accepted(world_fixes):
-    assert world_fixes[0].T_map_body is None
-    assert world_fixes[0].confidence == 0.0
-
-
 def test_T_map_odom_explains_the_pose(world_fixes, world_drive):
     for fix, T_odom_body in zip(world_fixes, world_drive.T_odom_body, strict=True):
         if fix.T_map_body is not None:
@@ -81,9 +76,12 @@ def test_covariance_is_symmetric_positive_and_translation_first(world_fixes):
     assert (sigma[3:] > shared.shared_yaw).all()
 
 
-def test_confidence_is_between_zero_and_one(world_fixes):
-    assert all(0.0 <= fix.confidence <= 1.0 for fix in world_fixes)
-    assert world_fixes[-1].confidence > 0.3
+def test_confidence_is_the_probability_that_the_search_found(world_fixes, world_map, elsewhere):
+    posed = [fix for fix in world_fixes if fix.T_map_body is not None]
+    assert posed[0].confidence == posed[0].evidence.confidence
+    assert {fix.confidence for fix in posed} == {posed[0].confidence}  # tracking goes on from that place
+    assert posed[0].confidence > 1.0 - AcceptanceConfig().risk
+    assert all(fix.confidence == 0.0 for fix in follow(Localizer(world_map), elsewhere, 2))
 
 
 @pytest.mark.slow

@@ -10,18 +10,16 @@ from coview_stream.descriptors.coview import Descriptor
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
-from coview_stream.localization.search.acceptance import AcceptanceTest, SearchResult
+from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
-from coview_stream.localization.search.refinement import Candidate, RegisteredPlace, register_places, verify_places
-from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest
-from coview_stream.localization.search.scoring import Scored, score_hypotheses
+from coview_stream.localization.search.refinement import Candidate, register_place
+from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
+from coview_stream.localization.search.scoring import PlaceScorer, Scored
 
-_REMEMBERED = 32  # best places that the next keyframe scores again; set by hand
-REGISTERED = 3  # best places that are registered and verified, beside the hints; set by hand
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough; set by hand
-_MIN_SHARE = 0.5  # of the best one's rank: what is below that stays a rival as it has been scored; set by hand
+_REFUTED = 1e-3  # probability below which a keyframe speaks against a pose hint; set by hand
 
 
 class GlobalSearch:
@@ -47,10 +45,12 @@ class GlobalSearch:
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
         index = index or SearchIndex.of(base_map, config)
         self.coview, self.learned = _recognizers(base_map, config, index)
-        self._recognizers = [each for each in (self.coview, self.learned) if each is not None]
+        self._recognizers: list[CoViewRecognizer | PlaceRecognizer] = [
+            each for each in (self.coview, self.learned) if each is not None
+        ]
         self._local_maps = local_maps
         self._index = index
-        self._acceptance = AcceptanceTest(self.config)
+        self._scorer = PlaceScorer(base_map.field)
         self._epoch = Epoch()
         self.clear()
 
@@ -82,12 +82,11 @@ class GlobalSearch:
         _ = self.base_map.field.layers
 
     def clear(self) -> None:
-        """Forget all votes and confirmations."""
+        """Forget all votes and what the keyframes have observed."""
         for recognizer in self._recognizers:
             recognizer.clear()
-        self._remembered: list[Hypothesis] = []
         self._hints = HintSchedule()
-        self._acceptance.clear()
+        self._scorer.clear()
 
     def reset(self) -> None:
         """Forget the newest descriptors as well."""
@@ -103,59 +102,46 @@ class GlobalSearch:
         scan = ScanInput(
             prepare_scan(request.submap, request.position, self.config.registration), request.cloud, request.T_odom_body
         )
-        votes = self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
-        hypotheses, hints = self._propose(request)  # eq. 12: peaks of the consensus as T_map_odom
-        scored = self._score(hypotheses, hints, scan)  # the likelihood field, at the best pose near each
-        registered = self._register(scored, scan)  # eq. 13, the best few
-        candidates = self._verify(registered)  # the evidence there
-        self._remember(scored, candidates, hints, request)
-        return self._decide(candidates, request, votes, scored)
-
-    def _vote(self, request: SearchRequest) -> int:
-        """Let every recognizer compare the keyframe with the map; return how many keyframes have voted."""
-        for recognizer in self._recognizers:
-            recognizer.vote(request)
-        return max(map(len, self._recognizers))
-
-    def _propose(self, request: SearchRequest) -> tuple[list[Hypothesis], list[Hypothesis]]:
-        """Return what the votes name and what was good at the last keyframe; and the hints to try now."""
-        learned = [] if self.learned is None else self.learned.hypotheses()
-        coview = [] if self.coview is None else self.coview.hypotheses()
-        return [*coview, *learned, *self._remembered], self._hints.due(request.hints)
-
-    def _score(self, hypotheses: list[Hypothesis], hints: list[Hypothesis], scan: ScanInput) -> Scored:
-        """Score all of them by the map's likelihood field, at the places that they come to."""
-        return score_hypotheses(self.base_map.field, [*hypotheses, *hints], scan, _REMEMBERED, len(hints))
-
-    def _register(self, scored: Scored, scan: ScanInput) -> list[RegisteredPlace]:
-        """Register the best place, its rivals if they are not far below, and those that hints came to."""
-        enough = _MIN_SHARE * scored.places[0].rank if scored.places else 0.0
-        best = [place for place in scored.places[:REGISTERED] if place.rank >= enough]
-        chosen = best + [p for p in scored.places[len(best) :] if p.hinted]
-        return register_places(chosen, scan, self.base_map, self.config, self._local_maps)
-
-    def _verify(self, registered: list[RegisteredPlace]) -> list[Candidate]:
-        """Verify what was registered; best first."""
-        return verify_places(registered)
-
-    def _remember(
-        self, scored: Scored, candidates: list[Candidate], hints: list[Hypothesis], request: SearchRequest
-    ) -> None:
-        """Keep what the next keyframe tries again: the best places, and hints that were not refuted."""
-        if hints:
-            best = max((c.evidence.score for c in candidates if c.place.hinted), default=0.0)
-            positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
-            # where the map knows nothing, a keyframe does not speak against a hint
-            surveyed = all(self.base_map.surveyed(position).all() for position in positions)
-            self._hints.tried(refuted=surveyed and best < self.config.acceptance.score)
-        self._remembered = [replace(place.hypothesis, lead=0.0) for place in scored.places[:_REMEMBERED]]
-
-    def _decide(self, candidates: list[Candidate], request: SearchRequest, votes: int, scored: Scored) -> SearchResult:
-        """Accept the best candidate, or say why not yet."""
-        result = self._acceptance.decide(candidates, request, votes, scored)
+        self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
+        named, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
+        hints = self._hints.due(request.hints)
+        scored = self._scorer.score([*named, *hints], ranks, len(hints), scan)  # against chance, all keyframes
+        leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
+        self._note_hints(scored, hints, request)
+        result = decide(scored, leader, request, self.config.acceptance)
         if result.accepted is not None:
             self.clear()
         return result
+
+    def _vote(self, request: SearchRequest) -> None:
+        """Let every recognizer compare the keyframe with the map."""
+        for recognizer in self._recognizers:
+            recognizer.vote(request)
+
+    def _propose(self) -> tuple[list[Hypothesis], list[int]]:
+        """Return what the votes name, and the rank of each in its recognizer's votes."""
+        each = [recognizer.hypotheses() for recognizer in self._recognizers]
+        return [own for some in each for own in some], [rank for some in each for rank in range(len(some))]
+
+    def _register(self, scored: Scored, scan: ScanInput, request: SearchRequest) -> Candidate | None:
+        """Register the most probable place and verify it there; None if it comes to another one, or leans."""
+        if not scored.places:
+            return None
+        best = scored.places[0]
+        found = register_place(best, scan, self.base_map, self.config, self._local_maps)
+        if found is None or not same_place(found.T_map_odom, best.hypothesis.T_map_odom, request):
+            return None
+        return found
+
+    def _note_hints(self, scored: Scored, hints: list[Hypothesis], request: SearchRequest) -> None:
+        """Note whether the keyframe spoke against the hints that it tried."""
+        if not hints:
+            return
+        best = max((place.probability for place in scored.places if place.hinted), default=0.0)
+        positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
+        # where the map knows nothing, a keyframe does not speak against a hint
+        surveyed = all(self.base_map.surveyed(position).all() for position in positions)
+        self._hints.tried(refuted=surveyed and best < _REFUTED)
 
 
 def _recognizers(

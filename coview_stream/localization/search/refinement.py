@@ -1,4 +1,4 @@
-"""Candidates: the best scored places made exact, registered (eq. 13) and verified."""
+"""Candidates: the most probable place made exact, registered (eq. 13) and verified."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, transform, yaw_of
 from coview_stream.localization.registration.local_map import LocalMaps
-from coview_stream.localization.registration.register import ScanInput, ScanMatch, register_and_verify
+from coview_stream.localization.registration.register import ScanInput, register_and_verify
 from coview_stream.localization.registration.result import Prior, Registration
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.search.consensus import Hypothesis
@@ -46,43 +46,22 @@ class Candidate:
         return self.registration.T_map_source
 
 
-@dataclass(frozen=True)
-class RegisteredPlace:
-    """A place and the registration that began there."""
-
-    place: ScoredPlace
-    match: ScanMatch
-
-
-def register_places(
-    places: list[ScoredPlace], scan: ScanInput, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps
-) -> list[RegisteredPlace]:
-    """Register a scan at places; those off the map, with too few pairs, or whose result leans are left out."""
+def register_place(
+    place: ScoredPlace, scan: ScanInput, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps
+) -> Candidate | None:
+    """Register a scan at a place and verify it; None off the map, with too few pairs, or if the result leans."""
     settings = config.registration
     scales = tuple(scale for scale in settings.search if scale <= _WIDEST) or settings.search[-1:]
-    thinned = scan.cloud.every(_EVERY)
-    out = []
-    for place in places:
-        start = place.hypothesis.T_map_odom
-        target = local_maps.around(transform(start, scan.T_odom_body[None, :3, 3])[0])
-        if target is None:
-            continue
-        level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
-        upright = Prior(level, gravity_information(settings.gravity_sigma))
-        match = register_and_verify(base_map, scan, start, target, settings, scales, upright, thinned)
-        if match.registration is not None and tilt_of(match.T_map_odom) <= config.acceptance.max_tilt:
-            out.append(RegisteredPlace(place, match))
-    return out
-
-
-def verify_places(registered: list[RegisteredPlace]) -> list[Candidate]:
-    """Verify registered places; best first."""
-    candidates = [
-        Candidate(each.place, each.match.registration, each.match.evidence)
-        for each in registered
-        if each.match.registration is not None
-    ]
-    return sorted(candidates, key=lambda candidate: -candidate.evidence.score)
+    start = place.hypothesis.T_map_odom
+    target = local_maps.around(transform(start, scan.T_odom_body[None, :3, 3])[0])
+    if target is None:
+        return None
+    level = pose_from(rot_z(yaw_of(start)), start[:3, 3])
+    upright = Prior(level, gravity_information(settings.gravity_sigma))
+    match = register_and_verify(base_map, scan, start, target, settings, scales, upright, scan.cloud.every(_EVERY))
+    if match.registration is None or tilt_of(match.T_map_odom) > config.acceptance.max_tilt:
+        return None
+    return Candidate(place, match.registration, match.evidence)
 
 
 def gravity_information(sigma: float) -> Floats:

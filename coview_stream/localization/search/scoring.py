@@ -1,42 +1,40 @@
-"""Scores of hypotheses by the map's likelihood field: hundreds of one keyframe at once, before any is registered.
+"""Scores of places: hundreds of hypotheses of a keyframe at once, and the evidence of the best over all keyframes.
 
 Each hypothesis is moved to the best pose around it, up to three metres and seven degrees away, by looking up what the
-map has there (:func:`coview_kernels.field_scores`), and scored by the shares that verification computes exactly
-(:mod:`coview_stream.localization.registration.verification`). ``python -m bench field`` prints how often the right
-place comes first, and how the two scores compare.
+map has there (:mod:`coview_stream.localization.evidence.observed_scan`). The best places are followed: every later
+keyframe observes the map from them as well, and where a place is new, the keyframes before are asked as well, so that
+places are compared on the same observations. The evidence of a place is the log-likelihood ratio of the mean of its
+observations (:mod:`coview_stream.localization.evidence.likelihood`), against the background of all others.
+``python -m bench field`` prints how often the right place comes first.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
-from coview_stream.geometry.transforms import Points, norms
+from coview_stream.localization.evidence.background import estimate_background, scatter
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.observed_scan import ObservedScan, Share
+from coview_stream.localization.evidence.posterior import expected_by_chance, posterior
 from coview_stream.localization.registration.register import ScanInput
-from coview_stream.localization.registration.verification import (
-    FREE_HEIGHT,
-    FREE_RANGE,
-    MIN_STRUCTURE,
-    PSEUDO,
-    STRUCTURE_HEIGHT,
-    RangeImage,
-)
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 # set by hand
-_FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
-_PROMISING = 64  # best hypotheses that are looked up with the many
-_PATCH = 4.0  # metres: points of one patch are looked up one after the other, for they lie in the same memory
-_SAMPLES = 6000  # points in the space around the robot, of which those that rays passed through are looked up
-_DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
-_MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle: a ray has passed only what lies before that
-_LAYERS = 2  # cells that a surface fills on the way through it
+_PROMISING = 96  # best hypotheses that are looked up with many points
+_FOLLOWED = 64  # best places that the next keyframe observes again
+_KEPT = 16  # of them, those that stay by their evidence, however the newest keyframe ranks them
+_KEYFRAMES = 16  # newest keyframes whose observations a place has
+_CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share what it explains
+_BASIN_DISTANCE, _BASIN_ANGLE = SAME_DISTANCE, np.radians(15.0)  # from the leader: registration leads there from here
+_AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
+"""Shifts of the leader, metres, that are hypotheses too: along a corridor it may be anywhere."""
 
 
 @dataclass(frozen=True)
@@ -44,30 +42,31 @@ class ScoredPlace:
     """A hypothesis at the best pose near it.
 
     Attributes:
-        hypothesis: there; with the lead that any of those had which came to this place.
-        score: evidence score in [0, 1], as the field sees it.
+        hypothesis: there.
+        score: of the newest keyframe, in [0, 1], as verification has it.
         inside: share of the scan that lies where the map has been surveyed.
         hinted: whether a pose hint came to this place.
+        ratio: log-likelihood ratio of the keyframes so far against chance.
+        probability: posterior probability that the robot is here.
+        kept: share of what stands that is as the map has it, as the evidence has it.
     """
 
     hypothesis: Hypothesis
     score: float
     inside: float
     hinted: bool = False
-
-    @property
-    def rank(self) -> float:
-        """Score times the share that lies inside: what lies beyond the map is not explained by it."""
-        return self.score * self.inside
+    ratio: float = 0.0
+    probability: float = 0.0
+    kept: float = 0.0
 
 
 @dataclass(frozen=True)
 class Rivals:
-    """All places that one keyframe was scored at, best first; no two are the same.
+    """All places that one keyframe was scored at, best score first; no two are the same.
 
     Attributes:
         T_map_odom: (N, 4, 4).
-        scores: (N,) float32 evidence scores in [0, 1]; those of the best 64 hypotheses from four times as many points.
+        scores: (N,) float32 evidence scores in [0, 1]; those of the best hypotheses from four times as many points.
         inside: (N,) float32 shares of the scan that lie where the map has been surveyed.
     """
 
@@ -92,85 +91,225 @@ class Scored:
 
     Attributes:
         rivals: all places.
-        places: the best of them, and those that hints came to, best first.
+        places: those that are followed, the most probable first.
+        error: probability that the robot is not at the first of them.
+        none: probability that it is at no place of the map.
+        by_chance: expected number of chance places as good as the first.
+        second: the most probable place elsewhere than the first, if there is any.
     """
 
     rivals: Rivals
     places: list[ScoredPlace]
-
-
-def score_hypotheses(
-    field: kernels.FieldMap, hypotheses: Sequence[Hypothesis], scan: ScanInput, best: int, hints: int = 0
-) -> Scored:
-    """Score hypotheses of ``T_map_odom``, of which the last ``hints`` are pose hints.
-
-    Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them. The ``best`` places are returned
-    as hypotheses again.
-    """
-    if not hypotheses:
-        return Scored(Rivals.none(), [])
-    pivot = scan.T_odom_body[:3, 3]
-    T = np.array([each.T_map_odom for each in hypotheses])
-    yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
-    few, many = _field_scans(scan)
-    found = kernels.field_scores(field, few.scan, np.column_stack([T[:, :3, :3] @ pivot + T[:, :3, 3], yaw]))
-    score, inside = few.scores(found)
-    # some points tell what is far below the best; what is not is told apart by more
-    promising = np.argsort(-score * inside, kind="stable")[:_PROMISING]
-    score[promising], inside[promising] = many.scores(
-        kernels.field_scores(field, many.scan, found.pose[promising], refine=False)
-    )
-    T = _poses(found.pose, pivot)
-    members = _places(found.pose, score * inside)
-    firsts = np.array([each[0] for each in members])
-    rivals = Rivals(T[firsts], score[firsts].astype(np.float32), inside[firsts].astype(np.float32))
-    last = len(hypotheses) - hints  # what follows are hints
-    places = []
-    for rank, numbers in enumerate(members):
-        hinted = hints > 0 and max(numbers) >= last
-        if rank < best or hinted:
-            first, here = numbers[0], [hypotheses[k] for k in numbers]
-            # the votes for the place, if it has any: a hint that came to it, now or before, takes none away
-            own = next((each for each in here if each.station is not None), here[0])
-            own = replace(own, T_map_odom=T[first], lead=max(each.lead for each in here))
-            places.append(ScoredPlace(own, float(score[first]), float(inside[first]), hinted))
-    return Scored(rivals, places)
+    error: float = 1.0
+    none: float = 1.0
+    by_chance: float = np.inf
+    second: ScoredPlace | None = None
 
 
 @dataclass(frozen=True)
-class _Compared:
-    """A part of a scan that is compared with the field.
+class _Followed:
+    """P places that are followed, and their observations.
 
     Attributes:
-        scan: points.
-        every: how many of the scan's each of its structure, ground and free points stands for.
+        hypotheses: at the newest keyframe.
+        votes: (P,) newest rank in the votes that named each, from 0.
+        observed: (P, W, 7) at the keyframes, oldest first.
+        newest: of each, the number of its pose among those that the newest keyframe was scored at.
+        hinted: (P,) whether a pose hint came to it.
     """
 
-    scan: kernels.FieldScan
-    every: tuple[float, float, float]
+    hypotheses: list[Hypothesis]
+    votes: Ints
+    observed: Floats32
+    newest: Ints
+    hinted: Bools
 
     @classmethod
-    def of(cls, kinds: tuple[Points, Points, Points], counts: tuple[int, int, int]) -> _Compared:
-        """Take at most ``counts`` points of each kind."""
-        some = [_evenly(points, count) for points, count in zip(kinds, counts, strict=True)]
-        structure, low, free = (len(p) / max(len(s), 1) for p, s in zip(kinds, some, strict=True))
-        return cls(kernels.FieldScan(*some), (structure, low, free))
+    def none(cls) -> _Followed:
+        nothing = np.empty(0, dtype=np.int64)
+        return cls([], nothing, np.empty((0, 0, len(Share)), dtype=np.float32), nothing, nothing.astype(bool))
 
-    def scores(self, found: kernels.FieldScores) -> tuple[Floats, Floats]:
-        """Return evidence scores (H,) and shares inside (H,)."""
-        each_high, each_low, each_free = self.every
-        structure, low, near = found.structure * each_high, found.low * each_low, found.near * each_high
-        some = np.maximum(found.structure, 1)
-        ground = (found.grounded * each_low + 0.5 * PSEUDO) / (low + PSEUDO)
-        passed = found.passed * each_free * _points_passed()
-        free = (near + 0.5 * PSEUDO) / (near + passed + PSEUDO)
-        score = np.sqrt(found.near / some * (found.covered / some) * ground * free)
-        score[structure < MIN_STRUCTURE] = 0.0
-        whole = len(self.scan.structure) * each_high + len(self.scan.low) * each_low
-        return score, (structure + low) / max(whole, 1.0)
+    def __getitem__(self, order: Ints) -> _Followed:
+        own = [self.hypotheses[k] for k in order]
+        return _Followed(own, self.votes[order], self.observed[order], self.newest[order], self.hinted[order])
 
 
-def _places(pose: Floats, rank: Floats) -> list[list[int]]:
+@dataclass(frozen=True)
+class _Observed:
+    """H hypotheses of a keyframe, those that are followed first, at the best poses near them.
+
+    Attributes:
+        poses: (H, 4).
+        shares: (H, 7) observations.
+        scores: (H,) as verification has them.
+        groups: numbers of the hypotheses at each place, its best first, the best place first.
+    """
+
+    poses: Floats
+    shares: Floats32
+    scores: Floats32
+    groups: list[list[int]]
+
+    @property
+    def inside(self) -> Floats32:
+        """(H,) shares of the scan that lie where the map has been surveyed."""
+        return np.asarray(0.5 * (self.shares[:, Share.COVERED] + self.shares[:, Share.COVERED_GROUND]))
+
+
+class PlaceScorer:
+    """Places of a search, and what the keyframes so far have observed at them."""
+
+    def __init__(self, field: kernels.FieldMap) -> None:
+        """Score by a map's likelihood field."""
+        self._field = field
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all places and keyframes."""
+        self._followed = _Followed.none()
+        self._scans: deque[ObservedScan] = deque(maxlen=_KEYFRAMES)
+        self._scatter: deque[Floats] = deque(maxlen=_KEYFRAMES)
+
+    def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ScanInput) -> Scored:
+        """Observe the map from a keyframe's hypotheses and from the places that are followed.
+
+        Hypotheses that come to the same place (2 m, 5 degrees) are one: the best of them.
+
+        Args:
+            hypotheses: of ``T_map_odom``, of which the last ``hints`` are pose hints.
+            votes: rank of each in the votes that named it, from 0; any number for a hint.
+            hints: how many pose hints there are.
+            scan: the keyframe's.
+        """
+        seen, known = ObservedScan.of(scan), self._followed
+        named = len(hypotheses) - hints
+        fresh = [*hypotheses[:named], *self._around_leader(), *hypotheses[named:]]
+        every = [*known.hypotheses, *fresh]
+        ranks = np.full(len(every), len(every))
+        ranks[: len(known.votes)] = known.votes + 1
+        ranks[len(known.votes) : len(known.votes) + named] = votes[:named]
+        observed = self._observe(seen, len(known.hypotheses), every)
+        followed = self._follow(seen, observed, every, ranks, hints)
+        first = np.array([group[0] for group in observed.groups], dtype=np.int64)
+        ratios, kept = self._evidence(followed, observed, first)
+        order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
+        self._scans.append(seen)
+        self._followed = followed = followed[order]
+        chances = posterior(ratios[order], followed.votes, len(first))
+        numbers = zip(order, chances.place, followed.newest, strict=True)
+        places = [
+            ScoredPlace(
+                followed.hypotheses[k], float(observed.scores[n]), float(observed.inside[n]), bool(followed.hinted[k]),
+                float(ratios[old]), float(probability), float(kept[old]),
+            )
+            for k, (old, probability, n) in enumerate(numbers)
+        ]  # fmt: skip
+        rivals = Rivals(seen.transforms(observed.poses[first]), observed.scores[first], observed.inside[first])
+        if not places:
+            return Scored(rivals, places)
+        poses = observed.poses[followed.newest]
+        elsewhere = _apart(poses, poses[0], _BASIN_DISTANCE, _BASIN_ANGLE)
+        second = next((place for place, other in zip(places, elsewhere, strict=True) if other), None)
+        by_chance = expected_by_chance(places[0].ratio, len(first))
+        return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
+
+    def _around_leader(self) -> list[Hypothesis]:
+        """Return hypotheses beside the most probable place: along a corridor it may be anywhere."""
+        if not self._followed.hypotheses:
+            return []
+        T = np.tile(self._followed.hypotheses[0].T_map_odom, (len(_AROUND), 1, 1))
+        T[:, :2, 3] += _AROUND
+        return [Hypothesis(each, None, None, 0.0) for each in T]
+
+    def _observe(self, seen: ObservedScan, known: int, every: list[Hypothesis]) -> _Observed:
+        """Observe the map from hypotheses, of which the first ``known`` are followed: odometry hardly drifts."""
+        if not every:
+            return _Observed(np.empty((0, 4)), _NOTHING, np.empty(0, dtype=np.float32), [])
+        start = seen.poses(np.array([each.T_map_odom for each in every]))
+        parts = [
+            seen.few.look_up(self._field, start[:known], "near"),
+            seen.few.look_up(self._field, start[known:], "far"),
+        ]
+        poses, shares, scores = (np.concatenate(both) for both in zip(*parts, strict=True))
+        found = _Observed(poses, shares, scores, [])
+        # some points tell what is far below the best; what is not is told apart by more
+        promising = np.argsort(-scores * found.inside, kind="stable")[:_PROMISING]
+        _, shares[promising], scores[promising] = seen.many.look_up(self._field, poses[promising], "no")
+        return replace(found, groups=_places(poses, scores * found.inside))
+
+    def _follow(
+        self, seen: ObservedScan, observed: _Observed, every: list[Hypothesis], ranks: Ints, hints: int
+    ) -> _Followed:
+        """Choose the places to follow: the best now, the best so far, and what hints came to."""
+        before = self._followed
+        T = seen.transforms(observed.poses)
+        chosen, hinted, known = [], [], []
+        for number, group in enumerate(observed.groups):
+            old = min(group)
+            hint = hints > 0 and max(group) >= len(every) - hints
+            if number < _FOLLOWED or old < min(_KEPT, len(before.votes)) or hint:
+                chosen.append(group)
+                hinted.append(hint)
+                known.append(old if old < len(before.votes) else -1)
+        hypotheses = []
+        for group in chosen:
+            # the votes for the place, if it has any: a hint that came to it takes none away
+            own = next((every[k] for k in group if every[k].station is not None), every[group[0]])
+            hypotheses.append(replace(own, T_map_odom=T[group[0]]))
+        newest = np.array([group[0] for group in chosen], dtype=np.int64)
+        votes = np.array([ranks[group].min() for group in chosen], dtype=np.int64)
+        past = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
+        of = np.array(known, dtype=np.int64)
+        if len(self._scans):
+            width = before.observed.shape[1]
+            past[of >= 0] = before.observed[of[of >= 0], width - len(self._scans) :]
+            past[of < 0] = self._ask_earlier(T[newest[of < 0]])
+        shares = np.concatenate([past, observed.shares[newest][:, None]], axis=1)
+        return _Followed(hypotheses, votes, shares, newest, np.array(hinted, dtype=bool))
+
+    def _ask_earlier(self, T_map_odom: Floats) -> Floats32:
+        """Return what the earlier keyframes observe (P, W, 7) at new places, the drift since then undone."""
+        out = np.empty((len(T_map_odom), len(self._scans), len(Share)), dtype=np.float32)
+        for k in reversed(range(len(self._scans))):
+            scan = self._scans[k]
+            poses, out[:, k], _ = scan.few.look_up(self._field, scan.poses(T_map_odom), "near")
+            T_map_odom = scan.transforms(poses)
+        return out
+
+    def _evidence(self, followed: _Followed, observed: _Observed, first: Ints) -> tuple[Floats, Floats]:
+        """Return log-likelihood ratios (P,), and the shares (P,) of what is as the map has it."""
+        mean = followed.observed.mean(axis=1)
+        if not len(mean):
+            return np.empty(0), np.empty(0)
+        poses, places = observed.poses[followed.newest], observed.poses[first]
+        chance, kept = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
+        self._scatter.append(scatter(observed.shares[first]))
+        for last in (False, True):
+            known = [each for each in self._scatter if np.isfinite(each).all()] or [self._scatter[-1]]
+            spread = np.mean(known, axis=0)
+            background = estimate_background(
+                observed.shares[first][chance], spread, followed.observed[kept, -1], mean[kept]
+            )
+            ratios, q = log_likelihood_ratios(mean, background)
+            if last:
+                break
+            leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
+            # what lies around the leader shares what it explains
+            chance, kept = (_apart(each, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for each in (places, poses))
+            self._scatter[-1] = scatter(observed.shares[first][chance])
+        return ratios, q
+
+
+_NOTHING = np.empty((0, len(Share)), dtype=np.float32)
+
+
+def _apart(poses: Floats, leader: Floats, distance: float, angle: float) -> Bools:
+    """Tell which of (P, 4) poses are more than ``distance`` metres or ``angle`` radians from a leader (4,)."""
+    turn = np.abs((poses[:, 3] - leader[3] + np.pi) % (2.0 * np.pi) - np.pi)
+    return np.asarray((np.linalg.norm(poses[:, :3] - leader[:3], axis=1) > distance) | (turn > angle))
+
+
+def _places(pose: Floats, rank: Floats32) -> list[list[int]]:
     """Group poses (H, 4): those at each place, its best first, the best place first."""
     order = np.argsort(-rank, kind="stable")
     x, y, z, yaw = pose[order].astype(np.float32).T
@@ -189,57 +328,3 @@ def _places(pose: Floats, rank: Floats) -> list[list[int]]:
             free[members] = False
             out.append(order[members].tolist())
     return out
-
-
-def _poses(pose: Floats, pivot: Floats) -> Floats:
-    """Return ``T_map_odom`` (H, 4, 4) that put the pivot (3,) at poses (H, 4)."""
-    T = np.tile(np.eye(4), (len(pose), 1, 1))
-    cos, sin = np.cos(pose[:, 3]), np.sin(pose[:, 3])
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cos, -sin, sin, cos
-    T[:, :3, 3] = pose[:, :3] - T[:, :3, :3] @ pivot
-    return T
-
-
-def _field_scans(scan: ScanInput) -> tuple[_Compared, _Compared]:
-    """Return few and many points of a scan, relative to the body."""
-    cloud, T = scan.cloud, scan.T_odom_body
-    points = cloud.points - T[:3, 3].astype(np.float32)
-    order = _by_patch(points)
-    points, height, above = points[order], cloud.height[order], cloud.above[order]
-    free = (_seen_through(scan.range_image) @ T[:3, :3].T).astype(np.float32)
-    kinds = points[height > STRUCTURE_HEIGHT], points[~above], free[_by_patch(free)]
-    return _Compared.of(kinds, _FEW), _Compared.of(kinds, _MANY)
-
-
-def _evenly(points: Points, count: int) -> Points:
-    """Return at most ``count`` points, spread evenly over all in their order."""
-    return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
-
-
-def _by_patch(points: Points) -> Ints:
-    x, y = np.floor(points[:, :2] / np.float32(_PATCH)).T
-    return np.asarray(np.lexsort((x, y)))
-
-
-def _seen_through(seen: RangeImage) -> Floats:
-    """Return points (F, 3), body frame, metres, that the frame's rays passed through well above the ground."""
-    points, ranges, cell = _samples()
-    passed: Bools = seen.passed(cell, ranges + _MARGIN) & (points[:, 2] > seen.floor + FREE_HEIGHT)
-    return points[passed]
-
-
-@lru_cache(maxsize=1)
-def _samples() -> tuple[Floats, Floats, Ints]:
-    """Return points (N, 3), evenly in the space around the sensor, their ranges and cells of direction."""
-    rng = np.random.default_rng(20240)
-    radius, turn = FREE_RANGE * np.sqrt(rng.random(_SAMPLES)), 2.0 * np.pi * rng.random(_SAMPLES)
-    height = rng.uniform(*_DEPTH, _SAMPLES)
-    points = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), height])
-    ranges = norms(points)
-    return points, ranges, RangeImage.cells(points, ranges)
-
-
-def _points_passed(voxel: float = 0.5) -> float:
-    """Return how many points of a scan, one for each ``voxel``, the surface would have that a passed sample is on."""
-    volume = np.pi * FREE_RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES
-    return float(volume / (_LAYERS * 0.5) / voxel**2)

@@ -15,6 +15,9 @@ NO_GROUND, NOT_SURVEYED = -32768, -32767
 REACH, TURNS, TURN = 3, 7, 0.0349066
 """Metres of a coarse shift to either side, headings of the coarse level, and radians between these."""
 
+NEAR_STEP, NEAR_TURN = 0.25, 0.00872665
+"""Metres and radians of the first fine level where there is no coarse one; the next are half of it each."""
+
 ON_GROUND, UNDER_EDGE, UPPER_FLOOR, EDGE_STEP = 0.15, 0.5, 1.5, 0.25
 """Metres: off the ground that still are on it; above a roof edge that still are below it; above the lowest surface from
 which on the bits alone tell a floor; a unit of the stored edges."""
@@ -37,7 +40,7 @@ class FieldLayers(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A scan, the parts of it that the levels take, and the number of fine levels."""
+    """A scan, the parts of it that the levels take, the number of fine levels, and whether a coarse one comes first."""
 
     structure: F32
     low: F32
@@ -46,15 +49,16 @@ class Plan(NamedTuple):
     some: F32
     lows: F32
     levels: int
+    coarse: bool
 
 
 def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
     """Score hypotheses (H, 4), metres from the table's corner: twin of :func:`coview_kernels.field_scores`.
 
     Returns:
-        Poses (H, 4), and counts (H, 6) in the order of :class:`coview_kernels.FieldScores`.
+        Poses (H, 4), and counts (H, 7) in the order of :class:`coview_kernels.FieldScores`.
     """
-    poses, counts = start.copy(), np.zeros((len(start), 6), dtype=np.int32)
+    poses, counts = start.copy(), np.zeros((len(start), 7), dtype=np.int32)
     for pose, count in zip(poses, counts, strict=True):
         if plan.levels:
             _refine(layers, plan, pose)
@@ -63,18 +67,12 @@ def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]
 
 
 def _refine(layers: FieldLayers, plan: Plan, pose: F64) -> None:
-    best = -1
-    shift = (0, 0, 0)
-    for a in range(TURNS):
-        hits = _coarse_hits(layers.coarse, plan.few, pose, float(pose[3]) + TURN * (a - TURNS // 2))
-        for i, j in np.ndindex(hits.shape):
-            value = 16 * int(hits[i, j]) - abs(i - REACH) - abs(j - REACH) - abs(a - TURNS // 2)
-            if value > best:
-                best, shift = value, (i - REACH, j - REACH, a - TURNS // 2)
-    pose += np.array([shift[1], shift[0], 0.0, TURN * shift[2]])
+    step, angle = NEAR_STEP, NEAR_TURN
+    if plan.coarse:
+        pose += _coarse_shift(layers, plan, pose)
+        step, angle = 0.5, 0.5 * TURN
     for reach in (2.0, 0.5):
         pose[2] += _rise(layers, plan.lows, pose, reach)
-    step, angle = 0.5, 0.5 * TURN
     for _ in range(plan.levels):
         best, move = -1, np.zeros(4)
         for i, j in np.ndindex(3, 3):
@@ -91,6 +89,18 @@ def _refine(layers: FieldLayers, plan: Plan, pose: F64) -> None:
         pose[3] += turn
         step, angle = 0.5 * step, 0.5 * angle
     pose[2] += _rise(layers, plan.lows, pose, 0.5)
+
+
+def _coarse_shift(layers: FieldLayers, plan: Plan, pose: F64) -> F64:
+    best = -1
+    shift = (0, 0, 0)
+    for a in range(TURNS):
+        hits = _coarse_hits(layers.coarse, plan.few, pose, float(pose[3]) + TURN * (a - TURNS // 2))
+        for i, j in np.ndindex(hits.shape):
+            value = 16 * int(hits[i, j]) - abs(i - REACH) - abs(j - REACH) - abs(a - TURNS // 2)
+            if value > best:
+                best, shift = value, (i - REACH, j - REACH, a - TURNS // 2)
+    return np.array([shift[1], shift[0], 0.0, TURN * shift[2]])
 
 
 def _placed(points: F32, pose: F64) -> F32:
@@ -164,5 +174,6 @@ def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
     grounded = ((has & (np.abs(off) < ON_GROUND)) | upper) & known
     free = _placed(plan.free, pose)
     passed = _bit(layers.bits[_cells(layers, free)][:, 1], free[:, 2])
-    masks = surveyed, near, covered, known, grounded, passed
+    on = _bit(layers.bits[cell][:, 1], placed[:, 2]) & surveyed
+    masks = surveyed, near, covered, known, grounded, passed, on
     return tuple(int(mask.sum()) for mask in masks)

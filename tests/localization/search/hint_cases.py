@@ -24,3 +24,18 @@ def voteless(localizer, monkeypatch):
     """The keyframes vote, but nothing comes of it."""
     monkeypatch.setattr(localizer._search.coview.consensus, "hypotheses", list)
     return localizer
+
+
+def misled(localizer, drive, monkeypatch):
+    """The votes name some places, but never the right one, nor any near it."""
+    consensus = localizer._search.coview.consensus
+    found = consensus.hypotheses
+
+    def wrong():
+        newest = localizer._newest.T_odom_body
+        k = int(np.argmin([abs(T[:3, 3] - localizer._anchor - newest[:3, 3]).sum() for T in drive.T_odom_body]))
+        there = drive.T_map_body[k][:3, 3]
+        return [each for each in found() if np.linalg.norm((each.T_map_odom @ newest)[:3, 3] - there) > 8.0]
+
+    monkeypatch.setattr(consensus, "hypotheses", wrong)
+    return localizer

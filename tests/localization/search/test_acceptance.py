@@ -1,94 +1,116 @@
-"""The acceptance test: what learned features that favour the same place add to weak evidence, and what not."""
+"""The decision on a search: the probability of an error decides, and nothing else does."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
 
-import numpy as np
 import pytest
+from made_up_places import REQUEST, RULE, judged, moved, place
 
-from coview_stream.config import AcceptanceConfig, LocalizerConfig
-from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.registration.result import Registration
-from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.search.acceptance import AcceptanceTest
-from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.refinement import Candidate
-from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.scoring import ScoredPlace
+from coview_stream.localization.search.acceptance import BY_FEATURES
+from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.state import State
 
-RULE = AcceptanceConfig()
-NOTHING = np.empty((0, 3), dtype=np.float32)
-REQUEST = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING)
-HERE, ELSEWHERE = (pose_from(rot_z(-0.8), [x, 9.0, 0.5]) for x in (3.0, 40.0))
-WEAK = RULE.score + 0.03
+
+@pytest.mark.parametrize("risk", [1e-2, RULE.risk, 1e-9])
+@pytest.mark.parametrize(("share", "accepted"), [(0.01, True), (0.99, True), (1.0, False), (1.01, False), (50, False)])
+def test_place_is_accepted_only_below_the_integrity_risk(risk, share, accepted):
+    error = share * risk
+    best = place(1.0 - error)
+    result = judged(best, place(error, moved(20)), error=error, risk=risk)
+    assert (result.accepted is not None) == accepted
+    assert result.evidence.state is (State.TRACKING if accepted else State.AMBIGUOUS)
+    if accepted:
+        assert result.accepted.place is best
 
 
-def candidate(score: float, T_map_odom: np.ndarray = HERE, lead: float = 0.0, inside: float = 0.9) -> Candidate:
-    hypothesis = Hypothesis(T_map_odom, 5, 2, -3.0, learned=True, lead=lead)
-    found = Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
-    return Candidate(ScoredPlace(hypothesis, score, inside), found, Evidence(score, score, 1.0, 1.0, inside))
+def test_error_far_below_the_resolution_of_one_is_still_compared():
+    """1 - 1e-20 is 1: the error itself has to be compared, not what is left of the confidence."""
+    best, twin = place(1.0), place(0.0, moved(20))
+    assert judged(best, twin, error=1e-20, risk=1e-18).accepted is not None
+    assert judged(best, twin, error=1e-20, risk=1e-22).accepted is None
 
 
-def keyframes_needed(*candidates: Candidate) -> int | None:
-    """Keyframes of the same candidates, best first, until the first is accepted; None if 40 are not enough."""
-    test = AcceptanceTest(LocalizerConfig())
-    for count in range(1, 41):
-        if test.decide(list(candidates), REQUEST, count).accepted is not None:
-            return count
-    return None
+@pytest.mark.parametrize("score", [0.05, 0.3, 0.99])
+def test_score_decides_nothing(score):
+    assert judged(place(1.0, score=score), error=0.1 * RULE.risk).accepted is not None
+    assert judged(place(0.5, score=score), place(0.5, moved(20), score=0.1)).accepted is None
 
 
-def test_learned_support_lowers_evidence_sum_but_not_confirmations() -> None:
-    alone = keyframes_needed(candidate(WEAK))
-    favoured = keyframes_needed(candidate(WEAK, lead=1.0))
-    assert alone is not None
-    assert favoured is not None
-    assert RULE.confirmations <= favoured < 0.6 * alone
-    assert keyframes_needed(candidate(0.9, lead=100.0)) == RULE.confirmations
+def test_place_that_does_not_register_is_not_accepted():
+    result = judged(place(1.0), error=1e-12, leader=False)
+    assert result.accepted is None
+    assert result.evidence.state is State.AMBIGUOUS
+    assert "does not register" in result.evidence.reason
 
 
-def test_candidate_partly_off_the_map_needs_more_keyframes() -> None:
-    """At the map's edge a few points may fit anywhere: the fewer lie on it, the more keyframes are needed."""
-    shares = [RULE.full_overlap, 0.75 * RULE.full_overlap, RULE.min_overlap]
-    needed = [keyframes_needed(candidate(0.45, inside=share)) for share in shares]
-    assert None not in needed
-    assert needed == sorted(set(needed))
-    assert keyframes_needed(candidate(0.45, inside=0.95)) == needed[0]
-
-
-@pytest.mark.parametrize("lead", [0.0, -1.0])
-def test_learned_votes_without_lead_add_no_support(lead: float) -> None:
-    assert keyframes_needed(candidate(WEAK, lead=lead)) == keyframes_needed(candidate(WEAK))
-
-
-def test_learned_votes_for_another_place_add_no_support() -> None:
-    other = candidate(0.1, ELSEWHERE, lead=1.0)
-    assert keyframes_needed(candidate(WEAK), other) == keyframes_needed(candidate(WEAK))
-
-
-def test_learned_votes_count_for_place_named_by_coview() -> None:
-    twin = candidate(WEAK - 0.01, lead=1.0)
-    assert keyframes_needed(candidate(WEAK), twin) == keyframes_needed(candidate(WEAK, lead=1.0))
-
-
-def test_learned_votes_do_not_accept_a_poor_fit() -> None:
-    assert keyframes_needed(candidate(RULE.learned_score - 0.02, lead=100.0)) is None
-    assert keyframes_needed(candidate(WEAK, lead=100.0), candidate(WEAK - 0.05, ELSEWHERE)) is None
-    assert keyframes_needed(candidate(WEAK, lead=100.0, inside=RULE.min_overlap - 0.02)) is None
-
-
-def test_lower_score_is_accepted_only_with_clear_learned_lead() -> None:
-    low = RULE.score - 0.03
-    assert keyframes_needed(candidate(low)) is None
-    assert keyframes_needed(candidate(low, lead=0.9 * RULE.learned_lead)) is None
-    needed = keyframes_needed(candidate(low, lead=RULE.learned_lead))
-    assert needed is not None
-    assert needed > RULE.confirmations
-
-
-def test_single_scan_gets_no_learned_support() -> None:
-    test = AcceptanceTest(replace(LocalizerConfig(), stationary=True))
-    result = test.decide([candidate(RULE.single_score - 0.02, lead=100.0)], REQUEST, 1)
+def test_nothing_stands_out_means_searching():
+    result = judged(place(0.2), place(0.1, moved(20)), by_chance=31.4)
     assert result.evidence.state is State.SEARCHING
+    assert "31 places would fit as well by chance" in result.evidence.reason
+
+
+@pytest.mark.parametrize("T", [moved(20), moved(0, 180)], ids=["elsewhere", "turned"])
+def test_rival_as_probable_is_ambiguous(T):
+    result = judged(place(0.5), place(0.49, T), error=0.5)
+    assert result.accepted is None
+    assert result.evidence.state is State.AMBIGUOUS
+    assert result.evidence.reason == "two places fit: equally"
+
+
+def test_rival_that_is_less_probable_is_said_to_be():
+    reason = judged(place(0.98), place(0.02, moved(20)), error=0.02).evidence.reason
+    assert reason == "two places fit: the first is 49 times as probable"
+
+
+def test_leader_without_rival_waits_for_more_evidence():
+    reason = judged(place(0.99), place(0.001, moved(20)), error=0.01).evidence.reason
+    assert reason == "one place leads: wrong 1 in 100, 1 in 10,000 needed"
+
+
+def test_no_place_means_searching():
+    result = judged()
+    assert (result.travelled, result.epoch) == (REQUEST.travelled, REQUEST.epoch)
+    assert result.accepted is None
+    said = result.evidence
+    assert (said.state, said.score, said.confidence, said.by_chance) == (State.SEARCHING, 0.0, None, None)
+
+
+def test_evidence_says_what_the_decision_rests_on():
+    best, rival = place(0.9999, score=0.6), place(0.0001, moved(20), score=0.4)
+    result = judged(best, rival, error=0.5e-4, by_chance=2.5e-7)
+    assert (result.travelled, result.epoch) == (REQUEST.travelled, REQUEST.epoch)
+    said = result.evidence
+    assert (said.stamp, said.station, said.shift) == (7.0, 5, 2)
+    assert (said.score, said.rival) == (pytest.approx(0.8), pytest.approx(0.4))  # the leader's exact one
+    assert said.evidence.score == said.score
+    assert said.confidence == pytest.approx(1 - 0.5e-4, abs=1e-12)
+    assert said.by_chance == 2.5e-7
+    assert said.reason == "found: wrong 1 in 20,000"
+    assert len(result.rivals) == 2
+    json.dumps(said.to_json(), allow_nan=False)
+    # without one it is the field's
+    assert judged(best, rival, leader=False).evidence.score == 0.6
+    assert judged(best, rival, leader=False).evidence.evidence is None
+
+
+def test_reason_says_who_named_the_place():
+    other = place(0.0, moved(20))
+    hinted = judged(place(1.0, hinted=True, station=None, shift=None), other, error=1e-9).evidence
+    assert hinted.reason.endswith(FROM_THERE)
+    assert (hinted.station, hinted.shift) == (None, None)
+    learned = judged(place(1.0, learned=True), error=1e-9).evidence
+    assert learned.reason.endswith(BY_FEATURES)
+    assert (learned.station, learned.shift) == (5, None)
+    voted = judged(place(1.0, hinted=True), error=1e-9).evidence  # a hint takes no votes away
+    assert not voted.reason.endswith((FROM_THERE, BY_FEATURES))
+
+
+def test_hint_alone_is_not_accepted_before_votes_have_named_rivals():
+    hint = place(1.0, hinted=True, station=None, shift=None)
+    beside = place(0.0, moved(7), station=None, shift=None)
+    result = judged(hint, beside, error=1e-9)
+    assert result.accepted is None
+    assert result.evidence.state is State.AMBIGUOUS
+    assert "no vote" in result.evidence.reason
+    assert judged(hint, beside, place(0.0, moved(20)), error=1e-9).accepted is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_world
-from hint_cases import BESIDE, NEAR, RULE, first_fix, follow, voteless
+from hint_cases import BESIDE, NEAR, first_fix, follow, misled, voteless
 from se3 import exp_se3
 from small_world import pose_error
 
@@ -23,29 +23,32 @@ UTM = np.array([512_345.6, 5_403_210.9, 287.4])
 # ---- right ones
 
 
-def test_correct_hint_needs_the_usual_confirmations(world_map, world_drive, world_fixes):
+def test_correct_hint_is_judged_like_what_votes_find(world_map, world_drive, world_fixes):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
     fixes = follow(localizer, world_drive, 4)
-    assert first_fix(fixes) == first_fix(world_fixes) == RULE.confirmations - 1
+    assert first_fix(fixes) == first_fix(world_fixes)
     assert [f.evidence.state for f in fixes] == [f.evidence.state for f in world_fixes[:4]]
 
 
-def test_correct_hint_without_votes_waits_for_rivals(world_map, world_drive, monkeypatch):
-    localizer = voteless(Localizer(world_map), monkeypatch)
+def test_correct_hint_without_votes_for_it_gives_a_pose(world_map, world_drive, monkeypatch):
+    localizer = misled(Localizer(world_map), world_drive, monkeypatch)
     localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
-    fixes = follow(localizer, world_drive, 6)
+    fixes = follow(localizer, world_drive, 3)
     posed = first_fix(fixes)
-    # the first keyframes had voted too little for a rival to be seen
-    assert posed == 2 * RULE.confirmations - 2
-    assert all(fix.state is State.AMBIGUOUS for fix in fixes[:posed])
-    assert f"rivals rest on 1 keyframes' votes, {RULE.confirmations} needed" in fixes[0].evidence.reason
-    for fix in fixes[:posed]:
+    assert posed is not None
+    for fix in fixes[: posed + 1]:
         assert fix.evidence.reason.endswith(FROM_THERE)
         assert (fix.evidence.station, fix.evidence.shift) == (None, None)
     metres, degrees = pose_error(fixes[posed].T_map_body, world_drive.T_map_body[posed])
     assert metres < 0.1
     assert degrees < 0.3
+
+
+def test_correct_hint_without_any_votes_waits(world_map, world_drive, monkeypatch):
+    localizer = voteless(Localizer(world_map), monkeypatch)
+    localizer.hint_pose(world_drive.T_map_body[0] @ NEAR)
+    assert {fix.state for fix in follow(localizer, world_drive, 6)} == {State.AMBIGUOUS}
 
 
 def test_without_hint_and_votes_search_finds_nothing(world_map, world_drive, monkeypatch):
@@ -56,7 +59,7 @@ def test_without_hint_and_votes_search_finds_nothing(world_map, world_drive, mon
 def test_hint_is_given_in_map_source_coordinates(world_map, world_drive, monkeypatch):
     """A map far from zero, odometry far from zero, and a robot that leans otherwise than when it was saved."""
     far = BaseMap({**world_map._arrays, "origin": UTM + world_map.origin}, world_map.parameters)
-    localizer = voteless(Localizer(far), monkeypatch)
+    localizer = misled(Localizer(far), world_drive, monkeypatch)
     leaning = exp_se3(np.array([0.05, -0.04, 0.0, *UTM])) @ pose_from(np.eye(3), -UTM)
     there = pose_from(np.eye(3), UTM) @ world_drive.T_map_body[0] @ NEAR
     localizer.hint_pose(leaning @ there)
@@ -67,10 +70,8 @@ def test_hint_is_given_in_map_source_coordinates(world_map, world_drive, monkeyp
 
 
 def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
-    localizer = Localizer(world_map)
+    localizer = voteless(Localizer(world_map), monkeypatch)
     follow(localizer, world_drive, 1)
-    voteless(localizer, monkeypatch)
-    localizer._search.clear()
     T = world_drive.T_odom_body[0] @ pose_from(np.eye(3), [0.1, 0.0, 0.0])
     localizer.hint_pose(world_drive.T_map_body[0])
     assert localizer.add_frame(world_drive.clouds[0], T, 0.1) is None  # no keyframe: it has hardly moved
@@ -125,13 +126,13 @@ def lookalike_map(map_points, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_hint_of_lookalike_place_is_not_accepted(lookalike_map, world_drive):
+def test_hint_of_lookalike_place_is_never_accepted(lookalike_map, world_drive):
     plain = follow(Localizer(lookalike_map), world_drive, 8)
     localizer = Localizer(lookalike_map)
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
     fixes = follow(localizer, world_drive, 8)
-    assert first_fix(plain) is not None
-    assert first_fix(fixes) == first_fix(plain)
+    # a hint is one more rank for the wrong place, which may take some keyframes more to refute
+    assert first_fix(plain) <= first_fix(fixes)
     for fix, truth in zip(fixes, world_drive.T_map_body, strict=False):
         assert fix.T_map_body is None or pose_error(fix.T_map_body, truth)[0] < 0.1
 
@@ -142,10 +143,10 @@ def test_lookalike_hint_waits_for_votes_of_the_true_place(lookalike_map, world_d
     localizer = Localizer(lookalike_map)
     consensus = localizer._search.coview.consensus
     found = consensus.hypotheses
-    monkeypatch.setattr(consensus, "hypotheses", lambda: found() if len(consensus) > RULE.confirmations else [])
+    monkeypatch.setattr(consensus, "hypotheses", lambda: found() if len(consensus) > 3 else [])
     localizer.hint_pose(pose_from(np.eye(3), [2 * small_world.HALF, 0, 0]) @ world_drive.T_map_body[0])
     fixes = follow(localizer, world_drive, 8)
-    assert all(f.evidence.score > RULE.score for f in fixes[:3])  # the wrong one, and it was alone
+    assert all(f.evidence.confidence > 0.5 for f in fixes[:3])  # in the wrong one, and it was alone
     posed = first_fix(fixes)
     assert posed is not None
     for fix, truth in zip(fixes[posed:], world_drive.T_map_body[posed:], strict=False):

@@ -1,4 +1,4 @@
-"""Scores by the likelihood field: places of a keyframe, what they keep of the hypotheses that came to them."""
+"""Places of a search: what the keyframes observe there, what they keep of the hypotheses that came to them."""
 
 from __future__ import annotations
 
@@ -14,18 +14,27 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.registration.verification import verify
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.scoring import score_hypotheses
+from coview_stream.localization.search.scoring import PlaceScorer
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 
 
-@pytest.fixture(scope="module")
-def scan(world_drive):
+def scan_of(world_drive, k):
     """A frame of the small world, with odometry in a frame of its own."""
-    T = inverse(ODOM) @ world_drive.T_map_body[0]
-    cloud = world_drive.clouds[0]
+    T = inverse(ODOM) @ world_drive.T_map_body[k]
+    cloud = world_drive.clouds[k]
     points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
     return ScanInput(prepare_scan(points, T[:3, 3], LocalizerConfig().registration), cloud, T)
+
+
+@pytest.fixture(scope="module")
+def scan(world_drive):
+    return scan_of(world_drive, 0)
+
+
+@pytest.fixture
+def scorer(world_map):
+    return PlaceScorer(world_map.field)
 
 
 def off(forward, left, degrees, scan):
@@ -34,50 +43,84 @@ def off(forward, left, degrees, scan):
     return body @ inverse(scan.T_odom_body)
 
 
-def hypothesis(T, station=3, lead=0.0):
-    return Hypothesis(T, station, 0, -1.0, lead=lead)
+def hypothesis(T, station=3):
+    return Hypothesis(T, station, 0, -1.0)
 
 
-def test_hypotheses_near_the_right_place_become_one_and_keep_votes_and_lead(world_map, scan):
+def scored(scorer, hypotheses, scan, hints=0):
+    return scorer.score(hypotheses, range(len(hypotheses)), hints, scan)
+
+
+def some_places(scan, count=40, seed=4):
+    """The right place and others, at random."""
+    rng = np.random.default_rng(seed)
+    moves = np.column_stack([rng.uniform(-8, 8, (count, 2)), rng.uniform(-180, 180, count)])
+    return [hypothesis(off(*m, scan), n) for n, m in enumerate([(0, 0, 0), *moves])]
+
+
+def is_right(place, scan, metres=0.4):
+    gap = inverse(ODOM @ scan.T_odom_body) @ place.hypothesis.T_map_odom @ scan.T_odom_body
+    return np.linalg.norm(gap[:3, 3]) < metres and rotation_angle(gap) < np.radians(1.5)
+
+
+# ---- one keyframe
+
+
+def test_hypotheses_near_the_right_place_become_one_and_keep_votes(scorer, scan):
     near = [
         hypothesis(off(0.3, 0.2, 1.0, scan), station=None),
-        hypothesis(off(-1.5, 1.0, -3.0, scan), lead=2.5),
+        hypothesis(off(-1.5, 1.0, -3.0, scan)),
         hypothesis(off(1.2, -1.4, 4.0, scan)),
     ]
-    far = hypothesis(off(9.0, -7.0, 120.0, scan))
-    scored = score_hypotheses(world_map.field, [far, *near], scan, best=10)
-    assert len(scored.rivals) == len(scored.places) == 2
-    best, other = scored.places
-    gap = inverse(ODOM @ scan.T_odom_body) @ best.hypothesis.T_map_odom @ scan.T_odom_body
-    assert np.linalg.norm(gap[:3, 3]) < 0.4
-    assert rotation_angle(gap) < np.radians(1.5)
-    assert (best.hypothesis.station, best.hypothesis.lead) == (3, 2.5)
-    assert best.rank > 2 * other.rank
-    np.testing.assert_array_equal(scored.rivals.T_map_odom[0], best.hypothesis.T_map_odom)
-    assert scored.rivals.scores.tolist() == pytest.approx([best.score, other.score])
+    far = hypothesis(off(9.0, -7.0, 120.0, scan), station=8)
+    found = scored(scorer, [far, *near], scan)
+    assert len(found.rivals) == len(found.places) == 2
+    best, other = found.places
+    assert is_right(best, scan)
+    assert (best.hypothesis.station, other.hypothesis.station) == (3, 8)
+    assert best.ratio > other.ratio
+    assert found.second is other
+    np.testing.assert_array_equal(found.rivals.T_map_odom[0], best.hypothesis.T_map_odom)
+    assert found.rivals.scores.tolist() == pytest.approx([best.score, other.score])
+
+
+def test_probabilities_of_places_and_none_of_these_sum_to_one(scorer, scan):
+    found = scored(scorer, some_places(scan), scan)
+    probability = np.array([place.probability for place in found.places])
+    assert probability.sum() + found.none == pytest.approx(1.0, abs=1e-9)
+    assert (np.diff(probability) <= 1e-12).all()
+    assert is_right(found.places[0], scan)
+    # places beside the first from which registration leads to it may be no error; all others are
+    assert found.none <= found.error <= found.none + probability[1:].sum() + 1e-12
 
 
 def test_hint_is_found_again_among_the_places(world_map, scan):
     hint = hypothesis(off(0.5, 0.5, 2.0, scan), station=None)
     wrong = [hypothesis(off(x, y, 90.0, scan)) for x in (-9.0, 9.0) for y in (-8.0, 8.0)]
-    alone = score_hypotheses(world_map.field, [*wrong, hint], scan, best=1, hints=1).places
-    assert [p.hinted for p in alone] == [True]
+    alone = scored(PlaceScorer(world_map.field), [*wrong, hint], scan, hints=1).places
+    assert [place.hinted for place in alone] == [True, False, False, False, False]
     assert alone[0].hypothesis.station is None
     supported = [*wrong, hypothesis(off(0.0, 0.0, 0.0, scan)), hint]
-    (first,) = score_hypotheses(world_map.field, supported, scan, best=1, hints=1).places
+    first = scored(PlaceScorer(world_map.field), supported, scan, hints=1).places[0]
     assert first.hinted
     assert first.hypothesis.station == 3
     lost = [hypothesis(ODOM), replace(hint, T_map_odom=off(9.0, 8.0, 90.0, scan))]
-    places = score_hypotheses(world_map.field, lost, scan, best=1, hints=1).places
-    assert [p.hinted for p in places] == [False, True]
+    places = scored(PlaceScorer(world_map.field), lost, scan, hints=1).places
+    assert [place.hinted for place in places] == [False, True]
 
 
-def test_score_is_near_the_exact_one(world_map, scan):
-    rng = np.random.default_rng(4)
-    moves = np.column_stack([rng.uniform(-8, 8, (40, 2)), rng.uniform(-180, 180, 40)])
-    rivals = score_hypotheses(
-        world_map.field, [hypothesis(off(*m, scan)) for m in [(0, 0, 0), *moves]], scan, best=0
-    ).rivals
+def test_hint_is_no_better_than_a_vote(world_map, scan):
+    """A hint has no rank in any vote: the same place, named by the first of the votes, is more probable."""
+    others = some_places(scan)[1:]
+    right = hypothesis(off(0.0, 0.0, 0.0, scan), station=None)
+    hinted = scored(PlaceScorer(world_map.field), [*others, right], scan, hints=1)
+    voted = scored(PlaceScorer(world_map.field), [hypothesis(right.T_map_odom), *others], scan)
+    assert is_right(hinted.places[0], scan)
+    assert hinted.error >= voted.error
+
+
+def test_score_is_near_the_exact_one(world_map, scorer, scan):
+    rivals = scored(scorer, some_places(scan), scan).rivals
     target = LocalMaps(world_map, 50.0).around((ODOM @ scan.T_odom_body)[:3, 3])
     exact = [
         verify(scan.cloud, T, scan.range_image, T @ scan.T_odom_body, target, world_map.survey).score
@@ -88,11 +131,63 @@ def test_score_is_near_the_exact_one(world_map, scan):
     assert exact[0] == max(exact)
 
 
-def test_scan_without_structure_or_hypotheses_scores_nothing(world_map, scan):
-    none = score_hypotheses(world_map.field, [], scan, best=5)
+def test_scan_without_structure_or_hypotheses_is_found_nowhere(scorer, scan):
+    none = scored(scorer, [], scan)
     assert len(none.rivals) == 0
     assert none.places == []
+    assert (none.error, none.none) == (1.0, 1.0)
     ground, settings = scan.cloud.points[~scan.cloud.above], LocalizerConfig().registration
     flat = ScanInput(prepare_scan(ground, scan.T_odom_body[:3, 3], settings), scan.frame, scan.T_odom_body)
-    scored = score_hypotheses(world_map.field, [hypothesis(ODOM)], flat, best=1)
-    assert scored.rivals.scores.tolist() == [0.0]
+    scorer.clear()
+    found = scored(scorer, [hypothesis(ODOM)], flat)
+    assert found.rivals.scores.tolist() == [0.0]
+    assert found.error > 1e-2
+
+
+# ---- several keyframes
+
+
+def test_places_are_followed_without_new_hypotheses(world_map, world_drive):
+    scorer = PlaceScorer(world_map.field)
+    scored(scorer, some_places(scan_of(world_drive, 0)), scan_of(world_drive, 0))
+    for k in (1, 2, 3):
+        scan = scan_of(world_drive, k)
+        found = scored(scorer, [], scan)
+        assert is_right(found.places[0], scan)
+        assert found.places[0].hypothesis.station == 0
+    scorer.clear()
+    assert scored(scorer, [], scan).places == []
+
+
+def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map, world_drive):
+    """Places are compared on the same observations, whenever they came up."""
+    scans = [scan_of(world_drive, k) for k in range(4)]
+    right, *others = some_places(scans[0])
+    late, early = PlaceScorer(world_map.field), PlaceScorer(world_map.field)
+    for scan in scans[:3]:
+        scored(late, others, scan)
+        scored(early, [right, *others], scan)
+    found = [scored(scorer, [right, *others], scans[3]).places[0] for scorer in (late, early)]
+    assert all(is_right(place, scans[3]) for place in found)
+    assert found[0].ratio == pytest.approx(found[1].ratio, rel=0.25)
+
+
+def test_hypotheses_beside_the_leader_are_tried(world_map, world_drive):
+    """Along a corridor the robot may be anywhere: what lies beside the best place is its rival."""
+    scorer = PlaceScorer(world_map.field)
+    scan = scan_of(world_drive, 0)
+    assert len(scored(scorer, [hypothesis(ODOM)], scan).rivals) == 1
+    rivals = scored(scorer, [], scan).rivals
+    assert len(rivals) > 3
+    gap = np.linalg.norm((rivals.T_map_odom - ODOM) @ np.append(scan.T_odom_body[:3, 3], 1.0), axis=1)
+    assert 2.0 < np.sort(gap)[1] < 12.0
+
+
+def test_observations_are_kept_for_a_bounded_number_of_keyframes(world_map, world_drive):
+    scorer = PlaceScorer(world_map.field)
+    scan = scan_of(world_drive, 0)
+    ratios = [scored(scorer, some_places(scan, 12), scan).places[0].ratio for _ in range(24)]
+    assert np.isfinite(ratios).all()
+    assert len(scorer._scans) < 24
+    # the same scan again and again is no new evidence: chance repeats itself as well
+    assert max(ratios) < 2.0 * ratios[0]

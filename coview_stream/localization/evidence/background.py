@@ -1,0 +1,110 @@
+"""Background: what chance explains of this scan on this map, measured at the places that were scored and are wrong.
+
+All but the places around the leader are chance places. Their mean shares are what an observation is worth at a wrong
+place, in a yard of equal boxes as much as 0.4. How far they scatter about that mean says how many independent
+observations a scan is: neighbouring points fall and rise together, and so do the scans of successive keyframes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.localization.evidence.observed_scan import Share
+
+# what is presumed before any place has been scored: as many chance places as these; set by hand
+_PSEUDO = 6.0  # chance places
+_PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
+_PSEUDO_NUMBER = 10.0  # independent observations
+_LEAST = 0.01  # of any outcome: a share that was never seen is not impossible
+_COVERED = 0.05  # of a scan: below, the shares of what is covered say nothing
+_TAIL = (84.0, 95.0, 99.0)  # percentiles
+_CALIBRATED = 1.25
+"""Independent observations for each that the scatter shows: searches on maps of other sites then state an error below
+e in less than a share e of them (``python -m bench.integrity.calibrate``, towns, campuses, terraces, plantations)."""
+_PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
+
+
+@dataclass(frozen=True)
+class Background:
+    """Shares at chance places, and how many independent observations a scan is.
+
+    Attributes:
+        structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
+            unexplained.
+        passed: probability that a free point lies on map structure.
+        ground: parameters of the Beta distribution of the share of the ground that lies on the map's, over places.
+        number: effective numbers of independent structure points and of free points.
+    """
+
+    structure: Floats
+    passed: float
+    ground: tuple[float, float]
+    number: tuple[float, float]
+
+
+def outcomes(observed: Floats32) -> Floats:
+    """Return how the structure's outcomes (P, 4) share an observation (P, 7): on, near, edge, unexplained."""
+    on, near, edge, covered = (observed[:, k].astype(np.float64) for k in range(4))
+    return np.column_stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)])
+
+
+def scatter(observed: Floats32) -> Floats:
+    """Return the variances (4,) of chance places' shares: on, near, explained, passed.
+
+    They are those of the narrowest normal distribution that reaches as far as the shares do towards what a right place
+    has, at one, two and about three standard deviations: the tail decides, and it is often wider than the middle.
+    """
+    if len(observed) < 2:
+        return np.full(4, np.nan)
+    levels = np.percentile(_compared(observed), (50.0, *_TAIL), axis=0)
+    reach = (levels[1:] - levels[0]) / ndtri(np.array(_TAIL) / 100.0)[:, None]
+    return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
+
+
+def _compared(observed: Floats32) -> Floats:
+    covered = np.maximum(observed[:, Share.COVERED], _COVERED)
+    near = observed[:, Share.NEAR]
+    shares = observed[:, Share.ON] / covered, near / covered, (near + observed[:, Share.EDGE]) / covered
+    return np.column_stack([*shares, -observed[:, Share.PASSED]]).astype(np.float64)
+
+
+def estimate_background(now: Floats32, variance: Floats, kept_now: Floats32, kept_mean: Floats32) -> Background:
+    """Estimate the background from chance places.
+
+    Args:
+        now: (N, 7) the newest keyframe's observations at them.
+        variance: (4,) mean of :func:`scatter` over the keyframes so far.
+        kept_now: (K, 7) those of them that were followed over several keyframes, at the newest.
+        kept_mean: (K, 7) mean over the keyframes: chance does not repeat itself, so they scatter less.
+    """
+    counts = outcomes(now)
+    total = counts.sum(axis=0) + _PSEUDO * np.array(_PSEUDO_SHARES)
+    structure = np.maximum(total / total.sum(), _LEAST)
+    passed = float(np.clip(now[:, Share.PASSED].mean(), *_PASSED)) if len(now) else 0.05
+    averaged = np.ones(4)
+    if len(kept_now) > _PSEUDO:
+        averaged = np.maximum(1.0, _compared(kept_now).var(axis=0) / np.maximum(_compared(kept_mean).var(axis=0), 1e-6))
+    structure = structure / structure.sum()
+    chance = np.append(np.cumsum(structure[:3]), passed)
+    chance = chance * (1.0 - chance)
+    count = len(now)
+    seen = np.where(np.isfinite(variance), variance, 0.0)
+    presumed = chance / _PSEUDO_NUMBER
+    number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO)) * averaged
+    high = float(3.0 / (1.0 / number[:3]).sum())
+    return Background(structure, passed, _beta(now, kept_mean), (high, float(number[3])))
+
+
+def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:
+    """Fit a Beta distribution to the shares of the ground by their mean and variance."""
+    both = np.concatenate([now, kept])
+    shares = np.clip(both[:, Share.GROUND] / np.maximum(both[:, Share.COVERED_GROUND], _COVERED), 0.0, 1.0)
+    shares = np.concatenate([shares, np.linspace(0.0, 1.0, round(_PSEUDO))])
+    mean = float(np.clip(shares.mean(), 0.02, 0.98))
+    spread = float(np.clip(shares.var(), 1e-4, 0.9 * mean * (1.0 - mean)))
+    size = mean * (1.0 - mean) / spread - 1.0
+    return max(mean * size, 0.3), max((1.0 - mean) * size, 0.3)

@@ -1,0 +1,73 @@
+"""Likelihood ratio of a place: how much better "the robot is here" explains the observations than chance does.
+
+At the right place a share q of what stands is still as the map has it, and is explained as the survey allows; of the
+rest, chance explains what it explains anywhere. So an outcome has the probability
+
+    m = q d + (1 - q) b
+
+with b the background's and d what a survey of this kind shows of what is there. q (the site may have changed), d (a
+survey from above shows roofs, one from the ground facades) and the share of rays that pass through what stands
+(foliage) are nuisances: they are summed over, evenly. With n the effective number of observations of a kind and s the
+shares of their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that explains no more than chance
+cannot gain, as q >= 0. What the map does not cover adds nothing; a rival that has it covered gains by it.
+
+The ground is one observation of a place, not many, for a road is level everywhere: its share is held against the Beta
+distribution of the chance places' shares.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import betaln
+
+from coview_stream.geometry.arrays import Floats, Floats32
+from coview_stream.localization.evidence.background import Background, outcomes
+from coview_stream.localization.evidence.observed_scan import Share
+
+# set by hand
+_KEPT = np.linspace(0.05, 1.0, 20)  # shares q that are summed over
+_SURVEYS = np.array([[0.3, 0.15, 0.45, 0.1], [0.5, 0.25, 0.15, 0.1], [0.65, 0.25, 0.05, 0.05], [0.8, 0.17, 0.02, 0.01]])
+"""Outcomes of what is there: on, near, under an edge, unexplained; from an airborne survey to one of the same kind."""
+_LEAKS = np.array([0.05, 0.3, 0.6])  # of the background's passed rays, those that pass what stands there
+_GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
+_LEVEL = 0.01  # share of chance places whose ground is as good as any
+_EDGE = 0.02  # shares of the ground beyond it are not told apart
+
+
+def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[Floats, Floats]:
+    """Return log-likelihood ratios (P,) of places against chance, and the shares q (P,) that explain them best.
+
+    Args:
+        observed: (P, 7) mean observations at the places, see :class:`Share`.
+        background: what chance explains.
+    """
+    counts = outcomes(observed)
+    q = _KEPT[:, None, None]
+    explained = q * _SURVEYS + (1.0 - q) * background.structure  # (Q, D, 4)
+    structure = np.einsum("pc,qdc->pqd", counts, np.log(explained / background.structure)) * background.number[0]
+    passed = background.passed * (_KEPT[:, None] * _LEAKS + 1.0 - _KEPT[:, None])  # (Q, L)
+    hit = observed[:, Share.PASSED].astype(np.float64)
+    covered = np.maximum(observed[:, Share.COVERED], observed[:, Share.COVERED_GROUND])
+    clear = np.maximum(covered - hit, 0.0)
+    free = background.number[1] * (
+        hit[:, None, None] * np.log(passed / background.passed)
+        + clear[:, None, None] * np.log((1.0 - passed) / (1.0 - background.passed))
+    )
+    each = structure[:, :, :, None] + free[:, :, None, :]
+    best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
+    flat = each.reshape(len(each), -1)
+    top = flat.max(axis=1, initial=-np.inf)
+    return np.log(np.exp(flat - top[:, None]).mean(axis=1)) + top + _ground(observed, background), best
+
+
+def _ground(observed: Floats32, background: Background) -> Floats:
+    covered = observed[:, Share.COVERED_GROUND].astype(np.float64)
+    share = np.clip(observed[:, Share.GROUND] / np.maximum(covered, 0.05), _EDGE, 1.0 - _EDGE)
+    chance = np.logaddexp(_beta(share, *background.ground) + math.log1p(-_LEVEL), math.log(_LEVEL))
+    return np.asarray(np.clip(covered, 0.0, 1.0) * (_beta(share, *_GROUND) - chance))
+
+
+def _beta(x: Floats, a: float, b: float) -> Floats:
+    return np.asarray((a - 1.0) * np.log(x) + (b - 1.0) * np.log1p(-x) - betaln(a, b))

@@ -1,0 +1,51 @@
+"""Places that a search might have scored, with probabilities of our choice."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.registration.result import Registration
+from coview_stream.localization.registration.verification import Evidence
+from coview_stream.localization.search.acceptance import SearchResult, decide
+from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.refinement import Candidate
+from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.scoring import Rivals, Scored, ScoredPlace
+
+RULE = AcceptanceConfig()
+NOTHING = np.empty((0, 3), dtype=np.float32)
+REQUEST = SearchRequest(7.0, pose_from(rot_z(0.3), [40.0, -25.0, 1.2]), NOTHING, NOTHING, NOTHING, 5.5, (2, 3))
+HERE = pose_from(rot_z(-0.8), [3.0, 9.0, 0.5])  # map <- odometry
+NOBODY = Hypothesis(HERE, None, None, 0.0)  # named by no vote
+
+
+def moved(forward=0.0, degrees=0.0):
+    """``HERE`` with the robot (not the odometry's origin) moved and turned."""
+    body = HERE @ REQUEST.T_odom_body @ pose_from(rot_z(np.radians(degrees)), [forward, 0.0, 0.0])
+    return body @ inverse(REQUEST.T_odom_body)
+
+
+def place(probability, T_map_odom=HERE, score=0.7, hinted=False, **hypothesis):
+    own = Hypothesis(T_map_odom, **({"station": 5, "shift": 2, "score": -3.0} | hypothesis))
+    return ScoredPlace(own, score, 0.9, hinted, probability=probability)
+
+
+def candidate(at, score=0.8):
+    """What comes of a place once it is registered."""
+    found = Registration(at.hypothesis.T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
+    return Candidate(at, found, Evidence(score, score, 1.0, 1.0, 0.9))
+
+
+def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk) -> SearchResult:
+    """The decision on places, the most probable first; what is left of the probability is "none of these"."""
+    none = 1.0 - sum(each.probability for each in places)
+    if error is None:
+        error = 1.0 - places[0].probability if places else 1.0
+    some = np.array([each.score for each in places], dtype=np.float32)
+    T = np.array([each.hypothesis.T_map_odom for each in places]).reshape(-1, 4, 4)
+    second = places[1] if len(places) > 1 else None
+    scored = Scored(Rivals(T, some, some), list(places), error, none, by_chance, second)
+    best = candidate(places[0]) if leader and places else None
+    return decide(scored, best, REQUEST, AcceptanceConfig(risk=risk))
