@@ -15,14 +15,13 @@ import numpy as np
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Errors, Told
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.protection import RISK, TAILS, axes_of
+from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES, RISK, TAILS, axes_of
 from coview_stream.report.style import TRUTH, figure
 
 EVERY = 10.0
 """Metres of driving of which one pose counts."""
 
-ALERT = (1.0, 3.0)
-"""Alert limit: metres and degrees by which a pose that is given may be off."""
+ALERT = (ALERT_METRES, ALERT_DEGREES)
 
 TO_ALERT = (2.0, 2.0)
 """Seconds, and metres driven, after which a pose beyond the alert limit has to have been withdrawn."""
@@ -164,7 +163,7 @@ def stanford(sample: Sample, path: Path, title: str) -> None:
             axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), aspect="equal")
             axes.set(xlabel=f"error, {unit}", ylabel=f"protection level, {unit}")
             for x, y, said in (
-                (0.06, 0.55, "as promised"), (0.34, 0.06, "error > level:\nmisleading"), (0.77, 0.3, "HMI"),
+                (0.06, 0.68, "as promised"), (0.34, 0.06, "error > level:\nmisleading"), (0.77, 0.3, "HMI"),
                 (0.06, 0.9, "level > alert limit: unavailable"), (0.755, 0.02, f"alert limit {limit:g}"),
             ):  # fmt: skip
                 axes.text(x, y, said, transform=axes.transAxes, fontsize=8)

@@ -31,6 +31,7 @@ class MapMatch:
         innovation: squared Mahalanobis distance from where the graph predicts the pose.
         scan: what was registered; None where nothing could be.
         target: the map around it; None likewise.
+        moves_place: it contradicts odometry, and is believed in its place.
         confirms_search: it is the first at an accepted place; verified, it adds nothing to the search's evidence.
     """
 
@@ -40,6 +41,7 @@ class MapMatch:
     innovation: float = 0.0
     scan: ScanInput | None = None
     target: LocalMap | None = None
+    moves_place: bool = False
     confirms_search: bool = False
 
     @classmethod

@@ -10,7 +10,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
-from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, transform
+from coview_stream.geometry.transforms import Points, Pose, inverse, transform
 from coview_stream.localization.registration.covariance import (
     propagate,
     registration_covariance,
@@ -26,6 +26,7 @@ from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchV
 from coview_stream.localization.tracking.motion import MAX_FRAMES, Drift, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
+from coview_stream.localization.tracking.slip import has_slipped, matters, off_by
 
 _MIN_POINTS = 100  # to register; set by hand
 _STANDING_DRIVE = 0.2  # metres: what standing still until the next registration counts as; set by hand
@@ -54,6 +55,7 @@ class Tracker:
         self._scans = ScanBuffer(config.tracking)
         self._unregistered = 0  # frames since the newest registration
         self._shared_error = SharedErrorModel(config.registration)
+        self._disputed = False  # whether what fits has been off from where odometry leads, and may be wrong
         self._doubt = 1.0  # by how much the newest evidence that was believed has fallen below what is usual
 
     @property
@@ -117,7 +119,7 @@ class Tracker:
         It may not have converged yet: its own covariance is not believed.
         """
         self._baseline.clear()
-        self._doubt = 1.0
+        self._doubt, self._disputed = 1.0, False
         self._displacement.clear()
         self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
@@ -158,14 +160,16 @@ class Tracker:
             scales = self.config.registration.search[1:]
             again = self._matcher.match(scan, wider, target, scales, self._graph)
             match = max(match, again, key=_rank)
-        if match.verdict.verified and match.innovation > limit:
-            return _contradicting_odometry(match, belief)
+        if match.verdict.verified and (match.innovation > limit or self._disputed):
+            return self._against_odometry(match, belief, scan)
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose) -> None:
         """Correct the belief by a registration at the newest frame; a rejected one leaves it as it is."""
         verdict = match.verdict
-        if verdict.cause is RejectionReason.ODOMETRY:
+        if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
+            self._disputed = not (verdict.verified or match.moves_place)
+        if match.moves_place:
             # go on where the lidar says, for the next frame to confirm
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif verdict.verified:
@@ -194,6 +198,22 @@ class Tracker:
         return protection_level(self.reported_covariance(), self._doubt)
 
     # ---- inside
+
+    def _against_odometry(self, match: MapMatch, belief: Estimate, scan: ScanInput) -> MapMatch:
+        """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scan says so itself.
+
+        Where the two places are so near that either is good enough, what the lidar sees is believed.
+        """
+        metres, degrees = off_by(match.T_map_body, belief.T_map_body)
+        matter = matters(metres, degrees)
+        if not matter and match.innovation <= self.config.acceptance.max_innovation:
+            return match
+        moves = not matter or has_slipped(self._matcher.base_map, scan, belief.T_map_body, match.T_map_body)
+        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
+        if not moves:
+            reason += ", and the scan fits there hardly better: something may have been moved"
+        verdict = MatchVerdict(RejectionReason.ODOMETRY, reason, match.verdict.evidence, match.innovation)
+        return replace(match, verdict=verdict, moves_place=moves)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
@@ -230,12 +250,3 @@ class Tracker:
 
 def _rank(match: MapMatch) -> tuple[bool, float]:
     return match.verdict.verified, match.verdict.score
-
-
-def _contradicting_odometry(match: MapMatch, belief: Estimate) -> MapMatch:
-    """Return a match with the verdict that the place fits, but not where odometry leads."""
-    gap = boxminus(match.T_map_body, belief.T_map_body)
-    metres, degrees = float(np.linalg.norm(gap[3:])), np.degrees(float(np.linalg.norm(gap[:3])))
-    reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
-    verdict = MatchVerdict(RejectionReason.ODOMETRY, reason, match.verdict.evidence, match.innovation)
-    return replace(match, verdict=verdict)
