@@ -140,11 +140,13 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     details = next(row.details for row in rows if "results" in row.details)
     results = details["results"]
     made = f"{len(results)} runs of the {asked.group} kinds, code {details['code']}, {time.strftime('%Y-%m-%d')}."
-    return {
+    parts = {
         "": f"{class_table(results)}\n\n{made}",
         "families": family_table(results),
         "reliability": reliability_table([*results, *details["others"]]),
     }
+    before = "" if asked.group == "reported" else f"{asked.group} "  # the page's places are for what is reported
+    return {f"{before}{part}".strip(): text for part, text in parts.items()}
 
 
 def _shard(text: str) -> tuple[int, int]:

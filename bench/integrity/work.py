@@ -57,15 +57,15 @@ def on_site(site: Site, task: Task) -> list[Result]:
     """Make all runs on one map; what cannot be made is noted as ``failed``, and tried again another time."""
     from bench.integrity.run import localizer_on
 
-    begin, out = time.perf_counter(), list[Result]()
+    begin, out = time.process_time(), list[Result]()
     localizer, reason = None, ""
     try:
         localizer = localizer_on(map_of(site[0], task.maps), task.risk)
     except Exception as error:  # whatever it is, the other sites go on
         reason = f"{type(error).__name__}: {error}"
-    share = round((time.perf_counter() - begin) / len(site), 2)
+    share = round((time.process_time() - begin) / len(site), 2)
     for run in site:
-        begin = time.perf_counter()
+        begin = time.process_time()
         result: Result = {"outcome": "failed", "reason": reason}
         try:
             if localizer is not None:
@@ -73,7 +73,7 @@ def on_site(site: Site, task: Task) -> list[Result]:
         except Exception as error:  # likewise
             result["reason"] = f"{type(error).__name__}: {error}"
         result = {"key": task.key(run), "code": task.code, "class": run.of_class, **asdict(run), **result}
-        result |= {"asked_risk": task.risk, "site_s": share, "cost_s": round(time.perf_counter() - begin, 2)}
+        result |= {"asked_risk": task.risk, "site_s": share, "cost_s": round(time.process_time() - begin, 2)}
         append(task.results, result)
         out.append(result)
     return out
