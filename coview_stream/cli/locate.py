@@ -7,7 +7,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.options import add_gravity, add_registration, add_reloc, add_run_path, add_topics, lidar_config
+from coview_stream.cli.options import (
+    acceptance_config,
+    add_gravity,
+    add_registration,
+    add_reloc,
+    add_risk,
+    add_run_path,
+    add_topics,
+    lidar_config,
+)
 
 if TYPE_CHECKING:
     from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -31,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
     add_registration(parser)
     add_reloc(parser)
+    add_risk(parser)
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
 
@@ -47,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.localization.result import Fix
     from coview_stream.recordings.open_run import open_run
 
+    acceptance = acceptance_config(args.risk)
     lidar = _lidar_odometry(args.odometry, args.gravity)
     if args.registration == "gicp":
         library()  # before anything is read: it may be missing
@@ -69,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
     config = LocalizerConfig(
         retrieval=RetrievalConfig(mode=args.retrieval),
         registration=RegistrationConfig(method=args.registration),
+        acceptance=acceptance,
         reloc=args.reloc if missing is None else "coview",
     )
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:

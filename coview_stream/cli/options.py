@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they mean: runs, registration, network, odometry, kept state."""
+"""Options that several commands share, and what they mean: runs, search, network, odometry, kept state."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from coview_stream.config import AcceptanceConfig
     from coview_stream.config.odometry import LidarOdometryConfig
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
@@ -64,6 +65,32 @@ def add_reloc(parser: argparse.ArgumentParser) -> None:
         help="what names places to look at: co-view descriptors, learned features, or both on maps that have "
         "features (auto)",
     )
+
+
+def add_risk(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--risk``."""
+    parser.add_argument(
+        "--risk",
+        type=float,
+        default=1e-4,
+        metavar="P",
+        help="probability of a wrong place below which a search gives one; the smaller, the farther a robot may drive "
+        "before it is found (1e-4)",
+    )
+
+
+def acceptance_config(risk: float) -> AcceptanceConfig:
+    """Return what makes a fix, by ``--risk``.
+
+    Raises:
+        ConfigError: it is no probability below a half.
+    """
+    from coview_stream.config import AcceptanceConfig
+    from coview_stream.errors import ConfigError
+
+    if not 0 < risk < 0.5:
+        raise ConfigError(f"--risk {risk:g}: give the probability of a wrong place, in (0, 0.5), such as 1e-4")
+    return AcceptanceConfig(risk=risk)
 
 
 def add_gravity(parser: argparse._ActionsContainer) -> None:

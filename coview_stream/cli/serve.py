@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 from coview_stream.cli.options import (
     KISS_ICP,
     ROBOT,
+    acceptance_config,
     add_gravity,
     add_registration,
     add_reloc,
+    add_risk,
     add_state,
     check_codec,
     lidar_config,
@@ -78,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
     add_registration(parser)
     add_reloc(parser)
+    add_risk(parser)
     add_state(parser)
     parser.add_argument("--quiet", action="store_true", help="log errors only")
 
@@ -111,6 +114,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
+    risk = acceptance_config(args.risk).risk
     lidar = lidar_config(args.odometry, args.gravity, args.max_speed)
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
@@ -132,7 +136,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
-        args.registration, writable_state_folder(args), args.reloc,
+        args.registration, writable_state_folder(args), args.reloc, risk,
     )  # fmt: skip
     with stop_on_signals() as stop:
         ended = _serve(options, stop, children)

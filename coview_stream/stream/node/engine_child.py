@@ -22,19 +22,21 @@ waits for odometry. Set by hand."""
 
 
 class Opening(NamedTuple):
-    """What an engine is to be opened with; texts as they were given, to be checked by the engine.
+    """What an engine is to be opened with; as it was given, to be checked by the engine.
 
     Attributes:
         map_path: the map's file.
         sha256: of the map.
         registration: method of registration.
         reloc: recognizers that propose the places to search at.
+        risk: probability of a wrong place below which a search gives one.
     """
 
     map_path: str
     sha256: str
     registration: str
     reloc: str
+    risk: float
 
 
 class EngineChild:

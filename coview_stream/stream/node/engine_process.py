@@ -16,11 +16,11 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Protocol
 
+from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.errors import CoViewError
 from coview_stream.stream.node.engine_child import EngineChild, Opening, end
 
 if TYPE_CHECKING:
-    from coview_stream.config import RegistrationMethod, Reloc
     from coview_stream.stream.node.engines import Engine
     from coview_stream.stream.node.jobs import Job, Result
 
@@ -65,6 +65,7 @@ class EngineProcess:
         nice: added to the child's niceness, so that the clock here is never late; None for that of its kind.
         registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
         reloc: recognizers that propose the places to search at.
+        risk: probability of a wrong place below which a search gives one.
         job_timeout: seconds after which a job counts as hung; set by hand.
         open_timeout: seconds after which opening the map, or preparing for the first job, does; set by hand.
         child: started before, to be the first one; None starts one.
@@ -80,6 +81,7 @@ class EngineProcess:
         open_timeout: float = 120.0,
         registration: RegistrationMethod = "trimmed-icp",
         reloc: Reloc = "auto",
+        risk: float = AcceptanceConfig.risk,
         child: EngineChild | None = None,
     ) -> None:
         self.kind = kind
@@ -90,6 +92,7 @@ class EngineProcess:
         self.open_timeout = open_timeout
         self.registration = registration
         self.reloc = reloc
+        self.risk = risk
         self._started = child
         self._closed = False
         self._lock = threading.Lock()
@@ -112,7 +115,7 @@ class EngineProcess:
             self._child, self._pipe = started.take()
             self._awaited = ["ready", "prepared"]
             with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
-                self._pipe.send(Opening(self.map_path, self.sha256, self.registration, self.reloc))
+                self._pipe.send(Opening(self.map_path, self.sha256, self.registration, self.reloc, self.risk))
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until the child has opened the map.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.config import RegistrationMethod, Reloc
+from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, TransportError
@@ -44,6 +44,7 @@ class ServeOptions:
         registration: how scans are registered to the map.
         state: directory that keeps the last known poses; None for none.
         reloc: recognizers that propose the places to search at.
+        risk: probability of a wrong place below which a search gives one.
     """
 
     map_path: Path
@@ -59,6 +60,7 @@ class ServeOptions:
     registration: RegistrationMethod = "trimmed-icp"
     state: Path | None = None
     reloc: Reloc = "auto"
+    risk: float = AcceptanceConfig.risk
 
 
 def open_node(
@@ -94,7 +96,7 @@ def open_node(
         for kind, child in children.items():
             engines[kind] = EngineProcess(
                 kind, str(options.map_path), base_map.sha256, None,
-                registration=options.registration, reloc=reloc, child=child,
+                registration=options.registration, reloc=reloc, risk=options.risk, child=child,
             )  # fmt: skip
         for engine in engines.values():
             engine.start()

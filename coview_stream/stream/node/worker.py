@@ -28,7 +28,7 @@ def main(argv: list[str]) -> int:
         os.nice(nice)
     _set_group_nice(nice)
     from coview_kernels import warm_up
-    from coview_stream.config import LocalizerConfig, RegistrationConfig
+    from coview_stream.config import AcceptanceConfig, LocalizerConfig, RegistrationConfig
     from coview_stream.errors import CoViewError
     from coview_stream.stream.node.engine_process import attempt
     from coview_stream.stream.node.engines import kernels_of, open_engine
@@ -50,8 +50,9 @@ def main(argv: list[str]) -> int:
         opening = pipe.recv()
         _set_group_nice(0)
         try:
-            method = RegistrationConfig(method=opening.registration)  # any text; it checks
-            config = LocalizerConfig(registration=method, reloc=opening.reloc)  # likewise
+            method = RegistrationConfig(method=opening.registration)  # any text; it checks, as do the others
+            rule = AcceptanceConfig(risk=opening.risk)
+            config = LocalizerConfig(registration=method, acceptance=rule, reloc=opening.reloc)
             engine = open_engine(kind, opening.map_path, opening.sha256, config)
             pipe.send(("ready", None))
             engine.prepare()

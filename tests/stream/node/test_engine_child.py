@@ -53,7 +53,7 @@ def test_library_that_is_missing_is_the_jobs_error(monkeypatch):
     with Connection(ours.detach()) as pipe:
         child = threading.Thread(target=worker.main, args=([str(theirs.detach()), "odometry", "0"],), daemon=True)
         child.start()
-        pipe.send(Opening("map", "hash", "trimmed-icp", "auto"))
+        pipe.send(Opening("map", "hash", "trimmed-icp", "auto", 1e-4))
         assert pipe.recv() == ("ready", None)
         assert pipe.recv() == ("prepared", None)
         assert engine.asked.wait(10.0)

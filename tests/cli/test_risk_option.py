@@ -1,0 +1,61 @@
+"""``--risk`` of ``locate`` and ``serve``: it reaches those who search, in processes of their own too."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from coview_stream.cli import build_parser, main, serve
+from coview_stream.config import AcceptanceConfig
+from coview_stream.errors import CoViewError
+from coview_stream.stream.node.engine_process import EngineProcess
+
+SERVE = ["serve", "site.coview", "--robot", "r1"]
+LOCATE = ["locate", "site.coview", "run", "-o", "out"]
+
+
+@pytest.mark.parametrize("command", [SERVE, LOCATE])
+def test_default_risk_is_that_of_the_configuration(command):
+    assert build_parser().parse_args(command).risk == AcceptanceConfig().risk
+
+
+@pytest.mark.parametrize("given", ["0", "0.5", "-1e-4", "1", "nan", "inf", "1e-400"])
+def test_risk_that_is_no_small_probability_is_refused_before_anything_is_read(tmp_path, capsys, given):
+    none = str(tmp_path / "not-even-looked-for.coview")
+    for command in (["serve", none, "--robot", "r1", "--no-state"], ["locate", none, "run", "-o", str(tmp_path / "o")]):
+        assert main([*command, f"--risk={given}"]) == 2
+        said = capsys.readouterr().err
+        assert "--risk" in said
+        assert "(0, 0.5), such as 1e-4" in said
+        assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(("given", "wanted"), [([], 1e-4), (["--risk", "1e-6"], 1e-6)])
+def test_serve_passes_risk_option_to_engines(world_file, monkeypatch, given, wanted):
+    asked = []
+    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options) or True)
+    assert main(["serve", str(world_file), "--robot", "r1", "--no-state", *given]) == 0
+    assert [options.risk for options in asked] == [wanted]
+
+
+def test_a_risk_too_small_for_the_run_gives_no_pose(world_file, world_run, tmp_path, capsys):
+    out = tmp_path / "out"
+    command = ["locate", str(world_file), str(world_run), "-o", str(out), "--no-pictures"]
+    assert main([*command, "--risk", "1e-300"]) == 1
+    assert "localised          0 of" in capsys.readouterr().out
+    result = json.loads((out / "result.json").read_text())
+    assert {each["state"] for each in result["keyframes"]} == {"AMBIGUOUS"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["track", "search"])
+def test_risk_option_reaches_engine_process(world_file, kind):
+    """Which refuses what is none."""
+    process = EngineProcess(kind, str(world_file), "0" * 64, risk=0.7)
+    try:
+        process.start()
+        with pytest.raises(CoViewError, match=r"risk is 0\.7"):
+            process.wait_ready()
+    finally:
+        process.close()
