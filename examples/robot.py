@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from coview_stream import RobotClient
+from coview_stream.localization.evidence.words import one_in
 from coview_stream.recordings import Frame, open_run
 
 
@@ -42,7 +43,8 @@ def main(run: Path, name: str, endpoint: str | None = None, seconds: float = 0.1
             for pose in robot.poses(timeout=1.0):  # ends when none came for a second: not localised, or done
                 count += 1
                 x, y, z = pose.T_map_body[:3, 3]
-                print(f"{pose.stamp_ns / 1e9:.2f} s: x {x:.2f}  y {y:.2f}  z {z:.2f}  ({pose.confidence:.2f})")
+                wrong = one_in(1.0 - pose.confidence)
+                print(f"{pose.stamp_ns / 1e9:.2f} s: x {x:.2f}  y {y:.2f}  z {z:.2f}  (wrong {wrong})")
         if robot.latest_status:
             print(f"at the end: {robot.latest_status.get('state')} ({robot.latest_status.get('reason')})")
     return count

@@ -3,7 +3,7 @@
     coview-stream simulate world --scene campus --sensor os64 --length 0
     python examples/single_scan.py world/base.laz world/run/frames/000000.pcd
 
-One scan has no other keyframes to agree with it, so its evidence has to be stronger than on a drive.
+One scan has to bring the evidence alone that a drive collects from keyframe to keyframe.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from coview_stream import BaseMap, Fix
+from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.offline import locate
 from coview_stream.recordings import open_run
 
@@ -24,7 +25,7 @@ def main(base: Path, scan: Path) -> Fix:
     if fix.T_map_body is None:
         print(f"{fix.state.reported}: {fix.evidence.reason if fix.evidence else 'no evidence'}")
     else:
-        print(f"{fix.state.reported}, confidence {fix.confidence:.2f}; from the scan's frame into the map's:")
+        print(f"{fix.state.reported}, wrong {one_in(1.0 - fix.confidence)}; from the scan's frame into the map's:")
         print(fix.T_map_body.round(3))
     return fix
 

@@ -21,6 +21,7 @@ from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, pose_from_tum
+from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import State
@@ -47,6 +48,7 @@ class RunResult:
         sources: recognizers that named places: "coview", "learned"; empty if that is not known.
         query: descriptors of the keyframe that won the first fix, if there was one.
         winner: its evidence: station and shift.
+        driven: metres that odometry had driven at the first fix; None if that is not known.
     """
 
     frames: int
@@ -57,6 +59,7 @@ class RunResult:
     query: dict[Channel, Descriptor] = field(default_factory=dict)
     winner: KeyframeEvidence | None = None
     sources: tuple[str, ...] = ()
+    driven: float | None = None
 
     @property
     def posed(self) -> list[Fix]:
@@ -82,6 +85,7 @@ class RunResult:
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
+            "first_fix_m": None if self.driven is None else round(self.driven, 3),
             "frames": self.frames,
             "posed": len(self.posed),
             "skipped": self.skipped,
@@ -108,6 +112,7 @@ def locate(
     localizer = Localizer(base_map, config)
     localizer.prepare()
     located = RunResult(len(run), sources=localizer.sources)
+    driven, before = 0.0, None
     for index in range(len(run)):
         try:
             frame = run.read(index)
@@ -119,6 +124,10 @@ def locate(
                 progress(index + 1, len(run), None)
             continue
         located.seconds.append(time.perf_counter() - begin)
+        here = frame.T_odom_body[:3, 3]
+        driven, before = driven + (0.0 if before is None else float(np.linalg.norm(here - before))), here
+        if located.first is None and fix.T_map_body is not None:
+            located.driven = driven
         _note(located, localizer, _in_file_frame(fix, frame))
         if progress:
             progress(index + 1, len(run), fix)
@@ -209,7 +218,7 @@ def summary(located: RunResult) -> str:
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
-        lines.append(f"{'confidence':<18} {posed[-1].confidence:.2f}")
+        lines.append(f"{'found':<18} {_found(located, posed[0])}")
     elif located.keyframes:
         lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
     if located.skipped:
@@ -218,3 +227,8 @@ def summary(located: RunResult) -> str:
         p50, p99 = np.quantile(located.seconds, [0.5, 0.99]) * 1e3
         lines.append(f"{'step time':<18} p50 {p50:.1f} ms, p99 {p99:.0f} ms")
     return "\n".join(lines)
+
+
+def _found(located: RunResult, first: Fix) -> str:
+    where = "" if located.driven is None else f"after {located.driven:.1f} m: "
+    return f"{where}wrong {one_in(1.0 - first.confidence)} by chance"

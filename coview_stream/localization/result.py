@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -63,16 +64,16 @@ class KeyframeEvidence:
             "station": self.station,
             "shift": self.shift,
             "cause": None if self.cause is None else self.cause.value,
-            "innovation": None if self.innovation is None else round(self.innovation, 2),
-            "confidence": self.confidence,
-            "by_chance": None if self.by_chance is None else float(f"{self.by_chance:.3g}"),
+            "innovation": _number(self.innovation, ".2f"),
+            "confidence": _number(self.confidence, ".17g"),
+            "by_chance": _number(self.by_chance, ".3g"),
         }
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
         """Read back what :meth:`to_json` wrote; KeyError or ValueError if it is something else.
 
-        Earlier versions left out the shares that were not known, the cause and the innovation.
+        Earlier versions left out the shares that were not known, the cause, the innovation and what chance would do.
         """
         known = data.get(_SHARES[0]) is not None
         parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if known else None
@@ -82,6 +83,11 @@ class KeyframeEvidence:
             None if data.get("cause") is None else RejectionReason(data["cause"]), data.get("innovation"),
             data.get("confidence"), data.get("by_chance"),
         )  # fmt: skip
+
+
+def _number(value: float | None, form: str) -> float | None:
+    """Round a number by its format; None where there is none, or none that JSON can say."""
+    return None if value is None or not math.isfinite(value) else float(f"{value:{form}}")
 
 
 @dataclass(frozen=True)

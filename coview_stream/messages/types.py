@@ -98,7 +98,8 @@ class PoseMessage:
         state: always ``TRACKING`` from our node; kept for readers.
         T_map_body: (4, 4) float64 map <- body, metres.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, m2 and rad2.
-        confidence: in [0, 1].
+        confidence: probability, in [0, 1], that the robot is at this place and not at another or none; NaN where a
+            format has none.
         map_sha256: hash of the base map that the pose refers to.
         age: seconds of sensor time since the lidar frame that last corrected it.
         frame_id: name of the map frame, for formats that carry one.

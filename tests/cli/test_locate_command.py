@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -25,6 +26,7 @@ def test_run_on_the_map_is_localized(world_file, world_run, world_drive, tmp_pat
     assert main(["locate", str(world_file), str(world_run), "-o", str(out)]) == 0
     captured = capsys.readouterr()
     assert "TRACKING" in captured.out
+    found = re.search(r"^found +after (.*) m: wrong (?:less than )?1 in [\d,]+ by chance$", captured.out, re.MULTILINE)
     assert captured.err == ""
     stamps, poses = read_tum(out / "trajectory.tum")
     assert len(stamps) >= 2
@@ -34,6 +36,13 @@ def test_run_on_the_map_is_localized(world_file, world_run, world_drive, tmp_pat
     result = json.loads((out / "result.json").read_text())
     assert result["state"] == "TRACKING"
     assert result["first_fix_stamp"] == pytest.approx(stamps[0])
+    assert found[1] == f"{result['first_fix_m']:.1f}"
+    before = np.array(world_drive.T_odom_body)[: index[0] + 1, :3, 3]
+    driven = np.linalg.norm(np.diff(before, axis=0), axis=1).sum()
+    assert result["first_fix_m"] == pytest.approx(driven, abs=1e-3)
+    searched = [k for k in result["keyframes"] if k["stamp"] <= stamps[0]]
+    assert all(0.0 <= k["confidence"] <= 1.0 and k["by_chance"] >= 0.0 for k in searched)
+    assert searched[-1]["confidence"] > 1.0 - 1e-4
     assert len(result["map_sha256"]) == 64
     assert (out / "trajectory.png").exists()
 
@@ -49,6 +58,7 @@ def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path,
     assert result["state"] in ("SEARCHING", "AMBIGUOUS")
     assert result["T_map_odom"] is None
     assert result["first_fix_stamp"] is None
+    assert result["first_fix_m"] is None
     assert all(k["state"] in ("SEARCHING", "AMBIGUOUS") for k in result["keyframes"])
     assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -45,6 +46,22 @@ def test_evidence_json_always_has_the_same_keys(world_fixes):
     shares = ("near", "covered", "ground", "free_space", "inside")
     assert [blind[name] for name in shares] == [None] * 5
     assert all(0.0 <= known[name] <= 1.0 for name in shares)
+
+
+@pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
+def test_what_is_no_finite_number_is_written_as_null(number):
+    """JSON has no other word for it."""
+    names = ("innovation", "confidence", "by_chance")
+    evidence = KeyframeEvidence(1.5, State.SEARCHING, "odd", **dict.fromkeys(names, number))
+    data = json.loads(json.dumps(evidence.to_json(), allow_nan=False))
+    assert [data[name] for name in names] == [None] * 3
+
+
+def test_evidence_keeps_small_numbers():
+    found = KeyframeEvidence(1.5, State.TRACKING, "found", confidence=1.0 - 1e-12, by_chance=8.8377e-34)
+    data = found.to_json()
+    assert data["confidence"] == 1.0 - 1e-12
+    assert data["by_chance"] == 8.84e-34
 
 
 def test_doubted_evidence_is_written_as_ambiguous_with_its_cause():

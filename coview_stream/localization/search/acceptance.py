@@ -84,4 +84,6 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -
 
 def _apart(best: ScoredPlace, second: ScoredPlace) -> str:
     times = best.probability / max(second.probability, 1e-300)
-    return "equally" if times < 1.5 else f"the first is {times:,.0f} times as probable"
+    if times < 1.5:
+        return "equally"
+    return f"the first is {f'{times:,.0f}' if times < 1e6 else 'over 1,000,000'} times as probable"

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from coview_stream.geometry.transforms import yaw_of
+from coview_stream.localization.evidence.words import one_in
 from coview_stream.messages.types import PoseMessage
 
 # set by hand
 WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last one is no longer shown
 SILENT = 5.0  # seconds without any message: a node sends one every second
+_LEAST = 1e-6  # smaller probabilities of a wrong place are not told apart: columns are narrow
 
 _COLUMNS = (
     ("robot", -12),
@@ -24,7 +26,7 @@ _COLUMNS = (
     ("yaw deg", 8),
     ("age s", 6),
     ("Hz", 5),
-    ("conf", 5),
+    ("wrong", 15),
     ("ms p50/p99", 12),
     ("dropped", 8),
     ("reason", 0),
@@ -129,12 +131,21 @@ def _pose_cells(pose: PoseMessage | None, rate: float) -> list[str]:
         f"{yaw:.1f}",
         _number(pose.age, 2),
         f"{rate:.1f}",
-        _number(pose.confidence, 2),
+        _odds(1.0 - pose.confidence),
     ]
 
 
 def _cell(text: str, width: int) -> str:
     return text.ljust(-width) if width < 0 else text.rjust(width)
+
+
+def _odds(wrong: float) -> str:
+    """Say a probability in few letters."""
+    if not 0.0 <= wrong <= 1.0:  # its message does not say
+        return "-"
+    if wrong < _LEAST:
+        return f"<1 in {1.0 / _LEAST:,.0f}"
+    return one_in(wrong) if wrong < 0.5 else "likely"
 
 
 def _mapping(status: dict[str, Any], name: str) -> dict[str, Any]:

@@ -185,7 +185,7 @@ class OdomCorrection:
         T_map_odom: (4, 4) map <- odometry, source frame of the map.
         T_map_body: (4, 4) map <- body at the frame that it comes from.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, at that frame.
-        confidence: in [0, 1].
+        confidence: probability, in [0, 1], of the place, as the search that found it has it.
         verified_ns: stamp of the newest registration that spoke for it.
         travelled: metres that odometry had driven at the frame.
         turned: radians that it had turned.

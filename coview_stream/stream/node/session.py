@@ -270,6 +270,12 @@ class Session:
         with self._lock:
             return self.robot_state.age(self.odometry)
 
+    def confidence(self) -> float | None:
+        """Probability that the robot is at the place that it is tracked at; None unless TRACKING."""
+        with self._lock:
+            correction = self.robot_state.correction
+            return None if correction is None else correction.confidence
+
     def protection_level(self) -> ProtectionLevel | None:
         """Metres and degrees that the newest pose's error exceeds at most once in a thousand; None unless TRACKING."""
         with self._lock:

@@ -131,6 +131,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "pose": {
             "rate_hz": rate,
             "age_s": None if age is None else round(age, 3),
+            "confidence": session.confidence(),
             "protection_level": None if level is None else level.to_json(),
         },
         "latency_ms": queue.latency.to_json(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def test_tracking_robot_shows_its_pose():
     assert header.split()[:6] == ["robot", "state", "x", "y", "z", "yaw"]
     assert line.split() == [
         *("r1", "TRACKING", "412000.12", "5318000.46", "7.89", "30.0"),
-        *("0.12", "10.0", "0.93", "31/89", "4", "all", "well"),
+        *("0.12", "10.0", "1", "in", "14", "31/89", "4", "all", "well"),
     ]
 
 
@@ -94,6 +95,26 @@ def test_a_pose_without_confidence_shows_none():
     message = decode_pose(Sample("k", encode_pose(POSE, "foxglove").payload), hint="foxglove")
     fleet.add_pose(PoseMessage(**{**vars(message), "robot": "r1"}), 1.0)
     assert fleet.table(1.1)[1].split()[-4:] == ["0.0", "-", "-/-", "-"]
+
+
+@pytest.mark.parametrize(
+    ("confidence", "cell"),
+    [
+        (1.0 - 1e-4, "  1 in 10,000  "),
+        (1.0 - 1 / 612_345, "  1 in 610,000  "),
+        (1.0 - 1e-7, "  <1 in 1,000,000  "),
+        (1.0, "  <1 in 1,000,000  "),
+        (0.3, "  likely  "),
+        (1.5, "  -  "),
+        (-1e300, "  -  "),
+    ],
+)
+def test_probability_of_a_wrong_place_is_said_as_one_in_so_many(confidence, cell):
+    fleet = FleetTable()
+    fleet.add_pose(replace(POSE, confidence=confidence), 1.0)
+    title, line = fleet.table(1.1)
+    assert cell in line
+    assert title.index("wrong") + len("wrong") == line.index(cell) + len(cell) - 2
 
 
 @pytest.mark.parametrize("name", ["json", "cdr", "foxglove", "keelson"])

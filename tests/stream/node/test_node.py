@@ -35,6 +35,7 @@ def test_status_has_all_documented_fields(site):
     status = site.status("r1")
     assert (status["state"], status["reason"]) == ("SEARCHING", "waiting for clouds on coview/r1/in/cloud")
     assert status["pose"]["age_s"] is None
+    assert status["pose"]["confidence"] is None
     assert status["latency_ms"] == {"p50": None, "p95": None, "p99": None}
     site.frame("r1", 0.0)
     site.poses("r1")
@@ -47,6 +48,7 @@ def test_status_has_all_documented_fields(site):
     assert status["last_frame_ns"] == ns(0.0)
     assert status["evidence"]["score"] == 0.8
     assert status["pose"]["age_s"] == 0.0
+    assert status["pose"]["confidence"] == 0.8
     assert status["uptime_s"] >= 0.0
     assert set(status["latency_ms"]) == set(status["engine_ms"]) == {"p50", "p95", "p99"}
     assert status["engine_ms"]["p50"] == 10.0
