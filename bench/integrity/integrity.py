@@ -67,7 +67,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     # those with other risks tell of reliability only
     others = [each for key, each in known.items() if key not in keys and each.get("risk") is not None]
     yield from verdicts(results, asked.group)
-    yield informs("integrity/runs", len(results), "", {"results": results, "others": others, "code": code})
+    yield informs("integrity/runs", len(results), "", {"results": results, "others": others})
 
 
 def code_of_runs() -> str:
@@ -139,7 +139,8 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     """Classes, families, and reliability."""
     details = next(row.details for row in rows if "results" in row.details)
     results = details["results"]
-    made = f"{len(results)} runs of the {asked.group} kinds, code {details['code']}, {time.strftime('%Y-%m-%d')}."
+    code = " and ".join(sorted({each["code"] for each in results}))
+    made = f"{len(results)} runs of the {asked.group} kinds, code {code}, {time.strftime('%Y-%m-%d')}."
     parts = {
         "": f"{class_table(results)}\n\n{made}",
         "families": family_table(results),
