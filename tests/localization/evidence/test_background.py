@@ -1,0 +1,106 @@
+"""Background: what chance explains, and how many independent observations a scan is, from chance places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation
+
+from coview_stream.localization.evidence.background import estimate_background, outcomes, scatter
+from coview_stream.localization.evidence.observed_scan import Share
+
+NOTHING = np.empty((0, len(Share)), dtype=np.float32)
+
+
+def background_of(places):
+    """Of places (P, W, 7) that were followed over W keyframes."""
+    spread = np.mean([scatter(places[:, k]) for k in range(places.shape[1])], axis=0)
+    return estimate_background(places[:, -1], spread, places[:, -1], places.mean(axis=1))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20)
+
+
+def test_outcomes_of_an_observation_are_shares_of_what_is_covered():
+    places = observation([[0.4, 0.1, 0.2, 0.3], [1.0, 0.0, 0.0, 0.0]], covered=np.array([0.5, 1.0]))
+    np.testing.assert_allclose(outcomes(places), [[0.2, 0.05, 0.1, 0.15], [1, 0, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("number", [12, NUMBER, 60])
+def test_known_background_and_number_are_recovered(rng, number):
+    found = background_of(chance_places(rng, 250, number=number))
+    np.testing.assert_allclose(found.structure, CHANCE, atol=0.04)
+    assert found.structure.sum() == pytest.approx(1.0)
+    assert found.passed == pytest.approx(PASSED, abs=0.02)
+    assert all(0.5 * number < each < 2.0 * number for each in found.number)
+
+
+def test_correlated_points_are_counted_once(rng):
+    """A thousand points that fall and rise together in 15 groups are 15 observations, not a thousand."""
+    found = background_of(chance_places(rng, 250, number=15))
+    assert found.number[0] < 40
+
+
+@pytest.mark.parametrize("copies", [1, 4, 8])
+def test_few_copies_of_the_right_place_do_not_inflate_the_background(rng, copies):
+    chance = chance_places(rng, 200)
+    twins = observation(np.tile([0.8, 0.15, 0.03, 0.02], (copies, 1)), passed=0.01, ground=0.95)[:, None]
+    usual, found = background_of(chance), background_of(np.concatenate([chance, twins]))
+    np.testing.assert_allclose(found.structure, usual.structure, atol=0.04)
+    assert all(there < 1.3 * here for there, here in zip(found.number, usual.number, strict=True))
+
+
+def test_a_site_that_repeats_itself_makes_its_pattern_worth_nothing(rng):
+    """Half of all places are alike: then they are the background."""
+    chance = chance_places(rng, 100)
+    alike = observation(rng.multinomial(NUMBER, [0.7, 0.15, 0.05, 0.1], 100) / NUMBER, passed=0.02)[:, None]
+    found = background_of(np.concatenate([chance, alike]))
+    assert found.structure[0] > 0.35
+    assert found.number[0] < background_of(chance).number[0]
+
+
+def test_keyframes_add_up_only_where_chance_does_not_repeat_itself(rng):
+    fresh = chance_places(rng, 120, keyframes=8)
+    same = np.repeat(fresh[:, :1], 8, axis=1)
+    one, many, repeated = (background_of(each).number[0] for each in (fresh[:, :1], fresh, same))
+    assert many > 3.0 * one
+    assert repeated == pytest.approx(one, rel=0.3)
+
+
+def test_without_places_something_modest_is_presumed():
+    found = estimate_background(NOTHING, np.full(4, np.nan), NOTHING, NOTHING)
+    assert found.structure.sum() == pytest.approx(1.0)
+    assert (found.structure > 0).all()
+    assert 0 < found.passed < 1
+    assert all(1 < each < 50 for each in found.number)
+    assert all(np.isfinite(found.ground))
+
+
+def test_few_places_count_little_against_what_is_presumed(rng):
+    presumed = estimate_background(NOTHING, np.full(4, np.nan), NOTHING, NOTHING)
+    one = observation([[1.0, 0.0, 0.0, 0.0]])
+    found = estimate_background(one, scatter(one), one, one)
+    assert presumed.structure[0] < found.structure[0] < 0.5
+    assert np.isfinite(found.number).all()
+
+
+def test_scatter_of_fewer_than_two_places_is_not_known():
+    assert np.isnan(scatter(NOTHING)).all()
+    assert np.isnan(scatter(observation([CHANCE]))).all()
+
+
+def test_uncovered_places_say_nothing(rng):
+    """Beyond the map nothing is explained or unexplained: such places do not dilute the background."""
+    chance = chance_places(rng, 150)
+    beyond = observation(np.tile(CHANCE, (100, 1)), covered=np.zeros(100), covered_ground=np.zeros(100))[:, None]
+    found = background_of(np.concatenate([chance, beyond]))
+    np.testing.assert_allclose(found.structure, CHANCE, atol=0.05)
+
+
+@pytest.mark.parametrize("level", [0.05, 0.5, 0.9])
+def test_ground_parameters_follow_the_chance_places(rng, level):
+    places = observation(np.tile(CHANCE, (200, 1)), ground=np.clip(rng.normal(level, 0.05, 200), 0, 1))
+    a, b = estimate_background(places, scatter(places), places, places).ground
+    assert a / (a + b) == pytest.approx(level, abs=0.06)

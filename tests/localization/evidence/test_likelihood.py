@@ -1,0 +1,182 @@
+"""Likelihood ratio against chance: a plain sum written out, and what must and must not be worth something."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from made_up_scans import CHANCE, PASSED, chance_places, observation
+from scipy.stats import beta
+
+from coview_stream.localization.evidence import likelihood
+from coview_stream.localization.evidence.background import Background, estimate_background, scatter
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.observed_scan import Share
+from coview_stream.localization.evidence.posterior import posterior
+
+BACKGROUND = Background(CHANCE, PASSED, (1.5, 1.5), (30.0, 12.0))
+GOOD = np.array([0.75, 0.15, 0.04, 0.06])
+
+
+def ratio(*given, background=BACKGROUND, **known):
+    return log_likelihood_ratios(observation(*given, **known), background)[0]
+
+
+def plain_sum(row, background):
+    """The ratio of one observation (7,), one nuisance after the other."""
+    on, near, edge, covered = (float(row[k]) for k in (Share.ON, Share.NEAR, Share.EDGE, Share.COVERED))
+    shares = [on, near - on, edge, covered - near - edge]
+    passed = float(row[Share.PASSED])
+    clear = max(covered, float(row[Share.COVERED_GROUND])) - passed
+    total = 0.0
+    nuisances = list(product(likelihood._KEPT, likelihood._SURVEYS, likelihood._LEAKS))
+    for q, survey, leak in nuisances:
+        log = 0.0
+        for share, there, by_chance in zip(shares, survey, background.structure, strict=True):
+            log += background.number[0] * share * math.log((q * there + (1 - q) * by_chance) / by_chance)
+        hit = background.passed * (q * leak + 1 - q)
+        log += background.number[1] * passed * math.log(hit / background.passed)
+        log += background.number[1] * clear * math.log((1 - hit) / (1 - background.passed))
+        total += math.exp(log) / len(nuisances)
+    share = min(
+        max(float(row[Share.GROUND]) / float(row[Share.COVERED_GROUND]), likelihood._EDGE), 1 - likelihood._EDGE
+    )
+    right = beta.pdf(share, *likelihood._GROUND)
+    wrong = (1 - likelihood._LEVEL) * beta.pdf(share, *background.ground) + likelihood._LEVEL
+    return math.log(total) + float(row[Share.COVERED_GROUND]) * math.log(right / wrong)
+
+
+def test_ratio_is_the_plain_sum_over_the_nuisances():
+    rng = np.random.default_rng(3)
+    rows = observation(
+        rng.dirichlet([2, 1, 1, 2], 20), rng.uniform(0, 0.2, 20), rng.uniform(0, 1, 20), rng.uniform(0.3, 1, 20),
+        rng.uniform(0.3, 1, 20),
+    )  # fmt: skip
+    found, kept = log_likelihood_ratios(rows, BACKGROUND)
+    np.testing.assert_allclose(found, [plain_sum(row, BACKGROUND) for row in rows], rtol=1e-4, atol=1e-4)
+    assert ((kept > 0) & (kept <= 1)).all()
+
+
+def test_the_more_is_explained_the_higher_the_ratio():
+    steps = [(1 - t) * CHANCE + t * GOOD for t in np.linspace(0.0, 1.0, 11)]
+    found = ratio(steps)
+    assert (np.diff(found) > 0).all()
+    assert found[-1] > found[0] + 10
+    _, kept = log_likelihood_ratios(observation(steps), BACKGROUND)
+    assert (np.diff(kept) >= 0).all()
+    assert kept[0] < 0.2 < 0.7 < kept[-1]
+
+
+def test_the_more_is_contradicted_the_lower_the_ratio():
+    """Map structure that rays passed through, in places that explain the same of what stands."""
+    found = ratio(np.tile(GOOD, (5, 1)), passed=np.array([0.0, 0.02, 0.05, 0.1, 0.2]))
+    assert (np.diff(found) < 0).all()
+
+
+@pytest.mark.parametrize("number", [5.0, 50.0, 500.0])
+def test_place_at_the_shares_of_chance_gains_nothing(number):
+    background = Background(CHANCE, PASSED, (5.0, 5.0), (number, number))
+    found = ratio([CHANCE, 0.5 * CHANCE + 0.5 * np.array([0.0, 0.0, 0.0, 1.0])], background=background, ground=0.5)
+    assert (found < 0.5).all()
+    assert found[1] < found[0]
+
+
+def test_what_is_worth_a_lot_in_one_site_is_worth_nothing_in_another():
+    """In a yard of equal boxes any place explains as much."""
+    yard = Background(np.array([0.55, 0.2, 0.05, 0.2]), PASSED, (1.5, 1.5), (30.0, 12.0))
+    half = np.array([0.55, 0.2, 0.05, 0.2])
+    assert ratio([half])[0] > 5.0
+    assert ratio([half], background=yard)[0] < 1.0
+
+
+def test_what_the_map_does_not_cover_adds_nothing():
+    assert ratio([GOOD], passed=0.0, covered=0.0, covered_ground=0.0)[0] == pytest.approx(0.0, abs=1e-6)
+    covered = np.array([0.25, 0.5, 0.75, 1.0])
+    found = ratio(np.tile(GOOD, (4, 1)), passed=0.005, covered=covered, covered_ground=covered, ground=0.9)
+    assert (np.diff(found) > 0).all()  # a rival that has it covered gains by it
+    assert found[0] > 0
+
+
+@pytest.mark.parametrize("background", [(0.5, 0.5), (1.5, 1.5), (2.0, 30.0), (30.0, 2.0), (300.0, 1.0)])
+def test_ground_is_one_observation_and_bounded(background):
+    """A road is level everywhere: however its share compares, the ground is no proof."""
+    known = Background(CHANCE, PASSED, background, (30.0, 12.0))
+    shares = np.linspace(0.0, 1.0, 21)
+    grounds = ratio(np.tile(GOOD, (21, 1)), ground=shares, background=known)
+    without = ratio([GOOD], covered_ground=0.0, background=known)[0]
+    assert (grounds - without < 6.0).all()
+    assert np.isfinite(grounds).all()
+    assert grounds[-3] > grounds[0]
+
+
+def test_evidence_grows_with_the_effective_number_alone():
+    few, many = (Background(CHANCE, PASSED, (1.5, 1.5), (n, n)) for n in (10.0, 100.0))
+    assert ratio([GOOD], background=many)[0] > 3.0 * ratio([GOOD], background=few)[0]
+
+
+def test_few_explained_points_of_a_changed_site_are_worth_something():
+    """A third of what stands is as the map has it, the rest is as by chance."""
+    changed = 0.35 * GOOD + 0.65 * CHANCE
+    background = Background(CHANCE, PASSED, (1.5, 1.5), (200.0, 60.0))
+    found, kept = log_likelihood_ratios(observation([changed], passed=0.75 * PASSED, ground=0.9), background)
+    assert found[0] > 5.0
+    assert 0.2 < kept[0] < 0.6
+
+
+# ---- calibration against chance
+
+
+def searches_by_chance(count, places, number, seed, times=1.0):
+    """Posterior errors of the best place of searches in which all places are there by chance.
+
+    Each observation is counted so many times.
+    """
+    rng = np.random.default_rng(seed)
+    votes = np.arange(places)
+    for _ in range(count):
+        seen = chance_places(rng, places, number=number)[:, 0]
+        known = estimate_background(seen, scatter(seen), seen, seen)
+        known = replace(known, number=(times * known.number[0], times * known.number[1]))
+        ratios, _ = log_likelihood_ratios(seen, known)
+        found = posterior(ratios, votes, places)
+        yield found.error(votes == found.place.argmax())
+
+
+def holds(errors):
+    """Whether no stated error is reached in more of the searches than it says."""
+    return all((errors < stated).mean() <= stated for stated in (0.3, 1e-1, 1e-2, 1e-3))
+
+
+def test_stated_error_is_reached_by_chance_no_more_often_than_it_says():
+    """Searches outside the map: all that is found there is wrong."""
+    errors = np.fromiter(searches_by_chance(1000, 40, 30, 4), dtype=float)
+    assert holds(errors)
+    assert errors.min() > 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [15, 60])
+def test_stated_error_is_reached_by_chance_no_more_often_than_it_says_in_20000_searches(number):
+    errors = np.fromiter(searches_by_chance(10_000, 40, number, 5 + number), dtype=float)
+    assert holds(errors)
+    assert (errors < 1e-4).sum() <= 3
+
+
+def test_observations_counted_several_times_would_state_errors_too_small():
+    """The calibration above can fail: were every observation taken for eight, places would be found by chance."""
+    assert not holds(np.fromiter(searches_by_chance(300, 40, 30, 4, times=8.0), dtype=float))
+
+
+def test_right_place_is_told_from_chance():
+    """The same searches with the right place among the others: calibration is not silence."""
+    rng, found = np.random.default_rng(8), []
+    for _ in range(300):
+        seen = chance_places(rng, 40, number=40)[:, 0]
+        right = observation(rng.multinomial(40, GOOD, 1) / 40, passed=0.01, ground=0.9)
+        background = estimate_background(seen, scatter(seen), seen, seen)
+        ratios, _ = log_likelihood_ratios(np.concatenate([right, seen]), background)
+        found.append(posterior(ratios, np.arange(41), 41).error(np.arange(41) == 0))
+    assert (np.array(found) < 1e-4).mean() > 0.9
