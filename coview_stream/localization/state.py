@@ -11,7 +11,7 @@ class State(StrEnum):
     SEARCHING = "SEARCHING"
     """No place explains what the robot sees well enough, or too little has been seen."""
     AMBIGUOUS = "AMBIGUOUS"
-    """A place does, but another one does too, or it has not been confirmed yet."""
+    """A place does, but another one does too, or the evidence does not suffice yet."""
     TRACKING = "TRACKING"
     """The pose is known: the newest registration speaks for it."""
     DOUBTED = "DOUBTED"
@@ -34,7 +34,7 @@ class Event(StrEnum):
     """Event that may change the state; its value is a clause for people."""
 
     NO_PLACE = "the search finds no place that fits"
-    PLACE_PROPOSED = "the search finds a place that is not alone or not confirmed"
+    PLACE_PROPOSED = "the search finds a place that is not alone or not certain"
     PLACE_ACCEPTED = "the search accepts a place"
     MATCH_VERIFIED = "a registration speaks for the place"
     MATCH_REJECTED = "a registration speaks against the place"
