@@ -82,7 +82,7 @@ def test_example_robot(world_run, capsys):
     net.publish(Sample("coview/r1/out/status", b"{}"))
     assert example("robot.py")(world_run, "r1", seconds=0.0, transport=net) == 7
     out = capsys.readouterr().out
-    assert "100.00 s: x 0.00  y 0.00  z 0.00  (0.90)" in out
+    assert "100.00 s: x 0.00  y 0.00  z 0.00  (wrong 1 in 10)" in out
     assert [s.key for s in net.samples("coview/r1/in/*")] == ["coview/r1/in/odom", "coview/r1/in/cloud"] * 7
     assert net.raised == []
 
