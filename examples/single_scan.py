@@ -20,7 +20,7 @@ from coview_stream.recordings import open_run
 def main(base: Path, scan: Path) -> Fix:
     """Print the scan's pose in the map, or why there is none; return the fix."""
     base_map = BaseMap.build(base, preset="tls")  # descriptors reach 100 m, as terrestrial scanners do
-    # one cloud file is a run of one frame, localized as a stationary scan; its z axis has to point up
+    # one cloud file is a run of one frame; its z axis has to point up
     fix = locate(base_map, open_run(scan)).fixes[-1]
     if fix.T_map_body is None:
         print(f"{fix.state.reported}: {fix.evidence.reason if fix.evidence else 'no evidence'}")

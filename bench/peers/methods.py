@@ -2,7 +2,7 @@
 
 * As in the product: the search gets the keyframes of the drive one after the other and gives a pose once three of
   them have confirmed it (``LocalizerConfig()``); the time is that of all keyframes until then.
-* One scan: the same search with ``stationary=True``, from one submap, which has to stand alone.
+* One scan: the same search from one submap, which has to stand alone.
 * Tracking: registration at the scales that the tracker uses, then its verification, which is in the time, too.
 """
 
@@ -55,9 +55,9 @@ def started(place: Place) -> Pose:
 class Keyframes:
     """The search over the keyframes of a drive."""
 
-    def __init__(self, site: BaseMap, stationary: bool = False) -> None:
+    def __init__(self, site: BaseMap) -> None:
         coview_kernels.warm_up()
-        config = LocalizerConfig(stationary=stationary)
+        config = LocalizerConfig()
         self._search = GlobalSearch(site, config, LocalMaps(site, config.registration.source_range))
 
     def answer(self, place: Place) -> Answer:
@@ -75,9 +75,6 @@ class Keyframes:
 
 class OneScan(Keyframes):
     """The search from one submap alone: all points of the drive as if they were one scan."""
-
-    def __init__(self, site: BaseMap) -> None:
-        super().__init__(site, stationary=True)
 
     def _queries(self, place: Place) -> list[SearchRequest]:
         newest = place.queries[-1]

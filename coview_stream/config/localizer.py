@@ -27,7 +27,6 @@ class LocalizerConfig:
         learned: how learned features are looked up.
         reloc: which place recognition names places, see :data:`coview_stream.config.Reloc`; ``auto`` goes without
             learned features where map or installation lack them.
-        stationary: the paper's path for terrestrial scans: one frame may be enough for a fix.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -39,7 +38,6 @@ class LocalizerConfig:
     graph: GraphConfig = field(default_factory=GraphConfig)
     learned: LearnedConfig = field(default_factory=LearnedConfig)
     reloc: Reloc = "auto"
-    stationary: bool = False
 
     def __post_init__(self) -> None:
         known = get_args(Reloc)

@@ -101,14 +101,11 @@ def locate(
 ) -> RunResult:
     """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
 
-    A run of one frame is localized by the stationary path. A frame that cannot be read is skipped and noted.
+    A frame that cannot be read is skipped and noted.
 
     Raises:
         InputError: not one frame could be used; the message ends with the first frame's.
     """
-    config = config or LocalizerConfig()
-    if len(run) == 1:
-        config = replace(config, stationary=True)
     localizer = Localizer(base_map, config)
     localizer.prepare()
     located = RunResult(len(run), sources=localizer.sources)

@@ -90,7 +90,6 @@ def test_defaults_are_those_of_the_paper():
     assert (usual.descriptor.rings, usual.descriptor.sectors) == (20, 60)
     assert LocalizerConfig().keyframe.distance == 2.0
     assert LocalizerConfig().retrieval.mode == "exhaustive"
-    assert LocalizerConfig().stationary is False
 
 
 def test_configurations_are_frozen_and_equal_by_value():
@@ -99,7 +98,7 @@ def test_configurations_are_frozen_and_equal_by_value():
         MapConfig().block = 3.0
     for item in fields(LocalizerConfig):
         inner = getattr(LocalizerConfig(), item.name)
-        if item.name not in ("stationary", "reloc"):
+        if item.name != "reloc":
             assert type(inner)(**asdict(inner)) == inner
 
 

@@ -35,8 +35,6 @@ class Hypothesis:
         shift: its number of sectors; None for a pose hint.
         score: sum of its votes, lower is better.
         learned: whether the votes are those of learned features.
-        lead: how much the mean keyframe's votes prefer it to the next place, in robust standard deviations; 0 where it
-            is not the first.
     """
 
     T_map_odom: Pose
@@ -44,7 +42,6 @@ class Hypothesis:
     shift: int | None
     score: float
     learned: bool = False
-    lead: float = 0.0
 
 
 @dataclass(frozen=True)

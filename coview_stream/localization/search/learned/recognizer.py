@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-
-import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import on_ground
-from coview_stream.geometry.arrays import Bools
-from coview_stream.geometry.transforms import Pose, transform
+from coview_stream.geometry.transforms import transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.learned.matcher import FeatureMatcher, QueryFeatures
+from coview_stream.localization.search.learned.matcher import FeatureMatcher
 from coview_stream.localization.search.request import SearchRequest
 
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other; set by hand
@@ -27,29 +23,21 @@ class LearnedRecognizer:
         self.learned = learned
         peaks = replace(config.consensus, mode="consensus", peaks=config.learned.peaks)
         self.consensus = Consensus(base_map.station_grid, peaks)
-        self._query: QueryFeatures | None = None
 
     def vote(self, request: SearchRequest) -> None:
         """Compare the ground network's features around the robot with the map's."""
         if len(request.surroundings) < self.config.keyframe.min_points:
             return
         centre = on_ground(request.surroundings, request.position)
-        self._query = self.learned.encode(request.surroundings, centre)
+        query = self.learned.encode(request.surroundings, centre)
         hinted = [transform(T, request.position[None])[0, :2] for T in request.hints]
-        self.consensus.vote(self.learned.vote(self._query, hinted))
+        self.consensus.vote(self.learned.vote(query, hinted))
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the consensus' peaks on every storey that they may be on: from above these look alike."""
-        peaks = self.consensus.hypotheses()
-        if self._query is None or not peaks:
-            return peaks
-        same = self._same_but_height([each.T_map_odom for each in peaks], self._query)
-        lead = 0.0
-        if not same.all():
-            lead = (peaks[int(same.argmin())].score - peaks[0].score) / math.sqrt(len(self.consensus))
         found: dict[tuple[int | None, int | None], Hypothesis] = {}
-        for peak, own in zip(peaks, same.tolist(), strict=True):
-            for each in self._storeys(replace(peak, learned=True, lead=lead * own)):
+        for peak in self.consensus.hypotheses():
+            for each in self._storeys(replace(peak, learned=True)):
                 found.setdefault((each.station, each.shift), each)
         return list(found.values())[: _MAX_PER_PEAK * self.config.learned.peaks]
 
@@ -67,20 +55,9 @@ class LearnedRecognizer:
                 out.append(replace(peak, T_map_odom=T, station=station))
         return out
 
-    def _same_but_height(self, poses: list[Pose], query: QueryFeatures) -> Bools:
-        """Tell which of ``T_map_odom`` (4, 4) put the query at the place of the first, at any height."""
-        T = np.array(poses)
-        there = (T[:, :3, :3] @ query.centre + T[:, :3, 3])[:, :2]
-        yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
-        turn = np.abs((yaw - yaw[0] + np.pi) % (2.0 * np.pi) - np.pi)
-        rule = self.consensus.config
-        near = np.hypot(*(there - there[0]).T) < rule.distinct_distance
-        return np.asarray(near & (turn < rule.distinct_yaw))
-
     def clear(self) -> None:
         """Forget all votes."""
         self.consensus.clear()
-        self._query = None
 
     def __len__(self) -> int:
         """Return how many keyframes have voted."""
