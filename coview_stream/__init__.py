@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.config import LocalizerConfig, MapConfig
     from coview_stream.errors import CoViewError
+    from coview_stream.geometry.protection import ProtectionLevel
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.result import Fix, KeyframeEvidence
     from coview_stream.localization.state import State
@@ -32,6 +33,7 @@ __all__ = [
     "Localizer",
     "LocalizerConfig",
     "MapConfig",
+    "ProtectionLevel",
     "RejectionReason",
     "RobotClient",
     "State",
@@ -46,6 +48,7 @@ _HOMES = {
     "Localizer": "localization.localizer",
     "LocalizerConfig": "config",
     "MapConfig": "config",
+    "ProtectionLevel": "geometry.protection",
     "RejectionReason": "localization.tracking.monitor",
     "RobotClient": "stream.client.client",
     "State": "localization.state",
