@@ -46,7 +46,7 @@ def test_node_poses_are_correct_on_a_drive(world_map, world_drive):
     status = site.status("r1")
     assert status["state"] == "TRACKING"
     assert status["counters"]["processed"] == 8
-    assert status["counters"]["searches"] >= 3
+    assert status["counters"]["searches"] >= 1
     assert status["counters"]["fixes"] == 1
     assert 0.2 < status["evidence"]["score"] <= 1.0
 

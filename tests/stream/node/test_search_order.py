@@ -32,7 +32,7 @@ def test_proposed_place_comes_first_then_the_newly_lost():
     assert search_order([waiting(1.0, 100), waiting(0.5, 2), waiting(0.1, 50, 3)], NOW) == [2, 1, 0]
 
 
-def test_who_needs_the_fewest_confirmations_comes_first():
+def test_whose_place_was_proposed_most_often_in_a_row_comes_first():
     assert first(waiting(0.5, 3, 1), waiting(0.1, 4, 2)) == 1
 
 
