@@ -21,7 +21,16 @@ from bench.harness.files import fingerprint, folder
 from bench.harness.rows import Row, informs, judged
 from bench.integrity.plan import FAMILIES, Site, plan
 from bench.integrity.store import ANY, Result, read
-from bench.integrity.tables import Tally, class_table, classes, family_table, percent, plain, reliability_table
+from bench.integrity.tables import (
+    Tally,
+    class_table,
+    classes,
+    false_list,
+    family_table,
+    percent,
+    plain,
+    reliability_table,
+)
 from bench.integrity.work import Task, everywhere
 from coview_stream.errors import InputError
 
@@ -142,7 +151,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
     code = " and ".join(sorted({each["code"] for each in results}))
     made = f"{len(results)} runs of the {asked.group} kinds, code {code}, {time.strftime('%Y-%m-%d')}."
     parts = {
-        "": f"{class_table(results)}\n\n{made}",
+        "": "\n\n".join(filter(None, (class_table(results), false_list(results), made))),
         "families": family_table(results),
         "reliability": reliability_table([*results, *details["others"]]),
     }

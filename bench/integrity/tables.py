@@ -92,7 +92,7 @@ def classes(results: Sequence[Result]) -> dict[str, Tally]:
     of_class = {name: [r for r in results if r["class"] == name] for name in ("near copies", "outside", "ordinary")}
     # with nothing but buildings in view nothing tells that all of them have moved
     but = [r for r in results if r["family"] != "shifted"]
-    parts = {"all": results, **of_class, "all but shifted buildings": but}
+    parts = {"all": results, **of_class} | ({"all but shifted buildings": but} if len(but) < len(results) else {})
     return {name: Tally.of(each) for name, each in parts.items() if Tally.of(each).runs}
 
 
@@ -126,6 +126,22 @@ def family_table(results: Sequence[Result]) -> str:
                 number(t.median_m, 1), number(t.most_m, 1), percent(t.bound, 1), t.reason, what,
             ])  # fmt: skip
     return table(head, lines)
+
+
+def false_list(results: Sequence[Result]) -> str:
+    """List the false first fixes, one a line."""
+    lines = []
+    for each in results:
+        if each["outcome"] == "false":
+            off = (
+                f"{each['error_m']:.1f} m, {each['error_deg']:.1f} degrees off"
+                if "error_m" in each
+                else "no pose is right"
+            )
+            lines.append(
+                f"- {each['key']} ({each['sensor']}): after {each['metres']:.0f} m, {off}; stated {each['risk']:.1e}"
+            )
+    return "\n".join(lines)
 
 
 def reliability_table(results: Sequence[Result]) -> str:

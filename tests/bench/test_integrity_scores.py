@@ -7,7 +7,7 @@ import pytest
 from bench.integrity.bounds import lower, upper
 from bench.integrity.run import judged
 from bench.integrity.store import ANY, append, read
-from bench.integrity.tables import Tally, classes, family_table, plain, reliability_table
+from bench.integrity.tables import Tally, classes, false_list, family_table, plain, reliability_table
 from coview_stream.geometry.transforms import pose_from, rot_z
 
 
@@ -93,6 +93,16 @@ def test_shifted_buildings_are_counted_with_the_rest_and_without():
         "all": (2, 1), "near copies": (1, 1), "ordinary": (1, 0), "all but shifted buildings": (1, 0)
     }  # fmt: skip
     assert "shifted" in family_table(runs)
+    assert "all but shifted buildings" not in classes(runs[:1])
+
+
+def test_false_first_fixes_are_listed_one_by_one():
+    off = {"error_m": 55.0, "error_deg": 1.0, "risk": 3e-5, "sensor": "os64"}
+    runs = [result("a", "false", **off), result("b", "right", **off), result("c", "false", risk=0.0, sensor="os64")]
+    assert false_list(runs).splitlines() == [
+        "- a (os64): after 4 m, 55.0 m, 1.0 degrees off; stated 3.0e-05",
+        "- c (os64): after 4 m, no pose is right; stated 0.0e+00",
+    ]
 
 
 def test_reliability_counts_fixes_up_to_a_risk_and_between_two():
