@@ -98,7 +98,7 @@ def _field(arguments: tuple[Any, ...], result: Any) -> float:
     whole = size(field.occupied, field.ground, field.edge)
     cells = field.occupied[0].size * len(field.tiles)
     reach = 4 * _REACH * _REACH / _CELL**2 * whole / cells
-    return float(min(whole, len(poses) * reach) + size(tuple(part.points)))
+    return float(min(whole, len(poses) * reach) + size(part.points))
 
 
 def _registered(arguments: tuple[Any, ...], result: Any) -> float:

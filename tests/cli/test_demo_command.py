@@ -9,6 +9,7 @@ import pytest
 
 from coview_stream.cli import main
 from coview_stream.clouds import read_tum
+from coview_stream.localization.search.global_search import GlobalSearch
 
 SMALL = ["--scene", "campus", "--sensor", "os64", "--size", "100", "--length", "10"]
 PICTURES = ("map.png", "trajectory.png", "errors.png", "descriptors.png")
@@ -71,10 +72,10 @@ def test_demo_files_work_with_other_commands(demo, capsys):
 
 
 @pytest.mark.slow
-def test_demo_without_fix_exits_with_one_and_removes_old_result(demo, tmp_path, capsys):
+def test_demo_without_fix_exits_with_one_and_removes_old_result(demo, tmp_path, capsys, monkeypatch):
     out = tmp_path / "again"
     shutil.copytree(demo[1], out)
-    # two metres are one keyframe, and one is not enough to be believed
+    monkeypatch.setattr(GlobalSearch, "_register", lambda *given: None)  # no place registers
     assert main(["demo", "--offline", "--out", str(out), *SMALL, "--length", "1"]) == 1
     captured = capsys.readouterr()
     assert "never" in captured.out

@@ -113,7 +113,7 @@ def test_watch_prints_lines_without_terminal(node, watch, capsys):
     cells = line.split()
     assert cells[:6] == ["r1", "TRACKING", "12.34", "-5.00", "1.70", "28.6"]
     assert float(cells[7]) > 1.0
-    assert cells[8:] == ["0.90", "-/-", "3", "fine"]
+    assert cells[8:] == ["1", "in", "10", "-/-", "3", "fine"]
 
 
 @pytest.mark.slow
