@@ -22,7 +22,7 @@ _PSEUDO_NUMBER = 10.0  # independent observations
 _LEAST = 0.01  # of any outcome: a share that was never seen is not impossible
 _COVERED = 0.05  # of a scan: below, the shares of what is covered say nothing
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
-_CALIBRATED = 1.25
+_CALIBRATED = 1.5
 """Independent observations for each that the scatter shows: searches on maps of other sites then state an error below
 e in less than a share e of them (``python -m bench.integrity.calibrate``, towns, campuses, terraces, plantations)."""
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
@@ -72,31 +72,27 @@ def _compared(observed: Floats32) -> Floats:
     return np.column_stack([*shares, -observed[:, Share.PASSED]]).astype(np.float64)
 
 
-def estimate_background(now: Floats32, variance: Floats, kept_now: Floats32, kept_mean: Floats32) -> Background:
+def estimate_background(now: Floats32, variance: Floats, kept: Floats32) -> Background:
     """Estimate the background from chance places.
 
     Args:
         now: (N, 7) the newest keyframe's observations at them.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
-        kept_now: (K, 7) those of them that were followed over several keyframes, at the newest.
-        kept_mean: (K, 7) mean over the keyframes: chance does not repeat itself, so they scatter less.
+        kept: (K, 7) mean observations, over the keyframes, at those of them that are followed.
     """
     counts = outcomes(now)
     total = counts.sum(axis=0) + _PSEUDO * np.array(_PSEUDO_SHARES)
     structure = np.maximum(total / total.sum(), _LEAST)
     passed = float(np.clip(now[:, Share.PASSED].mean(), *_PASSED)) if len(now) else 0.05
-    averaged = np.ones(4)
-    if len(kept_now) > _PSEUDO:
-        averaged = np.maximum(1.0, _compared(kept_now).var(axis=0) / np.maximum(_compared(kept_mean).var(axis=0), 1e-6))
     structure = structure / structure.sum()
     chance = np.append(np.cumsum(structure[:3]), passed)
     chance = chance * (1.0 - chance)
     count = len(now)
     seen = np.where(np.isfinite(variance), variance, 0.0)
     presumed = chance / _PSEUDO_NUMBER
-    number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO)) * averaged
+    number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO))
     high = float(3.0 / (1.0 / number[:3]).sum())
-    return Background(structure, passed, _beta(now, kept_mean), (high, float(number[3])))
+    return Background(structure, passed, _beta(now, kept), (high, float(number[3])))
 
 
 def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:

@@ -32,7 +32,7 @@ _SURVEYS = np.array([[0.3, 0.15, 0.45, 0.1], [0.5, 0.25, 0.15, 0.1], [0.65, 0.25
 """Outcomes of what is there: on, near, under an edge, unexplained; from an airborne survey to one of the same kind."""
 _LEAKS = np.array([0.05, 0.3, 0.6])  # of the background's passed rays, those that pass what stands there
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
-_LEVEL = 0.01  # share of chance places whose ground is as good as any
+_OPEN, _LEVEL = 0.01, 0.01  # shares of chance places that are as clear of structure, as level as the right one
 _EDGE = 0.02  # shares of the ground beyond it are not told apart
 
 
@@ -55,6 +55,7 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[F
         hit[:, None, None] * np.log(passed / background.passed)
         + clear[:, None, None] * np.log((1.0 - passed) / (1.0 - background.passed))
     )
+    free -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + free)  # chance, too, may stand in the open
     each = structure[:, :, :, None] + free[:, :, None, :]
     best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
     flat = each.reshape(len(each), -1)

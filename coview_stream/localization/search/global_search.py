@@ -16,7 +16,7 @@ from coview_stream.localization.search.pose_hints import HintSchedule, robot_pos
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import Candidate, register_place
 from coview_stream.localization.search.request import Epoch, RequestSpec, SearchRequest, same_place
-from coview_stream.localization.search.scoring import PlaceScorer, Scored
+from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough; set by hand
 _REFUTED = 1e-3  # probability below which a keyframe speaks against a pose hint; set by hand
@@ -129,7 +129,8 @@ class GlobalSearch:
             return None
         best = scored.places[0]
         found = register_place(best, scan, self.base_map, self.config, self._local_maps)
-        if found is None or not same_place(found.T_map_odom, best.hypothesis.T_map_odom, request):
+        start = best.hypothesis.T_map_odom
+        if found is None or not same_place(found.T_map_odom, start, request, BASIN_DISTANCE, BASIN_ANGLE):
             return None
         return found
 

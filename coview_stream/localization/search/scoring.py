@@ -30,9 +30,12 @@ from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # of them, those that stay by their evidence, however the newest keyframe ranks them
-_KEYFRAMES = 16  # newest keyframes whose observations a place has
+_KEYFRAMES = 8  # newest keyframes whose observations a place has
 _CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share what it explains
-_BASIN_DISTANCE, _BASIN_ANGLE = SAME_DISTANCE, np.radians(15.0)  # from the leader: registration leads there from here
+BASIN_DISTANCE, BASIN_ANGLE = (
+    SAME_DISTANCE,
+    float(np.radians(15.0)),
+)  # from the leader: registration leads there; set by hand
 _AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
 """Shifts of the leader, metres, that are hypotheses too: along a corridor it may be anywhere."""
 
@@ -208,7 +211,7 @@ class PlaceScorer:
         if not places:
             return Scored(rivals, places)
         poses = observed.poses[followed.newest]
-        elsewhere = _apart(poses, poses[0], _BASIN_DISTANCE, _BASIN_ANGLE)
+        elsewhere = _apart(poses, poses[0], BASIN_DISTANCE, BASIN_ANGLE)
         second = next((place for place, other in zip(places, elsewhere, strict=True) if other), None)
         by_chance = expected_by_chance(places[0].ratio, len(first))
         return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
@@ -287,9 +290,7 @@ class PlaceScorer:
         for last in (False, True):
             known = [each for each in self._scatter if np.isfinite(each).all()] or [self._scatter[-1]]
             spread = np.mean(known, axis=0)
-            background = estimate_background(
-                observed.shares[first][chance], spread, followed.observed[kept, -1], mean[kept]
-            )
+            background = estimate_background(observed.shares[first][chance], spread, mean[kept])
             ratios, q = log_likelihood_ratios(mean, background)
             if last:
                 break

@@ -60,7 +60,7 @@ def slip_ratio(base_map: BaseMap, scan: ScanInput, T_map_predicted: Pose, T_map_
     poses = np.concatenate([both, _around(both[0])])
     observed = seen.few.look_up(base_map.field, poses, "no")[1]
     places, chance = observed[:2], observed[2:]
-    background = estimate_background(chance, scatter(chance), chance[:0], chance[:0])
+    background = estimate_background(chance, scatter(chance), chance[:0])
     predicted, found = log_likelihood_ratios(places, background)[0]
     return float(found - predicted)
 

@@ -38,8 +38,9 @@ def plain_sum(row, background):
         for share, there, by_chance in zip(shares, survey, background.structure, strict=True):
             log += background.number[0] * share * math.log((q * there + (1 - q) * by_chance) / by_chance)
         hit = background.passed * (q * leak + 1 - q)
-        log += background.number[1] * passed * math.log(hit / background.passed)
-        log += background.number[1] * clear * math.log((1 - hit) / (1 - background.passed))
+        free = background.number[1] * passed * math.log(hit / background.passed)
+        free += background.number[1] * clear * math.log((1 - hit) / (1 - background.passed))
+        log += free - math.log(1 - likelihood._OPEN + likelihood._OPEN * math.exp(free))
         total += math.exp(log) / len(nuisances)
     share = min(
         max(float(row[Share.GROUND]) / float(row[Share.COVERED_GROUND]), likelihood._EDGE), 1 - likelihood._EDGE
@@ -138,7 +139,7 @@ def searches_by_chance(count, places, number, seed, times=1.0):
     votes = np.arange(places)
     for _ in range(count):
         seen = chance_places(rng, places, number=number)[:, 0]
-        known = estimate_background(seen, scatter(seen), seen, seen)
+        known = estimate_background(seen, scatter(seen), seen)
         known = replace(known, number=(times * known.number[0], times * known.number[1]))
         ratios, _ = log_likelihood_ratios(seen, known)
         found = posterior(ratios, votes, places)
@@ -176,7 +177,7 @@ def test_right_place_is_told_from_chance():
     for _ in range(300):
         seen = chance_places(rng, 40, number=40)[:, 0]
         right = observation(rng.multinomial(40, GOOD, 1) / 40, passed=0.01, ground=0.9)
-        background = estimate_background(seen, scatter(seen), seen, seen)
+        background = estimate_background(seen, scatter(seen), seen)
         ratios, _ = log_likelihood_ratios(np.concatenate([right, seen]), background)
         found.append(posterior(ratios, np.arange(41), 41).error(np.arange(41) == 0))
     assert (np.array(found) < 1e-4).mean() > 0.9
