@@ -17,7 +17,7 @@ Group = Literal["calibration", "reported"]
 Class = Literal["ordinary", "outside", "near copies"]
 
 LIDARS = ("vlp16", "mid360", "os64")
-FIRST_SEED = {"calibration": 31_000, "reported": 71_000}
+FIRST_SEED = {"calibration": 31_000, "reported": 83_000}
 _CHOICES = 230  # random stream
 
 STREETS: dict[str, tuple[str, ...]] = {
