@@ -1,4 +1,4 @@
-"""Protection levels, on kinds of sites other than those that they were calibrated on.
+"""Protection levels, on kinds of sites other than those that the errors' tail is fitted on.
 
 Plain drives with odometry that drifts by 0.5 to 5 %. The tail of the errors is fitted on campuses and sparse forests
 (``fitted``), where the covariance is the most optimistic; the levels as the product has them are judged on towns,

@@ -24,7 +24,7 @@ ALERT_METRES, ALERT_DEGREES = 1.0, 3.0
 TAILS = {"metres": (1.03, 3.9), "degrees": (0.6, 2.7)}
 """Factor on the sigma, and degrees of freedom: set by hand, heavier than what ``python -m bench protection`` fits.
 
-That command fits (1.2, 14) and (0.5, 2.5) on campuses and sparse forests. But among the first few drives was one whose
+That command fits (1.2, 16) and (0.6, 2.5) on campuses and sparse forests. But among the first few drives was one whose
 errors were 4.5 sigma for 40 m, and it takes more kinds of sites than two to know how rare that is.
 """
 
