@@ -74,11 +74,14 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -
             return State.AMBIGUOUS, "no vote has named a place to compare it with"  # a hint is not trusted
         return State.TRACKING, f"found: wrong {one_in(scored.error)}"
     if scored.none > 0.5:
-        others = f"{scored.by_chance:.2g}" if scored.by_chance < 10 else f"{scored.by_chance:.0f}"
-        return State.SEARCHING, f"no place stands out: {others} places would fit as well by chance"
+        number = max(1, round(scored.by_chance))
+        others = "1 place" if number == 1 else f"{number} places"
+        return State.SEARCHING, f"no place stands out: {others} would fit as well by chance"
     best, second = scored.places[0], scored.second
     if second is not None and second.probability > scored.none:
         return State.AMBIGUOUS, f"two places fit: {_apart(best, second)}"
+    if scored.error >= 0.5:
+        return State.AMBIGUOUS, "several places fit, none is more likely than all others"
     return State.AMBIGUOUS, f"one place leads: wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
 
 

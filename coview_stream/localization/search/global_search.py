@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from coview_stream.basemap.basemap import BaseMap
@@ -19,7 +20,6 @@ from coview_stream.localization.search.request import Epoch, RequestSpec, Search
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough; set by hand
-_REFUTED = 1e-3  # probability below which a keyframe speaks against a pose hint; set by hand
 
 
 class GlobalSearch:
@@ -50,7 +50,7 @@ class GlobalSearch:
         ]
         self._local_maps = local_maps
         self._index = index
-        self._scorer = PlaceScorer(base_map.field)
+        self._scorer = PlaceScorer(base_map)
         self._epoch = Epoch()
         self.clear()
 
@@ -138,11 +138,11 @@ class GlobalSearch:
         """Note whether the keyframe spoke against the hints that it tried."""
         if not hints:
             return
-        best = max((place.probability for place in scored.places if place.hinted), default=0.0)
+        best = max((place.ratio for place in scored.places if place.hinted), default=-math.inf)
         positions = [robot_position(each.T_map_odom, request.T_odom_body) for each in hints]
         # where the map knows nothing, a keyframe does not speak against a hint
         surveyed = all(self.base_map.surveyed(position).all() for position in positions)
-        self._hints.tried(refuted=surveyed and best < _REFUTED)
+        self._hints.tried(refuted=surveyed and best < 0.0)
 
 
 def _recognizers(

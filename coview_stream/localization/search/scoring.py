@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-import coview_kernels as kernels
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import estimate_background, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
@@ -162,9 +162,9 @@ class _Observed:
 class PlaceScorer:
     """Places of a search, and what the keyframes so far have observed at them."""
 
-    def __init__(self, field: kernels.FieldMap) -> None:
-        """Score by a map's likelihood field."""
-        self._field = field
+    def __init__(self, base_map: BaseMap) -> None:
+        """Score by a map's likelihood field, which is loaded at the first keyframe."""
+        self._base_map = base_map
         self.clear()
 
     def clear(self) -> None:
@@ -230,14 +230,14 @@ class PlaceScorer:
             return _Observed(np.empty((0, 4)), _NOTHING, np.empty(0, dtype=np.float32), [])
         start = seen.poses(np.array([each.T_map_odom for each in every]))
         parts = [
-            seen.few.look_up(self._field, start[:known], "near"),
-            seen.few.look_up(self._field, start[known:], "far"),
+            seen.few.look_up(self._base_map.field, start[:known], "near"),
+            seen.few.look_up(self._base_map.field, start[known:], "far"),
         ]
         poses, shares, scores = (np.concatenate(both) for both in zip(*parts, strict=True))
         found = _Observed(poses, shares, scores, [])
         # some points tell what is far below the best; what is not is told apart by more
         promising = np.argsort(-scores * found.inside, kind="stable")[:_PROMISING]
-        _, shares[promising], scores[promising] = seen.many.look_up(self._field, poses[promising], "no")
+        _, shares[promising], scores[promising] = seen.many.look_up(self._base_map.field, poses[promising], "no")
         return replace(found, groups=_places(poses, scores * found.inside))
 
     def _follow(
@@ -275,7 +275,7 @@ class PlaceScorer:
         out = np.empty((len(T_map_odom), len(self._scans), len(Share)), dtype=np.float32)
         for k in reversed(range(len(self._scans))):
             scan = self._scans[k]
-            poses, out[:, k], _ = scan.few.look_up(self._field, scan.poses(T_map_odom), "near")
+            poses, out[:, k], _ = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), "near")
             T_map_odom = scan.transforms(poses)
         return out
 

@@ -34,7 +34,7 @@ def scan(world_drive):
 
 @pytest.fixture
 def scorer(world_map):
-    return PlaceScorer(world_map.field)
+    return PlaceScorer(world_map)
 
 
 def off(forward, left, degrees, scan):
@@ -97,15 +97,15 @@ def test_probabilities_of_places_and_none_of_these_sum_to_one(scorer, scan):
 def test_hint_is_found_again_among_the_places(world_map, scan):
     hint = hypothesis(off(0.5, 0.5, 2.0, scan), station=None)
     wrong = [hypothesis(off(x, y, 90.0, scan)) for x in (-9.0, 9.0) for y in (-8.0, 8.0)]
-    alone = scored(PlaceScorer(world_map.field), [*wrong, hint], scan, hints=1).places
+    alone = scored(PlaceScorer(world_map), [*wrong, hint], scan, hints=1).places
     assert [place.hinted for place in alone] == [True, False, False, False, False]
     assert alone[0].hypothesis.station is None
     supported = [*wrong, hypothesis(off(0.0, 0.0, 0.0, scan)), hint]
-    first = scored(PlaceScorer(world_map.field), supported, scan, hints=1).places[0]
+    first = scored(PlaceScorer(world_map), supported, scan, hints=1).places[0]
     assert first.hinted
     assert first.hypothesis.station == 3
     lost = [hypothesis(ODOM), replace(hint, T_map_odom=off(9.0, 8.0, 90.0, scan))]
-    places = scored(PlaceScorer(world_map.field), lost, scan, hints=1).places
+    places = scored(PlaceScorer(world_map), lost, scan, hints=1).places
     assert [place.hinted for place in places] == [False, True]
 
 
@@ -113,8 +113,8 @@ def test_hint_is_no_better_than_a_vote(world_map, scan):
     """A hint has no rank in any vote: the same place, named by the first of the votes, is more probable."""
     others = some_places(scan)[1:]
     right = hypothesis(off(0.0, 0.0, 0.0, scan), station=None)
-    hinted = scored(PlaceScorer(world_map.field), [*others, right], scan, hints=1)
-    voted = scored(PlaceScorer(world_map.field), [hypothesis(right.T_map_odom), *others], scan)
+    hinted = scored(PlaceScorer(world_map), [*others, right], scan, hints=1)
+    voted = scored(PlaceScorer(world_map), [hypothesis(right.T_map_odom), *others], scan)
     assert is_right(hinted.places[0], scan)
     assert hinted.error >= voted.error
 
@@ -148,7 +148,7 @@ def test_scan_without_structure_or_hypotheses_is_found_nowhere(scorer, scan):
 
 
 def test_places_are_followed_without_new_hypotheses(world_map, world_drive):
-    scorer = PlaceScorer(world_map.field)
+    scorer = PlaceScorer(world_map)
     scored(scorer, some_places(scan_of(world_drive, 0)), scan_of(world_drive, 0))
     for k in (1, 2, 3):
         scan = scan_of(world_drive, k)
@@ -163,7 +163,7 @@ def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map,
     """Places are compared on the same observations, whenever they came up."""
     scans = [scan_of(world_drive, k) for k in range(4)]
     right, *others = some_places(scans[0])
-    late, early = PlaceScorer(world_map.field), PlaceScorer(world_map.field)
+    late, early = PlaceScorer(world_map), PlaceScorer(world_map.field)
     for scan in scans[:3]:
         scored(late, others, scan)
         scored(early, [right, *others], scan)
@@ -174,7 +174,7 @@ def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map,
 
 def test_hypotheses_beside_the_leader_are_tried(world_map, world_drive):
     """Along a corridor the robot may be anywhere: what lies beside the best place is its rival."""
-    scorer = PlaceScorer(world_map.field)
+    scorer = PlaceScorer(world_map)
     scan = scan_of(world_drive, 0)
     assert len(scored(scorer, [hypothesis(ODOM)], scan).rivals) == 1
     rivals = scored(scorer, [], scan).rivals
@@ -184,7 +184,7 @@ def test_hypotheses_beside_the_leader_are_tried(world_map, world_drive):
 
 
 def test_observations_are_kept_for_a_bounded_number_of_keyframes(world_map, world_drive):
-    scorer = PlaceScorer(world_map.field)
+    scorer = PlaceScorer(world_map)
     scan = scan_of(world_drive, 0)
     ratios = [scored(scorer, some_places(scan, 12), scan).places[0].ratio for _ in range(24)]
     assert np.isfinite(ratios).all()
