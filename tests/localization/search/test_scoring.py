@@ -163,7 +163,7 @@ def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map,
     """Places are compared on the same observations, whenever they came up."""
     scans = [scan_of(world_drive, k) for k in range(4)]
     right, *others = some_places(scans[0])
-    late, early = PlaceScorer(world_map), PlaceScorer(world_map.field)
+    late, early = PlaceScorer(world_map), PlaceScorer(world_map)
     for scan in scans[:3]:
         scored(late, others, scan)
         scored(early, [right, *others], scan)
