@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.options import acceptance_config, add_risk
+
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.config import AcceptanceConfig
 
 HELP = "show what is inside a base map file"
 
@@ -16,6 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("map", type=Path, metavar="SITE.coview")
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the map and its stations")
+    parser.add_argument(
+        "--ambiguity",
+        action="store_true",
+        help="look at the map from its own places: where a robot may stay AMBIGUOUS, and how far it has to drive "
+        "there; takes about a minute",
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="A.png", help="draw the ambiguity")
+    add_risk(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -26,9 +38,15 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.errors import ConfigError
 
+    if args.output and not args.ambiguity:
+        raise ConfigError("-o draws the ambiguity: give --ambiguity as well, or --plot for the map and its stations")
+    acceptance = acceptance_config(args.risk)
     base_map = BaseMap.load(args.map)
     facts = describe(base_map)
+    if args.ambiguity:
+        facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
     if args.json:
         print(json.dumps(facts, indent=1))
     else:
@@ -39,6 +57,29 @@ def run(args: argparse.Namespace) -> int:
         points = base_map.points.astype(np.float64) + base_map.origin
         plot_map(points, base_map.stations + base_map.origin, args.plot, args.map.name)
     return 0
+
+
+def _ambiguity(base_map: BaseMap, acceptance: AcceptanceConfig, args: argparse.Namespace) -> object:
+    """Return the map's ambiguity, numbers for JSON or a sentence; draw it if a picture is asked for."""
+    from tqdm import tqdm
+
+    from coview_stream.config import LocalizerConfig
+    from coview_stream.localization.search.ambiguity import ambiguity
+    from coview_stream.report import ambiguity as report
+
+    with tqdm(desc="looking", unit="place", disable=not sys.stderr.isatty(), leave=False) as bar:
+
+        def step(done: int, total: int) -> None:
+            if done < bar.n:  # places to drive from, after those to look from
+                bar.reset(total)
+                bar.set_description("driving")
+            bar.total = total
+            bar.update(done - bar.n)
+
+        found = ambiguity(base_map, LocalizerConfig(acceptance=acceptance), progress=step)
+    if args.output:
+        report.plot_ambiguity(found, base_map, args.output, args.map.name)
+    return report.facts(found, base_map) if args.json else report.summary(found, base_map)
 
 
 def describe(base_map: BaseMap) -> dict[str, object]:
@@ -81,4 +122,4 @@ def _text(value: object) -> str:
         return ("\n" + " " * 15).join(rows)
     if isinstance(value, list):
         return "  ".join(str(v) for v in value)
-    return "unknown" if value is None else " ".join(str(value).split())[:100]
+    return "unknown" if value is None else " ".join(str(value).split())[:300]

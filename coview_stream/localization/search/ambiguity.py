@@ -1,0 +1,275 @@
+"""Ambiguity of a map: at which of its stations the map itself would leave a robot undecided, and for how long.
+
+At a station the map is seen as a robot would see it (:mod:`coview_stream.localization.search.virtual_scan`), with a
+share of the site changed since the survey, and the place is searched for by the evidence of a search: among what the
+votes of the station's own descriptors name, and places around it. Where that leaves an error above the risk, the robot
+drives on, along the longest way that is open, and the keyframes there are added as a search adds them.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.arrays import Bools, Floats, Indices
+from coview_stream.geometry.transforms import yaw_of
+from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.retrieval import Retrieval
+from coview_stream.localization.search.scoring import PlaceScorer, Scored, ScoredPlace
+from coview_stream.localization.search.virtual_scan import EYE, virtual_scan
+
+# set by hand
+STATIONS = 500  # at most so many are looked at, a tenth of a second each
+_DRIVES = 60  # from so many of those that are not found at once a robot drives; the others have the nearest one's
+_CHANGED = 0.3  # share of the site that has changed since the survey
+_KEYFRAMES = (2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0)  # metres driven
+FARTHEST = _KEYFRAMES[-1]
+"""Metres that a robot drives at most."""
+_AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0, 14.0, 28.0) for a in np.arange(8) * np.pi / 4])
+"""Shifts of a station, metres, that are its rivals as well: along a corridor the robot may be anywhere."""
+_RIGHT_DISTANCE, _RIGHT_ANGLE = 2.0, np.radians(15.0)  # metres, radians: the place itself
+_HEADINGS = 16  # in which a robot may set out, or go on
+_SHARPEST = np.radians(100.0)  # turn on its way
+_STEP = 1.0  # metres: its way is open if every one has a station
+_SHORTEST = 3  # steps; it does not set out for less
+_TALL, _HALF_WIDTH = 2.0, 0.8  # metres: what stands in its way
+_STOREY = 2.5  # metres
+_KEPT_SCANS = 8
+
+Progress = Callable[[int, int], None]
+"""Called with (done, total)."""
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """How far a robot has to drive from K stations until it is found.
+
+    Attributes:
+        station: (K,) indices of the stations.
+        position: (K, 3) where they are; metres, relative to the map's origin.
+        drive: (K,) metres; 0 at once, infinite if not within 40 m or to the end of the way.
+        driven: (K,) whether that has been tried from there, or is that of the nearest station tried.
+        evidence: (K,) log-likelihood ratio of the place against chance at once, nats.
+        lead: (K,) how much greater it is than that of the best place elsewhere, nats.
+        error: (K,) probability at once that the robot is elsewhere.
+        wrong: (K,) whether a search would have been sure of another place.
+        risk: probability of an error that is accepted.
+        changed: share of the site that was presumed changed since the survey.
+    """
+
+    station: Indices
+    position: Floats
+    drive: Floats
+    driven: Bools
+    evidence: Floats
+    lead: Floats
+    error: Floats
+    wrong: Bools
+    risk: float
+    changed: float
+
+    def __len__(self) -> int:
+        """Return the number of stations K."""
+        return len(self.station)
+
+    def share(self, metres: float) -> float:
+        """Return the share of the stations from which the robot is found within so many metres."""
+        return float((self.drive <= metres).mean()) if len(self) else 0.0
+
+
+def ambiguity(
+    base_map: BaseMap,
+    config: LocalizerConfig | None = None,
+    count: int = STATIONS,
+    changed: float = _CHANGED,
+    progress: Progress | None = None,
+) -> Ambiguity:
+    """Look at a map from at most ``count`` of its stations, evenly spread.
+
+    Args:
+        base_map: the map.
+        config: of the search; its risk decides.
+        count: of the stations.
+        changed: share of the site that has changed since the survey, in [0, 1].
+        progress: told how many stations are done, and of how many.
+
+    Raises:
+        MapError: the map's likelihood field cannot be used.
+    """
+    rehearsal = _Rehearsal(base_map, config or LocalizerConfig(), changed)
+    station = sample(base_map, count)
+    begun = [rehearsal.begin(int(each)) for each in _counted(station, progress)]
+    waiting = np.flatnonzero([not each.found and not each.wrong for each in begun])
+    tried = waiting[np.linspace(0, len(waiting) - 1, min(_DRIVES, len(waiting))).round().astype(np.int64)]
+    drive = np.where([each.found for each in begun], 0.0, np.inf)
+    wrong = np.array([each.wrong for each in begun], dtype=bool)
+    for k in _counted(tried, progress):
+        drive[k], wrong[k] = rehearsal.drive(int(station[k]))
+    position = base_map.stations[station].astype(np.float64)
+    for k in np.setdiff1d(waiting, tried):
+        drive[k] = drive[tried[np.argmin(np.linalg.norm(position[tried] - position[k], axis=1))]]
+    values = np.array([(each.evidence, each.lead, each.error) for each in begun]).reshape(-1, 3)
+    evidence, lead, error = values.T
+    driven = ~np.isin(np.arange(len(station)), np.setdiff1d(waiting, tried))
+    return Ambiguity(
+        station, position, drive, driven, evidence, lead, error, wrong, rehearsal.config.acceptance.risk, changed
+    )  # fmt: skip
+
+
+def sample(base_map: BaseMap, count: int) -> Indices:
+    """Return at most ``count`` stations, evenly spread: one of each cell of a grid, as fine as that allows."""
+    stations = base_map.stations.astype(np.float64)
+    cell = base_map.config.block
+    while True:
+        index = np.floor(stations / (cell, cell, max(cell, _STOREY))).astype(np.int64)
+        middle = (index[:, :2] + 0.5) * cell
+        order = np.argsort(np.linalg.norm(stations[:, :2] - middle, axis=1), kind="stable")
+        first = np.unique(index[order], axis=0, return_index=True)[1]
+        if len(first) <= count:
+            return np.sort(order[first])
+        cell *= 1.05
+
+
+def _counted(items: Indices, progress: Progress | None) -> Iterator[int]:
+    for done, each in enumerate(items.tolist()):
+        yield each
+        if progress is not None:
+            progress(done + 1, len(items))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a search makes of a station: whether it is found, and the numbers of :class:`Ambiguity`."""
+
+    found: bool
+    wrong: bool
+    evidence: float
+    lead: float
+    error: float
+
+
+class _Rehearsal:
+    """A search without a robot: keyframes at stations, by the map's own points."""
+
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig, changed: float) -> None:
+        self.base_map = base_map
+        self.config = config
+        self.changed = changed
+        self._retrieval = Retrieval(base_map, config.retrieval)
+        self._scorer = PlaceScorer(base_map)
+        self._scans: OrderedDict[tuple[float, ...], ScanInput | None] = OrderedDict()
+        self._clear()
+
+    def _clear(self) -> None:
+        self._consensus = Consensus(self.base_map.station_grid, self.config.consensus)
+        self._scorer.clear()
+
+    def begin(self, station: int) -> _Seen:
+        """Search for a station by one keyframe."""
+        self._clear()
+        return self._look(self.base_map.stations[station].astype(np.float64), station)
+
+    def drive(self, station: int) -> tuple[float, bool]:
+        """Drive on from a station; return after how many metres it is found, and whether another place was."""
+        if self.begin(station).wrong:
+            return np.inf, True
+        for metres, place in self._way(self.base_map.stations[station].astype(np.float64)):
+            seen = self._look(place, int(self.base_map.station_grid.at(place[None])[0]))
+            if seen.found or seen.wrong:
+                return (metres, False) if seen.found else (np.inf, True)
+        return np.inf, False
+
+    def _look(self, place: Floats, station: int) -> _Seen:
+        """Add a keyframe at a place (3,) on the ground, near a station."""
+        scan = self._scan(place)
+        if scan is None:
+            return _Seen(False, False, 0.0, 0.0, 1.0)
+        channels = self.base_map.descriptor_config.channels
+        query = {name: self.base_map.descriptors(name)[station].astype(np.float32) for name in channels}
+        self._consensus.vote(self._retrieval.vote(self.base_map.stations[station].astype(np.float64), query))
+        named = self._consensus.hypotheses()
+        beside = np.tile(np.eye(4), (len(_AROUND), 1, 1))
+        beside[:, :2, 3] = _AROUND
+        others = [*named, *(Hypothesis(T, station, 0, 0.0) for T in beside)]
+        scored = self._scorer.score([Hypothesis(np.eye(4), station, 0, 0.0), *others], range(len(others) + 1), 0, scan)
+        return _judged(scored, scan.T_odom_body[:3, 3], self.config.acceptance.risk)
+
+    def _scan(self, place: Floats) -> ScanInput | None:
+        """Return the virtual scan at a place (3,) on the ground."""
+        key = tuple(place.tolist())
+        if key not in self._scans:
+            eye = place + np.array([0.0, 0.0, EYE])
+            self._scans[key] = virtual_scan(self.base_map, eye, self.changed, self.config.registration)
+            if len(self._scans) > _KEPT_SCANS:
+                self._scans.popitem(last=False)
+        return self._scans[key]
+
+    def _way(self, place: Floats) -> Iterator[tuple[float, Floats]]:
+        """Yield the metres driven and the places (3,) on the ground of the keyframes that follow."""
+        driven, heading = 0.0, None
+        due = deque(_KEYFRAMES)
+        while due:
+            places, heading = self._straight(place, heading, due[-1] - driven)
+            if len(places) < _SHORTEST:
+                return
+            while due and due[0] <= driven + len(places) * _STEP:
+                metres = due.popleft()
+                yield metres, places[round((metres - driven) / _STEP) - 1]
+            driven, place = driven + len(places) * _STEP, places[-1]
+
+    def _straight(self, place: Floats, before: float | None, metres: float) -> tuple[Floats, float]:
+        """Return the longest straight way (N, 3) from a place, a metre from place to place, and its heading."""
+        scan = self._scan(place)
+        high = np.empty((0, 3)) if scan is None else scan.cloud.points[scan.cloud.above] - place
+        obstacle = high[high[:, 2] < _TALL, :2]
+        best, chosen = np.empty((0, 3)), 0.0
+        for heading in np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS):
+            if before is not None and abs((heading - before + np.pi) % (2.0 * np.pi) - np.pi) > _SHARPEST:
+                continue
+            along = np.array([np.cos(heading), np.sin(heading)])
+            ahead, beside = obstacle @ along, obstacle @ (-along[1], along[0])
+            blocking = ahead[(np.abs(beside) < _HALF_WIDTH) & (ahead > 0.0)]
+            free = min(metres, float(blocking.min(initial=np.inf)) - _HALF_WIDTH)
+            ways = self._with_stations(place, along, int(free / _STEP))
+            if len(ways) > len(best):
+                best, chosen = ways, float(heading)
+        return best, chosen
+
+    def _with_stations(self, place: Floats, along: Floats, steps: int) -> Floats:
+        """Return the steps (N, 3) from a place along a direction (2,) up to where there are no more stations."""
+        out = []
+        z = place[2]
+        for k in range(1, steps + 1):
+            there = np.array([*(place[:2] + k * _STEP * along), z])
+            station = int(self.base_map.station_grid.at(there[None])[0])
+            if station < 0:
+                break
+            z = there[2] = float(self.base_map.stations[station, 2])
+            out.append(there)
+        return np.array(out).reshape(-1, 3)
+
+
+def _judged(scored: Scored, body: Floats, risk: float) -> _Seen:
+    """Compare the places with the true one, the identity."""
+    right = [_is_right(place, body) for place in scored.places]
+    if not scored.places:
+        return _Seen(False, False, 0.0, 0.0, 1.0)
+    own = max((p.ratio for p, yes in zip(scored.places, right, strict=True) if yes), default=0.0)
+    rival = max((p.ratio for p, yes in zip(scored.places, right, strict=True) if not yes), default=0.0)
+    sure = scored.error < risk
+    error = scored.error if right[0] else 1.0 - sum(
+        p.probability for p, yes in zip(scored.places, right, strict=True) if yes
+    )  # fmt: skip
+    return _Seen(sure and right[0], sure and not right[0], own, own - max(rival, 0.0), error)
+
+
+def _is_right(place: ScoredPlace, body: Floats) -> bool:
+    T = place.hypothesis.T_map_odom
+    apart = float(np.linalg.norm(T[:3, :3] @ body + T[:3, 3] - body))
+    return apart < _RIGHT_DISTANCE and abs(yaw_of(T)) < _RIGHT_ANGLE

@@ -1,0 +1,82 @@
+"""``coview-stream info --ambiguity``: a sentence, numbers, a picture."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.cli import main
+from coview_stream.localization.search import ambiguity as module
+from coview_stream.report.ambiguity import facts, plot_ambiguity, summary
+
+
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch):
+    """Few places to look from: the default is for sites."""
+    monkeypatch.setattr(module.ambiguity, "__defaults__", (None, 6, 0.3, None))
+
+
+def made_up(base_map, drive, wrong=False):
+    count = len(drive)
+    zeros = np.zeros(count)
+    station = np.arange(count)
+    position = base_map.stations[station].astype(np.float64)
+    wrongs = np.full(count, wrong)
+    return module.Ambiguity(
+        station, position, np.array(drive), wrongs, zeros, zeros, zeros, wrongs, 1e-4, 0.3
+    )  # fmt: skip
+
+
+def test_option_prints_a_sentence_and_draws(world_file, tmp_path, capsys):
+    picture = tmp_path / "ambiguity.png"
+    assert main(["info", str(world_file), "--ambiguity", "-o", str(picture)]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("ambiguity"))
+    assert "told apart at once" in line
+    assert "risk 0.0001" in line
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_option_prints_numbers_for_each_station(world_file, capsys):
+    assert main(["info", str(world_file), "--ambiguity", "--json", "--risk", "1e-3"]) == 0
+    found = json.loads(capsys.readouterr().out)["ambiguity"]
+    base_map = BaseMap.load(world_file)
+    assert found["risk"] == 1e-3
+    assert 1 <= len(found["stations"]) <= 6
+    for each in found["stations"]:
+        np.testing.assert_allclose(each["position"], base_map.stations[each["station"]] + base_map.origin, atol=0.01)
+        assert each["drive"] is None or each["drive"] >= 0.0
+        assert 0.0 <= each["error"] <= 1.0
+    assert found["within"]["40"] + found["never"] == pytest.approx(1.0)
+
+
+def test_plain_info_does_not_look(world_file, capsys):
+    assert main(["info", str(world_file), "--json"]) == 0
+    assert "ambiguity" not in json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("more", [["-o", "a.png"], ["--ambiguity", "--risk", "2"]])
+def test_options_that_do_not_go_together_are_one_line(world_file, capsys, more):
+    assert main(["info", str(world_file), *more]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_summary_says_how_many_and_where(world_map):
+    text = summary(made_up(world_map, [0.0, 0.0, 8.0, np.inf]), world_map)
+    for part in ("50 % of 4 places", "25 % after driving up to 8 m", "25 % stay ambiguous", "worst around"):
+        assert part in text
+    assert "another place" not in text
+    assert "worst" not in summary(made_up(world_map, [0.0, 0.0]), world_map)
+    assert "at 2 another place" in summary(made_up(world_map, [np.inf, np.inf], wrong=True), world_map)
+    assert summary(made_up(world_map, []), world_map) == "no stations"
+
+
+def test_numbers_and_picture_of_a_map_that_tells_nothing_apart(world_map, tmp_path):
+    found = made_up(world_map, [np.inf, np.inf])
+    assert [each["drive"] for each in facts(found, world_map)["stations"]] == [None, None]
+    json.dumps(facts(found, world_map))
+    for number, each in enumerate((found, made_up(world_map, []))):
+        plot_ambiguity(each, world_map, tmp_path / f"{number}.png", "site")
+        assert (tmp_path / f"{number}.png").read_bytes().startswith(b"\x89PNG")
