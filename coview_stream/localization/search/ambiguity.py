@@ -25,8 +25,8 @@ from coview_stream.localization.search.scoring import PlaceScorer, Scored, Score
 from coview_stream.localization.search.virtual_scan import EYE, virtual_scan
 
 # set by hand
-STATIONS = 500  # at most so many are looked at, a tenth of a second each
-_DRIVES = 60  # from so many of those that are not found at once a robot drives; the others have the nearest one's
+STATIONS = 1000  # at most so many are looked at, a twentieth of a second each
+_DRIVES = 100  # from so many of those that are not found at once a robot drives; the others have the nearest one's
 _CHANGED = 0.3  # share of the site that has changed since the survey
 _KEYFRAMES = (2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0)  # metres driven
 FARTHEST = _KEYFRAMES[-1]
@@ -126,6 +126,7 @@ def sample(base_map: BaseMap, count: int) -> Indices:
     """Return at most ``count`` stations, evenly spread: one of each cell of a grid, as fine as that allows."""
     stations = base_map.stations.astype(np.float64)
     cell = base_map.config.block
+    stations -= stations.min(axis=0) - 0.5 * cell
     while True:
         index = np.floor(stations / (cell, cell, max(cell, _STOREY))).astype(np.int64)
         middle = (index[:, :2] + 0.5) * cell

@@ -13,7 +13,7 @@ from coview_stream.config import AcceptanceConfig, LocalizerConfig
 from coview_stream.localization.search.ambiguity import FARTHEST, ambiguity, sample
 from coview_stream.localization.search.virtual_scan import EYE, virtual_scan
 
-PLACES = 12
+PLACES = 8
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,7 @@ def test_sample_is_spread_over_the_map(world_map):
     assert gaps.min() > 1.0
     assert np.ptp(xy, axis=0).min() > 0.6 * 2 * small_world.HALF
     np.testing.assert_array_equal(sample(world_map, len(world_map)), np.arange(len(world_map)))
+    assert len(sample(world_map, 1)) == 1
 
 
 # ---- virtual scan
