@@ -24,7 +24,7 @@ from coview_kernels.evidence import (
     match_rays,
     sort_beams,
 )
-from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores
+from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores, unexplained
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
@@ -82,6 +82,7 @@ __all__ = [
     "station_bins",
     "submit",
     "transform_unique",
+    "unexplained",
     "unit_columns",
     "warm_up",
     "window_products",

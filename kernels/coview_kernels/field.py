@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, U16, as_finite64, as_float32
+from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, U16, Mask, as_finite64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
 from coview_kernels.warm_up import SAMPLE, compiled_by
@@ -155,6 +155,19 @@ def field_scores(
     # float32 resolves a tenth of a millimetre a kilometre from the corner
     pose, counts = runtime.dispatch(_native, reference.field_scores, layers, plan, start - corner)
     return FieldScores(pose + corner, *np.ascontiguousarray(counts.T))
+
+
+def unexplained(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
+    """Tell which structure points (N, 3) at a pose (4,) are surveyed and yet neither near structure nor below an edge.
+
+    Arguments are as for :func:`field_scores`. In NumPy, as it is asked for one pose and seldom.
+    """
+    at = as_finite64("pose", np.reshape(np.asarray(pose, dtype=np.float64), (1, -1)), 1, 4)[0]
+    corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
+    surveyed, _, covered, _ = reference.structure_at(
+        field.layers, as_float32("structure", structure, None, 3), at - corner
+    )
+    return np.asarray(surveyed & ~covered)
 
 
 def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:

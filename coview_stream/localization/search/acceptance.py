@@ -73,6 +73,9 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -
         if all(place.hypothesis.station is None for place in scored.places):
             return State.AMBIGUOUS, "no vote has named a place to compare it with"  # a hint is not trusted
         return State.TRACKING, f"found: wrong {one_in(scored.error)}"
+    if scored.moved.probability > rule.risk:
+        metres = f"{scored.moved.metres:.0f} m"
+        return State.AMBIGUOUS, f"a part of what is seen fits {metres} beside the rest: wrong {one_in(scored.error)}"
     if scored.none > 0.5:
         number = max(1, round(scored.by_chance))
         others = "1 place" if number == 1 else f"{number} places"

@@ -20,6 +20,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.localization.evidence.background import estimate_background, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observed_scan import ObservedScan, Share
 from coview_stream.localization.evidence.posterior import expected_by_chance, posterior
 from coview_stream.localization.registration.register import ScanInput
@@ -99,6 +100,7 @@ class Scored:
         none: probability that it is at no place of the map.
         by_chance: expected number of chance places as good as the first.
         second: the most probable place elsewhere than the first, if there is any.
+        moved: part of the scan that fits elsewhere than at the first.
     """
 
     rivals: Rivals
@@ -107,6 +109,11 @@ class Scored:
     none: float = 1.0
     by_chance: float = np.inf
     second: ScoredPlace | None = None
+    moved: MovedPart = NO_PART
+
+    def doubted(self, moved: MovedPart) -> Scored:
+        """Return it with the error that a moved part adds: either part may be the one that stayed."""
+        return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from coview_kernels.reference.covisibility import coview, visible
 from coview_kernels.reference.crop import crop_points
 from coview_kernels.reference.distinct import distinct_poses
 from coview_kernels.reference.evidence import match_points, match_rays, sort_beams
-from coview_kernels.reference.field import field_scores
+from coview_kernels.reference.field import field_scores, structure_at
 from coview_kernels.reference.icp import align_planes
 from coview_kernels.reference.nearest import nearest
 from coview_kernels.reference.overhead import height_columns, lowest_heights, offsets_near
@@ -38,6 +38,7 @@ __all__ = [
     "polar_bin",
     "sort_beams",
     "station_bins",
+    "structure_at",
     "transform_unique",
     "visible",
     "window_products",

@@ -158,14 +158,20 @@ def _fine_hits(layers: FieldLayers, structure: F32, pose: F64) -> int:
     return int(_bit(words[:, 0], placed[:, 2]).sum()) + int(_bit(words[:, 1], placed[:, 2]).sum())
 
 
-def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
-    placed = _placed(plan.structure, pose)
+def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, Mask, Mask, Mask]:
+    """Tell which structure points (N, 3) at a pose (4,) lie where the map is surveyed; near, covered by, on its own."""
+    placed = _placed(structure, pose)
     cell = _cells(layers, placed)
     _, _, surveyed = _heights(layers, cell)
     edge = layers.surface[cell] >> 16
     near = _bit(layers.bits[cell][:, 0], placed[:, 2]) & surveyed
     top = np.where(edge > 0, layers.base[cell[0]] + np.float32(EDGE_STEP) * edge.astype(np.float32), np.float32(-1e6))
     covered = (near | (top > placed[:, 2] - np.float32(UNDER_EDGE))) & surveyed
+    return surveyed, near, covered, _bit(layers.bits[cell][:, 1], placed[:, 2]) & surveyed
+
+
+def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
+    surveyed, near, covered, on = structure_at(layers, plan.structure, pose)
     lower = _placed(plan.low, pose)
     under = _cells(layers, lower)
     height, has, known = _heights(layers, under)
@@ -174,6 +180,5 @@ def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
     grounded = ((has & (np.abs(off) < ON_GROUND)) | upper) & known
     free = _placed(plan.free, pose)
     passed = _bit(layers.bits[_cells(layers, free)][:, 1], free[:, 2])
-    on = _bit(layers.bits[cell][:, 1], placed[:, 2]) & surveyed
     masks = surveyed, near, covered, known, grounded, passed, on
     return tuple(int(mask.sum()) for mask in masks)

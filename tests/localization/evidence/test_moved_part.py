@@ -1,0 +1,73 @@
+"""A part of what is seen that fits some metres beside the rest is found; what was merely replaced is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import coview_kernels as kernels
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, find_moved_part
+from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.registration.prepare_scan import prepare_scan
+from coview_stream.localization.registration.register import ScanInput
+
+ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
+RISK = 1e-4
+
+
+@pytest.fixture(scope="module")
+def seen(world_drive):
+    T, cloud = inverse(ODOM) @ world_drive.T_map_body[0], world_drive.clouds[0]
+    points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    return ObservedScan.of(ScanInput(prepare_scan(points, T[:3, 3], LocalizerConfig().registration), cloud, T))
+
+
+def with_moved(seen: ObservedScan, shifts: np.ndarray) -> ObservedScan:
+    """The scan with what stands in each of a few sectors moved, (sectors, 2) metres along the map's axes."""
+    structure = seen.many.points.structure.copy()
+    sector = ((np.arctan2(structure[:, 1], structure[:, 0]) + np.pi) / (2 * np.pi) * len(shifts)).astype(int)
+    back = ODOM[:2, :2].T  # the odometry frame's axes
+    structure[:, :2] += (shifts @ back.T)[np.minimum(sector, len(shifts) - 1)].astype(np.float32)
+    return replace(seen, many=replace(seen.many, points=replace(seen.many.points, structure=structure)))
+
+
+def found(world_map, seen: ObservedScan) -> MovedPart:
+    return find_moved_part(world_map.field, seen, ODOM)
+
+
+def test_scan_that_is_explained_has_no_moved_part(world_map, seen):
+    assert found(world_map, seen).probability < RISK
+
+
+def test_third_of_the_scan_that_is_four_metres_off_is_found(world_map, seen):
+    shifts = np.zeros((12, 2))
+    shifts[::3] = [2.8, -2.9]
+    part = found(world_map, with_moved(seen, shifts))
+    assert part.probability > RISK > 5 * found(world_map, seen).probability
+    assert part.metres == pytest.approx(4.0, abs=0.8)
+
+
+def test_parts_that_moved_each_by_itself_are_no_moved_part(world_map, seen):
+    angle = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+    shifts = np.zeros((24, 2))
+    shifts[::3] = 4.5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    assert found(world_map, with_moved(seen, shifts)).probability < RISK
+
+
+def test_few_points_say_nothing(world_map, seen):
+    few = replace(seen.many.points, structure=seen.many.points.structure[:20] + np.float32([0.0, 0.0, 40.0]))
+    assert found(world_map, replace(seen, many=replace(seen.many, points=few))) == NO_PART
+
+
+def test_unexplained_points_are_what_the_counts_leave(world_map, seen):
+    pose = seen.poses(ODOM[None])
+    moved = pose + np.array([2.0, 1.0, 0.0, 0.1])
+    for at in (pose, moved):
+        points = seen.many.points
+        counts = kernels.field_scores(world_map.field, points, at, refine=False)
+        left = kernels.unexplained(world_map.field, points.structure, at[0])
+        assert abs(int(left.sum()) - int(counts.structure[0] - counts.covered[0])) <= 4
