@@ -153,6 +153,7 @@ def test_rows_are_shown_under_their_benchmark():
         ("forest", [f"forest {part}" for part in ("recall", "metric", "compared", "times", "disk recall",
                     "disk metric", "disk compared")] + ["forest_scale", "forest_runs", "forest_plot"]),
         ("tracking", ["tracking", "tracking coverage", "tracking protection"]),
+        ("integrity", ["integrity", "integrity families", "integrity reliability", "protection", "protection tails"]),
         ("accuracy", ["accuracy", "ablation", "ground"]),
     ],
 )  # fmt: skip
