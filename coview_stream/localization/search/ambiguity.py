@@ -31,8 +31,8 @@ _CHANGED = 0.3  # share of the site that has changed since the survey
 _KEYFRAMES = (2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0)  # metres driven
 FARTHEST = _KEYFRAMES[-1]
 """Metres that a robot drives at most."""
-_AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0, 14.0, 28.0) for a in np.arange(8) * np.pi / 4])
-"""Shifts of a station, metres, that are its rivals as well: along a corridor the robot may be anywhere."""
+_AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
+"""Shifts of a station, metres, that are its rivals as well, as a search tries those of its leader."""
 _RIGHT_DISTANCE, _RIGHT_ANGLE = 2.0, np.radians(15.0)  # metres, radians: the place itself
 _HEADINGS = 16  # in which a robot may set out, or go on
 _SHARPEST = np.radians(100.0)  # turn on its way
