@@ -18,8 +18,9 @@ from coview_stream.localization.evidence.observed_scan import Share
 # what is presumed before any place has been scored: as many chance places as these; set by hand
 _PSEUDO = 6.0  # chance places
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
-_PSEUDO_NUMBER = 10.0  # independent observations
-_LEAST = 0.01  # of any outcome: a share that was never seen is not impossible
+_PSEUDO_NUMBER = 3.0  # independent observations
+_MOST = 40.0  # independent observations of a scan: on a bare field chance places hardly scatter
+_LEAST = 0.05  # of any outcome: what few chance places show is not impossible at another
 _COVERED = 0.05  # of a scan: below, the shares of what is covered say nothing
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
 _CALIBRATED = 1.5
@@ -87,12 +88,12 @@ def estimate_background(now: Floats32, variance: Floats, kept: Floats32) -> Back
     structure = structure / structure.sum()
     chance = np.append(np.cumsum(structure[:3]), passed)
     chance = chance * (1.0 - chance)
-    count = len(now)
+    count = np.where(np.isfinite(variance), len(now), 0)
     seen = np.where(np.isfinite(variance), variance, 0.0)
     presumed = chance / _PSEUDO_NUMBER
     number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO))
     high = float(3.0 / (1.0 / number[:3]).sum())
-    return Background(structure, passed, _beta(now, kept), (high, float(number[3])))
+    return Background(structure, passed, _beta(now, kept), (min(high, _MOST), float(number[3])))
 
 
 def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:

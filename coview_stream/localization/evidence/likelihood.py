@@ -12,7 +12,8 @@ shares of their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a pla
 cannot gain, as q >= 0. What the map does not cover adds nothing; a rival that has it covered gains by it.
 
 The ground is one observation of a place, not many, for a road is level everywhere: its share is held against the Beta
-distribution of the chance places' shares.
+distribution of the chance places' shares. One chance place in a hundred is presumed to be as clear and as level as the
+right one.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _SURVEYS = np.array([[0.3, 0.15, 0.45, 0.1], [0.5, 0.25, 0.15, 0.1], [0.65, 0.25
 """Outcomes of what is there: on, near, under an edge, unexplained; from an airborne survey to one of the same kind."""
 _LEAKS = np.array([0.05, 0.3, 0.6])  # of the background's passed rays, those that pass what stands there
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
-_OPEN, _LEVEL = 0.01, 0.01  # shares of chance places that are as clear of structure, as level as the right one
+_OPEN = 0.01  # share of chance places that are as clear of structure and as level as the right one: an open road
 _EDGE = 0.02  # shares of the ground beyond it are not told apart
 
 
@@ -55,19 +56,26 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[F
         hit[:, None, None] * np.log(passed / background.passed)
         + clear[:, None, None] * np.log((1.0 - passed) / (1.0 - background.passed))
     )
-    free -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + free)  # chance, too, may stand in the open
-    each = structure[:, :, :, None] + free[:, :, None, :]
+    beside = free + _ground(observed, background)[:, None, None]
+    beside -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + beside)  # chance, too, may stand on an open road
+    each = structure[:, :, :, None] + beside[:, :, None, :]
+    if not len(each):
+        return np.empty(0), np.empty(0)
     best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
     flat = each.reshape(len(each), -1)
-    top = flat.max(axis=1, initial=-np.inf)
-    return np.log(np.exp(flat - top[:, None]).mean(axis=1)) + top + _ground(observed, background), best
+    top = flat.max(axis=1)
+    return np.log(np.exp(flat - top[:, None]).mean(axis=1)) + top, best
 
 
 def _ground(observed: Floats32, background: Background) -> Floats:
     covered = observed[:, Share.COVERED_GROUND].astype(np.float64)
     share = np.clip(observed[:, Share.GROUND] / np.maximum(covered, 0.05), _EDGE, 1.0 - _EDGE)
-    chance = np.logaddexp(_beta(share, *background.ground) + math.log1p(-_LEVEL), math.log(_LEVEL))
-    return np.asarray(np.clip(covered, 0.0, 1.0) * (_beta(share, *_GROUND) - chance))
+    a, b = background.ground
+    gain = _beta(share, *_GROUND) - _beta(share, a, b)
+    mean = np.full(1, min(max(a / (a + b), _EDGE), 1.0 - _EDGE))
+    # a place that is rougher than chance is worth no more than one that is like chance, however rare it is
+    usual = float((_beta(mean, *_GROUND) - _beta(mean, a, b))[0])
+    return np.asarray(np.clip(covered, 0.0, 1.0) * np.where(share < mean, np.minimum(gain, usual), gain))
 
 
 def _beta(x: Floats, a: float, b: float) -> Floats:

@@ -32,17 +32,20 @@ class Posterior:
         return float(self.place[~same].sum() + self.none)
 
 
-def posterior(ratios: Floats, votes: Ints, count: int) -> Posterior:
+def posterior(ratios: Floats, votes: Ints, count: int, looks: int = 1) -> Posterior:
     """Return the posterior of places.
 
     Args:
         ratios: (P,) log-likelihood ratios against chance.
         votes: (P,) rank of each in the votes, from 0.
         count: number N of places that were scored, these among them: the others have the likelihood of chance.
+        looks: how often a search has looked anew, on other keyframes than before: each is another chance of an error.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
+    # two recognizers rank places, and those that are followed keep theirs: the sum may be more than one list's
     harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
-    logs = np.append(ratios - np.log1p(ranks) - np.log(harmonic), 0.0)
+    total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
+    logs = np.append(ratios - np.log1p(ranks) - np.log(total * looks), 0.0)
     odds = np.exp(logs - logs.max())
     odds /= odds.sum()
     return Posterior(odds[:-1], float(odds[-1]))

@@ -15,11 +15,9 @@ The score is sqrt(near * covered * ground * free space): structure, which tells 
 and free space together. A fifth share, inside, is not in it: how many of the points lie where the map has been surveyed
 at all; the others leave out the points that do not.
 
-The score separates right from wrong, but not by itself. Seen by hand on a few runs, no command prints it: right places
-score 0.3 to 0.75 in simulated towns and campuses, and wrong ones mostly below 0.2 but 0.3 to 0.57 at times when the
-robot is outside the map; on the road corridor ``riverside`` right places reach 0.8 to 0.95 and wrong ones on the same
-road 0.6 to 0.7. Hence the lead over the best rival, the ground share and the evidence of several keyframes that
-:class:`coview_stream.config.AcceptanceConfig` asks for as well. The constants below are set by hand.
+The score separates right from wrong, but not by itself: right places score 0.3 to 0.95, wrong ones up to 0.7 on a road that
+looks the same all along. A search judges places against chance instead (docs/integrity.md); the score is what is told
+of a place, and what tracking compares with the usual. The constants below are set by hand.
 """
 
 from __future__ import annotations

@@ -77,9 +77,9 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -
         metres = f"{scored.moved.metres:.0f} m"
         return State.AMBIGUOUS, f"a part of what is seen fits {metres} beside the rest: wrong {one_in(scored.error)}"
     if scored.none > 0.5:
-        number = max(1, round(scored.by_chance))
-        others = "1 place" if number == 1 else f"{number} places"
-        return State.SEARCHING, f"no place stands out: {others} would fit as well by chance"
+        if scored.by_chance < 1.5:
+            return State.SEARCHING, "no place stands out: the best fits no better than chance would have it"
+        return State.SEARCHING, f"no place stands out: {scored.by_chance:.0f} places would fit as well by chance"
     best, second = scored.places[0], scored.second
     if second is not None and second.probability > scored.none:
         return State.AMBIGUOUS, f"two places fit: {_apart(best, second)}"

@@ -177,6 +177,7 @@ class PlaceScorer:
     def clear(self) -> None:
         """Forget all places and keyframes."""
         self._followed = _Followed.none()
+        self._seen = 0  # keyframes
         self._scans: deque[ObservedScan] = deque(maxlen=_KEYFRAMES)
         self._scatter: deque[Floats] = deque(maxlen=_KEYFRAMES)
 
@@ -203,9 +204,10 @@ class PlaceScorer:
         first = np.array([group[0] for group in observed.groups], dtype=np.int64)
         ratios, kept = self._evidence(followed, observed, first)
         order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
+        self._seen += 1
         self._scans.append(seen)
         self._followed = followed = followed[order]
-        chances = posterior(ratios[order], followed.votes, len(first))
+        chances = posterior(ratios[order], followed.votes, len(first), 1 + self._seen // _KEYFRAMES)
         numbers = zip(order, chances.place, followed.newest, strict=True)
         places = [
             ScoredPlace(
@@ -267,7 +269,7 @@ class PlaceScorer:
             own = next((every[k] for k in group if every[k].station is not None), every[group[0]])
             hypotheses.append(replace(own, T_map_odom=T[group[0]]))
         newest = np.array([group[0] for group in chosen], dtype=np.int64)
-        votes = np.array([ranks[group].min() for group in chosen], dtype=np.int64)
+        votes = np.array([min(ranks[group].min(), len(observed.groups) - 1) for group in chosen], dtype=np.int64)
         past = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
         of = np.array(known, dtype=np.int64)
         if len(self._scans):

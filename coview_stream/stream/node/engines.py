@@ -63,7 +63,7 @@ class TrackEngine:
     kernels = ("transform_unique",)
     # of robots that have a place to be tracked from, which takes a search longer than it does to load them
     later_kernels: tuple[str, ...] = (
-        "crop_points", "nearest", "align_planes", "match_points", "match_rays", "sort_beams",
+        "crop_points", "nearest", "align_planes", "match_points", "match_rays", "sort_beams", "field_scores",
     )  # fmt: skip
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
@@ -107,8 +107,9 @@ class TrackEngine:
         """Do nothing: the map is cropped where robots are."""
 
     def prepare_later(self) -> None:
-        """Import what the graph of poses runs on."""
+        """Import what the graph of poses runs on, and load what a slip of odometry is judged by."""
         PoseGraph(self.config.graph)
+        _ = self.base_map.field.layers
 
     def _localizer(self, job: FrameJob) -> Localizer:
         """Return the robot's localizer, which forgets all but the map with a new epoch."""

@@ -237,13 +237,19 @@ def with_leaning_odometry(world_map, world_drive, monkeypatch, gravity_sigma, ma
     """First search keyframe; the odometry leans against gravity by TILT, the hypothesis is right but upright."""
     search = searching(
         world_map,
-        AcceptanceConfig(max_tilt=max_tilt, risk=0.3),
+        AcceptanceConfig(max_tilt=max_tilt, risk=0.49),
         registration=RegistrationConfig(gravity_sigma=gravity_sigma),
     )
     robot = pose_from(np.eye(3), world_drive.T_map_body[0][:3, 3])
     leaning = robot @ exp_se3(np.array([TILT, 0.0, 0.0, 0.0, 0.0, 0.0]))
     upright = Hypothesis(robot, 0, 0, 0.0)
-    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [upright])
+    rng = np.random.default_rng(5)  # wrong places, which chance is measured at
+    shifts = np.column_stack([rng.uniform(-8.0, 8.0, (60, 2)), np.zeros(60)])
+    others = [
+        Hypothesis(pose_from(rot_z(yaw), robot[:3, 3] + shift), 1, 0, 0.0)
+        for shift, yaw in zip(shifts, rng.uniform(0.5, 5.8, 60), strict=True)
+    ]
+    monkeypatch.setattr(search.coview.consensus, "hypotheses", lambda: [upright, *others])
     return search.update(next(run_of(world_drive, 1, leaning)))
 
 
