@@ -15,9 +15,9 @@ The score is sqrt(near * covered * ground * free space): structure, which tells 
 and free space together. A fifth share, inside, is not in it: how many of the points lie where the map has been surveyed
 at all; the others leave out the points that do not.
 
-The score separates right from wrong, but not by itself: right places score 0.3 to 0.95, wrong ones up to 0.7 on a road that
-looks the same all along. A search judges places against chance instead (docs/integrity.md); the score is what is told
-of a place, and what tracking compares with the usual. The constants below are set by hand.
+The score separates right from wrong, but not by itself: right places score 0.3 to 0.95, wrong ones up to 0.7 on a road
+that looks the same all along. A search judges places against chance instead (docs/integrity.md); the score is what is
+told of a place, and what tracking compares with the usual. The constants below are set by hand.
 """
 
 from __future__ import annotations
