@@ -208,8 +208,8 @@ class Localizer:
     def hint_pose(self, T_map_body: Pose) -> None:
         """Hint that the robot may be here at the next frame, until a place is accepted or :meth:`reset`.
 
-        A hint is never trusted: the search registers, verifies and judges it like any other hypothesis. Ignored while
-        a place is known.
+        A hint is never trusted: the search scores and judges it like any other hypothesis, as the one that votes name
+        last. Ignored while a place is known.
 
         Args:
             T_map_body: (4, 4) in the frame of the map's sources, as :attr:`Fix.T_map_body`, metres.

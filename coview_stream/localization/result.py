@@ -26,7 +26,7 @@ class KeyframeEvidence:
         state: the state it led to.
         reason: one clause for people.
         score: evidence score of the best hypothesis, 0 if there is none.
-        rival: score of the best distinct rival, 0 if there is none.
+        rival: score of the most probable place elsewhere, as the field has it, 0 if there is none; not registered.
         evidence: its parts, if a hypothesis could be registered.
         station: winning station, if this keyframe searched.
         shift: winning shift of the co-view descriptors; None if the place was found by learned features.
