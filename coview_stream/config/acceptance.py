@@ -17,7 +17,8 @@ class AcceptanceConfig:
     :mod:`coview_stream.localization.tracking.monitor`.
 
     ``risk`` and ``max_tilt`` are what a search is decided by. The others are set by hand, and no command prints the
-    figures that they were set by; what ``python -m bench tracking`` prints with all of them together is in docs/tracking.md.
+    figures that they were set by; what ``python -m bench tracking`` prints with all of them together is in
+    docs/tracking.md.
 
     Attributes:
         risk: integrity risk: a search gives a place once the probability that it is wrong is smaller.

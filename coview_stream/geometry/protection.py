@@ -24,9 +24,9 @@ ALERT_METRES, ALERT_DEGREES = 1.0, 3.0
 TAILS = {"metres": (1.03, 3.9), "degrees": (0.6, 2.7)}
 """Factor on the sigma, and degrees of freedom: set by hand; ``python -m bench protection`` prints what fits.
 
-It fits (1.2, 16) and (0.6, 2.5) on campuses and sparse forests: at 1e-3 the tail of metres is heavier than that, the one
-of degrees 15 % lighter. Among the first few drives was one whose errors were 4.5 sigma for 40 m, and it takes more kinds
-of sites than two to know how rare that is.
+It fits (1.2, 16) and (0.6, 2.5) on campuses and sparse forests: at 1e-3 the tail of metres is heavier than that, the
+one of degrees 15 % lighter. Among the first few drives was one whose errors were 4.5 sigma for 40 m, and it takes more
+kinds of sites than two to know how rare that is.
 """
 
 
