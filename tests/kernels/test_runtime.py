@@ -47,7 +47,7 @@ def test_public_names():
         *("FieldMap", "FieldScan", "FieldScores", "field_scores"),
         *("CodedQuery", "StationCodes", "distinct_poses"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
-        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unit_columns"),
+        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unexplained", "unit_columns"),
         "warm_up",
     }
     assert all(callable(getattr(coview_kernels, name)) for name in coview_kernels.__all__)

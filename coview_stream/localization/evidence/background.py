@@ -19,11 +19,11 @@ from coview_stream.localization.evidence.observed_scan import Share
 _PSEUDO = 6.0  # chance places
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
 _PSEUDO_NUMBER = 3.0  # independent observations
-_MOST = 40.0  # independent observations of a scan: on a bare field chance places hardly scatter
+_MOST = 100.0  # independent observations of a scan: on a bare field chance places hardly scatter
 _LEAST = 0.05  # of any outcome: what few chance places show is not impossible at another
 _COVERED = 0.05  # of a scan: below, the shares of what is covered say nothing
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
-_CALIBRATED = 1.5
+_CALIBRATED = 1.75
 """Independent observations for each that the scatter shows: searches on maps of other sites then state an error below
 e in less than a share e of them (``python -m bench.integrity.calibrate``, towns, campuses, terraces, plantations)."""
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
