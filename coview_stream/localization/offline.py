@@ -228,4 +228,4 @@ def summary(located: RunResult) -> str:
 
 def _found(located: RunResult, first: Fix) -> str:
     where = "" if located.driven is None else f"after {located.driven:.1f} m: "
-    return f"{where}wrong {one_in(1.0 - first.confidence)} by chance"
+    return f"{where}wrong {one_in(1.0 - first.confidence)}"

@@ -79,6 +79,8 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -
     if scored.none > 0.5:
         if scored.by_chance < 1.5:
             return State.SEARCHING, "no place stands out: the best fits no better than chance would have it"
+        if scored.by_chance > 0.5 * len(scored.rivals):
+            return State.SEARCHING, f"no place stands out: none of {len(scored.rivals)} fits better than chance"
         return State.SEARCHING, f"no place stands out: {scored.by_chance:.0f} places would fit as well by chance"
     best, second = scored.places[0], scored.second
     if second is not None and second.probability > scored.none:

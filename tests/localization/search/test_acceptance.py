@@ -47,7 +47,7 @@ def test_place_that_does_not_register_is_not_accepted():
 def test_nothing_stands_out_means_searching():
     result = judged(place(0.2), place(0.1, moved(20)), by_chance=31.4)
     assert result.evidence.state is State.SEARCHING
-    assert "31 places would fit as well by chance" in result.evidence.reason
+    assert "none of 2 fits better than chance" in result.evidence.reason
 
 
 @pytest.mark.parametrize("T", [moved(20), moved(0, 180)], ids=["elsewhere", "turned"])
