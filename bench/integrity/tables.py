@@ -6,20 +6,19 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from bench.harness.tables import NOTHING, number, table
 from bench.integrity.bounds import lower, upper
-from bench.integrity.plan import FAMILIES
+from bench.integrity.plan import FAMILIES, STATED
 from bench.integrity.store import Result
 
 OUTCOMES = ("right", "false", "none")
 """What counts as a run; what failed or had no way to drive does not."""
 
-RISKS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Stated risks that the reliability table is about."""
+FIX = 1e-4
+"""Stated error below which a first fix counts in the table of reliability; of larger ones see :data:`STATED`."""
 
 _LONG = 58  # characters of a reason that are shown
 
@@ -31,6 +30,7 @@ class Tally:
     Attributes:
         runs: how many count.
         sites: on how many maps.
+        sites_false: on how many maps some first fix was false.
         right: first fixes that are right.
         false: first fixes that are not.
         ambiguous: runs without a fix whose last state was AMBIGUOUS.
@@ -42,6 +42,7 @@ class Tally:
 
     runs: int
     sites: int
+    sites_false: int
     right: int
     false: int
     ambiguous: int
@@ -60,15 +61,22 @@ class Tally:
         reasons = Counter(plain(each.get("reason", "")) for each in without).most_common(1)
         metres = [each["metres"] for each in counted if each["outcome"] == "right"]
         median, most = (float(np.quantile(metres, q)) if metres else np.nan for q in (0.5, 0.9))
+        sites = {(each["kind"], each["seed"]): False for each in counted}
+        sites |= {(each["kind"], each["seed"]): True for each in counted if each["outcome"] == "false"}
         return cls(
-            len(counted), len({(each["kind"], each["seed"]) for each in counted}), outcome["right"], outcome["false"],
-            ambiguous, len(without) - ambiguous, f"{reasons[0][0]} ({reasons[0][1]})" if reasons else "", median, most,
+            len(counted), len(sites), sum(sites.values()), outcome["right"], outcome["false"], ambiguous,
+            len(without) - ambiguous, f"{reasons[0][0]} ({reasons[0][1]})" if reasons else "", median, most,
         )  # fmt: skip
 
     @property
     def bound(self) -> float:
         """Share of false first fixes that the true one is below, at 95 %."""
         return upper(self.false, self.runs)
+
+    @property
+    def site_bound(self) -> float:
+        """Share of sites with a false first fix that the true one is below, at 95 %: runs of one map count once."""
+        return upper(self.sites_false, self.sites)
 
     @property
     def found(self) -> float:
@@ -98,13 +106,17 @@ def classes(results: Sequence[Result]) -> dict[str, Tally]:
 
 def class_table(results: Sequence[Result]) -> str:
     """Lay out the counts of each class, with exact bounds."""
-    head = ("runs", "number", "sites", "right", "false", "none", "false, below (95 %)", "found", "median m", "90 % m")
+    head = (
+        "runs", "number", "sites", "right", "false", "none", "false, below (95 %)", "sites with false",
+        "sites, below (95 %)", "found", "median m", "90 % m",
+    )  # fmt: skip
     return table(
         head,
         [
             [
                 name, str(t.runs), str(t.sites), str(t.right), str(t.false), str(t.ambiguous + t.searching),
-                percent(t.bound), percent(t.found, 1), number(t.median_m, 1), number(t.most_m, 1),
+                percent(t.bound), str(t.sites_false), percent(t.site_bound), percent(t.found, 1),
+                number(t.median_m, 1), number(t.most_m, 1),
             ]
             for name, t in classes(results).items()
         ],
@@ -145,15 +157,25 @@ def false_list(results: Sequence[Result]) -> str:
 
 
 def reliability_table(results: Sequence[Result]) -> str:
-    """Lay out first fixes by the risk they state: up to each, and between two, how many were false."""
-    fixes = [(each["risk"], each["outcome"] == "false") for each in results if each.get("risk") is not None]
+    """Lay out how often what a search states is wrong: once a run, when it first states an error below each limit.
+
+    Above :data:`FIX` it is the most probable place of the keyframe, accepted or not; below, the first fix.
+    """
     lines = []
-    steps = [(f"<= {risk:g}", 0.0, risk) for risk in RISKS]
-    steps += [(f"{low:g} to {high:g}", low, high) for high, low in pairwise(RISKS)]
-    for name, low, high in steps:
-        chosen = [(risk, false) for risk, false in fixes if (low < risk or low == 0.0) and risk <= high]
-        n, k = len(chosen), sum(false for _, false in chosen)
-        stated = float(np.mean([risk for risk, _ in chosen])) if n else np.nan
-        between = f"{percent(lower(k, n))} to {percent(upper(k, n))}" if n else NOTHING
-        lines.append([name, str(n), NOTHING if np.isnan(stated) else f"{stated:.1e}", str(k), between])
-    return table(("stated risk", "first fixes", "mean of it", "false", "observed (95 % below, 95 % above)"), lines)
+    for name, stated in _stated(results).items():
+        count, wrong = len(stated), sum(not right for _, right in stated)
+        mean = f"{np.mean([error for error, _ in stated]):.1e}" if count else NOTHING
+        between = f"{percent(lower(wrong, count))} to {percent(upper(wrong, count))}" if count else NOTHING
+        lines.append([f"< {name}", str(count), mean, str(wrong), between])
+    return table(("stated error", "first times", "mean stated", "wrong", "wrong, between (95 % each)"), lines)
+
+
+def _stated(results: Sequence[Result]) -> dict[str, list[tuple[float, bool]]]:
+    """Return stated errors, and whether the place was right, by limit."""
+    counted = [each for each in results if each["outcome"] in OUTCOMES]
+    found = {f"{limit:g}": list[tuple[float, bool]]() for limit in STATED}
+    for name, stated in found.items():
+        noted = [each["stated"][name] for each in counted if name in each.get("stated", {})]
+        stated += [(each["error"], each["right"]) for each in noted]
+    fixes = [(each["risk"], each["outcome"] == "right") for each in counted if each.get("risk", 1.0) < FIX]
+    return found | {f"{FIX:g}": fixes}

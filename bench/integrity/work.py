@@ -9,12 +9,16 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.harness.files import fingerprint, remembered
 from bench.harness.suite import thread_settings
 from bench.integrity.plan import Run, Site
 from bench.integrity.store import Result, append
 from coview_stream import BaseMap
+
+if TYPE_CHECKING:
+    from bench.integrity.run import Robot
 
 SITE_CODE = ("coview_stream/sim", "coview_stream/basemap", "coview_stream/clouds", "coview_stream/descriptors")
 """What makes a map, besides this benchmark."""
@@ -55,12 +59,12 @@ def everywhere(sites: Sequence[Site], task: Task, jobs: int) -> Iterator[Result]
 
 def on_site(site: Site, task: Task) -> list[Result]:
     """Make all runs on one map; what cannot be made is noted as ``failed``, and tried again another time."""
-    from bench.integrity.run import localizer_on
+    from bench.integrity.run import Robot
 
     begin, out = time.process_time(), list[Result]()
-    localizer, reason = None, ""
+    robot, reason = None, ""
     try:
-        localizer = localizer_on(map_of(site[0], task.maps), task.risk)
+        robot = Robot.on(map_of(site[0], task.maps), task.risk)
     except Exception as error:  # whatever it is, the other sites go on
         reason = f"{type(error).__name__}: {error}"
     share = round((time.process_time() - begin) / len(site), 2)
@@ -68,8 +72,8 @@ def on_site(site: Site, task: Task) -> list[Result]:
         begin = time.process_time()
         result: Result = {"outcome": "failed", "reason": reason}
         try:
-            if localizer is not None:
-                result = _one(run, localizer)
+            if robot is not None:
+                result = _one(run, robot)
         except Exception as error:  # likewise
             result["reason"] = f"{type(error).__name__}: {error}"
         result = {"key": task.key(run), "code": task.code, "class": run.of_class, **asdict(run), **result}
@@ -79,13 +83,11 @@ def on_site(site: Site, task: Task) -> list[Result]:
     return out
 
 
-def _one(run: Run, localizer: object) -> Result:
+def _one(run: Run, robot: Robot) -> Result:
     from bench.integrity.run import drive_of, first_fix
-    from coview_stream import Localizer
 
-    assert isinstance(localizer, Localizer)
     drive = drive_of(run)
-    return {"outcome": "no way", "reason": "no such street"} if drive is None else first_fix(localizer, drive)
+    return {"outcome": "no way", "reason": "no such street"} if drive is None else first_fix(robot, drive)
 
 
 def map_of(run: Run, kept: Path | None = None) -> BaseMap:

@@ -83,7 +83,7 @@ def test_shares_that_are_none_are_refused(asked, text, capsys):
     assert text in capsys.readouterr().err
 
 
-def test_runs_with_another_risk_have_results_of_their_own_that_tell_of_reliability(asked, made):
+def test_runs_with_another_risk_have_results_of_their_own(asked, made):
     list(integrity.rows(asked()))
     list(integrity.rows(asked("--risk", "0.1")))
     assert len(set(made)) == 120

@@ -1,3 +1,4 @@
+import json
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +12,9 @@ from bench.integrity.plan import FAMILIES, Run, plan
 from bench.integrity.ways import FAR, NEAR, beside_border, lane
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.result import Fix
+from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.state import State
 
 
@@ -155,25 +158,55 @@ def test_lanes_lead_along_the_boxes_or_across():
     assert abs(headings[0] @ headings[1]) < 0.05
 
 
+ORIGIN = np.array([100.0, -50.0, 3.0])
+
+
 @dataclass
 class Told:
-    """A localizer that says the same of every frame until it finds its place."""
+    """A localizer that asks for a search at every frame, and has the fix ``found`` from one of them on."""
 
     at: int
-    pose: object
+    found: object
     seen: list = field(default_factory=list)
+    applied: list = field(default_factory=list)
     state: State = State.SEARCHING
 
     def reset(self):
         self.seen.clear()
 
-    def step(self, cloud, T_odom_body, stamp):
+    def add_frame(self, cloud, T_odom_body, stamp):
         self.seen.append(len(cloud))
-        return (
-            Fix(stamp, State.TRACKING, self.pose, confidence=0.9999)
-            if len(self.seen) > self.at
-            else Fix(stamp, State.AMBIGUOUS)
-        )
+        nothing = np.empty((0, 3), dtype=np.float32)
+        return SearchRequest(stamp, T_odom_body, nothing, nothing, nothing)
+
+    def apply_search_result(self, result):
+        self.applied.append(result)
+
+    def fix(self):
+        if len(self.seen) > self.at:
+            return Fix(0.0, State.TRACKING, self.found, confidence=0.99995)
+        return Fix(0.0, State.AMBIGUOUS)
+
+
+@dataclass
+class Stating:
+    """A search that states errors, one a keyframe, of places that lie so many metres off the odometry's poses."""
+
+    errors: list
+    metres: list
+    asked: int = 0
+
+    def update(self, request):
+        k, self.asked = self.asked, self.asked + 1
+        error = self.errors[k] if k < len(self.errors) else None
+        known = None if error is None else 1.0 - error
+        said = KeyframeEvidence(request.stamp, State.AMBIGUOUS, "said", confidence=known)
+        leader = None if error is None else pose_from(np.eye(3), [self.metres[k], 0.0, 0.0] - ORIGIN)
+        return SearchResult(None, said, leader=leader)
+
+
+def robot(at, found, errors=(), metres=()):
+    return runs.Robot(Told(at, found), Stating(list(errors), list(metres)), ORIGIN)
 
 
 def drive(truth):
@@ -190,15 +223,40 @@ def drive(truth):
 
 def test_a_run_ends_at_its_first_fix_and_casts_no_further_frame():
     way, cast = drive(truth=True)
-    out = runs.first_fix(Told(5, way.truth[5]), way)
+    out = runs.first_fix(robot(5, way.truth[5]), way)
     assert cast == list(range(6))
     assert (out["outcome"], out["frames"], out["metres"]) == ("right", 6, 2.0)
-    assert out["risk"] == pytest.approx(1e-4)
-    assert runs.first_fix(Told(5, way.truth[15]), way)["outcome"] == "false"
-    assert runs.first_fix(Told(5, way.truth[5]), drive(truth=False)[0])["outcome"] == "false"
+    assert out["risk"] == pytest.approx(5e-5)
+    assert runs.first_fix(robot(5, way.truth[15]), way)["outcome"] == "false"
+    assert runs.first_fix(robot(5, way.truth[5]), drive(truth=False)[0])["outcome"] == "false"
 
 
 def test_a_run_without_a_fix_keeps_what_was_said_last():
-    out = runs.first_fix(Told(99, None), drive(truth=True)[0])
+    out = runs.first_fix(robot(99, None), drive(truth=True)[0])
     assert (out["outcome"], out["state"], out["frames"]) == ("none", "AMBIGUOUS", 20)
     assert "risk" not in out
+    assert out["stated"] == {}
+
+
+def test_first_errors_below_each_limit_are_noted_with_the_place_they_are_of():
+    errors, metres = [0.5, 0.05, 0.02, 5e-4, 1e-9], [0.0, 4.0, 0.0, 1.0, 50.0]
+    out = runs.first_fix(robot(99, None, errors, metres), drive(truth=True)[0])
+    tenth, hundredth, thousandth = (out["stated"][name] for name in ("0.1", "0.01", "0.001"))
+    assert tenth == {"error": pytest.approx(0.05), "metres": 0.4, "right": False}  # 4 m off
+    assert hundredth == {"error": pytest.approx(5e-4), "metres": 1.2, "right": True}
+    assert thousandth == hundredth
+    nowhere = runs.first_fix(robot(99, None, errors, metres), drive(truth=False)[0])
+    assert [each["right"] for each in nowhere["stated"].values()] == 3 * [False]
+    json.dumps(out, allow_nan=False)
+
+
+def test_watching_the_search_changes_no_fix(world_map, world_drive, world_fixes):
+    watched, leaders = runs.Robot.on(world_map, None), []
+    for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=True)):
+        fix, leader = watched.step(cloud, T, 0.5 * k)
+        assert (fix.state, fix.confidence) == (world_fixes[k].state, world_fixes[k].confidence)
+        np.testing.assert_array_equal(fix.T_map_body, world_fixes[k].T_map_body)
+        leaders.append(leader)
+    assert leaders[0].error == 1.0 - world_fixes[0].confidence
+    assert runs.judged(leaders[0].T_map_body, world_drive.T_map_body[0])["error_m"] < 0.2
+    assert not any(leaders[1:])  # it was found, nothing is searched for

@@ -7,7 +7,7 @@ import pytest
 from bench.integrity.bounds import lower, upper
 from bench.integrity.run import judged
 from bench.integrity.store import ANY, append, read
-from bench.integrity.tables import Tally, classes, false_list, family_table, plain, reliability_table
+from bench.integrity.tables import Tally, class_table, classes, false_list, family_table, plain, reliability_table
 from coview_stream.geometry.transforms import pose_from, rot_z
 
 
@@ -105,11 +105,26 @@ def test_false_first_fixes_are_listed_one_by_one():
     ]
 
 
-def test_reliability_counts_fixes_up_to_a_risk_and_between_two():
-    fixes = [result(str(k), "right", risk=5e-3) for k in range(9)] + [result("x", "false", risk=0.05)]
-    lines = {line.split("|")[1].strip(): line.split("|")[2:5] for line in reliability_table(fixes).splitlines()[2:]}
-    counts = {name: (int(cells[0]), int(cells[2])) for name, cells in lines.items()}
-    assert counts["<= 0.1"] == (10, 1)
-    assert counts["<= 0.01"] == (9, 0)
-    assert counts["0.01 to 0.1"] == (1, 1)
-    assert counts["<= 0.001"] == (0, 0)
+def test_a_site_with_two_false_runs_counts_once():
+    runs = [result(str(k), "false" if k < 2 else "right", seed=k // 2) for k in range(40)]
+    tally = Tally.of(runs)
+    assert (tally.false, tally.sites_false, tally.sites) == (2, 1, 20)
+    assert tally.site_bound == upper(1, 20) > tally.bound == upper(2, 40)
+    cells = [cell.strip() for cell in class_table(runs).splitlines()[2].split("|")]
+    assert cells[1:4] == ["all", "40", "20"]
+    assert cells[8:10] == ["1", "21.61 %"]
+
+
+def test_reliability_counts_each_run_once_where_it_first_states_an_error():
+    def stated(error, right):
+        return {"error": error, "metres": 2.0, "right": right}
+
+    runs = [result(str(k), "right", risk=1e-5, stated={"0.1": stated(0.04, True)}) for k in range(9)]
+    runs.append(result("x", "none", stated={"0.1": stated(0.08, False), "0.01": stated(5e-3, True)}))
+    runs.append(result("y", "false", risk=5e-3))  # with --risk 0.01: not below 1e-4
+    runs.append(result("z", "failed", stated={"0.1": stated(0.01, False)}))
+    lines = {line.split("|")[1].strip(): line.split("|")[2:5] for line in reliability_table(runs).splitlines()[2:]}
+    counts = {name: (int(cells[0]), cells[1].strip(), int(cells[2])) for name, cells in lines.items()}
+    assert counts == {
+        "< 0.1": (10, "4.4e-02", 1), "< 0.01": (1, "5.0e-03", 0), "< 0.001": (0, "-", 0), "< 0.0001": (9, "1.0e-05", 0)
+    }  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.pose_hints import FROM_THERE
@@ -27,6 +28,8 @@ class SearchResult:
         travelled: metres that odometry had driven at the keyframe.
         epoch: the request's.
         rivals: all places that the keyframe was scored at, the most probable among them.
+        leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
+            without any place.
     """
 
     accepted: Candidate | None
@@ -34,6 +37,7 @@ class SearchResult:
     travelled: float = 0.0
     epoch: Epoch = FIRST_EPOCH
     rivals: Rivals = field(default_factory=Rivals.none)
+    leader: Pose | None = None
 
 
 def decide(scored: Scored, leader: Candidate | None, request: SearchRequest, rule: AcceptanceConfig) -> SearchResult:
@@ -61,7 +65,8 @@ def decide(scored: Scored, leader: Candidate | None, request: SearchRequest, rul
         own.station, None if own.learned else own.shift, confidence=1.0 - scored.error, by_chance=scored.by_chance,
     )  # fmt: skip
     accepted = leader if state is State.TRACKING else None
-    return SearchResult(accepted, evidence, request.travelled, request.epoch, scored.rivals)
+    T_map_odom = own.T_map_odom if leader is None else leader.T_map_odom
+    return SearchResult(accepted, evidence, request.travelled, request.epoch, scored.rivals, T_map_odom)
 
 
 def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -> tuple[State, str]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
-from made_up_places import REQUEST, RULE, judged, moved, place
+from made_up_places import REQUEST, RULE, candidate, judged, moved, place
 
 from coview_stream.localization.search.acceptance import BY_FEATURES
 from coview_stream.localization.search.pose_hints import FROM_THERE
@@ -92,6 +93,16 @@ def test_evidence_says_what_the_decision_rests_on():
     # without one it is the field's
     assert judged(best, rival, leader=False).evidence.score == 0.6
     assert judged(best, rival, leader=False).evidence.evidence is None
+
+
+def test_most_probable_place_is_told_whether_or_not_it_is_accepted():
+    for error, accepted in ((1e-9, True), (0.1, False)):
+        result = judged(place(1.0 - error), place(0.0, moved(20)), error=error)
+        assert (result.accepted is not None) == accepted
+        assert result.leader is candidate(place(1.0)).T_map_odom
+    unregistered = judged(place(0.9, moved(1.5)), leader=False)
+    np.testing.assert_array_equal(unregistered.leader, moved(1.5))
+    assert judged().leader is None
 
 
 def test_reason_says_who_named_the_place():
