@@ -77,7 +77,10 @@ class RunResult:
         return next(iter(self.posed), None)
 
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
-        """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres."""
+        """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres.
+
+        ``confidence`` is the first fix's: that of the search that accepted the place.
+        """
         last = self.posed[-1] if self.posed else None
         latency = np.quantile(self.seconds, [0.5, 0.95, 0.99]).round(6).tolist() if self.seconds else [None] * 3
         return {
@@ -85,6 +88,7 @@ class RunResult:
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
+            "confidence": None if self.first is None else self.first.confidence,
             "first_fix_m": None if self.driven is None else round(self.driven, 3),
             "frames": self.frames,
             "posed": len(self.posed),

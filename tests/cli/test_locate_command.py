@@ -40,9 +40,10 @@ def test_run_on_the_map_is_localized(world_file, world_run, world_drive, tmp_pat
     before = np.array(world_drive.T_odom_body)[: index[0] + 1, :3, 3]
     driven = np.linalg.norm(np.diff(before, axis=0), axis=1).sum()
     assert result["first_fix_m"] == pytest.approx(driven, abs=1e-3)
+    assert result["confidence"] > 1.0 - 1e-4
     searched = [k for k in result["keyframes"] if k["stamp"] <= stamps[0]]
     assert all(0.0 <= k["confidence"] <= 1.0 and k["by_chance"] >= 0.0 for k in searched)
-    assert searched[-1]["confidence"] > 1.0 - 1e-4
+    assert searched[-1]["confidence"] == pytest.approx(result["confidence"], abs=1e-15)
     assert len(result["map_sha256"]) == 64
     assert (out / "trajectory.png").exists()
 
@@ -59,6 +60,7 @@ def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path,
     assert result["T_map_odom"] is None
     assert result["first_fix_stamp"] is None
     assert result["first_fix_m"] is None
+    assert result["confidence"] is None
     assert all(k["state"] in ("SEARCHING", "AMBIGUOUS") for k in result["keyframes"])
     assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
 
