@@ -128,8 +128,8 @@ def misleading(told: Told, error: Errors, driven: Floats) -> int:
 
 def level_table(samples: Mapping[str, Sample]) -> str:
     """Lay out, by name of the group: poses, how many are above their level, the bound, and how wide the levels are."""
-    head = ["poses", "one per 10 m", "> level, m", "below, %", "> level, deg", "below, %", "worst m", "worst deg"]
-    head += ["level m p50", "p99", "level deg p50", "p99"]
+    head = ["poses", "one per 10 m", "> level, m", "below, %", "> level, deg", "below, %", "worst / level, m"]
+    head += ["worst / level, deg", "level m p50", "p99", "level deg p50", "p99"]
     rows = []
     for name, sample in samples.items():
         count, cells = len(sample.error), [name]
