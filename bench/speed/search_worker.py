@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any, NamedTuple
 
-_NEVER = ({"risk": sys.float_info.min}, {"evidence_sum": 1e9})  # what no place meets, now and in earlier commits
+_NEVER = {"risk": sys.float_info.min, "evidence_sum": 1e9}  # what no place meets, now and in earlier commits
 _CROPS = 24  # of the map that are kept, as the search engine has it
 _STARTS = 7  # a run's starts lie this share of it apart, then between those
 
@@ -40,8 +40,10 @@ def prepared(site_file: str, run_folder: str) -> Search:
     from coview_stream.localization.search.recognizers import SearchIndex
     from coview_stream.recordings.open_run import open_run
 
-    known = {field.name for field in fields(AcceptanceConfig)}
-    config = LocalizerConfig(acceptance=AcceptanceConfig(**next(each for each in _NEVER if known.issuperset(each))))
+    rule = AcceptanceConfig()
+    for name in _NEVER.keys() & {field.name for field in fields(rule)}:
+        object.__setattr__(rule, name, _NEVER[name])  # no user may ask for it
+    config = LocalizerConfig(acceptance=rule)
     site, run = BaseMap.load(site_file), open_run(run_folder)
     maps = LocalMaps(site, config.registration.source_range, _CROPS)
     index = SearchIndex.of(site, config)

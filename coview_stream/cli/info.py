@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.options import acceptance_config, add_risk
+from coview_stream.cli.options import acceptance_config, add_risk, check_picture
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -28,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, metavar="A.png", help="draw the ambiguity")
     add_risk(parser)
+    parser.set_defaults(risk=None)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -38,11 +39,16 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.config import AcceptanceConfig
     from coview_stream.errors import ConfigError
 
     if args.output and not args.ambiguity:
         raise ConfigError("-o draws the ambiguity: give --ambiguity as well, or --plot for the map and its stations")
-    acceptance = acceptance_config(args.risk)
+    if args.risk is not None and not args.ambiguity:
+        raise ConfigError("--risk is that of the ambiguity: give --ambiguity as well")
+    acceptance = AcceptanceConfig() if args.risk is None else acceptance_config(args.risk)
+    check_picture("-o", args.output)
+    check_picture("--plot", args.plot)
     base_map = BaseMap.load(args.map)
     facts = describe(base_map)
     if args.ambiguity:

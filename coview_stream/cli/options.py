@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,26 +72,45 @@ def add_risk(parser: argparse.ArgumentParser) -> None:
     """Declare ``--risk``."""
     parser.add_argument(
         "--risk",
-        type=float,
         default=1e-4,
         metavar="P",
-        help="probability of a wrong place below which a search gives one; the smaller, the farther a robot may drive "
-        "before it is found (1e-4)",
+        help="probability of a wrong place below which a search gives one, from 1e-9 to below 0.5; the smaller, the "
+        "farther a robot may drive before it is found (1e-4)",
     )
 
 
-def acceptance_config(risk: float) -> AcceptanceConfig:
-    """Return what makes a fix, by ``--risk``.
+def acceptance_config(risk: str | float) -> AcceptanceConfig:
+    """Return what makes a fix, by ``--risk`` as it was given.
 
     Raises:
-        ConfigError: it is no probability below a half.
+        ConfigError: it is no number from 1e-9 to below a half.
     """
-    from coview_stream.config import AcceptanceConfig
+    from coview_stream.config.acceptance import LEAST_RISK, AcceptanceConfig
     from coview_stream.errors import ConfigError
 
-    if not 0 < risk < 0.5:
-        raise ConfigError(f"--risk {risk:g}: give the probability of a wrong place, in (0, 0.5), such as 1e-4")
-    return AcceptanceConfig(risk=risk)
+    try:
+        value = float(risk)
+    except ValueError:
+        value = math.nan
+    if not LEAST_RISK <= value < 0.5:
+        raise ConfigError(f"--risk {risk}: give the probability of a wrong place, in [1e-9, 0.5), such as 1e-4")
+    return AcceptanceConfig(risk=value)
+
+
+def check_picture(option: str, path: Path | None) -> None:
+    """Refuse a picture that is a directory or in one that is not there; None is always right.
+
+    Raises:
+        ConfigError: it is.
+    """
+    from coview_stream.errors import ConfigError
+
+    if path is None:
+        return
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: is a directory; name the picture, such as {path / 'picture.png'}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: {path.parent} is no directory; make it first")
 
 
 def add_gravity(parser: argparse._ActionsContainer) -> None:

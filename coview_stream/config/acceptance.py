@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from coview_stream.config.checks import counts, fraction, positive, require
 
+LEAST_RISK = 1e-9
+"""Smaller risks are refused: errors below are not told apart, for the model of the evidence is not as good as that."""
+
 
 @dataclass(frozen=True)
 class AcceptanceConfig:
@@ -49,7 +52,7 @@ class AcceptanceConfig:
     max_blind_s: float = 60.0
 
     def __post_init__(self) -> None:
-        require(0 < self.risk < 0.5, self, "risk", "in (0, 0.5)")
+        require(LEAST_RISK <= self.risk < 0.5, self, "risk", "in [1e-9, 0.5)")
         fraction(self, "min_overlap")
         fraction(self, "tracking_min_score", "tracking_min_share", "tracking_min_ground")
         counts(self, "confirmations", "max_rejections")

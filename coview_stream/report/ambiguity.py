@@ -93,13 +93,13 @@ def plot_ambiguity(found: Ambiguity, base_map: BaseMap, path: str | os.PathLike[
                 axes.scatter(at[here, 0], at[here, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
         if not len(found):
             draw_notice(axes, "no stations")
-        axes.set_title(title)
-        legend_below(drawing, axes)
+        axes.set_title(f"{title}: where the map tells places apart, and after how many metres")
+        legend_below(drawing, axes, "a robot that sets out here is found (share of all places looked at)")
 
 
 def _name(before: float, limit: float) -> str:
     if limit == 0.0:
-        return "told apart at once"
+        return "at once"
     return f"after {before:.0f} to {limit:.0f} m" if math.isfinite(limit) else f"not within {before:.0f} m"
 
 

@@ -150,11 +150,12 @@ def draw_notice(axes: Any, text: str) -> None:
     )
 
 
-def legend_below(drawing: Any, axes: Any) -> None:
+def legend_below(drawing: Any, axes: Any, title: str | None = None) -> None:
     """Put the legend under the picture, where it hides nothing, with marks of one readable size."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        legend = drawing.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=10)
+        place = {"loc": "outside lower center", "ncols": 2, "title": title}
+        legend = drawing.legend(handles, labels, fontsize=10, title_fontsize=10, **place)
         _even_marks(legend)
 
 

@@ -10,6 +10,7 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 from coview_stream.localization.search import ambiguity as module
+from coview_stream.report import ambiguity as report
 from coview_stream.report.ambiguity import facts, plot_ambiguity, summary
 
 
@@ -57,10 +58,39 @@ def test_plain_info_does_not_look(world_file, capsys):
     assert "ambiguity" not in json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("more", [["-o", "a.png"], ["--ambiguity", "--risk", "2"]])
-def test_options_that_do_not_go_together_are_one_line(world_file, capsys, more):
-    assert main(["info", str(world_file), *more]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["-o", "a.png"], "give --ambiguity as well"),
+        (["--risk", "1e-4"], "give --ambiguity as well"),
+        (["--ambiguity", "--risk", "2"], "[1e-9, 0.5)"),
+        (["--ambiguity", "-o", "{}"], "is a directory; name the picture"),
+        (["--ambiguity", "-o", "{}/none/a.png"], "make it first"),
+        (["--plot", "{}"], "is a directory; name the picture"),
+    ],
+)
+def test_options_that_do_not_go_together_are_one_line_before_anything_is_looked_at(tmp_path, capsys, more, said):
+    none = str(tmp_path / "not-even-looked-for.coview")
+    assert main(["info", none, *(each.format(tmp_path) for each in more)]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_picture_says_what_its_colours_mean(world_map, tmp_path, monkeypatch):
+    drawn = {}
+
+    def kept(drawing, axes, title):
+        drawn["labels"], drawn["legend"], drawn["title"] = (
+            axes.get_legend_handles_labels()[1], title, axes.get_title("left")
+        )  # fmt: skip
+
+    monkeypatch.setattr(report, "legend_below", kept)
+    plot_ambiguity(made_up(world_map, [0.0, 0.0, 8.0, np.inf]), world_map, tmp_path / "a.png", "site.coview")
+    assert drawn["labels"] == ["at once: 50 %", "after 5 to 10 m: 25 %", "not within 40 m: 25 %"]
+    assert "found" in drawn["legend"]
+    assert drawn["title"].startswith("site.coview: ")
 
 
 def test_summary_says_how_many_and_where(world_map):

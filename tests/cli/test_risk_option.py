@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
+from any_risk import NEVER
 
 from coview_stream.cli import build_parser, main, serve
+from coview_stream.cli.options import acceptance_config
 from coview_stream.config import AcceptanceConfig
+from coview_stream.config.acceptance import LEAST_RISK
 from coview_stream.errors import CoViewError
+from coview_stream.localization import offline
+from coview_stream.localization.evidence.words import LEAST
 from coview_stream.stream.node.engine_process import EngineProcess
 
 SERVE = ["serve", "site.coview", "--robot", "r1"]
@@ -20,15 +26,20 @@ def test_default_risk_is_that_of_the_configuration(command):
     assert build_parser().parse_args(command).risk == AcceptanceConfig().risk
 
 
-@pytest.mark.parametrize("given", ["0", "0.5", "-1e-4", "1", "nan", "inf", "1e-400"])
+@pytest.mark.parametrize("given", ["0", "0.5", "-1e-4", "1", "nan", "inf", "1e-400", "0.99e-9", "small", ""])
 def test_risk_that_is_no_small_probability_is_refused_before_anything_is_read(tmp_path, capsys, given):
     none = str(tmp_path / "not-even-looked-for.coview")
-    for command in (["serve", none, "--robot", "r1", "--no-state"], ["locate", none, "run", "-o", str(tmp_path / "o")]):
+    locate = ["locate", none, "run", "-o", str(tmp_path / "o")]
+    for command in (["serve", none, "--robot", "r1", "--no-state"], locate, ["info", none, "--ambiguity"]):
         assert main([*command, f"--risk={given}"]) == 2
         said = capsys.readouterr().err
-        assert "--risk" in said
-        assert "(0, 0.5), such as 1e-4" in said
+        assert f"--risk {given}: give the probability" in said
+        assert "[1e-9, 0.5), such as 1e-4" in said
         assert said.count("\n") == 1
+
+
+def test_smallest_risk_is_what_is_told_apart_in_words():
+    assert LEAST_RISK == LEAST == acceptance_config("1e-9").risk
 
 
 @pytest.mark.parametrize(("given", "wanted"), [([], 1e-4), (["--risk", "1e-6"], 1e-6)])
@@ -39,11 +50,19 @@ def test_serve_passes_risk_option_to_engines(world_file, monkeypatch, given, wan
     assert [options.risk for options in asked] == [wanted]
 
 
-def test_a_risk_too_small_for_the_run_gives_no_pose(world_file, world_run, tmp_path, capsys):
+def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path, monkeypatch):
+    """Whose result is none where nothing is that certain."""
+    usual, asked = offline.locate, []
+
+    def never_sure(base_map, run, config, progress):
+        asked.append(config.acceptance.risk)
+        return usual(base_map, run, replace(config, acceptance=NEVER), progress)
+
+    monkeypatch.setattr(offline, "locate", never_sure)
     out = tmp_path / "out"
     command = ["locate", str(world_file), str(world_run), "-o", str(out), "--no-pictures"]
-    assert main([*command, "--risk", "1e-300"]) == 1
-    assert "localised          0 of" in capsys.readouterr().out
+    assert main([*command, "--risk", "1e-9"]) == 1
+    assert asked == [1e-9]
     result = json.loads((out / "result.json").read_text())
     assert {each["state"] for each in result["keyframes"]} == {"AMBIGUOUS"}
 

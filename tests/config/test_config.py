@@ -68,6 +68,7 @@ BAD = [
     (RegistrationConfig, "iterations", 0),
     (RegistrationConfig, "gravity_sigma", 0.0),
     (AcceptanceConfig, "risk", 0.0),
+    (AcceptanceConfig, "risk", 0.9e-9),
     (AcceptanceConfig, "risk", 0.5),
     (AcceptanceConfig, "risk", float("nan")),
     (AcceptanceConfig, "min_overlap", 1.01),

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from any_risk import NEVER
 from trackers import garbage
 
-from coview_stream.config import AcceptanceConfig
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.state import TRANSITIONS, Event, State, next_state, transition_table
 
@@ -106,7 +105,7 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
         states.append(fix.state)
 
     usual = localizer._search.config
-    localizer._search.config = replace(usual, acceptance=AcceptanceConfig(risk=sys.float_info.min))  # never met
+    localizer._search.config = replace(usual, acceptance=NEVER)
     for k in range(2):
         step(k)
     localizer._search.config = usual

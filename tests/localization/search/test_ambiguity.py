@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_world
+from any_risk import NEVER
 from small_world import Box
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.files import write_cloud
-from coview_stream.config import AcceptanceConfig, LocalizerConfig
+from coview_stream.config import LocalizerConfig
 from coview_stream.localization.search.ambiguity import FARTHEST, ambiguity, sample
 from coview_stream.localization.search.virtual_scan import EYE, virtual_scan
 
@@ -42,7 +43,7 @@ def test_distinct_buildings_are_told_apart_and_equal_rows_are_not(world_map, row
 def test_changes_and_a_smaller_risk_make_places_harder_to_tell_apart(world_map):
     as_it_was, changed = (ambiguity(world_map, count=PLACES, changed=share) for share in (0.0, 0.6))
     assert np.median(as_it_was.evidence) > np.median(changed.evidence)
-    strict = LocalizerConfig(acceptance=AcceptanceConfig(risk=1e-200))
+    strict = LocalizerConfig(acceptance=NEVER)
     none = ambiguity(world_map, strict, count=4, changed=0.6)
     assert not np.isfinite(none.drive).any()
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from any_risk import NEVER
 from se3 import exp_se3
 
 from coview_stream.basemap.basemap import BaseMap
@@ -34,7 +34,6 @@ from coview_stream.localization.state import State
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])  # of the runs through the small world
 TILT = np.radians(4.0)
 SHARES = ("near", "covered", "ground", "free_space")
-NEVER = AcceptanceConfig(risk=sys.float_info.min)  # no place is that certain
 TWIN = 192.0  # metres, whole tiles of the likelihood field, farther than a scan reaches
 
 
@@ -49,8 +48,8 @@ def search(world_map):
 
 
 @pytest.fixture
-def insatiable(world_map):
-    """A search that goes on, whatever it sees."""
+def never_sure(world_map):
+    """A search that accepts no place."""
     return searching(world_map, NEVER)
 
 
@@ -104,9 +103,9 @@ def test_risk_alone_decides_what_is_accepted(world_map, world_drive):
     assert searching(world_map, AcceptanceConfig(risk=0.1)).update(request).accepted is not None
 
 
-def test_evidence_of_the_right_place_adds_up_over_keyframes(insatiable, world_drive):
+def test_evidence_of_the_right_place_adds_up_over_keyframes(never_sure, world_drive):
     """Against chance; the effective number of observations may vary a little from scan to scan."""
-    results = [insatiable.update(request) for request in run_of(world_drive, 5)]
+    results = [never_sure.update(request) for request in run_of(world_drive, 5)]
     assert all(result.evidence.state is State.AMBIGUOUS for result in results)
     assert results[-1].evidence.by_chance < results[0].evidence.by_chance
 
@@ -174,25 +173,25 @@ def test_single_minimum_mode_finds_an_easy_place(world_map, world_drive):
 # ---- what is kept
 
 
-def test_good_place_is_observed_again_without_votes(insatiable, world_drive, monkeypatch):
+def test_good_place_is_observed_again_without_votes(never_sure, world_drive, monkeypatch):
     frames = run_of(world_drive, 3)
-    first = insatiable.update(next(frames))
+    first = never_sure.update(next(frames))
     assert first.evidence.score > 0.8
-    monkeypatch.setattr(insatiable.coview.consensus, "hypotheses", list)
-    again = insatiable.update(next(frames))
+    monkeypatch.setattr(never_sure.coview.consensus, "hypotheses", list)
+    again = never_sure.update(next(frames))
     assert again.evidence.score > 0.8
     assert again.evidence.station == first.evidence.station
-    insatiable.clear()
-    nothing = insatiable.update(next(frames))
+    never_sure.clear()
+    nothing = never_sure.update(next(frames))
     assert (nothing.evidence.score, nothing.evidence.state, len(nothing.rivals)) == (0.0, State.SEARCHING, 0)
 
 
-def test_request_of_another_epoch_starts_anew(insatiable, world_drive, monkeypatch):
-    insatiable.update(next(run_of(world_drive, 1)))
-    monkeypatch.setattr(insatiable.coview.consensus, "hypotheses", list)
-    anew = insatiable.update(next(run_of(world_drive, 1, epoch=Epoch(1, 0))))
+def test_request_of_another_epoch_starts_anew(never_sure, world_drive, monkeypatch):
+    never_sure.update(next(run_of(world_drive, 1)))
+    monkeypatch.setattr(never_sure.coview.consensus, "hypotheses", list)
+    anew = never_sure.update(next(run_of(world_drive, 1, epoch=Epoch(1, 0))))
     assert len(anew.rivals) == 0
-    assert len(insatiable.coview) == 1
+    assert len(never_sure.coview) == 1
 
 
 def test_accepted_place_ends_the_search(search, world_drive, monkeypatch):

@@ -1,0 +1,18 @@
+"""Acceptance rules with risks that no user may ask for: so that no place, however certain, is accepted."""
+
+from __future__ import annotations
+
+import sys
+
+from coview_stream.config import AcceptanceConfig
+
+
+def with_risk(risk: float) -> AcceptanceConfig:
+    """The usual rule with any risk."""
+    rule = AcceptanceConfig()
+    object.__setattr__(rule, "risk", risk)
+    return rule
+
+
+NEVER = with_risk(sys.float_info.min)
+"""Nothing is that certain."""
