@@ -93,7 +93,7 @@ def plot_ambiguity(found: Ambiguity, base_map: BaseMap, path: str | os.PathLike[
                 axes.scatter(at[here, 0], at[here, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
         if not len(found):
             draw_notice(axes, "no stations")
-        axes.set_title(f"{title}: where the map tells places apart, and after how many metres")
+        axes.set_title(f"{title}: metres to drive until found")
         legend_below(drawing, axes, "a robot that sets out here is found (share of all places looked at)")
 
 
