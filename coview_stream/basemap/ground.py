@@ -162,8 +162,9 @@ def ground_mask(points: Points, config: GroundConfig | None = None) -> Bools:
     slope = _slope(surface)
     for start in range(0, len(points), _PORTION):
         part = points[start : start + _PORTION]
-        column = ((part[:, 0] - surface.x0) / surface.cell).astype(np.intp)
-        row = ((part[:, 1] - surface.y0) / surface.cell).astype(np.intp)
+        # float32 may round the outermost point up to the next cell
+        column = np.minimum(((part[:, 0] - surface.x0) / surface.cell).astype(np.intp), slope.shape[1] - 1)
+        row = np.minimum(((part[:, 1] - surface.y0) / surface.cell).astype(np.intp), slope.shape[0] - 1)
         allowed = config.class_threshold + config.slope_allowance * slope[row, column]
         mask[start : start + len(part)] = np.abs(part[:, 2] - surface.height_at(part[:, :2])) <= allowed
     return mask

@@ -202,3 +202,12 @@ def test_ground_error_on_delft_data(method: str) -> None:
     mask = ground_mask(cloud.points, GroundConfig(method=method))
     assert (label & ~mask).sum() / label.sum() < 0.01
     assert (label != mask).mean() < 0.035
+
+
+def test_outermost_point_that_float32_rounds_up_has_a_cell():
+    """A point just inside of 90 m is 180.0 m from one at -90 m in float32, which is the next cell."""
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-20.0, 20.0, (500, 3)).astype(np.float32)
+    points[:, 2] = 0.0
+    points[0, :2], points[1, :2] = -90.0, np.nextafter(np.float32(90.0), np.float32(0.0))
+    assert ground_mask(points).all()
