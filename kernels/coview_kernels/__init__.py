@@ -24,7 +24,7 @@ from coview_kernels.evidence import (
     match_rays,
     sort_beams,
 )
-from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores, unexplained
+from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores, near_structure, unexplained
 from coview_kernels.icp import Alignment, Belief, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
@@ -74,6 +74,7 @@ __all__ = [
     "lowest_heights",
     "match_points",
     "match_rays",
+    "near_structure",
     "nearest",
     "offsets_near",
     "polar_bin",

@@ -162,12 +162,19 @@ def unexplained(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
 
     Arguments are as for :func:`field_scores`. In NumPy, as it is asked for one pose and seldom.
     """
+    surveyed, _, covered, _ = _structure_at(field, structure, pose)
+    return np.asarray(surveyed & ~covered)
+
+
+def near_structure(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
+    """Tell which structure points (N, 3) at a pose (4,) lie within about half a metre of map structure, likewise."""
+    return _structure_at(field, structure, pose)[1]
+
+
+def _structure_at(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> tuple[Mask, Mask, Mask, Mask]:
     at = as_finite64("pose", np.reshape(np.asarray(pose, dtype=np.float64), (1, -1)), 1, 4)[0]
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
-    surveyed, _, covered, _ = reference.structure_at(
-        field.layers, as_float32("structure", structure, None, 3), at - corner
-    )
-    return np.asarray(surveyed & ~covered)
+    return reference.structure_at(field.layers, as_float32("structure", structure, None, 3), at - corner)
 
 
 def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:

@@ -44,10 +44,10 @@ def test_public_names():
         *("Crop", "Cut", "crop_points"),
         *("WindowImages", "WindowRaster", "window_products"),
         *("OverheadGrid", "height_columns", "lowest_heights", "offsets_near"),
-        *("FieldMap", "FieldScan", "FieldScores", "field_scores"),
+        *("FieldMap", "FieldScan", "FieldScores", "field_scores", "near_structure", "unexplained"),
         *("CodedQuery", "StationCodes", "distinct_poses"),
         *("PointGrid", "PolarGrid", "all_shift_distance", "backend", "column_spectra", "coview", "nearest"),
-        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unexplained", "unit_columns"),
+        *("polar_bin", "shutdown", "station_bins", "submit", "transform_unique", "unit_columns"),
         "warm_up",
     }
     assert all(callable(getattr(coview_kernels, name)) for name in coview_kernels.__all__)

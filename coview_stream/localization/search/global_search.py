@@ -9,7 +9,6 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.localization.evidence.moved_part import find_moved_part
-from coview_stream.localization.evidence.observed_scan import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
@@ -111,7 +110,7 @@ class GlobalSearch:
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
         self._note_hints(scored, hints, request)
         if leader is not None and scored.error < self.config.acceptance.risk:
-            scored = scored.doubted(find_moved_part(self.base_map.field, ObservedScan.of(scan), leader.T_map_odom))
+            scored = scored.doubted(find_moved_part(self.base_map.field, self._scorer.scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance)
         if result.accepted is not None:
             self.clear()

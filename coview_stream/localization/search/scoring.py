@@ -174,6 +174,11 @@ class PlaceScorer:
         self._base_map = base_map
         self.clear()
 
+    @property
+    def scans(self) -> list[ObservedScan]:
+        """Newest keyframes, the newest last."""
+        return list(self._scans)
+
     def clear(self) -> None:
         """Forget all places and keyframes."""
         self._followed = _Followed.none()

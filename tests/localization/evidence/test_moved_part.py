@@ -19,24 +19,29 @@ ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 RISK = 1e-4
 
 
-@pytest.fixture(scope="module")
-def seen(world_drive):
-    T, cloud = inverse(ODOM) @ world_drive.T_map_body[0], world_drive.clouds[0]
+def scan_of(drive, frame: int) -> ObservedScan:
+    T, cloud = inverse(ODOM) @ drive.T_map_body[frame], drive.clouds[frame]
     points = (cloud @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
     return ObservedScan.of(ScanInput(prepare_scan(points, T[:3, 3], LocalizerConfig().registration), cloud, T))
 
 
-def with_moved(seen: ObservedScan, shifts: np.ndarray) -> ObservedScan:
+@pytest.fixture(scope="module")
+def seen(world_drive):
+    return scan_of(world_drive, 0)
+
+
+def with_moved(scan: ObservedScan, shifts: np.ndarray, centre: ObservedScan | None = None) -> ObservedScan:
     """The scan with what stands in each of a few sectors moved, (sectors, 2) metres along the map's axes."""
-    structure = seen.many.points.structure.copy()
-    sector = ((np.arctan2(structure[:, 1], structure[:, 0]) + np.pi) / (2 * np.pi) * len(shifts)).astype(int)
+    structure = scan.many.points.structure.copy()
+    x, y = (structure[:, :2] + (scan.body - (centre or scan).body)[:2]).T  # what moves is the same in all scans
+    sector = ((np.arctan2(y, x) + np.pi) / (2 * np.pi) * len(shifts)).astype(int)
     back = ODOM[:2, :2].T  # the odometry frame's axes
     structure[:, :2] += (shifts @ back.T)[np.minimum(sector, len(shifts) - 1)].astype(np.float32)
-    return replace(seen, many=replace(seen.many, points=replace(seen.many.points, structure=structure)))
+    return replace(scan, many=replace(scan.many, points=replace(scan.many.points, structure=structure)))
 
 
-def found(world_map, seen: ObservedScan) -> MovedPart:
-    return find_moved_part(world_map.field, seen, ODOM)
+def found(world_map, *scans: ObservedScan, T_map_odom: np.ndarray = ODOM) -> MovedPart:
+    return find_moved_part(world_map.field, scans, T_map_odom)
 
 
 def test_scan_that_is_explained_has_no_moved_part(world_map, seen):
@@ -45,7 +50,7 @@ def test_scan_that_is_explained_has_no_moved_part(world_map, seen):
 
 def test_third_of_the_scan_that_is_four_metres_off_is_found(world_map, seen):
     shifts = np.zeros((12, 2))
-    shifts[::3] = [2.8, -2.9]
+    shifts[::3] = [-4.0, 0.5]
     part = found(world_map, with_moved(seen, shifts))
     assert part.probability > RISK > 5 * found(world_map, seen).probability
     assert part.metres == pytest.approx(4.0, abs=0.8)
@@ -58,12 +63,35 @@ def test_parts_that_moved_each_by_itself_are_no_moved_part(world_map, seen):
     assert found(world_map, with_moved(seen, shifts)).probability < 5 * RISK
 
 
+def test_evidence_of_several_keyframes_is_that_of_one_shift(world_map, world_drive, seen):
+    shifts = np.zeros((12, 2))
+    shifts[::4] = [-4.0, 0.5]
+    scans = [scan_of(world_drive, frame) for frame in (9, 5)]
+    part = found(world_map, *(with_moved(scan, shifts, seen) for scan in [*scans, seen]))
+    assert part.probability > 0.9
+    assert part.metres == pytest.approx(4.0, abs=0.8)
+    assert found(world_map, *scans, seen).probability < RISK
+
+
+def test_what_the_scan_has_explained_at_the_place_is_no_second_time(world_map, seen):
+    pose = seen.poses(ODOM[None])[0]
+    points = seen.many.points.structure
+    explained = points[~kernels.unexplained(world_map.field, points, pose)]
+    back = (np.array([4.0, 1.0]) @ ODOM[:2, :2]).astype(np.float32)
+    ghosts = explained[::4].copy()
+    ghosts[:, :2] -= back  # seen where nothing is, and beside what is seen as well
+    both = np.concatenate([points, ghosts])
+    with_ghosts = replace(seen, many=replace(seen.many, points=replace(seen.many.points, structure=both)))
+    alone = replace(seen, many=replace(seen.many, points=replace(seen.many.points, structure=ghosts)))
+    assert 50 * found(world_map, with_ghosts).probability < found(world_map, alone).probability
+
+
 def test_few_points_say_nothing(world_map, seen):
-    few = replace(seen.many.points, structure=seen.many.points.structure[:20] + np.float32([0.0, 0.0, 40.0]))
+    few = replace(seen.many.points, structure=seen.many.points.structure[:9] + np.float32([0.0, 0.0, 40.0]))
     assert found(world_map, replace(seen, many=replace(seen.many, points=few))) == NO_PART
 
 
-def test_unexplained_points_are_what_the_counts_leave(world_map, seen):
+def test_masks_of_points_are_what_is_counted(world_map, seen):
     pose = seen.poses(ODOM[None])
     moved = pose + np.array([2.0, 1.0, 0.0, 0.1])
     for at in (pose, moved):
@@ -71,3 +99,5 @@ def test_unexplained_points_are_what_the_counts_leave(world_map, seen):
         counts = kernels.field_scores(world_map.field, points, at, refine=False)
         left = kernels.unexplained(world_map.field, points.structure, at[0])
         assert abs(int(left.sum()) - int(counts.structure[0] - counts.covered[0])) <= 4
+        near = kernels.near_structure(world_map.field, points.structure, at[0])
+        assert abs(int(near.sum()) - int(counts.near[0])) <= 4
