@@ -37,6 +37,10 @@ _OPEN = 0.01  # share of chance places that are as clear of structure and as lev
 _EDGE = 0.02  # shares of the ground beyond it are not told apart
 
 
+NUISANCES = (len(_KEPT), len(_SURVEYS), len(_LEAKS))
+"""Shape (Q, D, L) of a table over the nuisances: share kept, kind of survey, leaks."""
+
+
 def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[Floats, Floats]:
     """Return log-likelihood ratios (P,) of places against chance, and the shares q (P,) that explain them best.
 
@@ -44,6 +48,17 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[F
         observed: (P, 7) mean observations at the places, see :class:`Share`.
         background: what chance explains.
     """
+    each = log_likelihoods(observed, background)
+    if not len(each):
+        return np.empty(0), np.empty(0)
+    best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
+    flat = each.reshape(len(each), -1)
+    top = flat.max(axis=1)
+    return np.log(np.exp(flat - top[:, None]).mean(axis=1)) + top, best
+
+
+def log_likelihoods(observed: Floats32, background: Background) -> Floats:
+    """Return log-likelihood ratios (P, Q, D, L) of places against chance, for each value of the nuisances."""
     counts = outcomes(observed)
     q = _KEPT[:, None, None]
     explained = q * _SURVEYS + (1.0 - q) * background.structure  # (Q, D, 4)
@@ -58,13 +73,12 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[F
     )
     beside = free + _ground(observed, background)[:, None, None]
     beside -= np.logaddexp(math.log1p(-_OPEN), math.log(_OPEN) + beside)  # chance, too, may stand on an open road
-    each = structure[:, :, :, None] + beside[:, :, None, :]
-    if not len(each):
-        return np.empty(0), np.empty(0)
-    best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
-    flat = each.reshape(len(each), -1)
-    top = flat.max(axis=1)
-    return np.log(np.exp(flat - top[:, None]).mean(axis=1)) + top, best
+    return np.asarray(structure[:, :, :, None] + beside[:, :, None, :])
+
+
+def steps_of_kept() -> Floats:
+    """Return the shares q (Q,) that are summed over."""
+    return _KEPT.copy()
 
 
 def _ground(observed: Floats32, background: Background) -> Floats:

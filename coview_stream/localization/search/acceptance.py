@@ -40,7 +40,9 @@ class SearchResult:
     leader: Pose | None = None
 
 
-def decide(scored: Scored, leader: Candidate | None, request: SearchRequest, rule: AcceptanceConfig) -> SearchResult:
+def decide(
+    scored: Scored, leader: Candidate | None, request: SearchRequest, rule: AcceptanceConfig, undecided: float = 0.0
+) -> SearchResult:
     """Judge a keyframe.
 
     Args:
@@ -48,8 +50,9 @@ def decide(scored: Scored, leader: Candidate | None, request: SearchRequest, rul
         leader: the most probable place, registered and verified; None if that failed.
         request: the keyframe.
         rule: the integrity risk.
+        undecided: metres between poses of the first place that are as probable; 0 if one is more probable than all.
     """
-    state, reason = _verdict(scored, leader, rule)
+    state, reason = _verdict(scored, leader, rule, undecided)
     if not scored.places:
         evidence = KeyframeEvidence(request.stamp, state, reason)
         return SearchResult(None, evidence, request.travelled, request.epoch, scored.rivals)
@@ -69,7 +72,7 @@ def decide(scored: Scored, leader: Candidate | None, request: SearchRequest, rul
     return SearchResult(accepted, evidence, request.travelled, request.epoch, scored.rivals, T_map_odom)
 
 
-def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -> tuple[State, str]:
+def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig, undecided: float) -> tuple[State, str]:
     if not scored.places:
         return State.SEARCHING, "too few points to search with"
     if scored.error < rule.risk:
@@ -77,6 +80,8 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig) -
             return State.AMBIGUOUS, "the place that stands out does not register"
         if all(place.hypothesis.station is None for place in scored.places):
             return State.AMBIGUOUS, "no vote has named a place to compare it with"  # a hint is not trusted
+        if undecided:
+            return State.AMBIGUOUS, f"the place is found, but poses {undecided:.1f} m apart fit there equally"
         return State.TRACKING, f"found: wrong {one_in(scored.error)}"
     if scored.moved.probability > rule.risk:
         metres = f"{scored.moved.metres:.0f} m"

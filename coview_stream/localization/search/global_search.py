@@ -14,6 +14,7 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.modes import find_modes
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import Candidate, register_place
@@ -109,9 +110,12 @@ class GlobalSearch:
         scored = self._scorer.score([*named, *hints], ranks, len(hints), scan)  # against chance, all keyframes
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
         self._note_hints(scored, hints, request)
+        undecided = 0.0
         if leader is not None and scored.error < self.config.acceptance.risk:
+            modes = find_modes(leader, scan, request, self.base_map, self.config, self._local_maps)
+            leader, undecided = modes.best, modes.undecided
             scored = scored.doubted(find_moved_part(self.base_map.field, self._scorer.scans, leader.T_map_odom))
-        result = decide(scored, leader, request, self.config.acceptance)
+        result = decide(scored, leader, request, self.config.acceptance, undecided)
         if result.accepted is not None:
             self.clear()
         return result

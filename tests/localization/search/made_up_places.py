@@ -38,7 +38,7 @@ def candidate(at, score=0.8):
     return Candidate(at, found, Evidence(score, score, 1.0, 1.0, 0.9))
 
 
-def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk) -> SearchResult:
+def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk, undecided=0.0) -> SearchResult:
     """The decision on places, the most probable first; what is left of the probability is "none of these"."""
     none = 1.0 - sum(each.probability for each in places)
     if error is None:
@@ -48,4 +48,4 @@ def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk) -> 
     second = places[1] if len(places) > 1 else None
     scored = Scored(Rivals(T, some, some), list(places), error, none, by_chance, second)
     best = candidate(places[0]) if leader and places else None
-    return decide(scored, best, REQUEST, AcceptanceConfig(risk=risk))
+    return decide(scored, best, REQUEST, AcceptanceConfig(risk=risk), undecided)

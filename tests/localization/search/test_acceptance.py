@@ -38,6 +38,14 @@ def test_place_that_does_not_register_is_not_accepted():
     assert "does not register" in result.evidence.reason
 
 
+def test_place_within_which_two_poses_fit_equally_is_not_accepted():
+    result = judged(place(1.0), error=1e-12, undecided=1.14)
+    assert result.accepted is None
+    assert result.evidence.state is State.AMBIGUOUS
+    assert result.evidence.reason == "the place is found, but poses 1.1 m apart fit there equally"
+    assert judged(place(0.5), place(0.5, moved(20)), undecided=1.14).evidence.reason == "two places fit: equally"
+
+
 def test_nothing_stands_out_means_searching():
     result = judged(place(0.2), place(0.1, moved(20)), by_chance=31.4)
     assert result.evidence.state is State.SEARCHING

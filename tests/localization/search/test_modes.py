@@ -1,0 +1,124 @@
+"""Modes of a place: posts in a row are as good a metre on, unless the row's end is seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_world
+from made_up_places import candidate, place
+from small_world import Box
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.files import write_cloud
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.search import modes
+from coview_stream.localization.search.modes import Modes, find_modes
+from coview_stream.localization.search.request import SearchRequest
+
+CONFIG = LocalizerConfig()
+T_MAP_ODOM = pose_from(rot_z(0.9), [14.0, -6.0, 0.4])
+ROW = [Box(np.array([x, 3.0]), np.array([0.5, 0.5, 3.0]), 0.0) for x in np.arange(-14.0, 14.5)]  # a metre apart
+WALL = Box(np.array([0.0, -9.0]), np.array([60.0, 6.0, 4.0]), 0.0)
+END = Box(np.array([23.0, 8.0]), np.array([6.0, 20.0, 5.0]), 0.0)
+NOTHING = np.empty((0, 3), dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return small_world.sample_map([*ROW, WALL, END])
+
+
+@pytest.fixture(scope="module")
+def row_map(points, tmp_path_factory):
+    path = tmp_path_factory.mktemp("row") / "site.ply"
+    write_cloud(path, points.astype(np.float32))
+    return BaseMap.build(path, radius=30.0)
+
+
+def look(row_map, points, x, reach, start):
+    """Modes of the place of a robot at ``x`` that sees all within ``reach`` metres, registered ``start`` m off."""
+    truth = pose_from(rot_z(0.2), [x, 0.0, small_world.SENSOR_HEIGHT])
+    near = points[np.linalg.norm(points[:, :2] - truth[:2, 3], axis=1) < reach]
+    cloud = transform(inverse(truth), near).astype(np.float32)
+    T_odom_body = inverse(T_MAP_ODOM) @ truth
+    scan = ScanInput(
+        prepare_scan(voxelized(cloud, T_odom_body, CONFIG.keyframe), T_odom_body[:3, 3], CONFIG.registration),
+        cloud, T_odom_body,
+    )  # fmt: skip
+    request = SearchRequest(0.0, T_odom_body, NOTHING, NOTHING, NOTHING, 0.0, (0, 0))
+    leader = candidate(place(1.0, pose_from(np.eye(3), [start, 0.0, 0.0]) @ T_MAP_ODOM))
+    return find_modes(leader, scan, request, row_map, CONFIG, LocalMaps(row_map, 50.0))
+
+
+def off(found: Modes) -> float:
+    """Metres along the row that the best mode lies off the truth."""
+    return float((found.best.T_map_odom @ inverse(T_MAP_ODOM))[0, 3])
+
+
+def test_equal_modes_leave_it_undecided(row_map, points):
+    found = look(row_map, points, 0.0, 6.0, 0.0)
+    assert found.undecided > 0.5
+    assert found.distances.max() == pytest.approx(2.0, abs=0.1)  # two posts on
+    assert found.probabilities.max() < 0.5
+    assert found.probabilities.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0, -1.0])
+def test_mode_that_the_scan_speaks_for_wins_wherever_it_began(row_map, points, start):
+    """The wall across the end of the row is seen."""
+    found = look(row_map, points, 11.0, 12.0, start)
+    assert found.undecided == 0.0
+    assert off(found) == pytest.approx(0.0, abs=0.1)
+    assert found.probabilities[0] > 0.8
+
+
+def test_same_mode_counts_once(row_map, points):
+    found = look(row_map, points, 11.0, 12.0, 0.0)
+    assert found.distances[0] == 0.0
+    assert (found.distances[1:] > 0.25).all()
+    assert 1 < len(found.distances) < 9
+
+
+def test_only_modes_within_the_place_count(row_map, points, monkeypatch):
+    """Registration that runs away is of no mode here; nor is one that fails."""
+    started = []
+
+    def elsewhere(place, *_):
+        started.append(place.hypothesis.T_map_odom[:2, 3] - T_MAP_ODOM[:2, 3])
+        if len(started) % 2:
+            return None
+        away = place.hypothesis.T_map_odom.copy()
+        away[0, 3] += 4.0
+        return candidate(replace(place, hypothesis=replace(place.hypothesis, T_map_odom=away)))
+
+    monkeypatch.setattr(modes, "register_place", elsewhere)
+    found = look(row_map, points, 11.0, 12.0, 0.0)
+    assert found.distances.tolist() == [0.0]
+    assert found.probabilities.tolist() == [1.0]
+    assert found.undecided == 0.0
+    np.testing.assert_allclose(np.linalg.norm(started, axis=1), 1.2)
+    np.testing.assert_allclose(np.mean(started, axis=0), 0.0, atol=1e-9)
+
+
+def made_up(distances, probabilities) -> Modes:
+    return Modes(candidate(place(1.0)), np.array(distances), np.array(probabilities))
+
+
+@pytest.mark.parametrize(
+    ("distances", "probabilities", "undecided"),
+    [
+        ([0.0], [1.0], 0.0),
+        ([0.0, 1.1], [0.5, 0.5], 1.1),
+        ([0.0, 1.1], [0.51, 0.49], 0.0),
+        ([0.0, 0.4], [0.5, 0.5], 0.0),  # within half of the alert limit: either will do
+        ([0.0, 0.9, 0.4, 1.3], [0.3, 0.28, 0.16, 0.26], 0.9),
+    ],
+)
+def test_modes_elsewhere_count_together(distances, probabilities, undecided):
+    assert made_up(distances, probabilities).undecided == undecided
