@@ -40,9 +40,9 @@ def add_frame(tracker, cloud, T_odom_body):
 
 
 def match_and_update(tracker, cloud, T_odom_body, **how):
-    """Register the newest scans and correct the belief; the verdict."""
+    """Register the newest scans, and correct the belief by what is verified; the verdict."""
     match = tracker.match_to_map(cloud, T_odom_body, **how)
-    tracker.update(match, T_odom_body)
+    tracker.update(match, T_odom_body, match.verdict.verified)
     return match.verdict
 
 

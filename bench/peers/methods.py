@@ -1,9 +1,10 @@
 """What a peer has to do, and coview_stream itself.
 
-* As in the product: the search gets the keyframes of the drive one after the other and gives a pose once three of
-  them have confirmed it (``LocalizerConfig()``); the time is that of all keyframes until then.
+* As in the product: the search gets the keyframes of the drive one after the other and gives a pose once the
+  probability of an error is below the integrity risk (``LocalizerConfig()``); the time is that of all until then.
 * One scan: the same search from one submap, which has to stand alone.
-* Tracking: registration at the scales that the tracker uses, then its verification, which is in the time, too.
+* Tracking: registration at the scales that the tracker uses, believed where the scan fits there better than chance;
+  that is in the time, too.
 """
 
 from __future__ import annotations
@@ -20,11 +21,10 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
-from coview_stream.localization.registration.register import register
-from coview_stream.localization.registration.verification import RangeImage, verify
+from coview_stream.localization.registration.register import ScanInput, register
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
+from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
 OFF, TURNED = 0.5, float(np.radians(3.0))  # how far from the truth tracking starts, metres and radians
 
@@ -82,7 +82,7 @@ class OneScan(Keyframes):
 
 
 class Tracking:
-    """Registration from a pose nearby, believed if it passes the check that every registration must pass."""
+    """Registration from a pose nearby, believed if the scan speaks for it, as for every registration."""
 
     def __init__(self, site: BaseMap) -> None:
         coview_kernels.warm_up()
@@ -100,7 +100,6 @@ class Tracking:
         if found is None:
             return Answer(None, False)
         T = found.T_map_source
-        T_map_body = T @ inverse(place.T_odom_submap) @ newest.T_odom_body
-        evidence = verify(source, T, RangeImage.of(newest.cloud), T_map_body, target, self._site.survey)
-        cause, _ = EvidenceBaseline().judge(evidence, LocalizerConfig().acceptance)
-        return Answer(T, cause is RejectionReason.VERIFIED)
+        # the submap's frame takes the place of odometry's
+        scan = ScanInput(source, newest.cloud, inverse(place.T_odom_submap) @ newest.T_odom_body)
+        return Answer(T, PlaceEvidence(self._site).observe(scan, T).ratio > 0.0)

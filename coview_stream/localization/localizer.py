@@ -23,7 +23,7 @@ from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import Epoch, SearchRequest
 from coview_stream.localization.state import Event, State, next_state
 from coview_stream.localization.tracking.map_matching import MapMatch
-from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason
+from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
@@ -139,8 +139,8 @@ class Localizer:
         elif (request := self._search_request(frame)) is not None:
             match = self._begin_tracking(self._search.update(request))  # eqs 1-13, over the whole map
         if match is not None:
-            event = self._verify(match)  # what its verdict and those before mean for the place
-            self._update(match, event)  # the graph of poses and the state
+            ruling = self._verify(match)  # what its verdict and those before mean for the place
+            self._update(match, ruling)  # the graph of poses and the state
         return self.fix()
 
     def add_frame(self, cloud: Points, T_odom_body: Pose, stamp: float, defer: bool = False) -> SearchRequest | None:
@@ -269,7 +269,7 @@ class Localizer:
         self._handle(Event.PLACE_ACCEPTED)
         self._confidence = result.evidence.confidence or 0.0
         self._tracker.start(result.accepted.registration, newest.T_odom_body, result.travelled)
-        self._monitor.clear()
+        self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
         # the robot may have driven on or been carried since the keyframe
@@ -287,29 +287,29 @@ class Localizer:
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 
-    def _verify(self, match: MapMatch) -> Event | None:
-        """Return what a registration's verdict means for the place, after those before it; None if nothing yet.
+    def _verify(self, match: MapMatch) -> Ruling:
+        """Return what a registration's verdict means for the place, after those before it.
 
         Its evidence is the next fix's, where it adds any.
         """
         assert self._newest is not None  # it is of the newest frame
         stamp, verdict = self._newest.stamp, match.verdict
-        event, reason = self._monitor.verify(verdict, stamp, self._tracker.travelled)
+        ruling = self._monitor.verify(verdict, stamp, self._tracker.travelled)
         self._registered_at = stamp
-        after = self.state if event is None else next_state(self.state, event)
-        if not (match.confirms_search and verdict.verified):
+        after = self.state if ruling.event is None else next_state(self.state, ruling.event)
+        if not (match.confirms_search and ruling.believed):
             self._evidence = KeyframeEvidence(
-                stamp, after, reason, verdict.score, 0.0, verdict.evidence,
-                cause=verdict.cause, innovation=verdict.innovation,
+                stamp, after, ruling.reason, verdict.score, 0.0, verdict.evidence,
+                cause=verdict.cause, innovation=verdict.innovation, confidence=1.0 - ruling.wrong,
             )  # fmt: skip
-        return event
+        return ruling
 
-    def _update(self, match: MapMatch, event: Event | None) -> None:
+    def _update(self, match: MapMatch, ruling: Ruling) -> None:
         """Correct the pose by a registration that is believed, and move on to the state that follows."""
         assert self._newest is not None  # as in _verify
-        self._tracker.update(match, self._newest.T_odom_body)
-        if event is not None:
-            self._handle(event)
+        self._tracker.update(match, self._newest.T_odom_body, ruling.believed)
+        if ruling.event is not None:
+            self._handle(ruling.event)
 
     # ---- states
 

@@ -41,16 +41,28 @@ def carried(drive, frm, to):
 # ---- DOUBTED
 
 
+def dusty(drive, k):
+    """A frame of which half is dust."""
+    some = np.random.default_rng(0).permutation(len(drive.clouds[k]))[: len(drive.clouds[k]) * 6 // 10]
+    return np.concatenate([drive.clouds[k][some], garbage()])
+
+
+def covered(seed):
+    """A sack over the sensor: a few returns from within it."""
+    return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
+
+
 def test_rejected_registration_gives_doubted_state_without_pose(found, world_drive):
-    doubtful = found.step(garbage(), world_drive.T_odom_body[5], 2.5)
+    doubtful = found.step(dusty(world_drive, 5), world_drive.T_odom_body[5], 2.5)
     assert doubtful.state is State.DOUBTED
     assert doubtful.T_map_body is None
     assert doubtful.T_map_odom is None
     assert doubtful.covariance is None
     assert doubtful.drift is None
     assert doubtful.confidence == 0.0
-    assert doubtful.evidence.score < RULE.tracking_min_score
     assert doubtful.evidence.cause in (RejectionReason.GROUND, RejectionReason.FITNESS, RejectionReason.FREE_SPACE)
+    assert 0.5 < doubtful.evidence.confidence < 1.0 - RULE.risk
+    assert "wrong 1 in " in doubtful.evidence.reason
     known = found.step(world_drive.clouds[6], world_drive.T_odom_body[6], 3.0)
     assert known.state is State.TRACKING
     assert right(known, world_drive.T_map_body[6])
@@ -58,10 +70,10 @@ def test_rejected_registration_gives_doubted_state_without_pose(found, world_dri
 
 def test_doubted_state_is_rechecked_while_standing(found, world_drive):
     """A covered sensor takes the pose away at once; uncovered again it is back at once, and nothing was lost."""
-    covered = [found.step(garbage(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
-    assert [fix.state for fix in covered] == [State.DOUBTED] * 6
-    assert [fix.T_map_body for fix in covered] == [None] * 6
-    assert covered[-1].evidence.stamp == 8.0
+    fixes = [found.step(covered(k), world_drive.T_odom_body[5], 3.0 + k) for k in range(6)]
+    assert [fix.state for fix in fixes] == [State.DOUBTED] * 6
+    assert [fix.T_map_body for fix in fixes] == [None] * 6
+    assert fixes[-1].evidence.stamp == 8.0
     again = found.step(world_drive.clouds[5], world_drive.T_odom_body[5], 9.0)
     assert again.state is State.TRACKING
     assert right(again, world_drive.T_map_body[5])
@@ -74,6 +86,7 @@ def test_evidence_reports_cause_reason_and_innovation(found, world_drive):
     assert 0.0 < fix.evidence.innovation < RULE.max_innovation
     assert fix.evidence.stamp == 2.5
     assert fix.drift is not None
+    assert fix.evidence.confidence > 1.0 - RULE.risk
     doubtful = found.step(garbage(), world_drive.T_odom_body[6], 3.0)
     assert doubtful.evidence.cause is not RejectionReason.VERIFIED
     assert doubtful.evidence.reason != "verified"
@@ -91,10 +104,10 @@ def test_search_evidence_has_no_cause_or_innovation(world_fixes):
 def test_search_after_loss_starts_from_scratch(found, world_drive):
     """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
     anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
-    lost = follow(found, anew, range(RULE.max_rejections), 2.5)
-    assert [fix.T_map_body for fix in lost] == [None] * RULE.max_rejections
-    assert lost[-1].state is State.LOST
-    frames = range(RULE.max_rejections, RULE.max_rejections + 3)
+    lost = follow(found, anew, range(1), 2.5)
+    assert lost[0].T_map_body is None
+    assert lost[0].state is State.LOST
+    frames = range(1, 4)
     again = follow(found, anew, frames, 2.5)
     assert {fix.state for fix in again} <= {State.LOST, State.TRACKING}
     assert again[-1].state is State.TRACKING
@@ -109,17 +122,15 @@ def found_frame(drive):
 
 @pytest.mark.slow
 def test_restarted_odometry_far_away_is_lost_and_relocalized(found, world_drive):
-    """There is no map there, which might be the map's edge: patience decides."""
+    """There is no map there, which might be the map's edge: but nobody drives that far between two frames."""
     anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
-    fixes = [found.step(anew.clouds[0], anew.T_odom_body[0], 3.0 + k) for k in range(12)]
-    assert fixes[0].evidence.cause is RejectionReason.OFF_MAP
-    states = [fix.state for fix in fixes]
-    assert states.index(State.LOST) == round(RULE.max_doubt_s)
-    assert all(fix.T_map_body is None or right(fix, anew.T_map_body[0]) for fix in fixes)
-    assert all(fix.T_map_body is None for fix in fixes[: states.index(State.LOST) + 1])
-    again = follow(found, anew, range(1, 5), 15.0)
+    lost = found.step(anew.clouds[0], anew.T_odom_body[0], 3.0)
+    assert lost.evidence.cause is RejectionReason.OFF_MAP
+    assert lost.state is State.LOST
+    assert lost.T_map_body is None
+    again = follow(found, anew, range(1, 5), 3.5)
+    assert all(fix.T_map_body is None or right(fix, anew.T_map_body[k]) for k, fix in enumerate(again, start=1))
     assert again[-1].state is State.TRACKING
-    assert right(again[-1], anew.T_map_body[4])
 
 
 @pytest.mark.slow
@@ -133,12 +144,13 @@ def test_kidnapped_robot_gets_no_wrong_pose(world_map, world_drive, to):
     went = follow(localizer, drive, range(to + 1, 10), 5.0)
     fixes = stood + went
     truths = [drive.T_map_body[to]] * 5 + drive.T_map_body[to + 1 :]
-    assert all(fix.T_map_body is None for fix in stood)
+    assert stood[0].T_map_body is None
     for fix, truth in zip(fixes, truths, strict=True):
         assert fix.T_map_body is None or right(fix, truth)
     lost = [fix for fix in fixes if fix.state is State.LOST]
     assert lost
-    assert f"{RULE.max_rejections} registrations rejected" in lost[0].evidence.reason
+    assert lost[0].evidence.reason.startswith("more probably elsewhere: ")
+    assert lost[0].evidence.confidence < 0.5
     assert lost[0].evidence.cause in (RejectionReason.FITNESS, RejectionReason.FREE_SPACE, RejectionReason.GROUND)
     assert went[-1].state is State.TRACKING
 
@@ -148,8 +160,8 @@ def test_kidnapping_with_frozen_odometry_is_detected(found, world_drive):
     elsewhere = small_world.scan(small_world.boxes(seed=77), world_drive.T_map_body[3])
     fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
     assert all(fix.T_map_body is None for fix in fixes)
-    assert fixes[5].state is State.DOUBTED
-    assert fixes[-1].state is State.LOST
+    assert {fix.state for fix in fixes} <= {State.DOUBTED, State.LOST}
+    assert fixes[3].state is State.LOST
 
 
 # ---- carried with open eyes
@@ -182,11 +194,6 @@ def test_frozen_odometry_while_moving_gives_no_wrong_pose(world_map, slow_drive,
 # ---- covered, and beyond the edge
 
 
-def covered(seed):
-    """A sack over the sensor: a few returns from within it."""
-    return np.random.default_rng(seed).uniform(-0.4, 0.4, (200, 3)).astype(np.float32)
-
-
 @pytest.mark.slow
 def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive):
     """As soon as any place could be: the first keyframe that sees anything counts already."""
@@ -199,26 +206,29 @@ def test_covered_sensor_is_doubted_then_lost_then_relocalized(found, world_drive
     assert fixes[-1].state is State.LOST
     again = follow(found, world_drive, range(6, 10), 100.0)
     posed = [k for k, fix in enumerate(again) if fix.T_map_body is not None]
-    assert posed[0] < RULE.confirmations
+    assert posed[0] < 3
     for k in posed:
         assert right(again[k], world_drive.T_map_body[6 + k])
 
 
 @pytest.mark.slow
-def test_pose_returns_at_once_after_short_cover_and_with_confirmations_after_long_cover(world_map, world_drive):
-    """Meanwhile it may have been carried: one frame could fit by chance."""
-    waits = []
-    for seconds in (0.5 * RULE.max_doubt_s, 2.0 * RULE.max_doubt_s):
+@pytest.mark.parametrize("seconds", [2.0, 40.0])
+def test_after_a_cover_the_pose_returns_with_the_first_frame_that_is_certain(world_map, world_drive, seconds):
+    """Meanwhile it may have been carried, and after a long cover one that fits only in part is not certain."""
+    for dust in (False, True):
         localizer = Localizer(world_map)
         follow(localizer, world_drive, range(5))
         for t in np.arange(2.5, 2.5 + seconds, 0.5):
             assert localizer.step(covered(1), world_drive.T_odom_body[5], t).T_map_body is None
-        after = follow(localizer, world_drive, range(5, 10), float(seconds))
-        assert State.LOST not in {fix.state for fix in after}
-        posed = [k for k, fix in enumerate(after) if fix.T_map_body is not None]
-        assert all(right(after[k], world_drive.T_map_body[5 + k]) for k in posed)
-        waits.append(posed[0])
-    assert waits == [0, RULE.confirmations - 1]
+        if dust:
+            first = localizer.step(dusty(world_drive, 5), world_drive.T_odom_body[5], 2.5 + seconds)
+            assert first.T_map_body is None
+        after = follow(localizer, world_drive, range(5, 8), 0.5 + seconds)
+        posed = [
+            right(fix, world_drive.T_map_body[k]) for k, fix in enumerate(after, start=5) if fix.T_map_body is not None
+        ]
+        assert all(posed)
+        assert len(posed) == len(after) or dust
 
 
 def test_driving_with_covered_sensor_is_doubted(found, world_drive):
@@ -233,8 +243,8 @@ def test_driving_with_covered_sensor_is_doubted(found, world_drive):
 
 @pytest.mark.slow
 def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene):
-    """Straight over the edge and back again; no pose is wrong, and none is given where there is no map."""
-    way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (-14.0, 90.0)]
+    """Straight over the edge and back again; no pose is wrong, and none is given 10 m after the map was last seen."""
+    way = [pose_from(np.eye(3), [x, -4.0, small_world.SENSOR_HEIGHT]) for x in (-14.0, 110.0)]
     out = small_world.record_along(scene, way, 2.6)
     localizer, fixes = Localizer(world_map), []
     frames = [*range(len(out.clouds)), *reversed(range(len(out.clouds)))]
@@ -242,7 +252,8 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
         fixes.append(localizer.step(out.clouds[k], out.T_odom_body[k], 0.5 * n))
     for fix, k in zip(fixes, frames, strict=True):
         assert fix.T_map_body is None or right(fix, out.T_map_body[k], 0.15)
-        if out.T_map_body[k][0, 3] > small_world.HALF + 25.0:
+        # the map's edge is seen from 45 m
+        if out.T_map_body[k][0, 3] > small_world.HALF + 45.0 + 10.0:
             assert fix.T_map_body is None
     assert any(fix.evidence.cause is RejectionReason.OFF_MAP for fix in fixes)
     assert any(fix.state is State.LOST for fix in fixes)
@@ -251,8 +262,9 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
 
 @pytest.mark.slow
 def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
-    """What came before the pause is no doubt that has lasted: one good frame is enough, one bad one is not too much."""
-    for cloud, expected in ((world_drive.clouds[5], State.TRACKING), (garbage(), State.DOUBTED)):
+    """What came before the pause is no doubt that has lasted: one good frame is enough."""
+    frames = (world_drive.clouds[5], State.TRACKING), (dusty(world_drive, 5), State.DOUBTED), (garbage(), State.LOST)
+    for cloud, expected in frames:
         localizer = Localizer(world_map)
         for k in range(5):
             fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)

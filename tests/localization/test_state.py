@@ -94,7 +94,7 @@ class Watched(Localizer):
 
 
 def test_localizer_moves_only_along_the_table(world_map, world_drive):
-    """Searched for and found, asked to verify, covered by garbage, lost and found again."""
+    """Searched for and found, asked to verify, covered, seeing garbage, lost and found again."""
     localizer, states = Watched(world_map), []
 
     def step(k, cloud=None, stamp=None):
@@ -114,8 +114,8 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
     localizer.require_verification()
     states.append(localizer.state)
     step(4, stamp=2.1)
-    for k in (5, 6):
-        step(k, garbage(k))
+    step(5, garbage(5, 60))
+    step(6, garbage(6))
     for k in (7, 8, 9):
         step(k)
     moved = [(before, after) for before, after in pairwise(states) if after is not before]

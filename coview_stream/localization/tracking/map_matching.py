@@ -17,6 +17,7 @@ from coview_stream.localization.registration.register import ScanInput, register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
 
@@ -56,13 +57,20 @@ class MapMatcher:
     Attributes:
         base_map: knows where it has been surveyed.
         config: of registration and acceptance.
-        baseline: usual evidence, which new evidence is judged by.
+        place: what a scan says of the place, against chance.
+        baseline: usual shares, by which people are told what is missing.
     """
 
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig, baseline: EvidenceBaseline) -> None:
+    def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
         self.base_map = base_map
         self.config = config
-        self.baseline = baseline
+        self.place = PlaceEvidence(base_map)
+        self.baseline = EvidenceBaseline()
+
+    def clear(self) -> None:
+        """Forget what is usual: the place is another."""
+        self.place.clear()
+        self.baseline.clear()
 
     def match(
         self, scan: ScanInput, belief: Estimate, target: LocalMap, scales: tuple[float, ...], graph: PoseGraph
@@ -83,11 +91,14 @@ class MapMatcher:
             return _failed(belief, "what is believed so far has a covariance without an inverse")
         prior = Prior(T_start, information)
         found = register_and_verify(self.base_map, scan, T_start, target, settings, scales, prior)
-        cause, reason = self.baseline.judge(found.evidence, acceptance)
+        seen = self.place.observe(scan, found.T_map_odom)
+        cause, reason = RejectionReason.VERIFIED, "verified"
+        if seen.ratio <= 0.0:
+            cause, reason = self.baseline.explain(found.evidence)
         if found.registration is None:
             if cause is RejectionReason.VERIFIED:
-                return _failed(belief, "too few points have a partner in the map", found.evidence)
-            return MapMatch.without_registration(MatchVerdict(cause, reason, found.evidence), belief)
+                return _failed(belief, "too few points have a partner in the map", found.evidence, seen)
+            return MapMatch.without_registration(MatchVerdict(cause, reason, found.evidence, None, seen), belief)
         tilt = tilt_of(found.T_map_odom)
         if tilt > acceptance.max_tilt:
             cause, reason = RejectionReason.TILT, f"leans {np.degrees(tilt):.0f} degrees against gravity"
@@ -97,13 +108,15 @@ class MapMatcher:
             covariance = registration_covariance(own.information, settings)
             innovation = graph.innovation(own.T_map_body, covariance)
         except InputError as error:
-            return _failed(belief, str(error), found.evidence)
-        verdict = MatchVerdict(cause, reason, found.evidence, innovation)
+            return _failed(belief, str(error), found.evidence, seen)
+        verdict = MatchVerdict(cause, reason, found.evidence, innovation, seen)
         return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target)
 
 
-def _failed(belief: Estimate, reason: str, evidence: Evidence | None = None) -> MapMatch:
-    verdict = MatchVerdict(RejectionReason.FITNESS, f"registration failed: {reason}", evidence)
+def _failed(
+    belief: Estimate, reason: str, evidence: Evidence | None = None, seen: Observation | None = None
+) -> MapMatch:
+    verdict = MatchVerdict(RejectionReason.FITNESS, f"registration failed: {reason}", evidence, None, seen)
     return MapMatch.without_registration(verdict, belief)
 
 

@@ -1,21 +1,30 @@
-"""Verification while tracking: whether a registration is believed, and when too much has spoken against the place.
+"""Monitoring a place while tracking: how probable it is that the robot is elsewhere, and what follows from that.
 
-No single threshold decides. Evidence has to be good by itself (``AcceptanceConfig.tracking_min_score``), but also as
-good as it has been on the last metres: right places score 0.3 in one street and 0.7 in the next, and a wrong one 0.25.
-And it has to agree with odometry, or odometry with it: a place that fits a metre from where the robot can be is another
-one, or the robot is being carried.
+Two hypotheses are compared: the robot is where it is tracked, or it is not (odometry has jumped, it has been carried,
+the place was wrong from the beginning). Each registration weighs them by its log-likelihood ratio
+(:mod:`coview_stream.localization.tracking.place_evidence`), and driving on makes the second a little more probable.
+A pose is given while its probability is below the integrity risk; once it is more probable than not, the place is lost.
+docs/integrity.md has the equations.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from coview_stream.config import AcceptanceConfig, TrackingConfig
+from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import Event
+from coview_stream.localization.tracking.place_evidence import Observation
 
-_NEWEST_SHARE = 0.2  # of a new score in the baseline: about the last five registrations; set by hand
+# prior probabilities that a place becomes wrong; set by hand
+_PER_METRE = 1e-5  # driven: once in 100 km odometry jumps, or the robot is displaced
+_PER_SECOND = 1e-3  # while the place is in doubt: a robot that sees nothing may be on its way elsewhere
+_OFF_MAP = 0.3  # of what is seen on the map: less is told as such, it decides nothing; set by hand
+_NEWEST_SHARE = 0.2  # of new shares in what is usual: about the last five registrations; set by hand
 
 
 class RejectionReason(StrEnum):
@@ -39,8 +48,8 @@ class RejectionReason(StrEnum):
     """The place fits, but not where odometry says that the robot has moved."""
 
 
-_NEUTRAL = (RejectionReason.BLIND, RejectionReason.ODOMETRY)
-"""Reasons that cost the pose, but do not speak against the place."""
+_AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT)
+"""Reasons that cost the pose, whatever the evidence for the place was before; none is evidence against it."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +61,18 @@ class MatchVerdict:
         reason: one clause for people.
         evidence: of the registered pose; None where nothing could be registered.
         innovation: squared Mahalanobis distance to the prediction; None likewise.
+        observation: what the scan says of that pose, against chance; None likewise.
     """
 
     cause: RejectionReason
     reason: str
     evidence: Evidence | None = None
     innovation: float | None = None
+    observation: Observation | None = None
 
     @property
     def verified(self) -> bool:
-        """Whether the registration is believed."""
+        """Whether the registration is believed, as far as it goes by itself."""
         return self.cause is RejectionReason.VERIFIED
 
     @property
@@ -69,9 +80,14 @@ class MatchVerdict:
         """The evidence's score, 0 without any."""
         return self.evidence.score if self.evidence else 0.0
 
+    @property
+    def ratio(self) -> float:
+        """Log-likelihood ratio of the place against chance; 0 where nothing could be observed."""
+        return self.observation.ratio if self.observation else 0.0
+
 
 class EvidenceBaseline:
-    """The usual evidence of the last metres, which new evidence is compared with.
+    """The usual shares of the last metres, by which people are told what is missing, and the protection level widens.
 
     Attributes:
         usual: running average; None before the first registration.
@@ -96,97 +112,104 @@ class EvidenceBaseline:
         """Return how many times better what is usual is than ``evidence``: 1 at least."""
         return max(1.0, self.usual.score / evidence.score) if self.usual and evidence.score > 0 else 1.0
 
-    def judge(self, evidence: Evidence, rule: AcceptanceConfig) -> tuple[RejectionReason, str]:
-        """Return whether evidence is good enough, and as good as usual: the cause and one clause."""
-        if evidence.inside < rule.min_overlap:
-            return RejectionReason.OFF_MAP, f"only {evidence.inside:.0%} of what is seen lies on the map"
-        if evidence.ground < rule.tracking_min_ground:
-            return RejectionReason.GROUND, f"only {evidence.ground:.0%} of the ground lies on the map's"
-        usual = self.usual
-        needed = max(rule.tracking_min_score, rule.tracking_min_share * usual.score if usual else 0.0)
-        if evidence.score >= needed:
-            return RejectionReason.VERIFIED, "verified"
-        return self._fallen_furthest(evidence, f"score {evidence.score:.2f}, {needed:.2f} needed")
-
-    def _fallen_furthest(self, evidence: Evidence, told: str) -> tuple[RejectionReason, str]:
-        """Return the part of the evidence that has fallen furthest below what is usual."""
+    def explain(self, evidence: Evidence) -> tuple[RejectionReason, str]:
+        """Return the cause of poor evidence, the share that has fallen furthest below what is usual, and a clause."""
         usual = self.usual
         structure = evidence.near * evidence.covered / ((usual.near * usual.covered if usual else 0.0) or 0.25)
         ground = evidence.ground / ((usual.ground if usual else 0.0) or 1.0)
         space = evidence.free_space / ((usual.free_space if usual else 0.0) or 1.0)
-        worst = min(structure, ground, space)
+        inside = evidence.inside / ((usual.inside if usual else 0.0) or 1.0)
+        worst = min(structure, ground, space, inside)
+        if worst == inside or evidence.inside < _OFF_MAP:
+            return RejectionReason.OFF_MAP, f"only {evidence.inside:.0%} of what is seen lies on the map"
         if worst == space:
-            reason = f"rays pass through {1 - evidence.free_space:.0%} of the map's points: {told}"
-            return RejectionReason.FREE_SPACE, reason
+            return RejectionReason.FREE_SPACE, f"rays pass through {1 - evidence.free_space:.0%} of the map's points"
         if worst == ground:
-            return RejectionReason.GROUND, f"{evidence.ground:.0%} of the ground lies on the map's: {told}"
+            return RejectionReason.GROUND, f"only {evidence.ground:.0%} of the ground lies on the map's"
         here = f"{evidence.near:.0%} of what stands above the ground is on the map"
-        return RejectionReason.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if usual else ''}: {told}"
+        return RejectionReason.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if usual else ''}"
+
+
+class Ruling(NamedTuple):
+    """What a registration means for the place, after those before it.
+
+    Attributes:
+        event: for the robot's state; None: nothing.
+        reason: one clause.
+        wrong: probability that the place is wrong.
+        believed: whether the pose may be corrected by the registration.
+    """
+
+    event: Event | None
+    reason: str
+    wrong: float
+    believed: bool
 
 
 class LossMonitor:
-    """Count of what has spoken against the place since the newest registration that spoke for it.
+    """Odds that the place is wrong, from registration to registration.
 
-    Every verified registration may end the doubt, but only driving on with a place that does not fit adds to it: a
-    covered frame loses nothing. While the sensor is blind there is no pose, but nothing speaks against the place where
-    odometry goes on to. After a long doubt one registration is not enough, for the robot may stand elsewhere: it takes
-    several, a metre or a second apart.
+    What speaks against the place adds up, a view at a time: registrations within ``TrackingConfig.distance`` of each
+    other are one view, of which the newest counts. What speaks for it does not: a place that fits by chance goes on to
+    fit, so that one view has to make up for all that was said against the place.
     """
 
     def __init__(self, rule: AcceptanceConfig, tracking: TrackingConfig) -> None:
         """Decide by ``rule``; ``tracking`` says how far apart registrations tell something new."""
         self._rule = rule
         self._tracking = tracking
-        self.clear()
+        self.begin(0.0)
 
-    def clear(self) -> None:
-        """Forget what has spoken against the place."""
-        self._since: float | None = None  # stamp of the first rejected registration
-        self._seen_since = 0.0  # and of the first that was not blind
-        self._rejections = self._confirmations = 0
-        self._rejected_at = 0.0  # metres driven at the newest rejection that counts
-        self._confirmed_at = (0.0, 0.0)  # metres driven and stamp of the newest confirmation that counts
-        self._lasted = 0.0  # seconds from the first rejection to the first confirmation
+    def begin(self, error: float) -> None:
+        """Begin at a place that is wrong with a probability of ``error``."""
+        self._odds = self._before = error / (1.0 - error)  # now, and before the view that is looked at
+        self._viewed_at = -math.inf  # metres driven where that view began
+        self._newest: tuple[float, float] | None = None  # stamp and metres driven, of the newest registration
+        self._since: float | None = None  # stamp of the first registration that was not believed
+        self._seen_since = 0.0  # and of the first of those that was not blind
 
-    def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> tuple[Event | None, str]:
-        """Return what a registration at ``travelled`` metres means for the place (None: nothing), and one clause."""
-        if verdict.verified:
-            return self._verified(verdict, stamp, travelled)
-        self._confirmations = 0
+    def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> Ruling:
+        """Return what a registration at ``travelled`` metres means for the place."""
+        self._weigh(verdict, stamp, travelled)
+        wrong = self._odds / (1.0 + self._odds)
+        if self._odds >= 1.0:
+            return Ruling(Event.PLACE_GIVEN_UP, f"more probably elsewhere: {verdict.reason}", wrong, False)
+        certain = wrong < self._rule.risk
+        if verdict.verified and certain:
+            self._before, self._since = self._odds, None
+            return Ruling(Event.MATCH_VERIFIED, verdict.reason, wrong, True)
+        if certain and self._since is None and verdict.cause not in _AT_ONCE:
+            return Ruling(None, f"odometry alone: {verdict.reason}", wrong, False)
+        return self._doubt(verdict, stamp, wrong)
+
+    def _doubt(self, verdict: MatchVerdict, stamp: float, wrong: float) -> Ruling:
+        """Give no pose, and after a while give the place up."""
         if self._since is None:
             self._since = self._seen_since = stamp
         blind = verdict.cause is RejectionReason.BLIND
         if blind:
             self._seen_since = stamp
-        elif verdict.cause not in _NEUTRAL:
-            self._count_rejection(travelled)
-        rule = self._rule
-        if self._rejections >= rule.max_rejections:
-            return Event.PLACE_GIVEN_UP, f"{self._rejections} registrations rejected: {verdict.reason}"
-        began = self._since if blind else self._seen_since
-        if stamp - began >= (rule.max_blind_s if blind else rule.max_doubt_s):
-            return Event.PLACE_GIVEN_UP, f"in doubt for {stamp - self._since:.0f} s: {verdict.reason}"
-        return Event.MATCH_REJECTED, verdict.reason
+        began, longest = (self._since, self._rule.max_blind_s) if blind else (self._seen_since, self._rule.max_doubt_s)
+        if stamp - began >= longest:
+            reason = f"in doubt for {stamp - self._since:.0f} s: {verdict.reason}"
+            return Ruling(Event.PLACE_GIVEN_UP, reason, wrong, False)
+        reason = verdict.reason
+        if verdict.verified or verdict.cause not in _AT_ONCE:
+            reason = f"{'it fits again' if verdict.verified else verdict.reason}: wrong {one_in(wrong)}"
+        return Ruling(Event.MATCH_REJECTED, reason, wrong, False)
 
-    def _count_rejection(self, travelled: float) -> None:
-        """Count a rejection, if it is not the same view again."""
-        if not self._rejections or travelled - self._rejected_at >= self._tracking.distance:
-            self._rejections += 1
-            self._rejected_at = travelled
-
-    def _verified(self, verdict: MatchVerdict, stamp: float, travelled: float) -> tuple[Event | None, str]:
-        """Clear the doubt; after a long one, only once several registrations have."""
-        if not self._confirmations:
-            self._lasted = 0.0 if self._since is None else stamp - self._since
-        if self._lasted >= self._rule.max_doubt_s:
-            driven, waited = travelled - self._confirmed_at[0], stamp - self._confirmed_at[1]
-            apart = driven >= self._tracking.distance or waited >= self._tracking.seconds
-            if not self._confirmations or apart:
-                self._confirmations += 1
-                self._confirmed_at = travelled, stamp
-            needed = self._rule.confirmations
-            if self._confirmations < needed:
-                after = f"after {self._lasted:.0f} s of doubt"
-                return None, f"verified {self._confirmations} of {needed} times {after}"
-        self.clear()
-        return Event.MATCH_VERIFIED, verdict.reason
+    def _weigh(self, verdict: MatchVerdict, stamp: float, travelled: float) -> None:
+        """Move the odds on by what was driven since the newest registration, and by what this one says."""
+        waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
+        self._newest = stamp, travelled
+        prior = _PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
+        # standing and fitting again and again is no certainty: at any view the place may have become wrong
+        self._before = max(self._before + prior, _PER_METRE * self._tracking.distance)
+        self._odds += prior
+        if verdict.observation is None:
+            return
+        if travelled - self._viewed_at >= self._tracking.distance:
+            self._viewed_at = travelled
+            # what spoke against the place stays; what spoke for it is not counted twice
+            self._before = max(self._before, self._odds)
+        self._odds = min(self._before * math.exp(min(-verdict.ratio, 500.0)), 1e9)

@@ -22,7 +22,7 @@ from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.tracking.displacement_check import DisplacementCheck
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
-from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import MAX_FRAMES, Drift, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
@@ -49,8 +49,7 @@ class Tracker:
         self.T_map_odom: Pose = np.eye(4)
         self._graph = PoseGraph(config.graph)
         self._odometry = OdometryTracker(config.tracking)
-        self._baseline = EvidenceBaseline()
-        self._matcher = MapMatcher(base_map, config, self._baseline)
+        self._matcher = MapMatcher(base_map, config)
         self._displacement = DisplacementCheck()
         self._scans = ScanBuffer(config.tracking)
         self._unregistered = 0  # frames since the newest registration
@@ -118,7 +117,7 @@ class Tracker:
 
         It may not have converged yet: its own covariance is not believed.
         """
-        self._baseline.clear()
+        self._matcher.clear()
         self._doubt, self._disputed = 1.0, False
         self._displacement.clear()
         self._shared_error.clear()
@@ -164,15 +163,15 @@ class Tracker:
             return self._against_odometry(match, belief, scan)
         return match
 
-    def update(self, match: MapMatch, T_odom_body: Pose) -> None:
-        """Correct the belief by a registration at the newest frame; a rejected one leaves it as it is."""
+    def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
+        """Correct the belief by a registration at the newest frame; one that is not believed leaves it as it is."""
         verdict = match.verdict
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # go on where the lidar says, for the next frame to confirm
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
-        elif verdict.verified:
+        elif believed:
             self._graph.correct(match.T_map_body, match.covariance)
             self._set_belief(T_odom_body)
             self._learn(match, T_odom_body[:3, 3])
@@ -208,12 +207,15 @@ class Tracker:
         matter = matters(metres, degrees)
         if not matter and match.innovation <= self.config.acceptance.max_innovation:
             return match
-        moves = not matter or has_slipped(self._matcher.base_map, scan, belief.T_map_body, match.T_map_body)
+        moves = not matter or self._has_slipped(scan, belief.T_map_body, match.T_map_body)
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         if not moves:
             reason += ", and the scan fits there hardly better: something may have been moved"
-        verdict = MatchVerdict(RejectionReason.ODOMETRY, reason, match.verdict.evidence, match.innovation)
+        verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
         return replace(match, verdict=verdict, moves_place=moves)
+
+    def _has_slipped(self, scan: ScanInput, predicted: Pose, seen: Pose) -> bool:
+        return has_slipped(self._matcher.place, scan, predicted, seen, self.config.acceptance.risk)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
@@ -238,15 +240,17 @@ class Tracker:
 
     def _learn(self, match: MapMatch, position: Floats) -> None:
         """Learn from a verified registration: odometry's drift, what is usual here, what errors repeat."""
-        evidence, scan, target, newest = match.verdict.evidence, match.scan, match.target, self._scans.newest
-        if evidence is None or scan is None or target is None or newest is None:
+        verdict, scan, target, newest = match.verdict, match.scan, match.target, self._scans.newest
+        evidence, seen = verdict.evidence, verdict.observation
+        if evidence is None or seen is None or scan is None or target is None or newest is None:
             raise ValueError("nothing can be learned from a match without a registration")
-        self._doubt = self._baseline.fallen(evidence)
-        self._baseline.learn(evidence)
+        self._doubt = self._matcher.baseline.fallen(evidence)
+        self._matcher.baseline.learn(evidence)
+        self._matcher.place.learn(seen)
         self._odometry.learn(match.T_map_body, match.covariance)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)
 
 
 def _rank(match: MapMatch) -> tuple[bool, float]:
-    return match.verdict.verified, match.verdict.score
+    return match.verdict.verified, match.verdict.ratio

@@ -1,124 +1,220 @@
-"""The loss monitor: one rejection costs the pose, driving on or time the place; a long doubt takes several to end."""
+"""The loss monitor: odds that the place is wrong, which add up against it a view at a time, and never for it."""
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 
 from coview_stream.config import AcceptanceConfig, TrackingConfig
+from coview_stream.localization.evidence.likelihood import NUISANCES
 from coview_stream.localization.state import Event
-from coview_stream.localization.tracking.monitor import LossMonitor, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.monitor import LossMonitor, MatchVerdict, RejectionReason, Ruling
+from coview_stream.localization.tracking.place_evidence import Observation
 
-RULE = AcceptanceConfig(max_rejections=3, max_doubt_s=10.0, max_blind_s=60.0, confirmations=3)
-GOOD = MatchVerdict(RejectionReason.VERIFIED, "verified")
-BAD = MatchVerdict(RejectionReason.FITNESS, "nothing fits")
-VERIFIED = (Event.MATCH_VERIFIED, "verified")
-AGAINST = [
-    RejectionReason.FITNESS,
-    RejectionReason.GROUND,
-    RejectionReason.FREE_SPACE,
-    RejectionReason.TILT,
-    RejectionReason.OFF_MAP,
-]
+RULE = AcceptanceConfig(risk=1e-4, max_doubt_s=10.0, max_blind_s=60.0)
+PRIOR = 1e-5  # of a view, 1 m driven
+AT_ONCE = [RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT]
+
+
+def said(ratio, cause=None, reason="why"):
+    """A verdict on a registration with a log-likelihood ratio for the place."""
+    usual = RejectionReason.VERIFIED if ratio > 0 else RejectionReason.FITNESS
+    return MatchVerdict(cause or usual, reason, None, None, Observation(ratio, np.zeros(NUISANCES)))
+
+
+def nothing(cause=RejectionReason.BLIND):
+    """A verdict without an observation."""
+    return MatchVerdict(cause, "covered")
 
 
 @pytest.fixture
 def monitor():
-    return LossMonitor(RULE, TrackingConfig(distance=2.0, seconds=5.0))
+    return LossMonitor(RULE, TrackingConfig(distance=1.0, seconds=5.0))
 
 
-def test_loss_monitor_starts_clear(monitor):
-    assert monitor.verify(GOOD, 0.0, 0.0) == VERIFIED
+def drive(monitor, ratios, start=0.0, speed=1.0):
+    """Registrations 1 m apart."""
+    return [monitor.verify(said(ratio), (start + k) / speed, start + k) for k, ratio in enumerate(ratios)]
 
 
-@pytest.mark.parametrize("cause", [cause for cause in RejectionReason if cause is not RejectionReason.VERIFIED])
-def test_one_rejection_begins_doubt_and_one_verification_clears_it(monitor, cause):
-    assert monitor.verify(MatchVerdict(cause, "why"), 1.0, 0.0) == (Event.MATCH_REJECTED, "why")
-    assert monitor.verify(GOOD, 2.0, 0.0) == VERIFIED
+def log_odds(ruling: Ruling) -> float:
+    return math.log(ruling.wrong / (1.0 - ruling.wrong))
 
 
-@pytest.mark.parametrize("cause", AGAINST)
-def test_rejections_while_driving_are_a_loss(monitor, cause):
-    against = MatchVerdict(cause, "why")
-    for metres in (0.0, 1.9, 2.0, 3.9):
-        assert monitor.verify(against, 0.1 * metres, metres)[0] is Event.MATCH_REJECTED
-    assert monitor.verify(against, 0.5, 4.0) == (Event.PLACE_GIVEN_UP, "3 registrations rejected: why")
+def test_good_registration_is_believed(monitor):
+    found = monitor.verify(said(12.0), 0.0, 0.0)
+    assert (found.event, found.reason, found.believed) == (Event.MATCH_VERIFIED, "why", True)
+    assert found.wrong < PRIOR
 
 
-@pytest.mark.parametrize("cause", [RejectionReason.BLIND, RejectionReason.ODOMETRY])
-def test_blind_or_odometry_rejections_are_not_counted_while_driving(monitor, cause):
+def test_what_speaks_against_the_place_adds_up_a_view_at_a_time(monitor):
+    found = [log_odds(ruling) for ruling in drive(monitor, [5.0, -1.0, -2.0, -4.0], speed=1e3)]
+    np.testing.assert_allclose(np.diff(found[1:]), [2.0, 4.0], atol=0.35)  # and what is driven
+    assert found[-1] == pytest.approx(math.log(PRIOR) + 7.0, abs=0.5)
+
+
+def test_newest_registration_of_a_view_counts(monitor):
+    monitor.verify(said(5.0), 0.0, 0.0)
+    first = monitor.verify(said(-6.0), 1.0, 1.0).wrong
+    assert [monitor.verify(said(-6.0), 1.0, 1.0).wrong for _ in range(20)] == pytest.approx([first] * 20)
+    assert monitor.verify(said(-1.0), 1.0, 1.4).wrong < 0.1 * first
+    assert monitor.verify(said(-6.0), 1.0, 1.99).wrong == pytest.approx(first, rel=1.1)
+    assert monitor.verify(said(-6.0), 1.0, 2.0).wrong > 50 * first
+
+
+def test_what_speaks_for_the_place_does_not_add_up(monitor):
+    """However often it has fitted, it takes as much to doubt it."""
+    once = LossMonitor(RULE, TrackingConfig(distance=1.0, seconds=5.0))
+    drive(once, [15.0])
+    drive(monitor, [15.0] * 50)
+    assert log_odds(monitor.verify(said(-9.0), 50.0, 50.0)) == pytest.approx(
+        log_odds(once.verify(said(-9.0), 1.0, 1.0)), abs=0.01
+    )
+
+
+def test_standing_and_looking_again_and_again_is_no_certainty(monitor):
+    """A robot that is carried, while its odometry stands still, is noticed as soon as any other."""
+    for k in range(50):
+        assert monitor.verify(said(15.0), float(k), 7.0).believed
+    assert monitor.verify(said(-6.0), 50.0, 7.0).event is Event.MATCH_REJECTED
+    assert monitor.verify(said(-14.0), 51.0, 7.0).event is Event.PLACE_GIVEN_UP
+
+
+def test_one_view_has_to_make_up_for_all_that_was_said_before(monitor):
+    """Two that speak for it as much as one needs do not, each by itself."""
+    drive(monitor, [5.0, -4.0, -4.0])
+    weak = drive(monitor, [3.0, 3.0, 3.0], 3.0)
+    assert [(ruling.event, ruling.believed) for ruling in weak] == [(Event.MATCH_REJECTED, False)] * 3
+    assert weak[-1].wrong > weak[0].wrong > RULE.risk
+    assert weak[0].reason.startswith("it fits again: wrong 1 in ")
+    assert monitor.verify(said(9.0), 6.0, 6.0) == pytest.approx((Event.MATCH_VERIFIED, "why", 1e-5, True), abs=3e-5)
+    # and is forgiven
+    assert drive(monitor, [1.0], 7.0)[0].believed
+
+
+def test_place_is_given_up_once_it_is_more_probable_than_not_that_it_is_wrong(monitor):
+    drive(monitor, [5.0])
+    doubt = monitor.verify(said(-math.log(0.5 / PRIOR)), 1.0, 1.0)
+    assert (doubt.event, doubt.believed) == (Event.MATCH_REJECTED, False)
+    assert 0.2 < doubt.wrong < 0.5
+    lost = monitor.verify(said(-math.log(4.0 / PRIOR)), 1.0, 1.0)
+    assert (lost.event, lost.reason) == (Event.PLACE_GIVEN_UP, "more probably elsewhere: why")
+    assert 0.5 < lost.wrong < 0.9
+
+
+@pytest.mark.parametrize("ratio", [-1e4, 1e4])
+def test_any_ratio_gives_a_probability(monitor, ratio):
+    found = monitor.verify(said(ratio), 0.0, 0.0)
+    assert 0.0 <= found.wrong <= 1.0
+    assert found.event is (Event.MATCH_VERIFIED if ratio > 0 else Event.PLACE_GIVEN_UP)
+
+
+def test_little_that_speaks_against_the_place_costs_no_pose_and_corrects_nothing(monitor):
+    drive(monitor, [5.0])
+    found = monitor.verify(said(-0.5), 1.0, 1.0)
+    assert (found.event, found.believed) == (None, False)
+    assert found.reason == "odometry alone: why"
+    assert PRIOR < found.wrong < RULE.risk
+
+
+def test_robot_on_odometry_alone_is_doubted_by_the_metre(monitor):
+    drive(monitor, [5.0])
+    found = [monitor.verify(nothing(RejectionReason.OFF_MAP), 1.0, float(metres)) for metres in range(1, 21)]
+    posed = [ruling.event is None for ruling in found]
+    assert posed == sorted(posed, reverse=True)
+    assert posed.count(True) == pytest.approx(RULE.risk / PRIOR, abs=2)
+    np.testing.assert_allclose(np.diff([ruling.wrong for ruling in found]), PRIOR, rtol=0.01)
+
+
+def test_robot_that_trusts_odometry_is_not_doubted_by_the_second(monitor):
+    drive(monitor, [5.0])
+    wrong = [monitor.verify(said(-0.5), 1.0 + k, 1.0).wrong for k in range(100)]
+    assert wrong == pytest.approx([wrong[0]] * 100)
+
+
+def test_doubt_makes_the_place_less_probable_by_the_second(monitor):
+    drive(monitor, [5.0])
+    wrong = [monitor.verify(nothing(), 1.0 + k, 0.0).wrong for k in range(30)]
+    np.testing.assert_allclose(np.diff(wrong), 1e-3, rtol=0.1)
+
+
+@pytest.mark.parametrize("cause", AT_ONCE)
+@pytest.mark.parametrize("ratio", [20.0, None], ids=["fits", "nothing seen"])
+def test_some_causes_cost_the_pose_at_once(monitor, cause, ratio):
+    drive(monitor, [15.0] * 3)
+    verdict = nothing(cause) if ratio is None else said(ratio, cause, "covered")
+    assert monitor.verify(verdict, 3.0, 3.0)[:2] == (Event.MATCH_REJECTED, "covered")
+    assert monitor.verify(said(15.0), 3.5, 3.5).event is Event.MATCH_VERIFIED
+
+
+@pytest.mark.parametrize("cause", AT_ONCE)
+def test_causes_that_are_no_evidence_lose_no_place_while_driving(monitor, cause):
+    drive(monitor, [15.0])
     for k in range(9):
-        assert monitor.verify(MatchVerdict(cause, "why"), 1.0 * k, 5.0 * k) == (Event.MATCH_REJECTED, "why")
-    # and what does speak against it is counted from nothing
-    for k in range(2):
-        assert monitor.verify(BAD, 9.0, 50.0 + 5.0 * k) == (Event.MATCH_REJECTED, "nothing fits")
-    given_up = (Event.PLACE_GIVEN_UP, "3 registrations rejected: nothing fits")
-    assert monitor.verify(BAD, 9.0, 60.0) == given_up
+        assert monitor.verify(nothing(cause), 1.0 + k, 5.0 * k).event is Event.MATCH_REJECTED
 
 
-def test_verification_resets_the_rejection_count(monitor):
-    for k in range(20):
-        event, _ = monitor.verify(GOOD if k % 3 == 2 else BAD, 0.1 * k, 5.0 * k)
-        assert event is (Event.MATCH_VERIFIED if k % 3 == 2 else Event.MATCH_REJECTED)
+@pytest.mark.parametrize("seconds", [2.0, 30.0])
+def test_return_after_long_blindness_needs_more_evidence(monitor, seconds):
+    """Meanwhile it may have been carried: one frame could fit by chance."""
+    drive(monitor, [15.0])
+    for k in range(int(seconds) + 1):
+        monitor.verify(nothing(), 1.0 + k, 0.0)
+    enough = math.log((PRIOR + 1e-3 * seconds) / RULE.risk)
+    told = monitor.verify(said(enough - 0.5), 1.0 + seconds, 0.0)
+    assert (told.event, told.believed) == (Event.MATCH_REJECTED, False)
+    assert "it fits again" in told.reason
+    assert monitor.verify(said(enough + 0.5), 1.0 + seconds, 0.0).event is Event.MATCH_VERIFIED
 
 
 @pytest.mark.parametrize(
-    ("cause", "longest"),
-    [(RejectionReason.FITNESS, 10.0), (RejectionReason.ODOMETRY, 10.0), (RejectionReason.BLIND, 60.0)],
+    ("verdict", "longest"),
+    [(said(-3.0), 10.0), (said(20.0, RejectionReason.ODOMETRY), 10.0), (nothing(), 60.0)],
+    ids=["against", "odometry", "blind"],
 )
-def test_doubt_while_standing_times_out(monitor, cause, longest):
-    verdict = MatchVerdict(cause, "why")
+def test_doubt_while_standing_times_out(monitor, verdict, longest):
+    drive(monitor, [5.0])
     for seconds in (0.0, longest - 0.1):
-        assert monitor.verify(verdict, 100.0 + seconds, 7.0)[0] is Event.MATCH_REJECTED
-    given_up = (Event.PLACE_GIVEN_UP, f"in doubt for {longest:.0f} s: why")
-    assert monitor.verify(verdict, 100.0 + longest, 7.0) == given_up
+        assert monitor.verify(verdict, 100.0 + seconds, 1.0).event is Event.MATCH_REJECTED
+    lost = monitor.verify(verdict, 100.0 + longest, 1.0)
+    assert lost.event is Event.PLACE_GIVEN_UP
+    assert lost.reason == f"in doubt for {longest:.0f} s: {verdict.reason}"
 
 
-def test_doubt_times_out_from_its_first_registration(monitor):
-    """Time before that does not count: a verification may have been required long before."""
-    assert monitor.verify(BAD, 1000.0, 0.0)[0] is Event.MATCH_REJECTED
-    assert monitor.verify(BAD, 1010.0, 0.0)[0] is Event.PLACE_GIVEN_UP
-    monitor.clear()
-    assert monitor.verify(BAD, 1010.0, 0.0)[0] is Event.MATCH_REJECTED
+def test_time_that_the_sensor_was_blind_is_no_time_of_doubt(monitor):
+    """What it sees then has the whole time to be doubted in."""
+    for k in range(31):
+        monitor.verify(nothing(), float(k), 0.0)
+    assert monitor.verify(said(-1.0), 30.0 + RULE.max_doubt_s - 0.1, 0.0).event is Event.MATCH_REJECTED
+    lost = monitor.verify(said(-1.0), 30.0 + RULE.max_doubt_s, 0.0)
+    assert (lost.event, lost.reason) == (Event.PLACE_GIVEN_UP, "in doubt for 40 s: why")
 
 
-def blinded(monitor, seconds):
-    for k in range(round(seconds) + 1):
-        event, _ = monitor.verify(MatchVerdict(RejectionReason.BLIND, "covered"), float(k), 0.0)
-        assert event is Event.MATCH_REJECTED
+def test_doubt_ends_with_the_first_registration_that_is_believed(monitor):
+    """The next one begins a doubt of its own."""
+    monitor.verify(nothing(), 0.0, 0.0)
+    assert monitor.verify(said(15.0), 9.0, 0.0).believed
+    assert monitor.verify(nothing(), 11.0, 0.0).event is Event.MATCH_REJECTED
+    assert monitor.verify(nothing(), 11.0 + RULE.max_blind_s - 0.1, 0.0).event is Event.MATCH_REJECTED
 
 
-def verified(count, seconds=31):
-    """One of several verifications that a long doubt takes."""
-    return None, f"verified {count} of 3 times after {seconds} s of doubt"
+@pytest.mark.parametrize("error", [0.0, 0.9e-4])
+def test_place_begins_with_the_error_of_the_search(monitor, error):
+    """What was said of the place before does not count, and what the search said does."""
+    drive(monitor, [5.0, -5.0, -5.0])
+    monitor.begin(error)
+    wrong = monitor.verify(said(-2.0), 3.0, 3.0).wrong
+    assert wrong == pytest.approx(max(error, PRIOR) * math.exp(2.0), rel=0.01)
+    monitor.begin(error)
+    assert monitor.verify(said(2.0), 3.0, 3.0).believed
 
 
-def test_long_doubt_needs_several_verifications(monitor):
-    blinded(monitor, 30.0)
-    told = [monitor.verify(GOOD, 31.0 + k, metres) for k, metres in enumerate((0.0, 0.5, 2.0, 3.9))]
-    # the same view again proves nothing more
-    assert told == [verified(1), verified(1), verified(2), verified(2)]
-    assert monitor.verify(GOOD, 36.0, 4.0) == VERIFIED
-    assert monitor.verify(BAD, 36.1, 9.0)[0] is Event.MATCH_REJECTED  # and all is forgotten
-    assert monitor.verify(GOOD, 36.2, 9.0) == VERIFIED
-
-
-def test_standing_robot_leaves_long_doubt_after_some_seconds(monitor):
-    blinded(monitor, 30.0)
-    told = [monitor.verify(GOOD, 31.0 + k, 0.0) for k in range(11)]
-    assert told == [verified(1)] * 5 + [verified(2)] * 5 + [VERIFIED]
-
-
-def test_rejection_resets_verifications_after_long_doubt(monitor):
-    blinded(monitor, 30.0)
-    monitor.verify(GOOD, 31.0, 0.0)
-    assert monitor.verify(GOOD, 32.0, 2.0) == verified(2)
-    monitor.verify(MatchVerdict(RejectionReason.BLIND, "covered"), 33.0, 4.0)
-    assert monitor.verify(GOOD, 34.0, 6.0) == verified(1, 34)
-
-
-def test_short_doubt_is_cleared_by_one_verification(monitor):
-    blinded(monitor, 8.0)
-    assert monitor.verify(GOOD, 9.9, 0.0) == VERIFIED
-    # and the verification of an earlier doubt is not counted for a later one
-    blinded(monitor, 30.0)
-    assert monitor.verify(GOOD, 31.0, 0.0) == verified(1)
+def test_risk_decides_what_is_believed():
+    for risk in (1e-2, 1e-6):
+        monitor = LossMonitor(AcceptanceConfig(risk=risk), TrackingConfig(distance=1.0))
+        drive(monitor, [15.0])
+        found = monitor.verify(said(1.0), 1.0, 1.0)  # 1e-5 / e
+        assert found.believed == (risk == 1e-2)
+        assert found.event is (Event.MATCH_VERIFIED if found.believed else Event.MATCH_REJECTED)

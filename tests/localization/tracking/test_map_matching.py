@@ -16,7 +16,7 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan, v
 from coview_stream.localization.registration.register import ScanInput, register
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
-from coview_stream.localization.tracking.monitor import EvidenceBaseline, RejectionReason
+from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
 CONFIG = LocalizerConfig()
@@ -42,7 +42,7 @@ def matched(world_map, scan, belief: Estimate, graph: Estimate | None = None) ->
     pose_graph.start(*(graph or belief))
     target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
     scales = CONFIG.registration.track
-    return MapMatcher(world_map, CONFIG, EvidenceBaseline()).match(scan, belief, target, scales, pose_graph)
+    return MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, pose_graph)
 
 
 def off(found, truth):
@@ -134,7 +134,7 @@ def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
     pose_graph.start(*belief)
     target = LocalMaps(world_map, 50.0).around(truth[:3, 3])
     scales = CONFIG.registration.track
-    found = MapMatcher(world_map, CONFIG, EvidenceBaseline()).match(scan, belief, target, scales, pose_graph)
+    found = MapMatcher(world_map, CONFIG).match(scan, belief, target, scales, pose_graph)
     assert found.verdict.cause is RejectionReason.OFF_MAP
 
 

@@ -9,9 +9,10 @@ from trackers import on_the_way, refused
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
-from coview_stream.localization.tracking import slip, tracker
+from coview_stream.localization.tracking import tracker
 from coview_stream.localization.tracking.monitor import RejectionReason
-from coview_stream.localization.tracking.slip import has_slipped, matters, off_by, slip_ratio
+from coview_stream.localization.tracking.place_evidence import PlaceEvidence
+from coview_stream.localization.tracking.slip import has_slipped, matters, off_by
 
 AWAY = pose_from(rot_z(np.radians(4.0)), [1.2, -0.5, 0.0])
 
@@ -30,14 +31,14 @@ def scan(world_map, world_drive):
 
 
 def test_place_that_explains_the_scan_wins_and_the_other_way_round_loses(world_map, scan):
-    seen, truth = scan
-    away = truth @ AWAY
-    ratio = slip_ratio(world_map, seen, away, truth)
+    (seen, truth), place = scan, PlaceEvidence(world_map)
+    away, T_body_odom = truth @ AWAY, inverse(seen.T_odom_body)
+    ratio = place.gain(seen, away @ T_body_odom, truth @ T_body_odom)
     assert ratio > 10.0
-    assert slip_ratio(world_map, seen, truth, away) == pytest.approx(-ratio, rel=0.5)
-    assert has_slipped(world_map, seen, away, truth)
-    assert not has_slipped(world_map, seen, truth, away)
-    assert slip_ratio(world_map, seen, truth, truth) == 0.0
+    for risk, slipped in ((1e-4, True), (1.01 * np.exp(-ratio), True), (0.99 * np.exp(-ratio), False)):
+        assert has_slipped(place, seen, away, truth, risk) == slipped
+        assert not has_slipped(place, seen, truth, away, risk)
+    assert place.gain(seen, truth @ T_body_odom, truth @ T_body_odom) == 0.0
 
 
 def test_places_within_half_of_the_alert_limit_need_no_decision():
@@ -46,16 +47,6 @@ def test_places_within_half_of_the_alert_limit_need_no_decision():
     assert not matters(0.4, 1.0)
     assert matters(0.6, 0.0)
     assert matters(0.0, 2.0)
-
-
-def test_chance_places_lie_around_at_all_sides():
-    around = slip._around(np.array([5.0, -3.0, 1.0, 0.2]))
-    gap = around[:, :2] - [5.0, -3.0]
-    assert len(around) == 32
-    assert np.linalg.norm(gap, axis=1).min() == pytest.approx(3.0)
-    np.testing.assert_allclose(gap.mean(axis=0), 0.0, atol=1e-9)
-    assert (around[:, 2] == 1.0).all()
-    assert np.abs(around[:, 3] - 0.2).min() > 0.0
 
 
 def test_registration_that_is_off_odometry_and_not_worth_it_moves_nothing(world_map, slow_drive, monkeypatch):
@@ -80,7 +71,7 @@ def test_doubt_that_makes_the_belief_wide_lets_no_such_registration_in(world_map
     ride.slips(pose_from(np.eye(3), [0.9, -0.6, 0.1]), truth[7])
     refused(ride, clouds[8], truth[8])
     monkeypatch.setattr(ride.tracker._graph, "innovation", lambda *_: 1.0)
-    assert refused(ride, clouds[9], truth[9]).cause is RejectionReason.ODOMETRY
+    assert refused(ride, clouds[9], truth[9], newest_only=True).cause is RejectionReason.ODOMETRY
     monkeypatch.setattr(tracker, "has_slipped", lambda *_: True)
-    assert ride.update(clouds[10], truth[10]).cause is RejectionReason.ODOMETRY
+    assert ride.update(clouds[10], truth[10], newest_only=True).cause is RejectionReason.ODOMETRY
     assert ride.error(truth[10])[0] < 0.1

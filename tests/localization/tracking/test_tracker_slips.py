@@ -117,7 +117,7 @@ def test_standing_still_uses_only_scans_since_last_registration(world_map, slow_
         ride.see(garbage(k), slow_drive.T_map_body[4])
     verdict = ride.update(garbage(3), slow_drive.T_map_body[4], standing_still=True)
     assert not verdict.verified
-    assert verdict.score < RULE.tracking_min_score
+    assert verdict.ratio < -5.0
     moving = on_the_way(world_map, slow_drive, wide, 4)
     for k in (1, 2):
         moving.see(garbage(k), slow_drive.T_map_body[4])

@@ -1,0 +1,93 @@
+"""Evidence of a tracked place: the search's log-likelihood ratio, with nuisances that are known from before.
+
+In a search nothing is known of how much of the site is as the map has it, of what the survey shows of it, and of how
+foliage lets rays through: these are summed over evenly. A robot that has been here for some metres knows them, for they
+change slowly along its way: what was learned at one registration, spread a little, is presumed at the next. So what is
+usual here is part of the likelihood (docs/integrity.md, eq. 6): explaining half of the scan speaks for a place in a
+street where half of everything has changed, and against it where nearly all was explained a metre before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.evidence.chance_places import observe_with_background
+from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihoods, steps_of_kept
+from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.registration.register import ScanInput
+
+# set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
+_SPREAD = 0.05  # standard deviation of the share q that is as the map has it, from one registration to the next
+_CHANGED = 1e-4  # probability that the site becomes another one from one registration to the next
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a scan says of a pose.
+
+    Attributes:
+        ratio: log-likelihood ratio of "the robot is here" against chance.
+        likelihoods: (Q, D, L) the same for each value of the nuisances.
+    """
+
+    ratio: float
+    likelihoods: Floats
+
+
+class PlaceEvidence:
+    """What registrations have told of the nuisances at one place, and what a scan says of it by that."""
+
+    def __init__(self, base_map: BaseMap) -> None:
+        self._base_map = base_map
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what is known: the place is another."""
+        self._known = np.full(NUISANCES, 1.0 / np.prod(NUISANCES))
+
+    def observe(self, scan: ScanInput, T_map_odom: Pose) -> Observation:
+        """Return what a scan, put there by a pose (4, 4), says of it; changes nothing."""
+        likelihoods = self._likelihoods(scan, T_map_odom[None])
+        return Observation(float(self._ratios(likelihoods)[0]), likelihoods[0])
+
+    def gain(self, scan: ScanInput, T_map_odom: Pose, T_map_other: Pose) -> float:
+        """Return the log-likelihood ratio of another pose (4, 4) to the first, against the first's background."""
+        first, other = self._ratios(self._likelihoods(scan, np.stack([T_map_odom, T_map_other])))
+        return float(other - first)
+
+    def learn(self, observation: Observation) -> None:
+        """Learn the nuisances from a registration that is believed; not from others, or a wrong place became usual."""
+        likelihoods = observation.likelihoods
+        posterior = self._presumed() * np.exp(likelihoods - likelihoods.max())
+        self._known = posterior / posterior.sum()
+
+    def _likelihoods(self, scan: ScanInput, T_map_odom: Floats) -> Floats:
+        """Return log-likelihood ratios (P, Q, D, L) of poses (P, 4, 4) against chance around the first."""
+        observed, background = observe_with_background(self._base_map.field, ObservedScan.of(scan), T_map_odom)
+        return log_likelihoods(observed, background)
+
+    def _ratios(self, likelihoods: Floats) -> Floats:
+        """Return the log-likelihood ratios (P,) with the nuisances that are presumed."""
+        top = likelihoods.max(axis=(1, 2, 3))
+        each = self._presumed() * np.exp(likelihoods - top[:, None, None, None])
+        return np.asarray(top + np.log(each.sum(axis=(1, 2, 3))))
+
+    def _presumed(self) -> Floats:
+        """Return the probabilities (Q, D, L) of the nuisances at the next registration."""
+        spread = np.einsum("qr,qdl->rdl", _STEPS, self._known)
+        return np.asarray((1.0 - _CHANGED) * spread + _CHANGED / np.prod(NUISANCES))
+
+
+def _steps() -> Floats:
+    """Return the probabilities (Q, Q) that one share q becomes another."""
+    kept = steps_of_kept()
+    weight = np.exp(-0.5 * ((kept[:, None] - kept) / _SPREAD) ** 2)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+
+
+_STEPS = _steps()

@@ -1,0 +1,169 @@
+"""Evidence of a tracked place: what was learned on the way is presumed, and what has changed speaks against it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.evidence.chance_places import observe_with_background
+from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihood_ratios, steps_of_kept
+from coview_stream.localization.evidence.observed_scan import ObservedScan
+from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
+from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
+
+T_MAP_ODOM = pose_from(rot_z(1.3), [-4.0, 11.0, 0.6])
+KEPT = steps_of_kept()
+
+
+@pytest.fixture(scope="module")
+def scans(world_drive):
+    """The drive's first scans."""
+    return [scan_of(world_drive.clouds[k], world_drive.T_map_body[k]) for k in range(6)]
+
+
+def scan_of(cloud, truth) -> ScanInput:
+    config, T = LocalizerConfig(), inverse(T_MAP_ODOM) @ truth
+    points = prepare_scan(voxelized(cloud, T, config.keyframe), T[:3, 3], config.registration)
+    return ScanInput(points, cloud, T)
+
+
+@pytest.fixture
+def place(world_map):
+    return PlaceEvidence(world_map)
+
+
+def moved(scan, metres, degrees=0.0):
+    """The map <- odometry that puts the robot so far ahead of where it is."""
+    T_odom_body = scan.T_odom_body
+    return T_MAP_ODOM @ T_odom_body @ pose_from(rot_z(np.radians(degrees)), [metres, 0.0, 0.0]) @ inverse(T_odom_body)
+
+
+def fits_best_with(kept):
+    """An observation that is the likelier the nearer the share that is as the map has it is to one."""
+    likelihoods = np.broadcast_to(-80.0 * (KEPT - kept)[:, None, None] ** 2, NUISANCES)
+    return Observation(0.0, likelihoods + 8.0 * kept)
+
+
+def ratio_of(place, observation):
+    """What another place's knowledge makes of an observation, written out."""
+    odds = np.exp(observation.likelihoods) * place._presumed()
+    return float(np.log(odds.sum()))
+
+
+# ---- what a scan says
+
+
+def test_right_pose_is_told_from_chance(place, scans):
+    for scan in scans:
+        assert place.observe(scan, T_MAP_ODOM).ratio > 5.0
+        for metres, degrees in ((8.0, 0.0), (-9.0, 20.0), (0.0, 90.0)):
+            assert place.observe(scan, moved(scan, metres, degrees)).ratio < 0.0
+
+
+def test_without_knowledge_it_is_the_ratio_of_the_search(world_map, place, scans):
+    found = place.observe(scans[2], T_MAP_ODOM)
+    observed, background = observe_with_background(world_map.field, ObservedScan.of(scans[2]), T_MAP_ODOM[None])
+    # but that shares near the ends have fewer neighbours to have come from
+    assert found.ratio == pytest.approx(log_likelihood_ratios(observed, background)[0][0], abs=0.1)
+    assert found.likelihoods.shape == NUISANCES
+
+
+def test_scan_of_another_world_speaks_against_the_place(place, scans, elsewhere, world_drive):
+    for scan in scans:
+        place.learn(place.observe(scan, T_MAP_ODOM))
+    for cloud in elsewhere.clouds:
+        assert place.observe(scan_of(cloud, world_drive.T_map_body[5]), T_MAP_ODOM).ratio < -5.0
+
+
+def test_scan_that_fits_in_part_speaks_for_a_place_only_where_that_is_usual(world_map, scans):
+    """A new robot does not know how much of the site has changed; one that drives through it does."""
+    fresh, unchanged, changed = (PlaceEvidence(world_map) for _ in range(3))
+    for scan in scans[:5]:
+        unchanged.learn(unchanged.observe(scan, T_MAP_ODOM))
+        changed.learn(changed.observe(gone(scan, 0.75), T_MAP_ODOM))
+    now = gone(scans[5], 0.75)
+    assert fresh.observe(now, T_MAP_ODOM).ratio > 1.0
+    assert changed.observe(now, T_MAP_ODOM).ratio > fresh.observe(now, T_MAP_ODOM).ratio
+    assert unchanged.observe(now, T_MAP_ODOM).ratio < -1.0
+    assert unchanged.observe(scans[5], T_MAP_ODOM).ratio > fresh.observe(scans[5], T_MAP_ODOM).ratio > 5.0
+
+
+def gone(scan, share):
+    """The scan with what stands in a sector, a share of all directions, half a dozen metres off."""
+    points = scan.cloud.points.copy()
+    off = points - scan.T_odom_body[:3, 3].astype(np.float32)
+    turn = np.arctan2(off[:, 1], off[:, 0]) / (2 * np.pi) + 0.5
+    points[(turn < share) & scan.cloud.above] += np.float32([3.1, 5.3, 0.0])
+    return replace(scan, cloud=replace(scan.cloud, points=points))
+
+
+# ---- what is learned
+
+
+def test_half_fitting_scan_speaks_against_where_all_fitted_and_for_where_half_did(world_map):
+    whole, half = PlaceEvidence(world_map), PlaceEvidence(world_map)
+    for _ in range(10):
+        whole.learn(fits_best_with(1.0))
+        half.learn(fits_best_with(0.5))
+    now = fits_best_with(0.5)
+    unknown = ratio_of(PlaceEvidence(world_map), now)
+    assert ratio_of(half, now) > unknown + 1.0
+    assert ratio_of(whole, now) < unknown - 3.0
+    assert ratio_of(whole, fits_best_with(1.0)) > 5.0
+
+
+def test_site_that_has_become_another_one_is_learned(world_map):
+    """However long all has fitted: a robot that has been shown half for some metres presumes half."""
+    place = PlaceEvidence(world_map)
+    for _ in range(100):
+        place.learn(fits_best_with(1.0))
+    believed = []
+    for _ in range(20):
+        believed.append(ratio_of(place, fits_best_with(0.4)))
+        place.learn(fits_best_with(0.4))
+    assert believed[0] < believed[-1] - 5.0
+    kept = place._presumed().sum(axis=(1, 2))
+    assert KEPT[kept.argmax()] == pytest.approx(0.4, abs=0.06)
+
+
+def test_change_is_never_impossible(world_map):
+    """What was learned costs a change of everything no more than its probability beforehand."""
+    place = PlaceEvidence(world_map)
+    for _ in range(1000):
+        place.learn(fits_best_with(1.0))
+    gone = fits_best_with(0.05)
+    assert ratio_of(PlaceEvidence(world_map), gone) - ratio_of(place, gone) < -np.log(1e-4) + 0.1
+    assert place._presumed().sum() == pytest.approx(1.0)
+
+
+def test_neighbouring_shares_are_hardly_told_apart(world_map):
+    place = PlaceEvidence(world_map)
+    for _ in range(50):
+        place.learn(Observation(0.0, fits_best_with(0.8).likelihoods * 20.0))
+    kept = place._presumed().sum(axis=(1, 2))
+    assert kept[np.abs(KEPT - 0.8) < 0.11].sum() > 0.9
+    assert kept[np.isclose(KEPT, 0.75)] > 0.1
+
+
+def test_observing_changes_nothing_and_clearing_forgets(place, scans):
+    before = place.observe(scans[0], T_MAP_ODOM)
+    for scan in scans:
+        place.observe(scan, T_MAP_ODOM)
+    again = place.observe(scans[0], T_MAP_ODOM)
+    assert again.ratio == before.ratio
+    np.testing.assert_array_equal(again.likelihoods, before.likelihoods)
+    place.learn(before)
+    assert place.observe(scans[0], T_MAP_ODOM).ratio > before.ratio + 0.5
+    place.clear()
+    assert place.observe(scans[0], T_MAP_ODOM).ratio == before.ratio
+
+
+def test_nothing_is_learned_where_all_is_as_likely(place, scans):
+    before = place.observe(scans[0], T_MAP_ODOM).ratio
+    place.learn(Observation(0.0, np.full(NUISANCES, -3.0)))
+    assert place.observe(scans[0], T_MAP_ODOM).ratio == pytest.approx(before, abs=0.1)
