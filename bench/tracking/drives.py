@@ -164,6 +164,17 @@ def jumped(drive: Drive) -> Drive:
     return drive.after("odometry jump", at, at, odometry=odometry)
 
 
+def slipped(drive: Drive) -> Drive:
+    """Let odometry slip every 30 m: sideways by 0.8 to 3.2 m, to either side, and round by 2 to 8 degrees."""
+    drive = drive.until(300.0)
+    for number, metres in enumerate(np.arange(30.0, 271.0, 30.0)):
+        at, size, side = drive.at(float(metres)), 0.8 * (1 + number % 4), (-1.0) ** number
+        step = pose_from(rot_z(np.radians(-2.5 * size * side)), [0.0, size * side, 0.0])
+        odometry = rejoined(drive.odometry, at, drive.odometry[at] @ step)
+        drive = drive.after(f"slip of {size:.1f} m", at, at, odometry=odometry)
+    return drive
+
+
 def restarted(drive: Drive) -> Drive:
     """Let odometry start again at its zero."""
     drive = drive.until(EVENT_AT + 120.0)

@@ -113,17 +113,28 @@ def tail(sample: Sample, part: int) -> tuple[float, float]:
     return float(np.exp(best[0])), float(np.clip(np.exp(best[1]), _HEAVIEST, _LIGHTEST))
 
 
-def misleading(told: Told, error: Errors, driven: Floats) -> int:
-    """Count the times that a pose was given beyond the alert limit for longer, or over more metres, than allowed."""
+class Beyond(NamedTuple):
+    """One time that poses were given beyond the alert limit: how long until they were withdrawn or right again."""
+
+    seconds: float
+    metres: float
+
+    @property
+    def misleading(self) -> bool:
+        """Whether that took longer, or led further, than allowed."""
+        return self.seconds > TO_ALERT[0] or self.metres > TO_ALERT[1]
+
+
+def beyond_alert_limit(told: Told, error: Errors, driven: Floats) -> list[Beyond]:
+    """Return the times that poses were given beyond the alert limit; (N,) metres ``driven`` at each frame."""
     beyond = told.tracking & ((error.metres > ALERT[0]) | (error.degrees > ALERT[1]))
     edges = np.diff(np.r_[False, beyond, False].astype(int))
-    count = 0
+    out = []
     for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
         last = min(end, len(driven) - 1)  # where it is withdrawn, or the drive's end
-        count += bool(
-            told.stamps[last] - told.stamps[begin] > TO_ALERT[0] or driven[last] - driven[begin] > TO_ALERT[1]
-        )
-    return count
+        seconds, metres = told.stamps[last] - told.stamps[begin], driven[last] - driven[begin]
+        out.append(Beyond(float(seconds), float(metres)))
+    return out
 
 
 def level_table(samples: Mapping[str, Sample]) -> str:

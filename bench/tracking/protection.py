@@ -20,7 +20,7 @@ from bench.harness.rows import Row, informs, judged
 from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import errors
 from bench.tracking import drives
-from bench.tracking.levels import PRODUCT, Sample, level_table, misleading, stanford, tail, upper_bound
+from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, level_table, stanford, tail, upper_bound
 from bench.tracking.tracking import follow
 from bench.tracking.worlds import World, map_of, open_world
 from coview_stream.geometry.protection import RISK
@@ -120,7 +120,7 @@ def measure(below: Path, world: World, variant: str) -> dict[str, Any]:
         error = errors(told, drive.truth)
         sample = Sample.of(told, error, drive.driven)
         about = {"kind": world.kind, "variant": variant, "driven_m": float(drive.driven[-1])}
-        about["misleading"] = misleading(told, error, drive.driven)
+        about["misleading"] = sum(each.misleading for each in beyond_alert_limit(told, error, drive.driven))
         return about | {"sample": sample.to_json()}
 
     return remembered(below / "protection-results" / f"{world.name}-{variant}.json", spec, work)

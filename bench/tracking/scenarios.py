@@ -46,6 +46,8 @@ _EVENTS: dict[str, tuple[Callable[[Drive], Drive], tuple[str, ...], float, str]]
     "dust": (partial(covered, cover=DUST), ("town",), 0.01, "plain"),
     "changed": (_FIRST_300, ("town", "campus", "forest"), 0.01, "changed"),
     "jump": (drives.jumped, ("town", "forest"), 0.01, "plain"),
+    "slip": (drives.slipped, ("town", "campus", "forest"), 0.01, "plain"),
+    "slip, changed": (drives.slipped, ("town", "campus", "forest"), 0.01, "changed"),
     "reset": (drives.restarted, ("campus",), 0.01, "plain"),
     "scale": (drives.scaled, ("town", "forest"), 0.005, "plain"),
 }

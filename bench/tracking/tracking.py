@@ -25,7 +25,7 @@ from bench.harness.tables import number, table
 from bench.harness.trajectory_scores import Told, errors, score
 from bench.tracking.coverage import PARTS, WITHIN, Squares, coverage_table, draw, honest, pooled, shares, spread
 from bench.tracking.drives import Drive, drift_share, seen
-from bench.tracking.levels import Sample, level_table, misleading
+from bench.tracking.levels import TO_ALERT, Sample, beyond_alert_limit, level_table
 from bench.tracking.scenarios import QUICK, SEEDS, Scenario, scenarios
 from bench.tracking.worlds import Recorded, map_of, open_world
 from coview_stream import BaseMap, Localizer
@@ -42,7 +42,8 @@ _COLUMNS = {
     "drift %": ("drift_percent", 1), "driven m": ("driven_m", 0), "right %": ("right_percent", 1),
     "first m": ("first_fix_m", 1), "rmse m": ("rmse_m", 3), "max m": ("max_m", 2), "rmse deg": ("rmse_deg", 2),
     "max deg": ("max_deg", 1), "false": ("false_frames", 0), "false s": ("false_s", 1),
-    "HMI": ("misleading", 0), "> 0.5 m": ("doubtful_frames", 0), "lost": ("losses", 0), "back m": ("recovery_m", 1),
+    "beyond": ("beyond", 0), "alert s": ("alert_s", 1), "alert m": ("alert_m", 1), "HMI": ("misleading", 0),
+    "> 0.5 m": ("doubtful_frames", 0), "lost": ("losses", 0), "back m": ("recovery_m", 1),
     "back s": ("recovery_s", 1), "p50 ms": ("p50_ms", 1), "p99 ms": ("p99_ms", 0),
 }  # fmt: skip
 """Of the table: a drive's figure, or one of its worst event, and its decimals."""
@@ -111,7 +112,13 @@ def measure(folder: Path, scenario: Scenario) -> tuple[Figures, Squares, Sample]
         about = {"name": scenario.name, "plain": scenario.plain, "drift_percent": 100 * drift}
         error = errors(told, drive.truth)
         parts, sample = spread(told, error), Sample.of(told, error, drive.driven)
-        about["misleading"] = misleading(told, error, drive.driven)
+        beyond = beyond_alert_limit(told, error, drive.driven)
+        about |= {
+            "misleading": sum(each.misleading for each in beyond),
+            "beyond": len(beyond),
+            "alert_s": max((each.seconds for each in beyond), default=None),
+            "alert_m": max((each.metres for each in beyond), default=None),
+        }
         lists = {part: {name: values.tolist() for name, values in axes.items()} for part, axes in parts.items()}
         figures = about | score(told, drive.truth, drive.driven, drive.events)
         return {"figures": figures, "squares": lists, "sample": sample.to_json()}
@@ -160,7 +167,10 @@ def verdicts(drives: Sequence[Figures], found: dict[str, dict[str, Any]], quick:
     false, seconds = (sum(figures[key] for figures in drives) for key in ("false_frames", "false_s"))
     yield judged("tracking/false frames", f"{false} ({seconds:.1f} s)", "0", false == 0, false)
     count = sum(figures["misleading"] for figures in drives)
-    yield judged("tracking/beyond the alert limit", f"{count} times", "0", not count, count)
+    times, asked = sum(figures["beyond"] for figures in drives), f"<= {TO_ALERT[0]:.0f} s and {TO_ALERT[1]:.0f} m"
+    longest = (max((figures[key] or 0.0 for figures in drives), default=0.0) for key in ("alert_s", "alert_m"))
+    said = f"{times} times, {next(longest):.1f} s and {next(longest):.1f} m at most"
+    yield judged("tracking/beyond the alert limit, to the alert", said, asked, not count, count)
     if quick:
         return
     if events := [event for figures in drives for event in figures["events"]]:

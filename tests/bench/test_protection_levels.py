@@ -8,7 +8,7 @@ from told import told, way
 
 from bench.harness.trajectory_scores import errors
 from bench.tracking import protection
-from bench.tracking.levels import PRODUCT, Sample, level_table, misleading, stanford, tail, upper_bound
+from bench.tracking.levels import PRODUCT, Sample, beyond_alert_limit, level_table, stanford, tail, upper_bound
 from coview_stream.geometry.protection import protection_level
 
 C = np.diag([1e-4, 1e-4, 1e-5, 1e-6, 1e-6, 2e-6])
@@ -63,10 +63,12 @@ def test_a_pose_beyond_the_alert_limit_misleads_unless_it_is_withdrawn_in_time()
     poses[30:, 0, 3] = 1.1  # 2.9 s, to the end
     said = told(["TRACKING"] * 60, poses)
     error = errors(said, truth)
-    assert misleading(said, error, np.zeros(60)) == 1
-    assert misleading(said, error, 0.3 * np.arange(60)) == 2  # 2.4 m
+    assert sum(each.misleading for each in beyond_alert_limit(said, error, np.zeros(60))) == 1
+    far = beyond_alert_limit(said, error, 0.3 * np.arange(60))
+    assert [each.misleading for each in far] == [True, True]
+    assert far[0] == pytest.approx((0.8, 2.4))
     withdrawn = told(["TRACKING"] * 45 + ["LOST"] * 15, poses)
-    assert misleading(withdrawn, errors(withdrawn, truth), np.zeros(60)) == 0
+    assert not any(each.misleading for each in beyond_alert_limit(withdrawn, errors(withdrawn, truth), np.zeros(60)))
 
 
 def test_table_and_picture_of_a_sample_and_of_none(tmp_path):

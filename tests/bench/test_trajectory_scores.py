@@ -145,7 +145,7 @@ def row(**changes):
         "name": "plain/x", "plain": True, "drift_percent": 1.0, "driven_m": 300.0, "right_percent": 98.0,
         "first_fix_m": 5.0, "rmse_m": 0.05, "max_m": 0.2, "rmse_deg": 0.05, "max_deg": 0.2, "false_frames": 0,
         "false_s": 0.0, "doubtful_frames": 0, "losses": 0, "reasons": [], "events": [], "p50_ms": 3.0, "p99_ms": 30.0,
-        "misleading": 0,
+        "misleading": 0, "beyond": 0, "alert_s": None, "alert_m": None,
     }  # fmt: skip
     return out | changes
 
@@ -157,7 +157,7 @@ def row(**changes):
         ({"rmse_m": 0.13}, {"rmse of plain drives, m"}),
         ({"rmse_deg": None}, {"rmse of plain drives, deg"}),
         ({"false_frames": 1, "false_s": 0.1}, {"false frames"}),
-        ({"misleading": 2}, {"beyond the alert limit"}),
+        ({"misleading": 2}, {"beyond the alert limit, to the alert"}),
         ({"events": [{"recovery_m": 20.1, "recovery_s": 9.0}]}, {"recovery, m driven"}),
         ({"events": [{"recovery_m": None, "recovery_s": None}]}, {"recovery, m driven"}),
     ],

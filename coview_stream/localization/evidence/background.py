@@ -57,12 +57,15 @@ def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares: on, near, explained, passed.
 
     They are those of the narrowest normal distribution that reaches as far as the shares do towards what a right place
-    has, at one, two and about three standard deviations: the tail decides, and it is often wider than the middle.
+    has, at one, two and about three standard deviations and at the very last of them: the tail decides, and it is often
+    wider than the middle, above all where a few places are of another kind than the rest.
     """
     if len(observed) < 2:
         return np.full(4, np.nan)
-    levels = np.percentile(_compared(observed), (50.0, *_TAIL), axis=0)
-    reach = (levels[1:] - levels[0]) / ndtri(np.array(_TAIL) / 100.0)[:, None]
+    count = len(observed)
+    levels = np.percentile(_compared(observed), (50.0, *_TAIL, 100.0), axis=0)
+    below = np.append(np.array(_TAIL) / 100.0, (count - 0.375) / (count + 0.25))  # the largest of many, after Blom
+    reach = (levels[1:] - levels[0]) / ndtri(below)[:, None]
     return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
 
 
