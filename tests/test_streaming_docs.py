@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from pathlib import Path
@@ -15,6 +16,7 @@ from coview_stream.localization import localizer
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search import global_search
 from coview_stream.localization.state import State
+from coview_stream.localization.tracking import monitor
 from coview_stream.messages import decode_cloud, decode_odometry, decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record
 from coview_stream.messages.types import PoseMessage, Sample
@@ -79,14 +81,28 @@ def test_docs_list_every_counter():
 
 
 def test_docs_state_doubted_duration_and_exits():
-    rule, words = AcceptanceConfig(), {2: "two", 3: "three", 10.0: "ten"}
+    rule, words = AcceptanceConfig(), {5.0: "five"}
     rows = re.findall(r"^\|.*AMBIGUOUS.*\|$", section("How the node behaves"), re.MULTILINE)
-    rejected, blind, long = rows[:3]
-    assert f"{words[rule.max_rejections]} rejected a metre apart" in rejected
-    assert f"{words[rule.max_doubt_s]} seconds of doubt" in rejected
+    doubted, odometry, blind = rows[:3]
+    assert "`--risk`" in doubted
+    assert f"{words[rule.max_doubt_s]} seconds of doubt" in doubted
+    assert "more probably wrong than right" in doubted
+    assert "contradicts odometry" in odometry
     assert f"goes on for {rule.max_blind_s:.0f} s without a pose" in blind
-    assert f"lasted {words[rule.max_doubt_s]} seconds" in long
-    assert f"{words[rule.confirmations]} registrations" in long
+
+
+def test_docs_of_tracking_state_the_priors_and_limits():
+    text, rule = (DOCS / "tracking.md").read_text(encoding="utf-8"), AcceptanceConfig()
+    told = " ".join(text.split("## States and reasons")[1].split("\n## ")[0].split())
+    assert f"grow by {monitor._PER_METRE:.0e} ".replace("e-05", "e-5") in told
+    assert f"by {monitor._PER_SECOND:.0e} with each second of doubt".replace("e-03", "e-3") in told
+    words = {5: "five", 10: "ten"}
+    assert f"for {words[round(rule.risk / monitor._PER_METRE)]} metres at most" in told
+    assert f"{words[round(rule.max_doubt_s)]} seconds of doubt" in told
+    assert f"after 30 s an L of {round(math.log(30 * monitor._PER_SECOND / rule.risk))}" in told
+    assert f"lean by more than {math.degrees(rule.max_tilt):.0f} degrees" in told
+    assert f"must be below {rule.max_innovation:.0f}" in told
+    assert f"less than {monitor._OFF_MAP:.0%}".replace("%", " %") in told
 
 
 def test_docs_list_every_transition_field():

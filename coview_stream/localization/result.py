@@ -33,8 +33,8 @@ class KeyframeEvidence:
         cause: what decided, while tracking; None from a search.
         innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and where odometry led
             from the ones before; None where nothing could be registered, and from a search.
-        confidence: posterior probability that the robot is at the most probable place; None while tracking.
-        by_chance: expected number of places of the map that would fit as well by chance; None likewise.
+        confidence: posterior probability that the robot is at the most probable place, or where it is tracked.
+        by_chance: expected number of places of the map that would fit as well by chance; None while tracking.
     """
 
     stamp: float
