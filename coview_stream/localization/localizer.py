@@ -224,6 +224,7 @@ class Localizer:
     def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
         self._tracker.forget_scans()
+        self._monitor.require_verification()
         self._handle(Event.VERIFICATION_REQUIRED)
 
     # ---- the steps

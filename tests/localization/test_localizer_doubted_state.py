@@ -104,10 +104,10 @@ def test_search_evidence_has_no_cause_or_innovation(world_fixes):
 def test_search_after_loss_starts_from_scratch(found, world_drive):
     """The robot is carried back and its odometry starts anew, turned: nothing from before may be mixed in."""
     anew = world_drive.seen_from(found_frame(world_drive) @ pose_from(rot_z(-2.0), [3.0, 2.0, 0.0]))
-    lost = follow(found, anew, range(1), 2.5)
-    assert lost[0].T_map_body is None
-    assert lost[0].state is State.LOST
-    frames = range(1, 4)
+    lost = follow(found, anew, range(2), 2.5)
+    assert [fix.T_map_body for fix in lost] == [None] * 2
+    assert [fix.state for fix in lost] == [State.DOUBTED, State.LOST]  # one frame may be garbage
+    frames = range(2, 5)
     again = follow(found, anew, frames, 2.5)
     assert {fix.state for fix in again} <= {State.LOST, State.TRACKING}
     assert again[-1].state is State.TRACKING
@@ -161,7 +161,8 @@ def test_kidnapping_with_frozen_odometry_is_detected(found, world_drive):
     fixes = [found.step(elsewhere, world_drive.T_odom_body[4], 2.1 + 0.5 * k) for k in range(22)]
     assert all(fix.T_map_body is None for fix in fixes)
     assert {fix.state for fix in fixes} <= {State.DOUBTED, State.LOST}
-    assert fixes[3].state is State.LOST
+    assert fixes[0].state is State.DOUBTED
+    assert fixes[11].state is State.LOST  # after five seconds
 
 
 # ---- carried with open eyes
@@ -263,7 +264,7 @@ def test_leaving_the_map_ends_poses_and_returning_restores_them(world_map, scene
 @pytest.mark.slow
 def test_first_frame_after_pause_decides_the_state(world_map, world_drive):
     """What came before the pause is no doubt that has lasted: one good frame is enough."""
-    frames = (world_drive.clouds[5], State.TRACKING), (dusty(world_drive, 5), State.DOUBTED), (garbage(), State.LOST)
+    frames = (world_drive.clouds[5], State.TRACKING), (dusty(world_drive, 5), State.DOUBTED), (garbage(), State.DOUBTED)
     for cloud, expected in frames:
         localizer = Localizer(world_map)
         for k in range(5):

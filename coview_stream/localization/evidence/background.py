@@ -23,6 +23,7 @@ _MOST = 100.0  # independent observations of a scan: on a bare field chance plac
 _LEAST = 0.05  # of any outcome: what few chance places show is not impossible at another
 _COVERED = 0.05  # of a scan: below, the shares of what is covered say nothing
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
+_MANY = 20  # places, of which the second largest share tells something
 _CALIBRATED = 1.75
 """Independent observations for each that the scatter shows: searches on maps of other sites then state an error below
 e in less than a share e of them (``python -m bench.integrity.calibrate``, towns, campuses, terraces, plantations)."""
@@ -57,15 +58,18 @@ def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares: on, near, explained, passed.
 
     They are those of the narrowest normal distribution that reaches as far as the shares do towards what a right place
-    has, at one, two and about three standard deviations and at the very last of them: the tail decides, and it is often
+    has, at one, two and about three standard deviations and at the last of them but one: the tail decides, and it is often
     wider than the middle, above all where a few places are of another kind than the rest.
     """
     if len(observed) < 2:
         return np.full(4, np.nan)
     count = len(observed)
-    levels = np.percentile(_compared(observed), (50.0, *_TAIL, 100.0), axis=0)
-    below = np.append(np.array(_TAIL) / 100.0, (count - 0.375) / (count + 0.25))  # the largest of many, after Blom
-    reach = (levels[1:] - levels[0]) / ndtri(below)[:, None]
+    shares = np.sort(_compared(observed), axis=0)
+    levels = np.percentile(shares, (50.0, *_TAIL), axis=0)
+    reach = (levels[1:] - levels[0]) / ndtri(np.array(_TAIL) / 100.0)[:, None]
+    if count >= _MANY:  # the second largest, after Blom; the largest may be a twin, which is a rival and not chance
+        last = (shares[-2] - levels[0]) / ndtri((count - 1.375) / (count + 0.25))
+        reach = np.vstack([reach, last])
     return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
 
 

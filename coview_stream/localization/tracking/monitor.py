@@ -167,18 +167,25 @@ class LossMonitor:
         self._newest: tuple[float, float] | None = None  # stamp and metres driven, of the newest registration
         self._since: float | None = None  # stamp of the first registration that was not believed
         self._seen_since = 0.0  # and of the first of those that was not blind
+        self._required = False  # whether there is to be no pose before a registration is believed
+
+    def require_verification(self) -> None:
+        """Begin a doubt: the robot may have been carried unseen."""
+        self._required = True
+        self._before, self._odds = self._before + _PER_SECOND, self._odds + _PER_SECOND
 
     def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> Ruling:
         """Return what a registration at ``travelled`` metres means for the place."""
         self._weigh(verdict, stamp, travelled)
         wrong = self._odds / (1.0 + self._odds)
-        if self._odds >= 1.0:
+        if min(self._before, self._odds) >= 1.0:  # a view before, and this one: a single frame may be garbage
             return Ruling(Event.PLACE_GIVEN_UP, f"more probably elsewhere: {verdict.reason}", wrong, False)
         certain = wrong < self._rule.risk
         if verdict.verified and certain:
-            self._before, self._since = self._odds, None
+            self._before, self._since, self._required = self._odds, None, False
             return Ruling(Event.MATCH_VERIFIED, verdict.reason, wrong, True)
-        if certain and self._since is None and verdict.cause not in _AT_ONCE:
+        in_doubt = self._required or self._since is not None
+        if certain and not in_doubt and verdict.cause not in _AT_ONCE:
             return Ruling(None, f"odometry alone: {verdict.reason}", wrong, False)
         return self._doubt(verdict, stamp, wrong)
 

@@ -79,7 +79,8 @@ def test_standing_and_looking_again_and_again_is_no_certainty(monitor):
     for k in range(50):
         assert monitor.verify(said(15.0), float(k), 7.0).believed
     assert monitor.verify(said(-6.0), 50.0, 7.0).event is Event.MATCH_REJECTED
-    assert monitor.verify(said(-14.0), 51.0, 7.0).event is Event.PLACE_GIVEN_UP
+    assert monitor.verify(said(-14.0), 51.0, 8.0).event is Event.MATCH_REJECTED
+    assert monitor.verify(said(-14.0), 52.0, 10.0).event is Event.PLACE_GIVEN_UP
 
 
 def test_one_view_has_to_make_up_for_all_that_was_said_before(monitor):
@@ -99,16 +100,37 @@ def test_place_is_given_up_once_it_is_more_probable_than_not_that_it_is_wrong(mo
     doubt = monitor.verify(said(-math.log(0.5 / PRIOR)), 1.0, 1.0)
     assert (doubt.event, doubt.believed) == (Event.MATCH_REJECTED, False)
     assert 0.2 < doubt.wrong < 0.5
-    lost = monitor.verify(said(-math.log(4.0 / PRIOR)), 1.0, 1.0)
+    worse = monitor.verify(said(-math.log(4.0 / PRIOR)), 1.0, 1.0)
+    assert (worse.event, worse.reason) == (Event.MATCH_REJECTED, "why: wrong more likely than not")
+    assert 0.5 < worse.wrong < 0.9
+    lost = monitor.verify(said(-1.0), 3.0, 3.0)
     assert (lost.event, lost.reason) == (Event.PLACE_GIVEN_UP, "more probably elsewhere: why")
-    assert 0.5 < lost.wrong < 0.9
+    assert lost.wrong > worse.wrong
+
+
+def test_single_frame_of_garbage_costs_its_pose_alone(monitor):
+    drive(monitor, [15.0, 15.0])
+    assert monitor.verify(said(-100.0), 3.0, 4.0).event is Event.MATCH_REJECTED
+    assert monitor.verify(said(15.0), 3.1, 4.2).believed
+
+
+def test_verification_that_is_required_begins_a_doubt_with_a_timeout(monitor):
+    drive(monitor, [15.0])
+    monitor.require_verification()
+    told = [monitor.verify(said(-0.1), 1.0 + seconds, 1.0).event for seconds in (0.0, 0.9 * RULE.max_doubt_s)]
+    assert told == [Event.MATCH_REJECTED] * 2
+    assert monitor.verify(said(-0.1), 1.0 + RULE.max_doubt_s, 1.0).event is Event.PLACE_GIVEN_UP
+    monitor.begin(0.0)
+    drive(monitor, [15.0])
+    monitor.require_verification()
+    assert monitor.verify(said(9.0), 60.0, 1.0).believed
 
 
 @pytest.mark.parametrize("ratio", [-1e4, 1e4])
 def test_any_ratio_gives_a_probability(monitor, ratio):
     found = monitor.verify(said(ratio), 0.0, 0.0)
     assert 0.0 <= found.wrong <= 1.0
-    assert found.event is (Event.MATCH_VERIFIED if ratio > 0 else Event.PLACE_GIVEN_UP)
+    assert found.event is (Event.MATCH_VERIFIED if ratio > 0 else Event.MATCH_REJECTED)
 
 
 def test_little_that_speaks_against_the_place_costs_no_pose_and_corrects_nothing(monitor):
