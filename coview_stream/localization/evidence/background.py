@@ -58,8 +58,8 @@ def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares: on, near, explained, passed.
 
     They are those of the narrowest normal distribution that reaches as far as the shares do towards what a right place
-    has, at one, two and about three standard deviations and at the last of them but one: the tail decides, and it is often
-    wider than the middle, above all where a few places are of another kind than the rest.
+    has, at one, two and about three standard deviations and at the last of them but one: the tail decides, and it is
+    often wider than the middle, above all where a few places are of another kind than the rest.
     """
     if len(observed) < 2:
         return np.full(4, np.nan)

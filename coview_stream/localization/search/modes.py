@@ -59,13 +59,13 @@ def find_modes(
     local_maps: LocalMaps,
 ) -> Modes:  # fmt: skip
     """Register a scan from poses around a registered place, and weigh what comes out within the place."""
-    start, found = leader.T_map_odom, [leader]
+    place, start, found = leader.place.hypothesis.T_map_odom, leader.T_map_odom, [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         moved = start.copy()
         moved[:2, 3] += _AROUND * np.cos(angle), _AROUND * np.sin(angle)
-        place = replace(leader.place, hypothesis=replace(leader.place.hypothesis, T_map_odom=moved))
-        other = register_place(place, scan, base_map, config, local_maps)
-        if other is not None and same_place(other.T_map_odom, start, request, BASIN_DISTANCE, BASIN_ANGLE):
+        beside = replace(leader.place, hypothesis=replace(leader.place.hypothesis, T_map_odom=moved))
+        other = register_place(beside, scan, base_map, config, local_maps)
+        if other is not None and same_place(other.T_map_odom, place, request, BASIN_DISTANCE, BASIN_ANGLE):
             found.append(other)
     seen = ObservedScan.of(scan)
     poses = np.array([each.T_map_odom for each in found])

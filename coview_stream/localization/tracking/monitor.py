@@ -4,6 +4,7 @@ Two hypotheses are compared: the robot is where it is tracked, or it is not (odo
 the place was wrong from the beginning). Each registration weighs them by its log-likelihood ratio
 (:mod:`coview_stream.localization.tracking.place_evidence`), and driving on makes the second a little more probable.
 A pose is given while its probability is below the integrity risk; once it is more probable than not, the place is lost.
+A scan may show nothing of the right place, so that it takes two views for that.
 docs/integrity.md has the equations.
 """
 
@@ -14,6 +15,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+import numpy as np
+
 from coview_stream.config import AcceptanceConfig, TrackingConfig
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.registration.verification import Evidence
@@ -22,7 +25,9 @@ from coview_stream.localization.tracking.place_evidence import Observation
 
 # prior probabilities that a place becomes wrong; set by hand
 _PER_METRE = 1e-5  # driven: once in 100 km odometry jumps, or the robot is displaced
-_PER_SECOND = 1e-3  # while the place is in doubt: a robot that sees nothing may be on its way elsewhere
+_PER_SECOND = 1e-4  # while the place is in doubt: a robot that sees nothing may be on its way elsewhere
+_UNSEEN = 5e-4  # while nothing was known of the robot
+_NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
 _OFF_MAP = 0.3  # of what is seen on the map: less is told as such, it decides nothing; set by hand
 _NEWEST_SHARE = 0.2  # of new shares in what is usual: about the last five registrations; set by hand
 
@@ -120,6 +125,8 @@ class EvidenceBaseline:
         space = evidence.free_space / ((usual.free_space if usual else 0.0) or 1.0)
         inside = evidence.inside / ((usual.inside if usual else 0.0) or 1.0)
         worst = min(structure, ground, space, inside)
+        if worst >= 1.0 and evidence.inside >= _OFF_MAP:
+            return RejectionReason.FITNESS, "what is seen fits no better here than by chance"
         if worst == inside or evidence.inside < _OFF_MAP:
             return RejectionReason.OFF_MAP, f"only {evidence.inside:.0%} of what is seen lies on the map"
         if worst == space:
@@ -171,14 +178,15 @@ class LossMonitor:
 
     def require_verification(self) -> None:
         """Begin a doubt: the robot may have been carried unseen."""
-        self._required = True
-        self._before, self._odds = self._before + _PER_SECOND, self._odds + _PER_SECOND
+        if not self._required:
+            self._required = True
+            self._before, self._odds = self._before + _UNSEEN, self._odds + _UNSEEN
 
     def verify(self, verdict: MatchVerdict, stamp: float, travelled: float) -> Ruling:
         """Return what a registration at ``travelled`` metres means for the place."""
         self._weigh(verdict, stamp, travelled)
         wrong = self._odds / (1.0 + self._odds)
-        if min(self._before, self._odds) >= 1.0:  # a view before, and this one: a single frame may be garbage
+        if self._odds >= 1.0:
             return Ruling(Event.PLACE_GIVEN_UP, f"more probably elsewhere: {verdict.reason}", wrong, False)
         certain = wrong < self._rule.risk
         if verdict.verified and certain:
@@ -219,4 +227,5 @@ class LossMonitor:
             self._viewed_at = travelled
             # what spoke against the place stays; what spoke for it is not counted twice
             self._before = max(self._before, self._odds)
-        self._odds = min(self._before * math.exp(min(-verdict.ratio, 500.0)), 1e9)
+        ratio = float(np.logaddexp(math.log1p(-_NOTHING) + verdict.ratio, math.log(_NOTHING)))
+        self._odds = self._before * math.exp(-ratio)

@@ -23,6 +23,7 @@ from coview_stream.localization.registration.register import ScanInput
 
 # set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
 _SPREAD = 0.05  # standard deviation of the share q that is as the map has it, from one registration to the next
+_ANOTHER = 0.01  # probability that the kind of survey and the leaks become others meanwhile
 _CHANGED = 1e-4  # probability that the site becomes another one from one registration to the next
 
 
@@ -80,6 +81,7 @@ class PlaceEvidence:
     def _presumed(self) -> Floats:
         """Return the probabilities (Q, D, L) of the nuisances at the next registration."""
         spread = np.einsum("qr,qdl->rdl", _STEPS, self._known)
+        spread = (1.0 - _ANOTHER) * spread + _ANOTHER * spread.mean(axis=(1, 2), keepdims=True)
         return np.asarray((1.0 - _CHANGED) * spread + _CHANGED / np.prod(NUISANCES))
 
 

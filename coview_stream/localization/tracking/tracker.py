@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -54,6 +55,7 @@ class Tracker:
         self._scans = ScanBuffer(config.tracking)
         self._unregistered = 0  # frames since the newest registration
         self._shared_error = SharedErrorModel(config.registration)
+        self._learned_at = -math.inf  # metres driven where what is usual here was learned last
         self._disputed = False  # whether what fits has been off from where odometry leads, and may be wrong
         self._doubt = 1.0  # by how much the newest evidence that was believed has fallen below what is usual
 
@@ -118,7 +120,7 @@ class Tracker:
         It may not have converged yet: its own covariance is not believed.
         """
         self._matcher.clear()
-        self._doubt, self._disputed = 1.0, False
+        self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.clear()
         self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
@@ -153,13 +155,14 @@ class Tracker:
             return MapMatch.without_registration(verdict, belief)
         scan = ScanInput(points, cloud, T_odom_body)
         match = self._matcher.match(scan, belief, target, self.config.registration.track, self._graph)
-        limit = self.config.acceptance.max_innovation
+        limit, tried = self.config.acceptance.max_innovation, False
         if newest_only or not match.verdict.verified or match.innovation > limit:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             scales = self.config.registration.search[1:]
             again = self._matcher.match(scan, wider, target, scales, self._graph)
-            match = max(match, again, key=_rank)
-        if match.verdict.verified and (match.innovation > limit or self._disputed):
+            match = self._better(match, again)
+            tried = match is again
+        if match.verdict.verified and (match.innovation > limit or self._disputed or tried):
             return self._against_odometry(match, belief, scan)
         return match
 
@@ -214,6 +217,14 @@ class Tracker:
         verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
         return replace(match, verdict=verdict, moves_place=moves)
 
+    def _better(self, match: MapMatch, again: MapMatch) -> MapMatch:
+        """Return the better match; one that fits where odometry leads has to be beaten by 1 to the risk."""
+        acceptance = self.config.acceptance
+        fits = match.verdict.verified and match.innovation <= acceptance.max_innovation
+        if fits and again.verdict.ratio < match.verdict.ratio - math.log(acceptance.risk):
+            return match
+        return max(match, again, key=_rank)
+
     def _has_slipped(self, scan: ScanInput, predicted: Pose, seen: Pose) -> bool:
         return has_slipped(self._matcher.place, scan, predicted, seen, self.config.acceptance.risk)
 
@@ -246,7 +257,9 @@ class Tracker:
             raise ValueError("nothing can be learned from a match without a registration")
         self._doubt = self._matcher.baseline.fallen(evidence)
         self._matcher.baseline.learn(evidence)
-        self._matcher.place.learn(seen)
+        if self.travelled - self._learned_at >= self.config.tracking.distance:  # one view tells the same again
+            self._learned_at = self.travelled
+            self._matcher.place.learn(seen)
         self._odometry.learn(match.T_map_body, match.covariance)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)
