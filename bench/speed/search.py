@@ -51,10 +51,12 @@ class Searcher:
             env=code.environment(), cwd=site.parent, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         self.steps: list[dict[str, Any]] = []
+        self.fixes: list[dict[str, Any]] = []  # the steps that accepted a place
         self.megabytes = 0.0
         self.about = self._answer()
         self.drive()
         self.steps.clear()  # of the first drive, while caches fill
+        self.fixes.clear()
 
     def __enter__(self) -> Searcher:
         return self
@@ -76,6 +78,7 @@ class Searcher:
         print(flush=True, file=self._process.stdin)
         found = self._answer()
         self.steps += found["steps"]
+        self.fixes += [found["fix"]] if found["fix"] else []
         self.megabytes = found["megabytes"]
 
     def percentile(self, share: float, key: str = "ms") -> float:
@@ -127,4 +130,7 @@ def _judged(world: str, sides: dict[str, Searcher]) -> Iterator[Row]:
         both = [side.percentile(50, "cpu_ms") for side in (ours, other)]  # nearly the same on a busy machine
         yield against(f"{name}: step p50 {earlier}, processor time", both[0], both[1], "ms", None)
     yield reached(f"{name}: rivals scored per step, median", ours.rivals(), "", LEAST_RIVALS)
+    if ours.fixes:
+        median = float(np.median([step["ms"] for step in ours.fixes]))
+        yield informs(f"{name}: step that accepts a place, median of {len(ours.fixes)}", median, "ms", {})
     yield informs(f"{name}: memory of the searching process, peak", ours.megabytes, "MB", details)

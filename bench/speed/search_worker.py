@@ -1,7 +1,8 @@
 """Searches in a process of their own, on one core: ``search_worker.py MAP RUN CORE KEYFRAMES``.
 
 For each line on standard input it drives ``KEYFRAMES`` keyframes from another start along the run, as a robot without
-a place does, and prints what each search step took, as JSON. No place is ever accepted, so that votes go on adding up.
+a place does, and prints what each search step took, as JSON. No place is ever accepted, so that votes go on adding up;
+the same drive is then searched as usual, for what the step that accepts a place takes.
 It has to run with the code of earlier commits too: no imports from ``bench``, only names that all of them have.
 """
 
@@ -27,6 +28,7 @@ class Search(NamedTuple):
     run: Any
     localizer: Any
     search: Any
+    usual: Any  # one that accepts places
     about: dict[str, Any]  # stations, recognizers, and the seconds that the index took
 
 
@@ -51,9 +53,9 @@ def prepared(site_file: str, run_folder: str) -> Search:
     begin = time.perf_counter()
     index.prepare()
     seconds = time.perf_counter() - begin
-    search = GlobalSearch(site, config, maps, index)
+    search, usual = (GlobalSearch(site, each, maps, index) for each in (config, LocalizerConfig()))
     about = {"stations": len(site), "recognizers": list(search.names), "prepare_s": seconds}
-    return Search(run, Localizer(site, config, maps, index), search, about)
+    return Search(run, Localizer(site, config, maps, index), search, usual, about)
 
 
 def requests(run: Any, localizer: Any, number: int, count: int) -> Iterator[Any]:
@@ -84,19 +86,22 @@ def timed(search: Any, request: Any) -> dict[str, Any]:
     result = search.update(request)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     rivals = getattr(result, "rivals", None)
-    return {"ms": 1e3 * wall, "cpu_ms": 1e3 * cpu, "rivals": None if rivals is None else len(rivals)}
+    accepted = getattr(result, "accepted", None) is not None
+    return {"ms": 1e3 * wall, "cpu_ms": 1e3 * cpu, "rivals": None if rivals is None else len(rivals), "fix": accepted}
 
 
 def main(site_file: str, run_folder: str, core: int, count: int) -> None:
     """Prepare, then drive at every line."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {core})  # before libraries count the cores
-    run, localizer, search, about = prepared(site_file, run_folder)
+    run, localizer, search, usual, about = prepared(site_file, run_folder)
     print(json.dumps(about), flush=True)
     for number, _ in enumerate(sys.stdin):
         steps = [timed(search, request) for request in requests(run, localizer, number, count)]
+        until = (timed(usual, request) for request in requests(run, localizer, number, count))
+        fix = next((step for step in until if step["fix"]), None)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(json.dumps({"steps": steps, "megabytes": peak}), flush=True)
+        print(json.dumps({"steps": steps, "fix": fix, "megabytes": peak}), flush=True)
 
 
 if __name__ == "__main__":

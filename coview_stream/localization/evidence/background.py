@@ -80,13 +80,16 @@ def _compared(observed: Floats32) -> Floats:
     return np.column_stack([*shares, -observed[:, Share.PASSED]]).astype(np.float64)
 
 
-def estimate_background(now: Floats32, variance: Floats, kept: Floats32) -> Background:
+def estimate_background(
+    now: Floats32, variance: Floats, kept: Floats32, patches: tuple[float, float] = (np.inf, np.inf)
+) -> Background:
     """Estimate the background from chance places.
 
     Args:
         now: (N, 7) the newest keyframe's observations at them.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
         kept: (K, 7) mean observations, over the keyframes, at those of them that are followed.
+        patches: how many patches of structure and of free space the scan shows: there are no more observations.
     """
     counts = outcomes(now)
     total = counts.sum(axis=0) + _PSEUDO * np.array(_PSEUDO_SHARES)
@@ -100,7 +103,8 @@ def estimate_background(now: Floats32, variance: Floats, kept: Floats32) -> Back
     presumed = chance / _PSEUDO_NUMBER
     number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO))
     high = float(3.0 / (1.0 / number[:3]).sum())
-    return Background(structure, passed, _beta(now, kept), (min(high, _MOST), float(number[3])))
+    both = min(high, _MOST, patches[0]), min(float(number[3]), patches[1])
+    return Background(structure, passed, _beta(now, kept), both)
 
 
 def _beta(now: Floats32, kept: Floats32) -> tuple[float, float]:

@@ -30,7 +30,7 @@ def observe_with_background(
     poses = seen.poses(T_map_odom)
     observed = seen.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), "no")[1]
     places, chance = observed[: len(poses)], observed[len(poses) :]
-    return places, estimate_background(chance, scatter(chance), chance[:0])
+    return places, estimate_background(chance, scatter(chance), chance[:0], seen.patches)
 
 
 def chance_places(pose: Floats) -> Floats:

@@ -32,6 +32,7 @@ from coview_stream.localization.registration.verification import (
 # set by hand
 _FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
 _PATCH = 4.0  # metres: points of one patch are looked up one after the other, for they lie in the same memory
+_OFFSET = 1 << 15  # patches: numbers of them are never negative
 _SAMPLES = 6000  # points in the space around the robot, of which those that rays passed through are looked up
 _DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
 _MARGIN = 0.35  # metres that a cell of the field reaches beyond its middle: a ray has passed only what lies before that
@@ -122,11 +123,14 @@ class ObservedScan:
         body: (3,) position of the body in the odometry frame, metres.
         few: some points.
         many: four times as many.
+        patches: patches of four metres that its structure fills, and cubes that its free space does: no more
+            observations than these are independent.
     """
 
     body: Floats
     few: ScanPart
     many: ScanPart
+    patches: tuple[float, float]
 
     @classmethod
     def of(cls, scan: ScanInput) -> ObservedScan:
@@ -137,7 +141,8 @@ class ObservedScan:
         points, height, above = points[order], cloud.height[order], cloud.above[order]
         free = (_seen_through(scan.range_image) @ T[:3, :3].T).astype(np.float32)
         kinds = points[height > STRUCTURE_HEIGHT], points[~above], free[_by_patch(free)]
-        return cls(np.asarray(T[:3, 3]), ScanPart.of(kinds, _FEW), ScanPart.of(kinds, _MANY))
+        patches = float(_filled(kinds[0][:, :2])), float(_filled(kinds[2]))
+        return cls(np.asarray(T[:3, 3]), ScanPart.of(kinds, _FEW), ScanPart.of(kinds, _MANY), patches)
 
     def poses(self, T_map_odom: Floats) -> Floats:
         """Return the poses (H, 4) at which level transforms (H, 4, 4) put the scan, as :meth:`ScanPart.look_up`."""
@@ -156,6 +161,12 @@ class ObservedScan:
 def _evenly(points: Points, count: int) -> Points:
     """Return at most ``count`` points, spread evenly over all in their order."""
     return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
+
+
+def _filled(points: Points) -> int:
+    """Return how many patches, or cubes, points (N, 2) or (N, 3) lie in."""
+    cell = np.floor(points / np.float32(_PATCH)).astype(np.int64) + _OFFSET
+    return len(np.unique(cell @ (1 << np.arange(0, 16 * points.shape[1], 16))))
 
 
 def _by_patch(points: Points) -> Ints:

@@ -207,7 +207,7 @@ class PlaceScorer:
         observed = self._observe(seen, len(known.hypotheses), every)
         followed = self._follow(seen, observed, every, ranks, hints)
         first = np.array([group[0] for group in observed.groups], dtype=np.int64)
-        ratios, kept = self._evidence(followed, observed, first)
+        ratios, kept = self._evidence(followed, observed, first, seen)
         order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
         self._seen += 1
         self._scans.append(seen)
@@ -293,18 +293,22 @@ class PlaceScorer:
             T_map_odom = scan.transforms(poses)
         return out
 
-    def _evidence(self, followed: _Followed, observed: _Observed, first: Ints) -> tuple[Floats, Floats]:
+    def _evidence(
+        self, followed: _Followed, observed: _Observed, first: Ints, seen: ObservedScan
+    ) -> tuple[Floats, Floats]:
         """Return log-likelihood ratios (P,), and the shares (P,) of what is as the map has it."""
         mean = followed.observed.mean(axis=1)
         if not len(mean):
             return np.empty(0), np.empty(0)
+        structure, free = np.mean([each.patches for each in (*self._scans, seen)], axis=0)
+        patches = float(structure), float(free)
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, kept = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
         self._scatter.append(scatter(observed.shares[first]))
         for last in (False, True):
             known = [each for each in self._scatter if np.isfinite(each).all()] or [self._scatter[-1]]
             spread = np.mean(known, axis=0)
-            background = estimate_background(observed.shares[first][chance], spread, mean[kept])
+            background = estimate_background(observed.shares[first][chance], spread, mean[kept], patches)
             ratios, q = log_likelihood_ratios(mean, background)
             if last:
                 break

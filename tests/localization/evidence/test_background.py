@@ -37,6 +37,14 @@ def test_known_background_and_number_are_recovered(rng, number):
     assert all(0.5 * number < each < 2.0 * number for each in found.number)
 
 
+@pytest.mark.parametrize(("patches", "expected"), [((7.0, 0.0), (7.0, 0.0)), ((1e3, 1e3), None)])
+def test_a_scan_is_no_more_observations_than_the_patches_that_it_shows(rng, patches, expected):
+    chance = chance_places(rng, 250, number=60)[:, 0]
+    usual = estimate_background(chance, scatter(chance), chance).number
+    found = estimate_background(chance, scatter(chance), chance, patches).number
+    assert found == (expected or usual)
+
+
 def test_correlated_points_are_counted_once(rng):
     """A thousand points that fall and rise together in 15 groups are 15 observations, not a thousand."""
     found = background_of(chance_places(rng, 250, number=15))

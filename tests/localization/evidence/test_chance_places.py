@@ -40,7 +40,7 @@ def test_background_is_what_the_places_around_the_first_pose_explain(world_map, 
     both = np.stack([T_MAP_ODOM, away])
     observed, background = observe_with_background(world_map.field, seen, both)
     chance = seen.few.look_up(world_map.field, chance_places(seen.poses(both)[0]), "no")[1]
-    expected = estimate_background(chance, scatter(chance), chance[:0])
+    expected = estimate_background(chance, scatter(chance), chance[:0], seen.patches)
     np.testing.assert_allclose(background.structure, expected.structure)
     assert background.passed == pytest.approx(expected.passed)
     assert background.ground == pytest.approx(expected.ground)
