@@ -99,7 +99,7 @@ def test_docs_of_tracking_state_the_priors_and_limits():
     words = {5: "five", 10: "ten"}
     assert f"for {words[round(rule.risk / monitor._PER_METRE)]} metres at most" in told
     assert f"{words[round(rule.max_doubt_s)]} seconds of doubt" in told
-    assert f"after 30 s an L of {round(math.log(30 * monitor._PER_SECOND / rule.risk))}" in told
+    assert f"after 30 s an L of {math.log(30 * monitor._PER_SECOND / rule.risk):.1f}" in told
     assert f"lean by more than {math.degrees(rule.max_tilt):.0f} degrees" in told
     assert f"must be below {rule.max_innovation:.0f}" in told
     assert f"less than {monitor._OFF_MAP:.0%}".replace("%", " %") in told

@@ -74,7 +74,7 @@ def add_risk(parser: argparse.ArgumentParser) -> None:
         "--risk",
         default=1e-4,
         metavar="P",
-        help="probability of a wrong place below which a search gives one, from 1e-9 to below 0.5; the smaller, the "
+        help="probability of a wrong place below which a search gives one, from 1e-6 to below 0.5; the smaller, the "
         "farther a robot may drive before it is found (1e-4)",
     )
 
@@ -83,7 +83,7 @@ def acceptance_config(risk: str | float) -> AcceptanceConfig:
     """Return what makes a fix, by ``--risk`` as it was given.
 
     Raises:
-        ConfigError: it is no number from 1e-9 to below a half.
+        ConfigError: it is no number from 1e-6 to below a half.
     """
     from coview_stream.config.acceptance import LEAST_RISK, AcceptanceConfig
     from coview_stream.errors import ConfigError
@@ -93,7 +93,7 @@ def acceptance_config(risk: str | float) -> AcceptanceConfig:
     except ValueError:
         value = math.nan
     if not LEAST_RISK <= value < 0.5:
-        raise ConfigError(f"--risk {risk}: give the probability of a wrong place, in [1e-9, 0.5), such as 1e-4")
+        raise ConfigError(f"--risk {risk}: give the probability of a wrong place, in [1e-6, 0.5), such as 1e-4")
     return AcceptanceConfig(risk=value)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from coview_stream.config.checks import positive, require
 
-LEAST_RISK = 1e-9
+LEAST_RISK = 1e-6
 """Smaller risks are refused: errors below are not told apart, for the model of the evidence is not as good as that."""
 
 
@@ -34,5 +34,5 @@ class AcceptanceConfig:
     max_blind_s: float = 60.0
 
     def __post_init__(self) -> None:
-        require(LEAST_RISK <= self.risk < 0.5, self, "risk", "in [1e-9, 0.5)")
+        require(LEAST_RISK <= self.risk < 0.5, self, "risk", "in [1e-6, 0.5)")
         positive(self, "max_tilt", "max_innovation", "max_doubt_s", "max_blind_s")

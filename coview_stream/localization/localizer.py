@@ -94,6 +94,7 @@ class Localizer:
         self._newest: _Frame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search that found the place
+        self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
     @property
@@ -192,7 +193,7 @@ class Localizer:
             pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
             to_map_origin(T_map_local, self._anchor, self.base_map.origin),
             self._tracker.reported_covariance(),
-            self._confidence,
+            min(self._confidence, 1.0 - self._wrong),
             evidence,
             self._tracker.drift,
             self._tracker.protection_level(),
@@ -296,6 +297,7 @@ class Localizer:
         assert self._newest is not None  # it is of the newest frame
         stamp, verdict = self._newest.stamp, match.verdict
         ruling = self._monitor.verify(verdict, stamp, self._tracker.travelled)
+        self._wrong = ruling.wrong
         self._registered_at = stamp
         after = self.state if ruling.event is None else next_state(self.state, ruling.event)
         if not (match.confirms_search and ruling.believed):

@@ -104,7 +104,7 @@ class Fix:
             map, whose georeferencing is not in it, and calibrated on simulated drives: see docs/tracking.md. One sigma
             of x, y and z, metres, is ``numpy.sqrt(numpy.diag(fix.covariance))[:3]``.
         confidence: in [0, 1]: probability that the robot is at this place and not at another or none, as the search
-            that found it has it: see docs/integrity.md.
+            that found it has it or, if that is less, the newest registration: see docs/integrity.md. 0 unless TRACKING.
         evidence: of the newest keyframe, None before the first.
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:

@@ -63,7 +63,7 @@ def test_plain_info_does_not_look(world_file, capsys):
     [
         (["-o", "a.png"], "give --ambiguity as well"),
         (["--risk", "1e-4"], "give --ambiguity as well"),
-        (["--ambiguity", "--risk", "2"], "[1e-9, 0.5)"),
+        (["--ambiguity", "--risk", "2"], "[1e-6, 0.5)"),
         (["--ambiguity", "-o", "{}"], "is a directory; name the picture"),
         (["--ambiguity", "-o", "{}/none/a.png"], "make it first"),
         (["--plot", "{}"], "is a directory; name the picture"),

@@ -85,7 +85,8 @@ def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig, u
         return State.TRACKING, f"found: wrong {one_in(scored.error)}"
     if scored.moved.probability > rule.risk:
         metres = f"{scored.moved.metres:.0f} m"
-        return State.AMBIGUOUS, f"a part of what is seen fits {metres} beside the rest: wrong {one_in(scored.error)}"
+        wrong = f"wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
+        return State.AMBIGUOUS, f"a part of what is seen may fit {metres} beside the rest: {wrong}"
     if scored.none > 0.5:
         if scored.by_chance < 1.5:
             return State.SEARCHING, "no place stands out: the best fits no better than chance would have it"

@@ -13,7 +13,7 @@ from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.state import State
 
 
-@pytest.mark.parametrize("risk", [1e-2, RULE.risk, 1e-9])
+@pytest.mark.parametrize("risk", [1e-2, RULE.risk, 1e-6])
 @pytest.mark.parametrize(("share", "accepted"), [(0.01, True), (0.99, True), (1.0, False), (1.01, False), (50, False)])
 def test_place_is_accepted_only_below_the_integrity_risk(risk, share, accepted):
     error = share * risk
@@ -97,7 +97,7 @@ def test_evidence_says_what_the_decision_rests_on():
 
 
 def test_most_probable_place_is_told_whether_or_not_it_is_accepted():
-    for error, accepted in ((1e-9, True), (0.1, False)):
+    for error, accepted in ((1e-6, True), (0.1, False)):
         result = judged(place(1.0 - error), place(0.0, moved(20)), error=error)
         assert (result.accepted is not None) == accepted
         assert result.leader is candidate(place(1.0)).T_map_odom
@@ -108,21 +108,21 @@ def test_most_probable_place_is_told_whether_or_not_it_is_accepted():
 
 def test_reason_says_who_named_the_place():
     other = place(0.0, moved(20))
-    hinted = judged(place(1.0, hinted=True, station=None, shift=None), other, error=1e-9).evidence
+    hinted = judged(place(1.0, hinted=True, station=None, shift=None), other, error=1e-6).evidence
     assert hinted.reason.endswith(FROM_THERE)
     assert (hinted.station, hinted.shift) == (None, None)
-    learned = judged(place(1.0, learned=True), error=1e-9).evidence
+    learned = judged(place(1.0, learned=True), error=1e-6).evidence
     assert learned.reason.endswith(BY_FEATURES)
     assert (learned.station, learned.shift) == (5, None)
-    voted = judged(place(1.0, hinted=True), error=1e-9).evidence  # a hint takes no votes away
+    voted = judged(place(1.0, hinted=True), error=1e-6).evidence  # a hint takes no votes away
     assert not voted.reason.endswith((FROM_THERE, BY_FEATURES))
 
 
 def test_hint_alone_is_not_accepted_before_votes_have_named_rivals():
     hint = place(1.0, hinted=True, station=None, shift=None)
     beside = place(0.0, moved(7), station=None, shift=None)
-    result = judged(hint, beside, error=1e-9)
+    result = judged(hint, beside, error=1e-6)
     assert result.accepted is None
     assert result.evidence.state is State.AMBIGUOUS
     assert "no vote" in result.evidence.reason
-    assert judged(hint, beside, place(0.0, moved(20)), error=1e-9).accepted is not None
+    assert judged(hint, beside, place(0.0, moved(20)), error=1e-6).accepted is not None
