@@ -94,10 +94,10 @@ def test_docs_state_doubted_duration_and_exits():
 def test_docs_of_tracking_state_the_priors_and_limits():
     text, rule = (DOCS / "tracking.md").read_text(encoding="utf-8"), AcceptanceConfig()
     told = " ".join(text.split("## States and reasons")[1].split("\n## ")[0].split())
-    assert f"grow by {monitor._PER_METRE:.0e} ".replace("e-05", "e-5") in told
+    assert f"grow by {monitor.PER_METRE:.0e} ".replace("e-05", "e-5") in told
     assert f"by {monitor._PER_SECOND:.0e} with each second of doubt".replace("e-04", "e-4") in told
     words = {5: "five", 10: "ten"}
-    assert f"for {words[round(rule.risk / monitor._PER_METRE)]} metres at most" in told
+    assert f"for {words[round(rule.risk / monitor.PER_METRE)]} metres at most" in told
     assert f"{words[round(rule.max_doubt_s)]} seconds of doubt" in told
     assert f"after 30 s an L of {math.log(30 * monitor._PER_SECOND / rule.risk):.1f}" in told
     assert f"lean by more than {math.degrees(rule.max_tilt):.0f} degrees" in told

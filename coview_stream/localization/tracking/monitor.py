@@ -24,7 +24,7 @@ from coview_stream.localization.state import Event
 from coview_stream.localization.tracking.place_evidence import Observation
 
 # prior probabilities that a place becomes wrong; set by hand
-_PER_METRE = 1e-5  # driven: once in 100 km odometry jumps, or the robot is displaced
+PER_METRE = 1e-5  # driven: once in 100 km odometry jumps, or the robot is displaced
 _PER_SECOND = 1e-4  # while the place is in doubt: a robot that sees nothing may be on its way elsewhere
 _UNSEEN = 5e-4  # while nothing was known of the robot
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
@@ -217,9 +217,9 @@ class LossMonitor:
         """Move the odds on by what was driven since the newest registration, and by what this one says."""
         waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
         self._newest = stamp, travelled
-        prior = _PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
+        prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
         # standing and fitting again and again is no certainty: at any view the place may have become wrong
-        self._before = max(self._before + prior, _PER_METRE * self._tracking.distance)
+        self._before = max(self._before + prior, PER_METRE * self._tracking.distance)
         self._odds += prior
         if verdict.observation is None:
             return

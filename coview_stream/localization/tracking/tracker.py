@@ -160,7 +160,7 @@ class Tracker:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             scales = self.config.registration.search[1:]
             again = self._matcher.match(scan, wider, target, scales, self._graph)
-            match = self._better(match, again)
+            match = max(match, again, key=_rank)
             tried = match is again
         if match.verdict.verified and (match.innovation > limit or self._disputed or tried):
             return self._against_odometry(match, belief, scan)
@@ -216,14 +216,6 @@ class Tracker:
             reason += ", and the scan fits there hardly better: something may have been moved"
         verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
         return replace(match, verdict=verdict, moves_place=moves)
-
-    def _better(self, match: MapMatch, again: MapMatch) -> MapMatch:
-        """Return the better match; one that fits where odometry leads has to be beaten by 1 to the risk."""
-        acceptance = self.config.acceptance
-        fits = match.verdict.verified and match.innovation <= acceptance.max_innovation
-        if fits and again.verdict.ratio < match.verdict.ratio - math.log(acceptance.risk):
-            return match
-        return max(match, again, key=_rank)
 
     def _has_slipped(self, scan: ScanInput, predicted: Pose, seen: Pose) -> bool:
         return has_slipped(self._matcher.place, scan, predicted, seen, self.config.acceptance.risk)
