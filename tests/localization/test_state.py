@@ -116,7 +116,8 @@ def test_localizer_moves_only_along_the_table(world_map, world_drive):
     step(4, stamp=2.1)
     step(5, garbage(5, 60))
     step(6, garbage(6))
-    for k in (7, 8, 9):
+    step(7, garbage(7))  # one frame may be garbage, two lose the place
+    for k in (8, 9):
         step(k)
     moved = [(before, after) for before, after in pairwise(states) if after is not before]
     assert list(dict.fromkeys(moved)) == [
