@@ -16,7 +16,7 @@ from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.register import ScanInput, register_and_verify
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.monitor import MOST_FALLEN, EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 
@@ -93,7 +93,7 @@ class MapMatcher:
         found = register_and_verify(self.base_map, scan, T_start, target, settings, scales, prior)
         seen = self.place.observe(scan, found.T_map_odom)
         cause, reason = RejectionReason.VERIFIED, "verified"
-        if seen.ratio <= 0.0:
+        if seen.ratio <= 0.0 or self.baseline.fallen(found.evidence) > MOST_FALLEN:
             cause, reason = self.baseline.explain(found.evidence)
         if found.registration is None:
             if cause is RejectionReason.VERIFIED:

@@ -29,6 +29,11 @@ _PER_SECOND = 1e-4  # while the place is in doubt: a robot that sees nothing may
 _UNSEEN = 5e-4  # while nothing was known of the robot
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
 _OFF_MAP = 0.3  # of what is seen on the map: less is told as such, it decides nothing; set by hand
+MOST_FALLEN = 1.0 / 0.65
+"""Times that the usual score may be better than that of a registration that is believed; set by hand.
+
+The likelihood alone follows an error that grows slowly along a road, as it learns from what it has believed."""
+
 _NEWEST_SHARE = 0.2  # of new shares in what is usual: about the last five registrations; set by hand
 
 
@@ -115,7 +120,9 @@ class EvidenceBaseline:
 
     def fallen(self, evidence: Evidence) -> float:
         """Return how many times better what is usual is than ``evidence``: 1 at least."""
-        return max(1.0, self.usual.score / evidence.score) if self.usual and evidence.score > 0 else 1.0
+        if self.usual is None:
+            return 1.0
+        return max(1.0, self.usual.score / evidence.score) if evidence.score > 0 else math.inf
 
     def explain(self, evidence: Evidence) -> tuple[RejectionReason, str]:
         """Return the cause of poor evidence, the share that has fallen furthest below what is usual, and a clause."""
@@ -193,7 +200,7 @@ class LossMonitor:
             self._before, self._since, self._required = self._odds, None, False
             return Ruling(Event.MATCH_VERIFIED, verdict.reason, wrong, True)
         in_doubt = self._required or self._since is not None
-        if certain and not in_doubt and verdict.cause not in _AT_ONCE:
+        if certain and not in_doubt and verdict.cause not in _AT_ONCE and verdict.ratio <= 0.0:
             return Ruling(None, f"odometry alone: {verdict.reason}", wrong, False)
         return self._doubt(verdict, stamp, wrong)
 
