@@ -122,7 +122,7 @@ def found_frame(drive):
 
 @pytest.mark.slow
 def test_restarted_odometry_far_away_is_lost_and_relocalized(found, world_drive):
-    """There is no map there, which might be the map's edge: but nobody drives that far between two frames."""
+    """A place without a map may lie at the map's edge, but no robot drives 6,000 km between two frames."""
     anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
     lost = found.step(anew.clouds[0], anew.T_odom_body[0], 3.0)
     assert lost.evidence.cause is RejectionReason.OFF_MAP

@@ -59,7 +59,7 @@ class RejectionReason(StrEnum):
 
 
 _AT_ONCE = (RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT)
-"""Reasons that cost the pose, whatever the evidence for the place was before; none is evidence against it."""
+"""Reasons for which no pose is given at once; none of them is evidence that the place is wrong."""
 
 
 @dataclass(frozen=True)
