@@ -67,6 +67,7 @@ BENCHMARKS = {
         "peers.peers", "other libraries on the same queries", _ANY, ("--places", "10", "--limit", "30"), 420.0
     ),
     "accuracy": Benchmark("accuracy.accuracy", "errors, runs localised and false fixes in held-out worlds"),
+    "conditions": Benchmark("accuracy.conditions", "real runs under a leaning sensor, bad odometry, fewer beams, gaps"),
     "field": Benchmark("accuracy.field", "the likelihood field beside the exact verification", page=True),
     "ablation": Benchmark("accuracy.ablation", "what each choice of the method is worth"),
     "ground": Benchmark("accuracy.ground", "the ground filter on labelled LAS files"),
