@@ -103,7 +103,7 @@ def share(scores: dict[str, Any], base: dict[str, Any]) -> float | None:
     """Return how many of the frames have a pose, per cent of how many the unspoilt run gave one."""
     if not base["posed"]:
         return None
-    return 100.0 * (scores["posed"] / scores["frames"]) / (base["posed"] / base["frames"])
+    return float(100.0 * (scores["posed"] / scores["frames"]) / (base["posed"] / base["frames"]))
 
 
 def verdicts(found: Sequence[dict[str, Any]]) -> Iterator[Row]:

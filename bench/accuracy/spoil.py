@@ -68,11 +68,10 @@ class Variant:
         """Return it with one more change of the clouds."""
         return replace(self, changes=(*self.changes, change))
 
-    def chosen(self, chosen: Indices) -> Variant:
+    def chosen(self, of: Indices) -> Variant:
         """Return it with some of its frames, in that order."""
-        every = (self.frames, self.stamps, self.odometry, self.truth)
-        frames, stamps, odometry, truth = (each[chosen] for each in every)
-        return replace(self, frames=frames, stamps=stamps, odometry=odometry, truth=truth)
+        odometry, truth = self.odometry[of], self.truth[of]
+        return replace(self, frames=self.frames[of], stamps=self.stamps[of], odometry=odometry, truth=truth)
 
 
 def spoilt(condition: str, run: Variant, seed: int) -> Variant:
@@ -166,7 +165,7 @@ def _still(run: Variant, figures: Sequence[float], rng: np.random.Generator) -> 
     copies = run.chosen(np.full(_COPIES, int(figures[0])))
     odometry = copies.odometry.copy()
     odometry[:, :3, 3] += rng.normal(0.0, _JITTER, (_COPIES, 3))
-    return replace(copies, stamps=_PERIOD * np.arange(_COPIES), odometry=odometry)
+    return replace(copies, stamps=np.arange(_COPIES) * np.float64(_PERIOD), odometry=odometry)
 
 
 def _one(run: Variant, figures: Sequence[float], rng: np.random.Generator) -> Variant:

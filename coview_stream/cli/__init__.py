@@ -22,7 +22,10 @@ from coview_stream.version import __version__
 
 PROGRAM = "coview-stream"
 
-COMMANDS = ("demo", "build", "info", "locate", "eval", "simulate", "serve", "replay", "watch", "doctor", "train")
+COMMANDS = (
+    *("demo", "build", "info", "locate", "eval", "simulate", "airborne"),
+    *("serve", "replay", "watch", "doctor", "train"),
+)
 """Names in the order of ``--help``."""
 
 _MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin where it is imported
