@@ -37,7 +37,7 @@ FOLDERS = (
 """Folders in the way of the data: each may import those before it, none those after it."""
 
 INNER = {
-    "localization": ("state", "registration", "evidence", "tracking", "result", "search"),
+    "localization": ("state", "registration", "evidence", "calibration", "tracking", "result", "search"),
     "stream": ("transport", "node", "client"),
 }
 """Parts of a folder that has folders of its own, likewise; what is not named here may import all of them."""

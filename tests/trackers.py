@@ -9,6 +9,7 @@ import small_world
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.registration.result import Registration
@@ -31,7 +32,7 @@ def garbage(seed=1, count=6000):
 def tracker_of(world_map, config=None):
     """A tracker that has not been started."""
     config = config or LocalizerConfig()
-    return Tracker(world_map, config, LocalMaps(world_map, config.registration.source_range))
+    return Tracker(world_map, config, LocalMaps(world_map, config.registration.source_range), CalibrationEstimator())
 
 
 def add_frame(tracker, cloud, T_odom_body):

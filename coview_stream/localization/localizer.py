@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, orthonormal, pose_from, to_local, to_map_origin
+from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from, to_local
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
+from coview_stream.localization.calibration.estimator import CalibrationEstimator, OdometryCorrection, tilt_variance
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.registration.verification import RangeImage
@@ -26,6 +30,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
+_LEVEL = math.radians(0.05)  # a frame that leans by less is not registered again for it; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
 
@@ -34,15 +39,19 @@ class _Frame:
     """One frame, checked.
 
     Attributes:
-        cloud: (N, 3) float32, body frame.
-        T_odom_body: (4, 4) odometry about the anchor.
+        raw: (N, 3) float32, body frame, as it came.
+        cloud: (N, 3) float32, body frame, levelled.
+        T_odom_body: (4, 4) odometry about the anchor, corrected.
+        T_odom_raw: (4, 4) odometry as it came.
         stamp: seconds.
         voxels: (M, 3) float32, one point per voxel, odometry frame about the anchor.
         keyframe: the one that it completes; None while a place is known, and between keyframes.
     """
 
+    raw: Points
     cloud: Points
     T_odom_body: Pose
+    T_odom_raw: Pose
     stamp: float
     voxels: Points
     keyframe: Keyframe | None
@@ -86,7 +95,9 @@ class Localizer:
         radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
         self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
-        self._tracker = Tracker(self.base_map, self.config, self._local_maps)
+        self._calibration = CalibrationEstimator()
+        self._odometry = OdometryCorrection()
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._calibration)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
         self._hints = PoseHints()
         self._odometry_check = OdometryCheck()
@@ -186,17 +197,19 @@ class Localizer:
         if self.state is not State.TRACKING or self._anchor is None:
             return Fix(newest.stamp, self.state, evidence=evidence)
         T_map_local = orthonormal(self._tracker.T_map_odom)
-        T_map_body = T_map_local @ newest.T_odom_body
+        T_map_local = T_map_local @ newest.T_odom_body
+        T_map_body = pose_from(T_map_local[:3, :3], T_map_local[:3, 3] + self.base_map.origin)
         return Fix(
             newest.stamp,
             self.state,
-            pose_from(T_map_body[:3, :3], T_map_body[:3, 3] + self.base_map.origin),
-            to_map_origin(T_map_local, self._anchor, self.base_map.origin),
+            T_map_body,
+            T_map_body @ inverse(newest.T_odom_raw),
             self._tracker.reported_covariance(),
             min(self._confidence, 1.0 - self._wrong),
             evidence,
             self._tracker.drift,
             self._tracker.protection_level(),
+            self._calibration.calibration,
         )
 
     def take_events(self) -> tuple[Event, ...]:
@@ -232,7 +245,8 @@ class Localizer:
 
     def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> _Frame:
         """Check a frame, and move the predicted pose on by its odometry."""
-        cloud, T = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
+        raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
+        cloud, T = self._levelled(raw), self._odometry.correct(T_raw, self._calibration.calibration)
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
         T = to_local(T, self._anchor)
@@ -240,8 +254,32 @@ class Localizer:
         # keyframes are for searching: a loss starts from nothing
         keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp)
         self._tracker.add_scan(voxels, T)
-        self._newest = _Frame(cloud, T, stamp, voxels, keyframe)
+        self._newest = _Frame(raw, cloud, T, T_raw, stamp, voxels, keyframe)
         return self._newest
+
+    def _level(self, match: MapMatch, newest: _Frame) -> MapMatch:
+        """Learn the sensor's tilt from the first registration at a place; level the newest frame, and match it again.
+
+        Returns:
+            The match of the levelled frame; ``match`` itself where nothing leans.
+        """
+        before = self._calibration.calibration
+        self._calibration.measure_attitude(match.T_map_body, newest.T_odom_body, tilt_variance(match.covariance))
+        now = self._calibration.calibration
+        if now.turned_since(before) < _LEVEL:
+            return match
+        cloud = self._levelled(newest.raw)
+        voxels = self._voxel_filter(cloud, newest.T_odom_body)[0].copy()
+        self._newest = replace(newest, cloud=cloud, voxels=voxels)
+        R = match.T_map_body[:3, :3] @ before.R_body_cloud @ now.R_body_cloud.T
+        T_map_body = pose_from(R, match.T_map_body[:3, 3])
+        self._tracker.start_levelled(T_map_body, match.covariance, newest.T_odom_body, voxels)
+        return self._tracker.match_to_map(cloud, newest.T_odom_body)
+
+    def _levelled(self, cloud: Points) -> Points:
+        """Turn a cloud (N, 3) by what is known of the sensor's tilt."""
+        R = self._calibration.calibration.R_body_cloud
+        return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
 
     def _search_request(self, frame: _Frame) -> SearchRequest | None:
         """Return what has to be searched for: the keyframe that a frame completes."""
@@ -276,6 +314,8 @@ class Localizer:
         self._buffer.clear()
         # the robot may have driven on or been carried since the keyframe
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
+        if match.verdict.verified:
+            match = self._level(match, newest)
         return replace(match, confirms_search=True)
 
     def _match_to_map(self, frame: _Frame, defer: bool = False) -> MapMatch | None:

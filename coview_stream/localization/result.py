@@ -9,6 +9,7 @@ from typing import Any
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
@@ -109,6 +110,7 @@ class Fix:
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:
             see docs/tracking.md; None unless TRACKING.
+        calibration: what is corrected of the sensor's tilt and of odometry; None before anything was measured.
     """
 
     stamp: float
@@ -120,3 +122,4 @@ class Fix:
     evidence: KeyframeEvidence | None = None
     drift: Drift | None = None
     protection: ProtectionLevel | None = None
+    calibration: Calibration | None = None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from coview_stream.config import AcceptanceConfig
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.words import one_in
@@ -28,6 +30,7 @@ class SearchResult:
         travelled: metres that odometry had driven at the keyframe.
         epoch: the request's.
         rivals: all places that the keyframe was scored at, the most probable among them.
+        T_odom_body: (4, 4) of the keyframe.
         leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
             without any place.
     """
@@ -38,6 +41,7 @@ class SearchResult:
     epoch: Epoch = FIRST_EPOCH
     rivals: Rivals = field(default_factory=Rivals.none)
     leader: Pose | None = None
+    T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
 
 
 def decide(
@@ -55,7 +59,9 @@ def decide(
     state, reason = _verdict(scored, leader, rule, undecided)
     if not scored.places:
         evidence = KeyframeEvidence(request.stamp, state, reason)
-        return SearchResult(None, evidence, request.travelled, request.epoch, scored.rivals)
+        return SearchResult(
+            None, evidence, request.travelled, request.epoch, scored.rivals, T_odom_body=request.T_odom_body
+        )  # fmt: skip
     best = scored.places[0]
     own = best.hypothesis
     if own.station is None and best.hinted:
@@ -69,7 +75,9 @@ def decide(
     )  # fmt: skip
     accepted = leader if state is State.TRACKING else None
     T_map_odom = own.T_map_odom if leader is None else leader.T_map_odom
-    return SearchResult(accepted, evidence, request.travelled, request.epoch, scored.rivals, T_map_odom)
+    return SearchResult(
+        accepted, evidence, request.travelled, request.epoch, scored.rivals, T_map_odom, request.T_odom_body
+    )  # fmt: skip
 
 
 def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig, undecided: float) -> tuple[State, str]:

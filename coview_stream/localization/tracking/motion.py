@@ -16,6 +16,7 @@ import numpy as np
 from coview_stream.config import TrackingConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, boxminus, inverse, yaw_of
+from coview_stream.localization.calibration.estimator import CalibrationEstimator, tilt_variance
 from coview_stream.localization.registration.covariance import swap_rotation_translation
 
 MAX_FRAMES = 40
@@ -153,9 +154,11 @@ class OdometryTracker:
         pose: (4, 4) the newest; None before the first, and where odometry may have jumped.
     """
 
-    def __init__(self, config: TrackingConfig) -> None:
+    def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
+        """Begin with the configured rates; ``calibration`` learns what is no random walk."""
         self.travelled = 0.0
         self.pose: Pose | None = None
+        self._calibration = calibration
         self._turned = 0.0
         self._keyframe = _Mark(np.eye(4), 0.0, 0.0)
         self._estimator = DriftEstimator(config)
@@ -191,7 +194,7 @@ class OdometryTracker:
         return self._estimator.drift
 
     def learn(self, T_map_body: Pose, covariance: Floats) -> None:
-        """Learn the drift from a verified registration at the newest keyframe.
+        """Learn calibration and drift from a verified registration at the newest keyframe.
 
         Args:
             T_map_body: (4, 4) as the map alone has it.
@@ -204,9 +207,12 @@ class OdometryTracker:
             if not worth_learning(driven, turned):
                 return
             step = inverse(before.mark.T_odom_body) @ now.T_odom_body
-            gap = boxminus(T_map_body, before.T_map_body @ step)
             noise = _OWN_NOISE * (variances + before.variances)
+            expected = self.drift.variances(driven, turned) + noise
+            step = self._calibration.measure_motion(before.T_map_body, T_map_body, step, expected[[3, 2]])
+            gap = boxminus(T_map_body, before.T_map_body @ step)
             self._estimator.add(gap, noise, driven, turned)
+            self._calibration.measure_attitude(T_map_body, now.T_odom_body, tilt_variance(covariance))
         self._registered = _Registered(T_map_body, variances, now)
 
     def forget_registration(self) -> None:

@@ -12,6 +12,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Points, Pose, inverse, transform
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.covariance import (
     propagate,
     registration_covariance,
@@ -44,12 +45,17 @@ class Tracker:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
     """
 
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps) -> None:
+    def __init__(
+        self, base_map: BaseMap, config: LocalizerConfig, local_maps: LocalMaps, calibration: CalibrationEstimator
+    ) -> None:
+        """Track on a map; ``calibration`` has corrected what is given, and learns from each registration."""
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
         self._graph = PoseGraph(config.graph)
-        self._odometry = OdometryTracker(config.tracking)
+        self._calibration = calibration
+        self._levelled = calibration.calibration  # what the newest registered cloud was corrected by
+        self._odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)
         self._displacement = DisplacementCheck()
         self._scans = ScanBuffer(config.tracking)
@@ -120,12 +126,26 @@ class Tracker:
         It may not have converged yet: its own covariance is not believed.
         """
         self._matcher.clear()
+        self._odometry.forget_registration()
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.clear()
         self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
         drifted = self.drift.covariance(self.travelled - travelled, 0.0)
         self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
+
+    def start_levelled(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose, points: Points) -> None:
+        """Begin again at the newest frame's first registration, once it is known how the sensor leans.
+
+        Args:
+            T_map_body: (4, 4) pose of that registration, of the levelled frame.
+            covariance: (6, 6) of it.
+            T_odom_body: (4, 4) odometry of the frame.
+            points: (N, 3) its points, levelled, odometry frame; all others are dropped.
+        """
+        self._scans.clear()
+        self._scans.add(points, self.travelled)
+        self._restart(T_map_body, covariance + _START, T_odom_body)
 
     def match_to_map(
         self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False
@@ -172,7 +192,8 @@ class Tracker:
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
-            # go on where the lidar says, for the next frame to confirm
+            # odometry has slipped, or drifts as it has done before; go on where the lidar says
+            self._odometry.learn(match.T_map_body, match.covariance)
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
             self._graph.correct(match.T_map_body, match.covariance)
@@ -226,7 +247,6 @@ class Tracker:
     def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
         self._graph.start(T_map_body, covariance)
-        self._odometry.forget_registration()
         self._odometry.set_keyframe(T_odom_body)
         self._set_belief(T_odom_body)
 
@@ -234,7 +254,12 @@ class Tracker:
         """Add a keyframe where odometry leads, and return what is believed of it."""
         driven, turned = self._odometry.since_keyframe()
         spread = self.drift.covariance(driven + _STANDING_DRIVE * standing_still, turned)
-        self._graph.move(self._odometry.motion(T_odom_body), spread)
+        motion = self._odometry.motion(T_odom_body)
+        step = self._graph.estimate.T_map_body[:3, :3] @ motion[:3, 3]
+        spread += self._calibration.motion_covariance(step)
+        before, self._levelled = self._levelled, self._calibration.calibration
+        spread[:2, :2] += np.eye(2) * before.turned_since(self._levelled) ** 2
+        self._graph.move(motion, spread)
         self._odometry.set_keyframe(T_odom_body)
         return self._graph.estimate
 

@@ -1,0 +1,83 @@
+"""The calibration: by how much sensor and odometry are off, as they seem to be now."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import exp_so3
+
+_WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next two
+_SCALE = 0.01
+_TURN = math.radians(0.05)  # per metre
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Corrections of a robot's clouds and odometry, and how well they are known.
+
+    Attributes:
+        roll: radians about the body's x by which clouds have to be turned to agree with odometry's gravity.
+        pitch: radians about the body's y, likewise.
+        scale: what odometry's distances have to be multiplied with, less one.
+        turn: radians per metre driven that odometry's heading has to be turned by.
+        sigma_tilt: radians, one sigma, each of roll and pitch.
+        sigma_scale: of the scale.
+        sigma_turn: radians per metre.
+    """
+
+    roll: float = 0.0
+    pitch: float = 0.0
+    scale: float = 0.0
+    turn: float = 0.0
+    sigma_tilt: float = math.radians(4.0)
+    sigma_scale: float = 0.03
+    sigma_turn: float = math.radians(0.05)
+
+    @property
+    def R_body_cloud(self) -> Floats:
+        """(3, 3) rotation that levels clouds."""
+        return exp_so3(np.array([self.roll, self.pitch, 0.0]))
+
+    def turned_since(self, other: Calibration) -> float:
+        """Return by how much the levelling differs from another's, radians."""
+        return math.hypot(self.roll - other.roll, self.pitch - other.pitch)
+
+    def describe(self) -> list[str]:
+        """Say in plain words, a clause each, what is corrected; nothing where sensor and odometry are as they should.
+
+        A sensor that leans by a *positive* pitch looks down, as ``--mount`` counts it.
+        """
+        said: list[str] = []
+        leans = [
+            f"{abs(math.degrees(angle)):.1f} deg in {name}"
+            for name, angle in (("roll", self.roll), ("pitch", self.pitch))
+            if abs(angle) >= _WORTH_TELLING
+        ]
+        if leans:
+            mount = f"{math.degrees(self.roll):.1f},{math.degrees(self.pitch):.1f},0"
+            said.append(f"sensor leans {' and '.join(leans)}: corrected; set --mount={mount} to silence this")
+        if abs(self.scale) >= _SCALE:
+            what = "short" if self.scale > 0 else "long"
+            said.append(f"odometry measures {abs(self.scale):.1%} too {what}: corrected")
+        if abs(self.turn) >= _TURN:
+            side = "left" if self.turn < 0 else "right"
+            said.append(f"odometry turns {abs(math.degrees(self.turn)):.2f} deg per metre too far {side}: corrected")
+        return said
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, degrees and per cent."""
+        deg = math.degrees
+        return {
+            "roll_deg": round(deg(self.roll), 2),
+            "pitch_deg": round(deg(self.pitch), 2),
+            "tilt_sigma_deg": round(deg(self.sigma_tilt), 2),
+            "odometry_scale": round(1.0 + self.scale, 4),
+            "odometry_scale_sigma": round(self.sigma_scale, 4),
+            "odometry_turn_deg_per_m": round(deg(self.turn), 3),
+            "odometry_turn_sigma_deg_per_m": round(deg(self.sigma_turn), 3),
+        }

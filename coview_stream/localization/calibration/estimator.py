@@ -1,0 +1,189 @@
+"""Estimation of the calibration: a Kalman filter over what is constant about a robot, or nearly so.
+
+The state is x = (roll, pitch, s, w): the tilt of the sensor against odometry's gravity, the scale of odometry's
+distances less one, and the turn of its heading per metre. It is what is left of the pose graph's errors when those that
+are independent from step to step (:class:`coview_stream.localization.tracking.motion.Drift`) are taken away. Each
+registration to the map that is believed measures two things:
+
+* its attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the tilt
+  that is left is u_map x u_odometry (eq. C1), but for the registration's error and odometry's own error in gravity;
+* the motion since the registration before against odometry's. Along the way they differ by s times the distance, in
+  heading by w times the distance (eq. C2), but for both registrations' errors and odometry's random walk.
+
+A motion far outside what all this allows (wheels slip) counts less, as under Student's t distribution. Nothing is for
+ever: each component walks at random, slowly, with the metres driven.
+
+Most sensors stand straight and most odometry has the right scale. So each of the three groups is a mixture: zero but
+for a small spread, or anything up to a large one; what is applied is the mean of both, weighed by how probable they are
+(Savage and Dickey's ratio, eq. C3).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Pose, exp_so3, inverse, log_so3, pose_from
+from coview_stream.localization.calibration.calibration import Calibration
+
+
+class _Prior(NamedTuple):
+    """What is known of a group of components before anything is seen; all set by hand.
+
+    Attributes:
+        axes: of the state.
+        exact: sigma of one that is as it should be.
+        wide: sigma of one that is not.
+        share: probability that it is not.
+        walk: sigma of its random walk, per square root of a metre.
+    """
+
+    axes: slice
+    exact: float
+    wide: float
+    share: float
+    walk: float
+
+
+_TILT = _Prior(slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03))
+_SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4)
+_TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4))
+_GROUPS = (_TILT, _SCALE, _TURN)
+
+_GRAVITY = math.radians(0.25)  # sigma of odometry's gravity, each of roll and pitch; set by hand
+_FREEDOM = 4.0  # degrees of freedom of Student's distribution; set by hand
+_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else; set by hand
+
+
+class CalibrationEstimator:
+    """Estimate of the calibration, and the correction of clouds and odometry by it.
+
+    Attributes:
+        calibration: what is applied.
+    """
+
+    def __init__(self) -> None:
+        self._x = np.zeros(4)
+        self._P = np.diag(np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide**2) for g in _GROUPS]))
+        self._mix()
+
+    def restore(self, known: Calibration) -> None:
+        """Begin with what was known of this robot before; it goes on being measured."""
+        self._x = np.array([known.roll, known.pitch, known.scale, known.turn])
+        self._P = np.diag(np.square([known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]))
+        self._mix()
+
+    def motion_covariance(self, step: Floats) -> Floats:
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the axes of that."""
+        along = np.concatenate([np.zeros(3), step])
+        spread = np.outer(along, along) * self.calibration.sigma_scale**2
+        spread[2, 2] += (self.calibration.sigma_turn * float(np.linalg.norm(step))) ** 2
+        return np.asarray(spread)
+
+    def measure_attitude(self, T_map_body: Pose, T_odom_body: Pose, variance: float) -> None:
+        """Take in the attitude of a registration (eq. C1).
+
+        Args:
+            T_map_body: (4, 4) as the map alone has it, of a cloud that has been corrected.
+            T_odom_body: (4, 4) odometry of the same body.
+            variance: of the registration's roll and pitch, rad^2.
+        """
+        left = np.cross(T_map_body[2, :3], T_odom_body[2, :3])
+        left[2] = 0.0
+        seen = log_so3(exp_so3(left) @ self.calibration.R_body_cloud)[:2]
+        H = np.eye(2, 4)
+        self._update(seen, H, np.eye(2) * (variance + _GRAVITY**2))
+
+    def measure_motion(self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats) -> Pose:
+        """Take in the motion between two registrations (eq. C2); return the step as it is corrected from now on.
+
+        Args:
+            T_map_before: (4, 4) the earlier one, as the map alone has it.
+            T_map_body: (4, 4) the later one.
+            step: (4, 4) odometry between them, as it has been corrected.
+            noise: (2,) variances along the way and of the heading, but for the calibration's.
+        """
+        driven = float(np.linalg.norm(step[:3, 3]))
+        if driven < _MIN_STEP:
+            return step
+        self._walk(driven)
+        motion = inverse(T_map_before) @ T_map_body
+        along = float((motion[:3, 3] - step[:3, 3]) @ step[:3, 3]) / driven
+        turned = float(log_so3(motion[:3, :3] @ step[:3, :3].T)[2])
+        before = self.calibration
+        raw = driven / (1.0 + before.scale)
+        for axis, gap, applied in ((2, along, before.scale), (3, turned, before.turn)):
+            H = np.zeros((1, 4))
+            H[0, axis] = raw
+            self._update(np.array([gap + applied * raw]), H, np.array([[noise[axis - 2]]]))
+        now = self.calibration
+        turn = exp_so3(np.array([0.0, 0.0, (now.turn - before.turn) * raw]))
+        return pose_from(turn @ step[:3, :3], (1.0 + now.scale) / (1.0 + before.scale) * step[:3, 3])
+
+    def _walk(self, driven: float) -> None:
+        """Let everything have changed a little over ``driven`` metres."""
+        for group in _GROUPS:
+            axes = np.arange(4)[group.axes]
+            self._P[axes, axes] = np.minimum(self._P[axes, axes] + group.walk**2 * driven, group.wide**2)
+
+    def _update(self, seen: Floats, H: Floats, R: Floats) -> None:
+        """Take in a measurement ``seen`` = H x + noise of covariance R, heavy-tailed."""
+        gap = seen - H @ self._x
+        distance = float(gap @ np.linalg.solve(H @ self._P @ H.T + R, gap))
+        R = R * max(1.0, (_FREEDOM + distance) / (_FREEDOM + len(gap)))
+        gain = np.linalg.solve(H @ self._P @ H.T + R, H @ self._P).T
+        self._x = self._x + gain @ gap
+        rest = np.eye(4) - gain @ H
+        self._P = rest @ self._P @ rest.T + gain @ R @ gain.T
+        self._mix()
+
+    def _mix(self) -> None:
+        """Weigh, group by group, "as it should be" against "anything" (eq. C3)."""
+        means, sigmas = np.zeros(4), []
+        for group in _GROUPS:
+            x, P = self._x[group.axes], self._P[group.axes, group.axes]
+            size = len(x)
+            spread = P + group.exact**2 * np.eye(size)
+            exact = -0.5 * (x @ np.linalg.solve(spread, x) + np.linalg.slogdet(spread)[1]) + size * math.log(group.wide)
+            weight = 1.0 / (1.0 + (1.0 - group.share) / group.share * math.exp(min(exact, 500.0)))
+            means[group.axes] = weight * x
+            about = group.exact**2 * np.trace(P) / (np.trace(P) + size * group.exact**2)
+            within = weight * np.trace(P) + (1.0 - weight) * about
+            sigmas.append(math.sqrt((within + weight * (1.0 - weight) * float(x @ x)) / size))
+        self.calibration = Calibration(*means.tolist(), *sigmas)
+
+
+def tilt_variance(covariance: Floats) -> float:
+    """Return the variance of roll or pitch, rad^2, of a covariance (6, 6) over (rx, ry, rz, x, y, z)."""
+    return 0.5 * float(covariance[0, 0] + covariance[1, 1])
+
+
+class OdometryCorrection:
+    """Odometry with its scale and its heading corrected, step by step; what has been corrected stays as it is.
+
+    Gravity stays odometry's: turns are about the vertical.
+    """
+
+    def __init__(self) -> None:
+        self._before: Pose | None = None  # as it came
+        self._position = np.zeros(3)
+        self._turned = 0.0
+
+    def correct(self, T_odom_body: Pose, calibration: Calibration) -> Pose:
+        """Return the next pose (4, 4), odometry <- body, corrected."""
+        if self._before is None:
+            self._position = T_odom_body[:3, 3].copy()
+        else:
+            step = T_odom_body[:3, 3] - self._before[:3, 3]
+            turn = calibration.turn * float(np.linalg.norm(step))
+            middle = exp_so3(np.array([0.0, 0.0, self._turned + 0.5 * turn]))
+            self._position = self._position + (1.0 + calibration.scale) * (middle @ step)
+            self._turned += turn
+        self._before = T_odom_body
+        T = np.eye(4)
+        T[:3, :3] = exp_so3(np.array([0.0, 0.0, self._turned])) @ T_odom_body[:3, :3]
+        T[:3, 3] = self._position
+        return T
