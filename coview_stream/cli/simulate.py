@@ -27,6 +27,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--changed", type=float, default=0.0, help="share of trees, cars and poles changed since the map (0)"
     )
     parser.add_argument("--drift", type=float, default=1.0, help="factor on the drift of the odometry (1)")
+    parser.add_argument(
+        "--dirt",
+        default="",
+        metavar="KINDS",
+        help="what is imperfect, e.g. rain,snow:0.4 (a number says how strong); real is all of motion, traffic, rain, "
+        "dust, beams, reflectors, glass, mounting, gravity, odometry, slip, strips, density, seasons, years, grass, "
+        "snow (none)",
+    )
+    parser.add_argument("--dirt-seed", type=int, default=0, help="of what is drawn for the dirt alone (0)")
     parser.add_argument("--utm", action="store_true", help="put the map at UTM-like coordinates")
     parser.add_argument(
         "--origin", type=float, nargs=3, metavar=("X", "Y", "Z"), help="put the map at these coordinates"
@@ -37,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the world and print its counts."""
-    from coview_stream.sim import OdometryConfig, SimulationConfig, simulate
+    from coview_stream.sim import OdometryConfig, SimulationConfig, parse_dirt, simulate
 
     if args.utm and args.origin:
         raise ConfigError("--utm and --origin: give one of them")
@@ -60,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
             position_walk=args.drift * drift.position_walk,
             tilt_noise=args.drift * drift.tilt_noise,
         ),
+        dirt=parse_dirt(args.dirt, args.dirt_seed),
     )
     progress = args.progress or sys.stderr.isatty()
     world = simulate(args.out, config, progress=progress, overwrite=args.overwrite)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.sim.caster import Caster
+from coview_stream.sim.caster import MeshCaster
 
 ALTITUDE = 250.0
 """Metres above the scene's zero."""
@@ -52,7 +52,7 @@ _DEFAULT_FLIGHT = Flight()
 
 
 def airborne_scan(
-    caster: Caster, size: float, density: float, rng: np.random.Generator, flight: Flight = _DEFAULT_FLIGHT
+    caster: MeshCaster, size: float, density: float, rng: np.random.Generator, flight: Flight = _DEFAULT_FLIGHT
 ) -> Iterator[tuple[float, Floats]]:
     """Scan the square of ``size`` metres with ``density`` pulses per square metre, strip by strip.
 
@@ -75,7 +75,13 @@ def _lines(size: float, flight: Flight) -> Floats:
 
 
 def _strip(
-    caster: Caster, heading: float, line: float, size: float, density: float, rng: np.random.Generator, flight: Flight
+    caster: MeshCaster,
+    heading: float,
+    line: float,
+    size: float,
+    density: float,
+    rng: np.random.Generator,
+    flight: Flight,
 ) -> Floats:
     half, reach = size / 2, size / np.sqrt(2)
     width = 2 * flight.altitude * np.tan(flight.swath)
@@ -102,9 +108,9 @@ def _strip(
 
 
 def _returns(
-    caster: Caster, origins: Floats, rays: Floats, half: float, rng: np.random.Generator, flight: Flight
+    caster: MeshCaster, origins: Floats, rays: Floats, half: float, rng: np.random.Generator, flight: Flight
 ) -> Floats:
-    t = caster.cast(_single(origins), _single(rays), rng, flight.porosity).distance.astype(np.float64)
+    t = caster.trace(_single(origins), _single(rays), rng, flight.porosity).distance.astype(np.float64)
     hit = np.isfinite(t)
     t = t[hit] + rng.normal(0, flight.noise, int(hit.sum()))
     points = origins[hit] + rays[hit] * t[:, None]

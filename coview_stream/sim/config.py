@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from coview_stream.errors import ConfigError
+from coview_stream.sim.dirt.config import Dirt
 from coview_stream.sim.kinds import KINDS
 from coview_stream.sim.odometry import OdometryConfig
 from coview_stream.sim.sensors import SENSORS
@@ -37,6 +38,7 @@ class SimulationConfig:
         speed: of the robot, metres per second.
         height: of the sensor above the ground, metres.
         odometry: errors of the odometry.
+        dirt: what is imperfect beyond that; nothing by default.
 
     Raises:
         ConfigError: unknown scene or sensor, or a value out of its range.
@@ -53,6 +55,7 @@ class SimulationConfig:
     speed: float = 1.5
     height: float = 1.5
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    dirt: Dirt = field(default_factory=Dirt)
 
     def __post_init__(self) -> None:
         for name, known in (("scene", KINDS), ("sensor", SENSORS)):
@@ -67,5 +70,8 @@ class SimulationConfig:
             raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values, for JSON."""
-        return asdict(self)
+        """Return all fields as plain values, for JSON; ``dirt`` is among them only if there is some."""
+        values = asdict(self) | {"dirt": self.dirt.to_dict()}
+        if not self.dirt.kinds:
+            del values["dirt"]
+        return values

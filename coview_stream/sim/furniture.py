@@ -10,6 +10,7 @@ from coview_stream.sim.layout import Layout, Site, directions
 from coview_stream.sim.mesh import Mesh, box, cylinder, frustum, join, placed
 
 _LORRIES = 0.95  # vehicles of this ``kind`` and above
+_SIGNS = (0.6, 0.85)  # poles of a ``kind`` between these carry a sign
 _MIN_CLEARANCE = 2.2  # metres from the robot's route to the middle of a vehicle
 
 
@@ -46,7 +47,7 @@ def _leaves_lane_free(rows: Floats, route: Floats) -> Bools:
 
 def cars(rows: Floats, site: Site) -> Mesh:
     """Return parked cars, vans and, for the largest ``kind``, lorries."""
-    return join(_stand(_vehicle(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
+    return join(_stand(vehicle(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
 
 
 def poles(rows: Floats, site: Site) -> Mesh:
@@ -54,11 +55,18 @@ def poles(rows: Floats, site: Site) -> Mesh:
     return join(_stand(_pole(kind), site, x, y, yaw) for x, y, yaw, kind in rows)
 
 
+def sign_plates(rows: Floats, site: Site) -> Mesh:
+    """Return the plates of the traffic signs among ``rows``, a little larger than :func:`poles` draws them."""
+    signs = rows[(rows[:, 3] >= _SIGNS[0]) & (rows[:, 3] < _SIGNS[1])]
+    return join(_stand(placed(box(0.1, 0.74, 0.74), 0, 0, 1.98), site, x, y, yaw) for x, y, yaw, _ in signs)
+
+
 def _stand(mesh: Mesh, site: Site, x: float, y: float, yaw: float) -> Mesh:
     return placed(mesh, x, y, site.height(x, y), yaw)
 
 
-def _vehicle(kind: float) -> Mesh:
+def vehicle(kind: float) -> Mesh:
+    """Return a car, van or lorry at the origin, its front towards +x; ``kind`` is in [0, 1)."""
     scale = 0.9 + 0.25 * ((kind * 7.0) % 1.0)
     if kind < 0.75:
         body = placed(box(4.3 * scale, 1.75, 0.65), 0, 0, 0.25)
@@ -71,10 +79,10 @@ def _vehicle(kind: float) -> Mesh:
 
 def _pole(kind: float) -> Mesh:
     tall = 4.5 + 4.0 * ((kind * 11.0) % 1.0)
-    if kind < 0.6:
+    if kind < _SIGNS[0]:
         # +y points at the road on the side where spots() puts things
         arm = placed(box(0.12, 1.6, 0.12), 0, 0.8, tall - 0.2)
         return join([cylinder(0.1, tall, 6, top=0.06), arm])
-    if kind < 0.85:
+    if kind < _SIGNS[1]:
         return join([cylinder(0.05, 2.6, 6), placed(box(0.08, 0.7, 0.7), 0, 0, 2.0)])
     return join([cylinder(0.18, tall + 2.0, 8, top=0.1), placed(box(1.2, 0.15, 0.15), 0, 0, tall + 1.2)])

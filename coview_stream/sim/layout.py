@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -179,9 +180,12 @@ class Site:
         """Return the height of the ground at one place, metres."""
         return float(self.z(x, y)[0])
 
-    def mesh(self) -> Mesh:
-        """Return the ground's mesh."""
-        return height_field(self._axis, self._heights)
+    def mesh(self, cover: Callable[[Floats, Floats], Floats] | None = None) -> Mesh:
+        """Return the ground's mesh, raised by what lies on it: ``cover`` (x, y) -> depth, (N,) metres."""
+        if cover is None:
+            return height_field(self._axis, self._heights)
+        X, Y = np.meshgrid(self._axis, self._axis, indexing="ij")
+        return height_field(self._axis, self._heights + cover(X.ravel(), Y.ravel()).reshape(X.shape))
 
     def road_distance(self, x: Floats, y: Floats) -> Floats:
         """Return (N,) metres to the nearest street's centre line."""

@@ -64,6 +64,36 @@ class SceneState:
 
 
 @dataclass(frozen=True)
+class Parts:
+    """What a scene consists of at one time.
+
+    Attributes:
+        ground: the bare ground.
+        built: buildings, and the hedges, walls and fences between them.
+        fixed: boulders and fallen trunks.
+        bushes: leafy undergrowth.
+        trees: rows of ``vegetation.TREE_COLUMNS``.
+        cars: rows of parked vehicles, as ``furniture.cars`` takes them.
+        poles: rows of poles, as ``furniture.poles`` takes them.
+    """
+
+    ground: Mesh
+    built: tuple[Mesh, ...]
+    fixed: tuple[Mesh, ...]
+    bushes: tuple[Mesh, ...]
+    trees: Floats
+    cars: Floats
+    poles: Floats
+
+    def state(self, site: Site) -> SceneState:
+        """Join all that is solid, and all that is leafy."""
+        below = site.z(self.trees[:, 0], self.trees[:, 1])
+        street = [furniture.cars(self.cars, site), furniture.poles(self.poles, site)]
+        solid = join([self.ground, *self.built, *self.fixed, *street, vegetation.trunks(self.trees, below)])
+        return SceneState(solid, join([*self.bushes, vegetation.crowns(self.trees, below)]))
+
+
+@dataclass(frozen=True)
 class Scene:
     """Scene in both states.
 
@@ -75,6 +105,8 @@ class Scene:
         site: ground and roads.
         route: (N, 2) closed loop that robots drive on, metres.
         footprints: of the buildings.
+        parts: what it was drawn from, when the map was made and now; None where it was not drawn here.
+        houses: for each footprint the index of its building among ``Parts.built``.
     """
 
     kind: str
@@ -84,6 +116,8 @@ class Scene:
     site: Site
     route: Floats
     footprints: tuple[Footprint, ...]
+    parts: tuple[Parts, Parts] | None = None
+    houses: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -119,25 +153,26 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
     rng = [np.random.default_rng([seed, sum(kind.encode()), stream]) for stream in range(5)]
     layout = spec.streets(rng[_GROUND], size, half)
     site = Site(rng[_GROUND], layout, half, relief=spec.relief, roughness=spec.roughness, ditch=spec.ditch)
-    footprints, built = _buildings(rng[_BUILT], site, spec)
+    footprints, houses, built = _buildings(rng[_BUILT], site, spec)
     fixed, bushes = _greenery(rng[_GREEN], site, spec)
     cars, poles = _street_furniture(rng[_STREET], site, spec)
     trees = _trees(rng[_GREEN], rng[_SPARE], site, spec, changed)
 
-    def state(pick: Callable[[_Movable], Floats]) -> SceneState:
-        rows = pick(trees)
-        ground = site.z(rows[:, 0], rows[:, 1])
-        street = [furniture.cars(pick(cars), site), furniture.poles(pick(poles), site)]
-        solid = join([site.mesh(), *built, *fixed, *street, vegetation.trunks(rows, ground)])
-        return SceneState(solid, join([*bushes, vegetation.crowns(rows, ground)]))
+    def parts(pick: Callable[[_Movable], Floats]) -> Parts:
+        rows, standing = pick(trees), (tuple(built), tuple(fixed), tuple(bushes))
+        return Parts(site.mesh(), *standing, rows, pick(cars), pick(poles))
 
-    mapped = state(lambda movable: movable.rows)
-    now = state(lambda movable: movable.now(rng[_SPARE], changed)) if changed else mapped
-    return Scene(kind, size, mapped, now, site, layout.route, tuple(footprints))
+    before = parts(lambda movable: movable.rows)
+    after = parts(lambda movable: movable.now(rng[_SPARE], changed)) if changed else before
+    mapped = before.state(site)
+    now = after.state(site) if changed else mapped
+    drawn = (tuple(footprints), (before, after), tuple(houses))
+    return Scene(kind, size, mapped, now, site, layout.route, *drawn)
 
 
-def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Footprint], list[Mesh]]:
+def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[Footprint], list[int], list[Mesh]]:
     footprints: list[Footprint] = []
+    houses: list[int] = []
     meshes: list[Mesh] = []
 
     def build(plot: Plot, x: float, y: float, yaw: float, w: float, d: float, margin: float) -> bool:
@@ -145,6 +180,7 @@ def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[F
             return False
         local = plot.draw(rng, w, d)
         ground = site.height(x, y)
+        houses.append(len(meshes))
         meshes.append(placed(local, x, y, ground, yaw))
         top = ground + float(local.vertices[:, 2].max(initial=0.0))
         footprints.append(Footprint(x, y, w, d, yaw, ground, top))
@@ -157,7 +193,7 @@ def _buildings(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[list[F
         plot, w, d = _draw_plot(rng, spec)
         x, y = rng.uniform(-site.half, site.half, 2)
         build(plot, x, y, rng.uniform(0, 2 * np.pi), w, d, 2.5)
-    return footprints, meshes
+    return footprints, houses, meshes
 
 
 def _line_street(

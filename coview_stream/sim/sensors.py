@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Bools, Floats, Reals
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.sim.caster import Caster
 
@@ -61,12 +61,19 @@ class Sensor:
         hits = caster.cast(origins, turned, rng, porosity)
         t = hits.distance.astype(np.float64)
         noisy = t + rng.normal(0, noise, len(t))
-        luck = rng.random(len(t))
+        seen = self.detects(t, hits.incidence, rng.random(len(t)))
+        return (rays[seen] * noisy[seen, None]).astype(np.float32)
+
+    def detects(self, distance: Floats, strength: Reals, luck: Floats) -> Bools:
+        """Tell which of (N,) pulses return, from (N,) distances in metres.
+
+        ``strength`` is the cosine of the incidence, less what was lost on the way; ``luck`` is uniform in [0, 1).
+        """
         with np.errstate(invalid="ignore"):
             # a Lambertian surface returns cos / r^2; below the threshold a pulse is lost more and more often
-            signal = hits.incidence * (self.max_range / np.maximum(t, 0.1)) ** 2
-            seen = (t > self.min_range) & (t < self.max_range) & (luck < (1 - _LOST_PULSES) * signal / 0.4)
-        return (rays[seen] * noisy[seen, None]).astype(np.float32)
+            signal = strength * (self.max_range / np.maximum(distance, 0.1)) ** 2
+            near = (distance > self.min_range) & (distance < self.max_range)
+            return np.asarray(near & (luck < (1 - _LOST_PULSES) * signal / 0.4))
 
 
 def _spherical(azimuth: Floats, elevation: Floats) -> Floats:

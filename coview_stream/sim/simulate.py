@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,13 @@ from coview_stream.errors import InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.sim.airborne import airborne_scan
-from coview_stream.sim.caster import Caster
+from coview_stream.sim.caster import Caster, MeshCaster
 from coview_stream.sim.config import SimulationConfig
+from coview_stream.sim.dirt.change import aged, drawn_parts
+from coview_stream.sim.dirt.scan import Scanner
+from coview_stream.sim.dirt.streams import Stream, stream
+from coview_stream.sim.dirt.surfaces import seasonal_caster
+from coview_stream.sim.dirt.survey import Thinning, spoilt_strips
 from coview_stream.sim.odometry import drifting_odometry, drive
 from coview_stream.sim.scenes import Scene, build_scene
 from coview_stream.sim.sensors import FRAME_PERIOD, SENSORS
@@ -72,13 +78,13 @@ def simulate(
     config = config or SimulationConfig()
     out = Path(out)
     with _staging(out, overwrite) as staging, _Bar(progress) as bar:
-        scene = build_scene(config.scene, config.seed, config.size, config.changed)
+        scene = scene_of(config)
         base = base_map(scene, config, bar)
         write_cloud(staging / "base.laz", base, origin=config.origin)
         stamps, truth, odometry = trajectories(scene, config)
         (staging / "run" / "frames").mkdir(parents=True)
         bar.begin("drive", len(truth))
-        for k, points in enumerate(frames(scene, config, truth)):
+        for k, points in enumerate(frames(scene, config, truth, odometry)):
             write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
             bar.advance(1)
         write_tum(staging / "run" / "odometry.tum", stamps, odometry)
@@ -91,12 +97,28 @@ def simulate(
     return Simulated(out, len(base), len(truth), distance)
 
 
+def scene_of(config: SimulationConfig) -> Scene:
+    """Draw the scene, with what changed in it since the survey."""
+    scene = build_scene(config.scene, config.seed, config.size, config.changed)
+    years = config.dirt.years
+    return scene if years is None else aged(scene, years, _dirt_stream(config, Stream.YEARS))[0]
+
+
 def base_map(scene: Scene, config: SimulationConfig, bar: _Bar | None = None) -> Floats:
     """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added)."""
-    bar = bar or _Bar(False)
+    bar, dirt = bar or _Bar(False), config.dirt
     bar.begin("airborne scan", 100)
+    caster: MeshCaster = Caster(scene.mapped)
+    if dirt.seasons is not None:
+        caster = seasonal_caster(drawn_parts(scene)[0], scene, dirt.seasons)
+    density = config.density if dirt.density is None else dirt.density.most
+    scanned = airborne_scan(caster, config.size, density, _stream(config, _AIRBORNE))
+    if dirt.strips is not None or dirt.density is not None:
+        uneven = _dirt_stream(config, Stream.DENSITY)
+        thinning = None if dirt.density is None else Thinning(dirt.density, uneven)
+        scanned = spoilt_strips(scanned, dirt.strips, thinning, _dirt_stream(config, Stream.STRIPS))
     strips, before = [], 0
-    for done, points in airborne_scan(Caster(scene.mapped), config.size, config.density, _stream(config, _AIRBORNE)):
+    for done, points in scanned:
         strips.append(points)
         bar.advance(int(100 * done) - before)
         before = int(100 * done)
@@ -108,15 +130,35 @@ def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats
     truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE))
     odometry = drifting_odometry(truth, config.odometry, _stream(config, _ODOMETRY))
     stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
+    dirt = config.dirt
+    if dirt.odometry is not None:
+        odometry = dirt.odometry.apply(odometry, _dirt_stream(config, Stream.ODOMETRY))
+    if dirt.slip is not None:
+        odometry = dirt.slip.apply(odometry, _dirt_stream(config, Stream.SLIP))
+    if dirt.gravity is not None:
+        odometry = dirt.gravity.apply(odometry, stamps, _dirt_stream(config, Stream.GRAVITY))
     return stamps, truth, odometry
 
 
-def frames(scene: Scene, config: SimulationConfig, truth: Floats) -> Iterator[Points]:
-    """Scan the scene as it is now from each true pose; (N, 3) float32 metres, body frame."""
-    caster, sensor, rng = Caster(scene.now), SENSORS[config.sensor](), _stream(config, _SENSOR)
+def frames(scene: Scene, config: SimulationConfig, truth: Floats, odometry: Floats | None = None) -> Iterator[Points]:
+    """Scan the scene as it is now from each true pose; (N, 3) float32 metres, body frame.
+
+    ``odometry`` (N, 4, 4) deskews raw sweeps, where there are some; the truth does without it.
+    """
+    sensor = SENSORS[config.sensor]()
+    if config.dirt.on_sensor:
+        scanner = Scanner(scene, sensor, config.dirt, config.height, partial(_dirt_stream, config))
+        stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
+        yield from scanner.frames(stamps, truth, truth if odometry is None else odometry)
+        return
+    caster, rng = Caster(scene.now), _stream(config, _SENSOR)
     T: Pose
     for k, T in enumerate(truth):
         yield sensor.scan(caster, T, k, rng)
+
+
+def _dirt_stream(config: SimulationConfig, purpose: Stream) -> np.random.Generator:
+    return stream(config.seed, config.dirt.seed, purpose)
 
 
 def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from surface_distance import distance_to_surfaces
 
 from coview_stream.sim.caster import Caster
 from coview_stream.sim.mesh import EMPTY, Mesh, box, join, placed
@@ -11,19 +12,6 @@ from coview_stream.sim.scenes import SceneState
 from coview_stream.sim.sensors import SENSORS
 
 RNG = np.random.default_rng(0)
-
-
-def distance_to_surfaces(scene, points):
-    """(N,) metres to the nearest triangle of the scene as it is now."""
-    from coview_stream.clouds.open3d_loader import open3d
-
-    o3d = open3d()
-    surfaces = o3d.t.geometry.RaycastingScene(nthreads=1)
-    for mesh in (scene.now.solid, scene.now.foliage):
-        vertices = o3d.core.Tensor(mesh.vertices.astype(np.float32))
-        surfaces.add_triangles(vertices, o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
-    queries = o3d.core.Tensor(points.astype(np.float32))
-    return surfaces.compute_distance(queries, nthreads=1).numpy()
 
 
 def around_buildings(scene, points):

@@ -1,0 +1,152 @@
+"""Dirt of the real world, by kind: what is on, and how strong."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from coview_stream.errors import ConfigError
+from coview_stream.sim.dirt.beams import Beams
+from coview_stream.sim.dirt.change import Seasons, Years
+from coview_stream.sim.dirt.glass import Glass
+from coview_stream.sim.dirt.ground_cover import Grass, Snow
+from coview_stream.sim.dirt.motion import Motion
+from coview_stream.sim.dirt.mounting import Mounting
+from coview_stream.sim.dirt.odometry_faults import Gravity, Miscalibration, Slip
+from coview_stream.sim.dirt.ranges import within
+from coview_stream.sim.dirt.reflectors import Reflectors
+from coview_stream.sim.dirt.survey import Density, Strips
+from coview_stream.sim.dirt.traffic import Traffic
+from coview_stream.sim.dirt.weather import Dust, Rain
+
+REAL = "real"
+"""Name of the preset with all kinds on."""
+
+
+@dataclass(frozen=True)
+class Dirt:
+    """Dirt in a simulated world; each kind is None (off) or its settings.
+
+    The truth that is written stays the true pose of the body.
+
+    Attributes:
+        seed: of all that is drawn for dirt, besides the world's own seed.
+        motion: raw sweeps of a moving robot, deskewed by its odometry.
+        traffic: people and vehicles that move.
+        rain: returns of drops.
+        dust: returns of a cloud behind the robot.
+        beams: noise that grows with the range, mixed echoes at edges.
+        reflectors: signs that bloom.
+        glass: windows that mirror or let through.
+        mounting: a leaning sensor beside its place.
+        gravity: a false direction of down in the odometry.
+        odometry: wrong scale and a turning heading.
+        slip: bursts of slipping wheels.
+        strips: survey strips that disagree.
+        density: an uneven density of the survey.
+        seasons: bare trees in the map, leaves now.
+        years: years between survey and run.
+        grass: tall grass off the roads.
+        snow: snow on the ground.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    seed: int = 0
+    motion: Motion | None = None
+    traffic: Traffic | None = None
+    rain: Rain | None = None
+    dust: Dust | None = None
+    beams: Beams | None = None
+    reflectors: Reflectors | None = None
+    glass: Glass | None = None
+    mounting: Mounting | None = None
+    gravity: Gravity | None = None
+    odometry: Miscalibration | None = None
+    slip: Slip | None = None
+    strips: Strips | None = None
+    density: Density | None = None
+    seasons: Seasons | None = None
+    years: Years | None = None
+    grass: Grass | None = None
+    snow: Snow | None = None
+
+    def __post_init__(self) -> None:
+        within(self, seed=(0, 2**31 - 1))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of the kinds that are on."""
+        return tuple(name for name in KINDS_OF_DIRT if getattr(self, name) is not None)
+
+    @property
+    def on_sensor(self) -> bool:
+        """Whether the robot's frames differ from those of a clean world, besides what was changed in the scene."""
+        return any(name in _ON_SENSOR for name in self.kinds)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the seed and the settings of the kinds that are on as plain values, for JSON."""
+        return {"seed": self.seed} | {name: asdict(getattr(self, name)) for name in self.kinds}
+
+
+_STRENGTH: dict[str, tuple[Any, str]] = {
+    "motion": (Motion, "rate"),
+    "traffic": (Traffic, "people"),
+    "rain": (Rain, "drops"),
+    "dust": (Dust, "reach"),
+    "beams": (Beams, "divergence"),
+    "reflectors": (Reflectors, "bloom"),
+    "glass": (Glass, "share"),
+    "mounting": (Mounting, "lean"),
+    "gravity": (Gravity, "error"),
+    "odometry": (Miscalibration, "scale"),
+    "slip": (Slip, "share"),
+    "strips": (Strips, "most"),
+    "density": (Density, "least"),
+    "seasons": (Seasons, "bare"),
+    "years": (Years, "years"),
+    "grass": (Grass, "height"),
+    "snow": (Snow, "depth"),
+}
+"""For each kind its settings, and the one that a number after its name on the command line sets."""
+
+KINDS_OF_DIRT = tuple(_STRENGTH)
+"""Names of all kinds of dirt."""
+
+_ON_SENSOR = frozenset(
+    ("motion", "traffic", "rain", "dust", "beams", "reflectors", "glass", "mounting", "grass", "snow")
+)
+
+
+def real(seed: int = 0) -> Dirt:
+    """Return all kinds of dirt at once, each with its default strength: the worst of all seasons in one run."""
+    return Dirt(seed, **{name: settings() for name, (settings, _) in _STRENGTH.items()})
+
+
+def parse_dirt(text: str, seed: int = 0) -> Dirt:
+    """Return the dirt that a list such as ``rain,snow:0.4`` names; ``real`` is all of them.
+
+    A number after a colon sets the kind's first setting; ``real,snow:0.1`` changes one of all.
+
+    Raises:
+        ConfigError: an unknown kind, a word for a number, or a number out of its range.
+    """
+    dirt = Dirt(seed)
+    for word in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = word.partition(":")
+        if word == REAL:
+            dirt = real(seed)
+            continue
+        if name not in _STRENGTH:
+            raise ConfigError(f"dirt: {name!r} is unknown; use {REAL}, or some of {', '.join(KINDS_OF_DIRT)}")
+        settings, strength = _STRENGTH[name]
+        dirt = replace(dirt, **{name: settings(**({strength: _number(word, value)} if value else {}))})
+    return dirt
+
+
+def _number(word: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError as error:
+        raise ConfigError(f"dirt: {word!r} does not end with a number; write for example snow:0.4") from error

@@ -1,0 +1,101 @@
+"""Faults of an airborne survey: strips that do not lie on each other, and a density that is not even."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.config.checks import require
+from coview_stream.geometry.arrays import Bools, Floats
+from coview_stream.sim.dirt.ranges import within
+
+_PATCH = 70.0  # metres: wavelength of the density; set by hand
+_WAVES = 6  # that make it up; set by hand
+_UPRIGHT = 0.5  # share of a strip's error that may be vertical; set by hand
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Misalignment of the strips of a survey, each as a whole; together they are right on average.
+
+    Attributes:
+        least: root mean square distance by which two strips disagree, metres; drawn evenly from here,
+        most: to here.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    least: float = 0.05
+    most: float = 0.15
+
+    def __post_init__(self) -> None:
+        within(self, least=(0.0, 5.0), most=(0.0, 5.0))
+        require(self.least <= self.most, self, "most", "at least .least")
+
+    def offsets(self, count: int, rng: np.random.Generator) -> Floats:
+        """Draw the offsets (count, 3) of the strips, metres."""
+        apart = rng.uniform(self.least, self.most)
+        offsets = rng.normal(size=(count, 3)) * (1.0, 1.0, _UPRIGHT)
+        offsets -= offsets.mean(axis=0)
+        size = disagreement(offsets)
+        return np.asarray(offsets * (apart / size if size > 0.0 else 0.0))
+
+
+def disagreement(offsets: Floats) -> float:
+    """Return the root mean square distance between two of (N, 3) offsets, metres."""
+    i, j = np.triu_indices(len(offsets), 1)
+    return float(np.sqrt(((offsets[i] - offsets[j]) ** 2).sum(axis=1).mean())) if len(i) else 0.0
+
+
+@dataclass(frozen=True)
+class Density:
+    """Density of a survey that varies from place to place; it takes the place of the configured one.
+
+    Attributes:
+        least: pulses per square metre where it is thinnest.
+        most: where it is densest.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    least: float = 4.0
+    most: float = 60.0
+
+    def __post_init__(self) -> None:
+        within(self, least=(0.1, 500.0), most=(0.1, 500.0))
+        require(self.least <= self.most, self, "most", "at least .least")
+
+
+class Thinning:
+    """Density of a survey at each place, and what it leaves of an even scan with the largest density."""
+
+    def __init__(self, density: Density, rng: np.random.Generator) -> None:
+        self._density = density
+        angle = rng.uniform(0, 2 * np.pi, _WAVES)
+        k = 2 * np.pi / (_PATCH * rng.uniform(0.7, 2.0, _WAVES))
+        self._k = np.stack([k * np.cos(angle), k * np.sin(angle)])
+        self._phase = rng.uniform(0, 2 * np.pi, _WAVES)
+
+    def at(self, xy: Floats) -> Floats:
+        """Return the pulses per square metre at (N, 2), metres."""
+        wave = np.sin(xy @ self._k + self._phase).sum(axis=1) / np.sqrt(_WAVES / 2)
+        share = 0.5 + 0.5 * np.tanh(1.2 * wave)
+        return np.asarray(self._density.least * (self._density.most / self._density.least) ** share)
+
+    def keeps(self, points: Floats, rng: np.random.Generator) -> Bools:
+        """Tell which of the points (N, 3) of a scan with the largest density are there."""
+        return np.asarray(rng.random(len(points)) * self._density.most < self.at(points[:, :2]))
+
+
+def spoilt_strips(
+    strips: Iterable[tuple[float, Floats]], faults: Strips | None, thinning: Thinning | None, rng: np.random.Generator
+) -> Iterator[tuple[float, Floats]]:
+    """Yield the strips of an airborne scan, as ``airborne_scan`` does, with their faults; after the last is flown."""
+    kept = [(done, points if thinning is None else points[thinning.keeps(points, rng)]) for done, points in strips]
+    offsets = np.zeros((len(kept), 3)) if faults is None else faults.offsets(len(kept), rng)
+    for (done, points), offset in zip(kept, offsets, strict=True):
+        yield done, points + offset
