@@ -40,11 +40,16 @@ _ARROW = " > "
 Runs = dict[str, dict[str, Any]]  # scores by code, "before" and "now"
 
 
-def options(parser: ArgumentParser) -> None:
-    """Add the sets, the conditions and the code that is compared with."""
+def add_sets(parser: ArgumentParser, sets: Sequence[str]) -> None:
+    """Add where the sets are, and which."""
     here = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=here, metavar="DIR", help="holds the sets (COVIEW_DATA)")
-    parser.add_argument("--sets", nargs="+", default=list(SETS), metavar="NAME", help=f"of {', '.join(SETS)}")
+    parser.add_argument("--sets", nargs="+", default=list(sets), metavar="NAME", help=f"folders ({', '.join(sets)})")
+
+
+def options(parser: ArgumentParser) -> None:
+    """Add the sets, the conditions and the code that is compared with."""
+    add_sets(parser, SETS)
     parser.add_argument("--conditions", nargs="+", default=list(CONDITIONS), metavar="NAME")
     parser.add_argument("--before", metavar="COMMIT", help="an earlier commit, measured on the same runs")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs at a time (1)")
@@ -53,12 +58,13 @@ def options(parser: ArgumentParser) -> None:
 def codes(asked: Namespace) -> dict[str, tuple[Code, str]]:
     """Return what is measured: the code with what its results depend on, the earlier one first."""
     now = {"now": (today(), fingerprint())}
-    return {"before": (pinned(asked.before), asked.before), **now} if asked.before else now
+    before = getattr(asked, "before", None)
+    return {"before": (pinned(before), before), **now} if before else now
 
 
-def map_of(code: Code, real: RealSet) -> Path:
-    """Return where a code's map of a set is kept."""
-    return folder() / "conditions" / f"maps-{code.version[:10]}" / f"{real.name}.coview"
+def map_of(code: Code, name: str) -> Path:
+    """Return where a code's map of that name is kept."""
+    return folder() / "conditions" / f"maps-{code.version[:10]}" / f"{name}.coview"
 
 
 def measured(real: RealSet, condition: str, asked: Namespace) -> Runs:
@@ -68,7 +74,7 @@ def measured(real: RealSet, condition: str, asked: Namespace) -> Runs:
     found: Runs = {}
     for label, (code, version) in codes(asked).items():
         out = folder() / "conditions" / f"runs-{version[:10]}" / real.name / name
-        found[label] = located(code, version, map_of(code, real), run, out)
+        found[label] = located(code, version, map_of(code, real.name), run, out)
     return found
 
 
@@ -78,7 +84,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     conditions = list(dict.fromkeys(("base", *(asked.conditions[:2] if asked.quick else asked.conditions))))
     for real in sets:
         for code, _ in codes(asked).values():
-            code.built([real.survey], map_of(code, real))
+            code.built([real.survey], map_of(code, real.name))
     every = [(real, condition) for real in sets for condition in conditions]
     unspoilt: dict[str, Runs] = {}
     yielded = []
