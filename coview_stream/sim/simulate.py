@@ -3,6 +3,7 @@
 OUT/base.laz                   airborne scan, map frame
 OUT/run/frames/000000.pcd ...  deskewed frames, body frame
 OUT/run/odometry.tum           odom <- body, drifting
+OUT/sweeps                     of a world with motion: a ROS recording with the raw sweeps and more odometry
 OUT/truth.tum                  map <- body
 OUT/world.json                 the configuration, and counts of points and frames
 """
@@ -13,7 +14,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,7 @@ from coview_stream.sim.airborne import airborne_scan
 from coview_stream.sim.caster import Caster, MeshCaster
 from coview_stream.sim.config import SimulationConfig
 from coview_stream.sim.dirt.change import aged, drawn_parts
+from coview_stream.sim.dirt.recording import Recording
 from coview_stream.sim.dirt.scan import Scanner
 from coview_stream.sim.dirt.streams import Stream, stream
 from coview_stream.sim.dirt.surfaces import seasonal_caster
@@ -84,9 +86,10 @@ def simulate(
         stamps, truth, odometry = trajectories(scene, config)
         (staging / "run" / "frames").mkdir(parents=True)
         bar.begin("drive", len(truth))
-        for k, points in enumerate(frames(scene, config, truth, odometry)):
-            write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
-            bar.advance(1)
+        with nullcontext() if config.dirt.motion is None else Recording(staging / "sweeps") as recording:
+            for k, points in enumerate(frames(scene, config, truth, odometry, recording)):
+                write_cloud(staging / "run" / "frames" / f"{k:06d}.pcd", points)
+                bar.advance(1)
         write_tum(staging / "run" / "odometry.tum", stamps, odometry)
         in_map = truth.copy()
         in_map[:, :3, 3] += config.origin
@@ -140,16 +143,23 @@ def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats
     return stamps, truth, odometry
 
 
-def frames(scene: Scene, config: SimulationConfig, truth: Floats, odometry: Floats | None = None) -> Iterator[Points]:
+def frames(
+    scene: Scene,
+    config: SimulationConfig,
+    truth: Floats,
+    odometry: Floats | None = None,
+    recording: Recording | None = None,
+) -> Iterator[Points]:
     """Scan the scene as it is now from each true pose; (N, 3) float32 metres, body frame.
 
-    ``odometry`` (N, 4, 4) deskews raw sweeps, where there are some; the truth does without it.
+    ``odometry`` (N, 4, 4) deskews raw sweeps, where there are some, in the place of the truth; ``recording`` takes
+    them as they are.
     """
     sensor = SENSORS[config.sensor]()
     if config.dirt.on_sensor:
         scanner = Scanner(scene, sensor, config.dirt, config.height, partial(_dirt_stream, config))
         stamps = _FIRST_STAMP + FRAME_PERIOD * np.arange(len(truth), dtype=np.float64)
-        yield from scanner.frames(stamps, truth, truth if odometry is None else odometry)
+        yield from scanner.frames(stamps, truth, truth if odometry is None else odometry, recording)
         return
     caster, rng = Caster(scene.now), _stream(config, _SENSOR)
     T: Pose

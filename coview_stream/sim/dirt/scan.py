@@ -12,6 +12,7 @@ from coview_stream.sim.caster import MeshCaster
 from coview_stream.sim.dirt.config import Dirt
 from coview_stream.sim.dirt.ground_cover import Cover
 from coview_stream.sim.dirt.motion import Track, beam_times
+from coview_stream.sim.dirt.recording import Recording
 from coview_stream.sim.dirt.streams import Stream
 from coview_stream.sim.dirt.surfaces import Echoes, Surfaces
 from coview_stream.sim.dirt.traffic import Movers
@@ -38,19 +39,26 @@ class Scanner:
         self.T_body_sensor = np.eye(4) if dirt.mounting is None else dirt.mounting.draw(rng(Stream.MOUNTING))
         self._rng, self._sky = rng(Stream.BEAMS), rng(Stream.WEATHER)
 
-    def frames(self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses) -> Iterator[Points]:
+    def frames(
+        self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses, recording: Recording | None = None
+    ) -> Iterator[Points]:
         """Yield frames (N, 3) float32 metres, in what the robot takes for its body frame.
 
         Args:
             stamps: (N,) seconds.
             T_scene_body: (N, 4, 4) true poses.
             T_odom_body: (N, 4, 4) odometry, by which raw sweeps are deskewed.
+            recording: takes the raw sweeps as well, where the robot moves during a sweep.
         """
-        track = None if self._dirt.motion is None else Track(stamps, T_scene_body, T_odom_body)
+        motion = self._dirt.motion
+        track = None if motion is None else Track(stamps, T_scene_body, T_odom_body)
         for k, T in enumerate(T_scene_body):
             points, times = self.sweep(k, T, track)
-            if track is not None and self._dirt.motion is not None and self._dirt.motion.deskewed:
-                points = track.straightened(k, points, times, self._dirt.motion.rate)
+            if track is not None and motion is not None:
+                if recording is not None:
+                    recording.add(points, times, track.segment(k, motion.rate))
+                if motion.deskewed:
+                    points = track.straightened(k, points, times, motion.rate)
             yield points
 
     def sweep(self, frame: int, T_scene_body: Pose, track: Track | None) -> tuple[Points, Floats]:

@@ -80,6 +80,7 @@ def test_the_command_line_takes_dirt(tmp_path, capsys):
 @pytest.mark.parametrize("name", KINDS_OF_DIRT)
 def test_each_kind_changes_what_it_should_and_never_the_truth(name, clean, tmp_path):
     simulate(tmp_path / "w", replace(TINY, dirt=parse_dirt(name, seed=1)))
+    assert (tmp_path / "w" / "sweeps").exists() is (name == "motion")
     assert (tmp_path / "w" / "truth.tum").read_bytes() == (clean / "truth.tum").read_bytes()
     odometry = (tmp_path / "w" / "run" / "odometry.tum").read_bytes()
     assert (odometry != (clean / "run" / "odometry.tum").read_bytes()) is (name in ("gravity", "odometry", "slip"))

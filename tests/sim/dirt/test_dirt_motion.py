@@ -9,8 +9,10 @@ from yard import vlp16, yard
 
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.recordings.open_run import open_run
 from coview_stream.sim.dirt import Dirt
 from coview_stream.sim.dirt.motion import Motion, Track, beam_times
+from coview_stream.sim.dirt.recording import Recording
 from coview_stream.sim.dirt.scan import Scanner
 from coview_stream.sim.mesh import box, placed
 
@@ -77,6 +79,21 @@ def test_a_single_frame_stands_still():
     truth = turning()[:1]
     track = Track(STAMPS[:1], truth, truth)
     np.testing.assert_allclose(inverse(truth[0]) @ track.true(STAMPS[:1] - 0.05)[0], np.eye(4), atol=1e-12)
+
+
+def test_the_recording_holds_raw_sweeps_that_the_reader_deskews(tmp_path):
+    scene, truth = yard(*WALLS), turning()
+    scanner = Scanner(scene, vlp16(), Dirt(motion=Motion()), 1.5, lambda _: np.random.default_rng(1))
+    with Recording(tmp_path / "sweeps") as recording:
+        frames = list(scanner.frames(STAMPS, truth, truth, recording))
+    run = open_run(tmp_path / "sweeps")
+    assert len(run) == 6
+    np.testing.assert_allclose(run.stamps, STAMPS, atol=1e-6)
+    np.testing.assert_allclose(run.poses, truth, atol=1e-6)
+    np.testing.assert_allclose(run.read(4).points, frames[4], atol=2e-3)
+    raw = run.source.message(4)
+    assert raw.times.min() == pytest.approx(-0.1, abs=1e-3)
+    assert np.abs(raw.points - frames[4]).max() > 0.3
 
 
 def test_settings_out_of_range_are_refused():
