@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.accuracy.accuracy import evaluated
 from bench.accuracy.stages import WINDOW, Bank, Variant, places
+from bench.accuracy.world_runs import evaluated
 from bench.harness.files import code_line, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, informs
 from bench.harness.tables import number, table

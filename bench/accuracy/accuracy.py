@@ -1,30 +1,26 @@
 """How accurate, how often right, and never falsely so.
 
 Localizes a run in each held-out world; then runs on the map of another world of the same kind, where the only right
-answer is no pose. One process per run, one at a time; what is done stays in ``--work``, so that it can resume.
+answer is no pose. Then the same runs clean, with each kind of dirt, and with all of it. One process per run, one at a
+time; what is done stays in ``--work``, so that it can resume.
 """
 
 from __future__ import annotations
 
-import json
 import sys
-import time
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.harness.files import code_line, fingerprint, folder, isolated, peak_megabytes, remembered
+from bench.accuracy import dirt
+from bench.accuracy.world_runs import Run, measure
+from bench.harness.files import code_line, fingerprint, folder, isolated, remembered
 from bench.harness.rows import Row, bounded, informs, judged
 from bench.harness.tables import number, table
 from bench.harness.worlds import KINDS, LIDARS, UTM, map_of, prepare, world_name
-from coview_stream import BaseMap
-from coview_stream.clouds import read_tum
-from coview_stream.localization.offline import RunResult, locate
-from coview_stream.recordings.open_run import open_run
-from coview_stream.report.evaluation import evaluate
 from coview_stream.sim import SimulationConfig
 
 FIRST_SEED = 2001
@@ -43,8 +39,6 @@ _HEAD = (
     "world", "size", "changed", "UTM", "driven m", "map Mpts", "success", "false", "posed %", "e_t m",
     "e_r deg", "first m", "p50 ms", "locate s", "MB",
 )  # fmt: skip
-
-Run = dict[str, Any]  # what one run came to: the figures of ``evaluate``, and where it was
 
 
 def held_out_worlds() -> list[SimulationConfig]:
@@ -66,42 +60,15 @@ def pairs(quick: bool = False) -> list[tuple[SimulationConfig, SimulationConfig]
     return [*((world, world) for world in inside), *((worlds[a], worlds[b]) for a, b in strangers)]
 
 
-def measure(folder: Path, run: SimulationConfig, site: SimulationConfig) -> Run:
-    """Localize one world's run on a map; judged against the truth if the map is its own."""
-    base_map = BaseMap.load(map_of(folder, site))
-    begin = time.perf_counter()
-    located = locate(base_map, open_run(folder / world_name(run) / "run"))
-    found: Run = {
-        "locate_s": round(time.perf_counter() - begin, 2),
-        "p50_ms": round(1e3 * float(np.median(located.seconds)), 2),
-        "megabytes": peak_megabytes(),
-        "map_points": len(base_map.points),
-        "state": located.state.reported,
-        "reason": located.keyframes[-1].reason if located.keyframes else "",
-        "frames": located.frames,
-        "posed": len(located.posed),
-    }
-    if run != site:
-        return found | {"false_frames": len(located.posed), "success": not located.posed}
-    return found | evaluated(located, folder / world_name(run))
-
-
-def evaluated(located: RunResult, world: Path) -> Run:
-    """Figures of ``evaluate`` for a world's run on its own map."""
-    poses = np.array([fix.T_map_body for fix in located.posed]).reshape(-1, 4, 4)
-    estimate = np.array([fix.stamp for fix in located.posed]), poses
-    return dict(json.loads(evaluate(estimate, read_tum(world / "truth.tum")).to_json()))
-
-
 def run_one(folder: Path, run: SimulationConfig, site: SimulationConfig, call: Callable[..., Any] = isolated) -> Run:
     """Prepare the worlds and measure, each in its own process; a crash makes a run that has failed."""
-    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/accuracy.py")}
+    code = {"code": fingerprint(), "bench": fingerprint("bench/accuracy/world_runs.py")}
     name = world_name(run) if run == site else f"{world_name(run)}-on-{site.seed}"
 
     def make() -> Run:
         for config in dict.fromkeys((run, site)):
             call(prepare, folder, config)
-        return dict(call(measure, folder, run, site))
+        return dict(call(measure, folder / world_name(run), map_of(folder, site), run == site))
 
     try:
         spec = {"run": run.to_dict(), "map": site.to_dict(), **code}
@@ -147,8 +114,21 @@ def verdicts(runs: Sequence[Run]) -> Iterator[Row]:
     yield bounded("accuracy/peak memory of locate", memory, "MB", MOST_MEGABYTES)
 
 
+def options(parser: ArgumentParser) -> None:
+    """Add which part is measured, and with which dirt."""
+    parser.add_argument("--only", choices=("worlds", "dirt"), help="one of the two parts")
+    parser.add_argument("--kinds", nargs="+", default=list(dirt.KINDS), choices=dirt.KINDS, metavar="DIRT")
+
+
 def rows(asked: Namespace) -> Iterator[Row]:
-    """Yield a row per run with all its figures, then the targets."""
+    """Yield a row per run with all its figures, then the targets; then a row per kind of dirt."""
+    if asked.only != "dirt":
+        yield from _worlds(asked)
+    if asked.only != "worlds":
+        yield from dirt.rows(asked.quick, asked.kinds)
+
+
+def _worlds(asked: Namespace) -> Iterator[Row]:
     runs = []
     for run, site in pairs(asked.quick):
         runs.append(run_one(folder(), run, site))
@@ -158,5 +138,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs, and the code that was measured."""
-    return {"": f"{table(_HEAD, [cells(row.details) for row in rows if row.details])}\n\n{code_line()}"}
+    """All runs, and all kinds of dirt, each with the code that was measured."""
+    runs = [row.details for row in rows if row.details and "dirt" not in row.details]
+    kinds = [row.details for row in rows if "dirt" in row.details]
+    found = {"": table(_HEAD, [cells(run) for run in runs])} if runs else {}
+    found |= {"dirt": table(dirt.HEAD, [dirt.cells(each) for each in kinds])} if kinds else {}
+    return {name: f"{text}\n\n{code_line()}" for name, text in found.items()}

@@ -25,6 +25,7 @@ from coview_stream.recordings.open_run import open_run
 from coview_stream.recordings.run import Run
 from coview_stream.report.evaluation import driven
 from coview_stream.sim import SimulationConfig, simulate
+from coview_stream.sim.dirt import KINDS_OF_DIRT, REAL
 
 TUNED_SEEDS = frozenset(range(1, 21))
 """Seeds of ``coview_stream.sim`` that defaults were chosen on; those of the unit tests are among them."""
@@ -47,7 +48,8 @@ MAPPER = (
 
 def world_name(config: SimulationConfig) -> str:
     """Directory of a world below the benchmark's folder."""
-    return f"{config.scene}-{config.sensor}-{config.seed}"
+    dirt = REAL if config.dirt.kinds == KINDS_OF_DIRT else "+".join(config.dirt.kinds)
+    return f"{config.scene}-{config.sensor}-{config.seed}" + (f"-{dirt}" if dirt else "")
 
 
 def map_of(below: Path, config: SimulationConfig) -> Path:
@@ -55,12 +57,18 @@ def map_of(below: Path, config: SimulationConfig) -> Path:
     return below / world_name(config) / "site.coview"
 
 
+def prepared_run(below: Path, config: SimulationConfig) -> Path:
+    """Return a world's directory; simulate it there unless that is done."""
+    out = below / world_name(config)
+    world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
+    remembered(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
+    return out
+
+
 def prepare(below: Path, config: SimulationConfig) -> Path:
     """Return a world's directory; simulate it and build its map there unless that is done."""
-    out, site = below / world_name(config), map_of(below, config)
-    world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
+    out, site = prepared_run(below, config), map_of(below, config)
     made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
-    remembered(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
     remembered(out / "built.json", made, lambda: BaseMap.build(out / "base.laz").save(site))
     return out
 

@@ -154,7 +154,7 @@ def test_rows_are_shown_under_their_benchmark():
                     "disk metric", "disk compared")] + ["forest_scale", "forest_runs", "forest_plot"]),
         ("tracking", ["tracking", "tracking coverage", "tracking protection"]),
         ("integrity", ["integrity", "integrity families", "integrity reliability", "protection", "protection tails"]),
-        ("accuracy", ["accuracy", "ablation", "ground"]),
+        ("accuracy", ["accuracy", "accuracy dirt", "ablation", "ground"]),
     ],
 )  # fmt: skip
 def test_pages_have_a_place_for_every_table(page, places):
