@@ -15,7 +15,7 @@ class Rain:
     """Rain: near drops return some beams, and far surfaces return fewer.
 
     Attributes:
-        drops: share of the beams under an open sky that return from a drop.
+        drops: share of the beams that meet a drop; they return from it where nothing is nearer.
         reach: mean range of such a return, metres.
         extinction: of the light, per metre.
 

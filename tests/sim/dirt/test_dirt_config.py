@@ -11,6 +11,7 @@ import pytest
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud, read_tum
 from coview_stream.errors import ConfigError
+from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import Dirt, SimulationConfig, parse_dirt, simulate
 from coview_stream.sim.dirt import KINDS_OF_DIRT, real
 from coview_stream.sim.dirt.streams import Stream, stream
@@ -104,6 +105,21 @@ def test_equal_seeds_give_equal_dirt(tmp_path):
     np.testing.assert_array_equal(a, b)
     assert a.shape != c.shape
     assert read_tum(tmp_path / "a" / "truth.tum")[1].shape == read_tum(tmp_path / "c" / "truth.tum")[1].shape
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "sensor"),
+    [("town", "os64"), ("campus", "mid360"), ("industrial", "vlp16"), ("forest", "vlp16"), ("forest", "mid360")],
+)
+def test_all_dirt_at_once_leaves_a_run_to_work_with(scene, sensor, tmp_path):
+    simulate(tmp_path / "w", replace(TINY, scene=scene, sensor=sensor, length=0.35, dirt=real()))
+    run = open_run(tmp_path / "w" / "run")
+    assert len(run) == 3
+    for frame in run:
+        assert len(frame.points) > 4_000
+        assert np.abs(frame.points).max() < 140.0
+    assert len(open_run(tmp_path / "w" / "sweeps")) == 3
 
 
 def test_one_kind_leaves_the_random_numbers_of_another():
