@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,9 +16,13 @@ from coview_stream.localization.registration.local_map import LocalMap
 from coview_stream.localization.registration.register import ScanInput, register_and_verify
 from coview_stream.localization.registration.result import Prior
 from coview_stream.localization.registration.verification import Evidence
-from coview_stream.localization.tracking.monitor import MOST_FALLEN, EvidenceBaseline, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
+from coview_stream.localization.tracking.rivals import Rival, find_rivals
+from coview_stream.localization.tracking.slip import matters, off_by
+
+_BESIDE = 2  # rivals that are looked for where something is wrong; set by hand
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class MapMatch:
         innovation: squared Mahalanobis distance from where the graph predicts the pose.
         scan: what was registered; None where nothing could be.
         target: the map around it; None likewise.
+        rivals: poses metres beside it, the most probable first, as far as they were looked for.
         moves_place: it contradicts odometry, and is believed in its place.
         confirms_search: it is the first at an accepted place; verified, it adds nothing to the search's evidence.
     """
@@ -42,6 +47,7 @@ class MapMatch:
     innovation: float = 0.0
     scan: ScanInput | None = None
     target: LocalMap | None = None
+    rivals: tuple[Rival, ...] = ()
     moves_place: bool = False
     confirms_search: bool = False
 
@@ -73,7 +79,13 @@ class MapMatcher:
         self.baseline.clear()
 
     def match(
-        self, scan: ScanInput, belief: Estimate, target: LocalMap, scales: tuple[float, ...], graph: PoseGraph
+        self,
+        scan: ScanInput,
+        belief: Estimate,
+        target: LocalMap,
+        scales: tuple[float, ...],
+        graph: PoseGraph,
+        beside: int = 1,
     ) -> MapMatch:
         """Register (eq. 13), verify and judge; where registration fails, the belief stays.
 
@@ -83,6 +95,7 @@ class MapMatcher:
             target: the map around it.
             scales: largest correspondence distance of each scale, metres.
             graph: predicts the pose.
+            beside: so many rivals at most are looked for.
         """
         settings, acceptance = self.config.registration, self.config.acceptance
         T_start = belief.T_map_body @ inverse(scan.T_odom_body)
@@ -92,9 +105,9 @@ class MapMatcher:
         prior = Prior(T_start, information)
         found = register_and_verify(self.base_map, scan, T_start, target, settings, scales, prior)
         seen = self.place.observe(scan, found.T_map_odom)
-        cause, reason = RejectionReason.VERIFIED, "verified"
-        if seen.ratio <= 0.0 or self.baseline.fallen(found.evidence) > MOST_FALLEN:
-            cause, reason = self.baseline.explain(found.evidence)
+        rivals = find_rivals(self.place, scan, found.T_map_odom, target, settings, beside) if beside else []
+        seen = replace(seen, rival=max([0.0, *(rival.ratio for rival in rivals)]))
+        cause, reason = self._judge(seen, found.evidence)
         if found.registration is None:
             if cause is RejectionReason.VERIFIED:
                 return _failed(belief, "too few points have a partner in the map", found.evidence, seen)
@@ -110,7 +123,60 @@ class MapMatcher:
         except InputError as error:
             return _failed(belief, str(error), found.evidence, seen)
         verdict = MatchVerdict(cause, reason, found.evidence, innovation, seen)
-        return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target)
+        return MapMatch(verdict, own.T_map_body, covariance, innovation, scan, target, tuple(rivals))
+
+    def match_widely(
+        self, first: MapMatch, scan: ScanInput, belief: Estimate, target: LocalMap, graph: PoseGraph
+    ) -> list[MapMatch]:
+        """Match again, from a wide belief and from the best rival of a match, and hold all against each other.
+
+        Args:
+            first: what may be wrong.
+            scan: what to register.
+            belief: wide enough for a slip.
+            target: the map around it.
+            graph: predicts the pose.
+
+        Returns:
+            Two or three matches, ``first`` being the first.
+        """
+        scales = self.config.registration.search[1:]
+        tries = [first, self.match(scan, belief, target, scales, graph, _BESIDE)]
+        rivals = sorted((rival for each in tries for rival in each.rivals), key=lambda rival: -rival.ratio)
+        for rival in rivals:
+            T_map_body = rival.T_map_odom @ scan.T_odom_body
+            if all(matters(*off_by(each.T_map_body, T_map_body)) for each in tries):
+                start = Estimate(T_map_body, belief.covariance)
+                tries.append(self.match(scan, start, target, scales, graph, 0))
+                break
+        return [self._against(each, tries) for each in tries]
+
+    def _against(self, match: MapMatch, others: list[MapMatch]) -> MapMatch:
+        """Hold a match against those of the same scan that ended elsewhere."""
+        verdict = match.verdict
+        seen, evidence = verdict.observation, verdict.evidence
+        if seen is None or evidence is None or match.scan is None:
+            return match
+        elsewhere = [
+            other.verdict.observation.ratio
+            for other in others
+            if other.scan is not None and other.verdict.observation is not None
+            and matters(*off_by(other.T_map_body, match.T_map_body))
+        ]  # fmt: skip
+        seen = replace(seen, rival=max([seen.rival, *elsewhere]))
+        verdict = replace(verdict, observation=seen)
+        if verdict.verified:
+            cause, reason = self._judge(seen, evidence)
+            verdict = replace(verdict, cause=cause, reason=reason)
+        return replace(match, verdict=verdict)
+
+    def _judge(self, seen: Observation, evidence: Evidence) -> tuple[RejectionReason, str]:
+        """Return what a scan says of a pose: a cause, and a clause."""
+        if seen.against_elsewhere > 0.0:
+            return RejectionReason.VERIFIED, "verified"
+        if seen.ratio > 0.0:
+            return RejectionReason.FITNESS, "what is seen fits as well metres beside"
+        return self.baseline.explain(evidence)
 
 
 def _failed(

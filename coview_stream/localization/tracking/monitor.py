@@ -29,11 +29,6 @@ _PER_SECOND = 1e-4  # while the place is in doubt: a robot that sees nothing may
 _UNSEEN = 5e-4  # while nothing was known of the robot
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
 _OFF_MAP = 0.3  # of what is seen on the map: less is told as such, it decides nothing; set by hand
-MOST_FALLEN = 1.0 / 0.65
-"""Times that the usual score may be better than that of a registration that is believed; set by hand.
-
-The likelihood alone follows an error that grows slowly along a road, as it learns from what it has believed."""
-
 _NEWEST_SHARE = 0.2  # of new shares in what is usual: about the last five registrations; set by hand
 
 
@@ -92,8 +87,8 @@ class MatchVerdict:
 
     @property
     def ratio(self) -> float:
-        """Log-likelihood ratio of the place against chance; 0 where nothing could be observed."""
-        return self.observation.ratio if self.observation else 0.0
+        """Log-likelihood ratio of the place against all others; 0 where nothing could be observed."""
+        return self.observation.against_elsewhere if self.observation else 0.0
 
 
 class EvidenceBaseline:

@@ -9,13 +9,16 @@ street where half of everything has changed, and against it where nearly all was
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.evidence.background import Background
 from coview_stream.localization.evidence.chance_places import observe_with_background
 from coview_stream.localization.evidence.likelihood import NUISANCES, log_likelihoods, steps_of_kept
 from coview_stream.localization.evidence.observed_scan import ObservedScan
@@ -25,6 +28,7 @@ from coview_stream.localization.registration.register import ScanInput
 _SPREAD = 0.05  # standard deviation of the share q that is as the map has it, from one registration to the next
 _ANOTHER = 0.01  # probability that the kind of survey and the leaks become others meanwhile
 _CHANGED = 1e-4  # probability that the site becomes another one from one registration to the next
+_BESIDE = 0.5  # of a place that is wrong: that the right one lies metres beside it, as odometry has slipped
 
 
 @dataclass(frozen=True)
@@ -34,10 +38,26 @@ class Observation:
     Attributes:
         ratio: log-likelihood ratio of "the robot is here" against chance.
         likelihoods: (Q, D, L) the same for each value of the nuisances.
+        rival: log-likelihood ratio of the most probable pose metres beside it; chance's where none is known.
     """
 
     ratio: float
     likelihoods: Floats
+    rival: float = 0.0
+
+    @property
+    def against_elsewhere(self) -> float:
+        """Log-likelihood ratio of "the robot is here" against "it is metres beside, or anywhere"."""
+        beside = math.log(_BESIDE) + max(self.rival, 0.0)
+        return self.ratio - float(np.logaddexp(math.log1p(-_BESIDE), beside))
+
+
+class _Around(NamedTuple):
+    """Background around a pose (4, 4) where a scan was observed."""
+
+    scan: ScanInput
+    T_map_odom: Pose
+    background: Background
 
 
 class PlaceEvidence:
@@ -45,6 +65,8 @@ class PlaceEvidence:
 
     def __init__(self, base_map: BaseMap) -> None:
         self._base_map = base_map
+        self._seen: tuple[ScanInput, ObservedScan] | None = None  # the newest
+        self._around: _Around | None = None  # likewise
         self.clear()
 
     def clear(self) -> None:
@@ -56,10 +78,20 @@ class PlaceEvidence:
         likelihoods = self._likelihoods(scan, T_map_odom[None])
         return Observation(float(self._ratios(likelihoods)[0]), likelihoods[0])
 
-    def gain(self, scan: ScanInput, T_map_odom: Pose, T_map_other: Pose) -> float:
-        """Return the log-likelihood ratio of another pose (4, 4) to the first, against the first's background."""
-        first, other = self._ratios(self._likelihoods(scan, np.stack([T_map_odom, T_map_other])))
-        return float(other - first)
+    def ratios(self, scan: ScanInput, T_map_odom: Floats) -> Floats:
+        """Return the log-likelihood ratios (P,) of poses (P, 4, 4) against chance around the first."""
+        return self._ratios(self._likelihoods(scan, T_map_odom))
+
+    def look_around(self, scan: ScanInput, T_map_odom: Pose, poses: Floats) -> tuple[Floats, Floats]:
+        """Move poses (H, 4) to the best near each: where to, and log-likelihood ratios (H,) as around (4, 4)."""
+        moved, observed, _ = self.seen(scan).few.look_up(self._base_map.field, poses, "near")
+        return moved, self._ratios(log_likelihoods(observed, self._background(scan, T_map_odom)))
+
+    def seen(self, scan: ScanInput) -> ObservedScan:
+        """Return a scan as it is observed; that of the newest is kept."""
+        if self._seen is None or self._seen[0] is not scan:
+            self._seen = scan, ObservedScan.of(scan)
+        return self._seen[1]
 
     def learn(self, observation: Observation) -> None:
         """Learn the nuisances from a registration that is believed; not from others, or a wrong place became usual."""
@@ -69,8 +101,17 @@ class PlaceEvidence:
 
     def _likelihoods(self, scan: ScanInput, T_map_odom: Floats) -> Floats:
         """Return log-likelihood ratios (P, Q, D, L) of poses (P, 4, 4) against chance around the first."""
-        observed, background = observe_with_background(self._base_map.field, ObservedScan.of(scan), T_map_odom)
-        return log_likelihoods(observed, background)
+        background = self._background(scan, T_map_odom[0])
+        seen = self.seen(scan)
+        return log_likelihoods(seen.few.look_up(self._base_map.field, seen.poses(T_map_odom), "no")[1], background)
+
+    def _background(self, scan: ScanInput, T_map_odom: Pose) -> Background:
+        """Return the background around a pose (4, 4); that of the newest is kept."""
+        around = self._around
+        if around is None or around.scan is not scan or not np.array_equal(around.T_map_odom, T_map_odom):
+            _, background = observe_with_background(self._base_map.field, self.seen(scan), T_map_odom[None])
+            self._around = around = _Around(scan, T_map_odom, background)
+        return around.background
 
     def _ratios(self, likelihoods: Floats) -> Floats:
         """Return the log-likelihood ratios (P,) with the nuisances that are presumed."""

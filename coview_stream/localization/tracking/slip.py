@@ -2,13 +2,14 @@
 
 A registration may fit, and yet not lie where odometry leads. Either odometry is wrong (wheels slip, the robot is
 pushed), and the robot is where the lidar sees it; or odometry is right, and a building or a stack of containers stands
-a metre off where it was surveyed. The scan itself decides, by how much better it is explained at the one place than at
-the other: the ratio of their likelihoods, with what is usual here taken into account.
+a metre off where it was surveyed. The scans themselves decide, by how much better they are explained at the one place
+than at all others: the ratio of their likelihoods, with what is usual here taken into account.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,15 +30,70 @@ def matters(metres: float, degrees: float) -> bool:
     return metres > 0.5 * ALERT_METRES or degrees > 0.5 * ALERT_DEGREES
 
 
-def has_slipped(place: PlaceEvidence, scan: ScanInput, T_map_predicted: Pose, T_map_seen: Pose, risk: float) -> bool:
-    """Tell whether a scan is so much better explained where it was registered that odometry must have slipped.
+class Dispute:
+    """Places that may be the right one while odometry is contradicted, and what the scans since then say of each.
 
-    Args:
-        place: what is known of how the map explains scans here.
-        scan: what was registered.
-        T_map_predicted: (4, 4) pose of the body where odometry leads.
-        T_map_seen: (4, 4) where it was registered.
-        risk: probability that the better place is not the right one, both being as likely before.
+    The first is where odometry leads. Scans of one view (a metre) tell the same: of each the newest counts, and views
+    add up. All are as likely beforehand; a place that is seen later begins like the first.
     """
-    T_body_odom = inverse(scan.T_odom_body)
-    return place.gain(scan, T_map_predicted @ T_body_odom, T_map_seen @ T_body_odom) >= -math.log(risk)
+
+    def __init__(self, place: PlaceEvidence, view: float) -> None:
+        """Weigh by ``place``; a view is ``view`` metres long."""
+        self._place = place
+        self._view = view
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget it: it has been settled."""
+        self._poses: list[Pose] = []  # T_map_odom
+        self._before = np.zeros(0)  # log-likelihood ratios of the views before
+        self._newest = np.zeros(0)  # and of this one
+        self._begun = -math.inf  # metres driven where it began
+
+    def settle(
+        self, scan: ScanInput, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float
+    ) -> Pose | None:
+        """Return the pose ``T_map_body`` (4, 4) that must be the right one, as odometry has slipped; None: undecided.
+
+        Args:
+            scan: what was registered.
+            T_map_predicted: (4, 4) pose of the body where odometry leads.
+            T_map_seen: (4, 4) each, where it was registered.
+            travelled: metres driven.
+            risk: probability that it is another one of them.
+        """
+        if travelled - self._begun >= self._view:
+            self._begun = travelled
+            self._before = self._before + self._newest
+        T_body_odom = inverse(scan.T_odom_body)
+        owners = self._assign([T_map_predicted, *T_map_seen], scan.T_odom_body)
+        candidates = [T_map_predicted @ T_body_odom, *self._poses[1:], *(T @ T_body_odom for T in T_map_seen)]
+        ratios = self._place.ratios(scan, np.stack(candidates))
+        self._newest = ratios[: len(self._poses)].copy()
+        np.maximum.at(self._newest, owners[1:], ratios[len(self._poses) :])
+        total = self._before + self._newest
+        best = int(total.argmax())
+        if best == 0 or total[best] - np.logaddexp.reduce(np.delete(total, best)) < -math.log(risk):
+            return None
+        return self._poses[best] @ scan.T_odom_body
+
+    def _assign(self, T_map_body: Sequence[Pose], T_odom_body: Pose) -> list[int]:
+        """Return which place each pose (4, 4) is nearest to, and move that there; those that are at none are new."""
+        T_body_odom = inverse(T_odom_body)
+        for k, T in enumerate(T_map_body):
+            if k == 0:
+                self._poses[:1] = [T @ T_body_odom]
+                self._before = self._before if len(self._before) else np.zeros(1)
+            elif all(matters(*off_by(each @ T_odom_body, T)) for each in self._poses):
+                self._poses.append(T @ T_body_odom)
+                self._before = np.append(self._before, self._before[0])
+        owners = [0]
+        for T in T_map_body[1:]:
+            gaps = [off_by(each @ T_odom_body, T) for each in self._poses]
+            owners.append(
+                min(range(len(gaps)), key=lambda k: max(gaps[k][0] / ALERT_METRES, gaps[k][1] / ALERT_DEGREES))
+            )
+        for k, T in zip(owners, T_map_body, strict=True):
+            if k:
+                self._poses[k] = T @ T_body_odom
+        return owners

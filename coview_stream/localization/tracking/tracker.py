@@ -28,7 +28,7 @@ from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionR
 from coview_stream.localization.tracking.motion import MAX_FRAMES, Drift, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
-from coview_stream.localization.tracking.slip import has_slipped, matters, off_by
+from coview_stream.localization.tracking.slip import Dispute, matters, off_by
 
 _MIN_POINTS = 100  # to register; set by hand
 _STANDING_DRIVE = 0.2  # metres: what standing still until the next registration counts as; set by hand
@@ -57,6 +57,7 @@ class Tracker:
         self._levelled = calibration.calibration  # what the newest registered cloud was corrected by
         self._odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)
+        self._dispute = Dispute(self._matcher.place, config.tracking.distance)
         self._displacement = DisplacementCheck()
         self._scans = ScanBuffer(config.tracking)
         self._unregistered = 0  # frames since the newest registration
@@ -175,15 +176,13 @@ class Tracker:
             return MapMatch.without_registration(verdict, belief)
         scan = ScanInput(points, cloud, T_odom_body)
         match = self._matcher.match(scan, belief, target, self.config.registration.track, self._graph)
-        limit, tried = self.config.acceptance.max_innovation, False
+        limit, tries = self.config.acceptance.max_innovation, [match]
         if newest_only or not match.verdict.verified or match.innovation > limit:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
-            scales = self.config.registration.search[1:]
-            again = self._matcher.match(scan, wider, target, scales, self._graph)
-            match = max(match, again, key=_rank)
-            tried = match is again
-        if match.verdict.verified and (match.innovation > limit or self._disputed or tried):
-            return self._against_odometry(match, belief, scan)
+            tries = self._matcher.match_widely(match, scan, wider, target, self._graph)
+            match = max(tries, key=_rank)
+        if match.verdict.verified and (match.innovation > limit or self._disputed or match is not tries[0]):
+            return self._against_odometry(match, belief, scan, tries)
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
@@ -196,6 +195,7 @@ class Tracker:
             self._odometry.learn(match.T_map_body, match.covariance)
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
+            self._dispute.clear()
             self._graph.correct(match.T_map_body, match.covariance)
             self._set_belief(T_odom_body)
             self._learn(match, T_odom_body[:3, 3])
@@ -222,30 +222,33 @@ class Tracker:
 
     # ---- inside
 
-    def _against_odometry(self, match: MapMatch, belief: Estimate, scan: ScanInput) -> MapMatch:
-        """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scan says so itself.
+    def _against_odometry(self, match: MapMatch, belief: Estimate, scan: ScanInput, tries: list[MapMatch]) -> MapMatch:
+        """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
 
         Where the two places are so near that either is good enough, what the lidar sees is believed.
         """
         metres, degrees = off_by(match.T_map_body, belief.T_map_body)
-        matter = matters(metres, degrees)
-        if not matter and match.innovation <= self.config.acceptance.max_innovation:
+        moves = not matters(metres, degrees)
+        if moves and match.innovation <= self.config.acceptance.max_innovation:
             return match
-        moves = not matter or self._has_slipped(scan, belief.T_map_body, match.T_map_body)
+        if not moves:
+            places = [each.T_map_body for each in tries if each.scan is not None]
+            places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]
+            risk = self.config.acceptance.risk
+            right = self._dispute.settle(scan, belief.T_map_body, places, self.travelled, risk)
+            moves = right is not None and not matters(*off_by(right, match.T_map_body))
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         if not moves:
-            reason += ", and the scan fits there hardly better: something may have been moved"
+            reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"
         verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
         return replace(match, verdict=verdict, moves_place=moves)
-
-    def _has_slipped(self, scan: ScanInput, predicted: Pose, seen: Pose) -> bool:
-        return has_slipped(self._matcher.place, scan, predicted, seen, self.config.acceptance.risk)
 
     def _target(self, T_odom_body: Pose) -> LocalMap | None:
         return self.local_maps.around(transform(self.T_map_odom, T_odom_body[None, :3, 3])[0])
 
     def _restart(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin a new graph: nothing that was believed before counts."""
+        self._dispute.clear()
         self._graph.start(T_map_body, covariance)
         self._odometry.set_keyframe(T_odom_body)
         self._set_belief(T_odom_body)

@@ -167,3 +167,31 @@ def test_nothing_is_learned_where_all_is_as_likely(place, scans):
     before = place.observe(scans[0], T_MAP_ODOM).ratio
     place.learn(Observation(0.0, np.full(NUISANCES, -3.0)))
     assert place.observe(scans[0], T_MAP_ODOM).ratio == pytest.approx(before, abs=0.1)
+
+
+# ---- against elsewhere
+
+
+def test_place_holds_against_the_better_of_chance_and_its_rival():
+    for rival in (-20.0, 0.0):
+        assert Observation(6.0, KEPT, rival).against_elsewhere == pytest.approx(6.0)
+    assert Observation(6.0, KEPT, 6.0).against_elsewhere == pytest.approx(np.log(2.0), abs=0.01)
+    assert Observation(6.0, KEPT, 12.0).against_elsewhere == pytest.approx(-6.0 + np.log(2.0), abs=0.01)
+
+
+def test_poses_are_moved_to_the_best_near_them(place, scans):
+    scan = scans[3]
+    here = place.seen(scan).poses(T_MAP_ODOM[None])
+    poses, ratios = place.look_around(scan, T_MAP_ODOM, here + np.array([0.3, -0.2, 0.0, 0.0]))
+    assert np.linalg.norm(poses[0, :2] - here[0, :2]) < 0.2
+    assert ratios[0] == pytest.approx(place.observe(scan, T_MAP_ODOM).ratio, abs=2.0)
+
+
+def test_ratios_are_those_of_observations_around_the_first(place, scans):
+    poses = np.stack([T_MAP_ODOM, moved(scans[1], 2.0)])
+    found = place.ratios(scans[1], poses)
+    assert found[0] == pytest.approx(place.observe(scans[1], T_MAP_ODOM).ratio)
+    assert found[1] < found[0]
+    np.testing.assert_array_equal(place.ratios(scans[1], poses), found)
+    other = place.ratios(scans[2], poses)  # another scan is not taken for the newest
+    np.testing.assert_array_equal(PlaceEvidence(place._base_map).ratios(scans[2], poses), other)
