@@ -84,6 +84,7 @@ BENCHMARKS = {
     "forest_runs": Benchmark("forest.runs", "whole runs in forests, and runs outside the map"),
     "forest_scale": Benchmark("forest.scale", "time of a learned query on 0.1 and 1 km2"),
     "forest_plot": Benchmark("forest.plot", "a real plot among real airborne tiles"),
+    "recognition": Benchmark("forest.recognition", "place recognition on public sets: AR@1, AR@5, AR@1 %, MRR"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
     "many": Benchmark("stream.many_robots", "sixteen robots on one node, of which eight search without end"),
 }
