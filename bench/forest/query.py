@@ -116,7 +116,7 @@ class Chain:
 
     def register(self, named: list[Hypothesis], scan: ScanInput) -> tuple[Scored, list[Candidate]]:
         """Return the evidence of the places named, and the most probable of them registered, in that order."""
-        scored = PlaceScorer(self._base_map.field).score(named, range(len(named)), 0, scan)
+        scored = PlaceScorer(self._base_map).score(named, range(len(named)), 0, scan)
         found = [
             register_place(place, scan, self._base_map, self.config, self._local_maps)
             for place in scored.places[:_REGISTERED]
