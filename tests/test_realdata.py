@@ -57,6 +57,22 @@ def test_real_run_is_localized(located):
 
 
 @pytest.mark.slow
+def test_real_run_is_localized_on_an_airborne_like_map(tmp_path):
+    """Seen from above, thinned to 8 pulses per square metre, without facades."""
+    folder = data("kitti04")
+    air, site = tmp_path / "air.laz", tmp_path / "site.coview"
+    assert main(["airborne", str(folder / "base.laz"), "-o", str(air), "--density", "8"]) == 0
+    assert main(["build", str(air), "-o", str(site)]) == 0
+    assert main(["locate", str(site), str(folder / "run"), "-o", str(tmp_path / "out"), "--no-pictures"]) == 0
+    verdict = evaluate(read_tum(tmp_path / "out" / "trajectory.tum"), read_tum(folder / "truth.tum"))
+    assert verdict.success
+    assert verdict.false_frames == 0
+    assert verdict.share_localised > 0.8
+    assert verdict.translation.mean < 0.1
+    assert verdict.rotation.mean < 0.3
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("located", ["kitti04"], indirect=True)
 def test_real_run_on_wrong_map_gets_no_pose(located, tmp_path):
     """The handheld run is no part of the street."""
