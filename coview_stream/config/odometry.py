@@ -33,7 +33,8 @@ class LidarOdometryConfig:
             how far the robot went meanwhile is not known.
         max_speed: metres per second; what says more is refused, and the local map begun anew.
         max_turn_rate: radians per second, likewise.
-        level_with_walls: keep roll and pitch from drifting by the walls in each frame.
+        keep_level: keep roll and pitch from drifting, and from registration's errors, by the walls and the ground
+            around.
         threads: of kiss-icp.
         convergence: step, metres and radians, below which its registration ends.
         iterations: after which it ends at the latest.
@@ -47,13 +48,13 @@ class LidarOdometryConfig:
     max_gap: float = 1.5
     max_speed: float = 50.0
     max_turn_rate: float = 10.0
-    level_with_walls: bool = True
+    keep_level: bool = True
     threads: int = 1
     convergence: float = 1e-3
     iterations: int = 60
 
     def __post_init__(self) -> None:
-        all_positive(self, "gravity", "level_with_walls")
+        all_positive(self, "gravity", "keep_level")
         require(self.max_range > self.min_range, self, "max_range", f"beyond min_range ({self.min_range} m)")
         if self.gravity not in ("ground", "level"):
             down(self.gravity)

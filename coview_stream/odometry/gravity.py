@@ -11,7 +11,7 @@ vlp16, os64, mid360): the ground's normal leans 0.4 to 4.1 degrees against gravi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,10 +66,32 @@ class Ground:
 
 def find_ground(points: Reals) -> Ground | str:
     """Find the ground in a cloud (N, 3), body frame with z about up, metres; or return why there is none."""
+    found = ground_plane(points)
+    if isinstance(found, str):
+        return found
+    corrected, walls = gravity_from_walls(points, found.up)
+    return replace(found, up=corrected, walls=walls)
+
+
+def ground_plane(points: Reals, near: Ground | None = None) -> Ground | str:
+    """Find the ground in a cloud (N, 3) as :func:`find_ground` does, without a look at walls.
+
+    Args:
+        points: (N, 3) body frame with z about up, metres.
+        near: where it is expected; searched for anew if there is none.
+    """
     lowest = _lowest(np.asarray(points, dtype=np.float64))
     if len(lowest) < _MIN_CELLS:
         return f"only {len(lowest)} cells of {_CELL:g} m within {_REACH:g} m hold points"
-    plane = _refined(lowest, _consensus_plane(lowest))
+    if near is not None:
+        found = _checked(lowest, _refined(lowest, (near.up, near.height)))
+        if not isinstance(found, str):
+            return found
+    return _checked(lowest, _refined(lowest, _consensus_plane(lowest)))
+
+
+def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str:
+    """Return the plane as the ground below the sensor, or why it is not."""
     if plane is None:
         return "no plane below the sensor fits three of the lowest points"
     up, height = plane
@@ -85,8 +107,7 @@ def find_ground(points: Reals) -> Ground | str:
     extent = np.sqrt(np.linalg.eigvalsh(np.cov(lowest[inside].T))[1])
     if extent < _MIN_EXTENT:
         return f"the best plane is a strip, {extent:.1f} m wide (one sigma)"
-    corrected, walls = gravity_from_walls(points, up)
-    return Ground(corrected, float(height), share, int(inside.sum()), walls)
+    return Ground(up, float(height), share, int(inside.sum()))
 
 
 def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple[Floats, int]:
@@ -97,14 +118,20 @@ def gravity_from_walls(points: Reals, up: Floats, sigma: float = SLOPE) -> tuple
     Returns:
         The unit vector, and the number of wall patches it was taken from.
     """
+    better, _, count = wall_evidence(points, up, sigma)
+    return better, count
+
+
+def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floats, int]:
+    """Return what :func:`gravity_from_walls` does, and in between the walls' own information (3, 3), 1 / radians^2."""
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
-    better = up
+    better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):
         weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's: a car's door is no wall
-        information = (normals.T * weights) @ normals + np.eye(3) / sigma**2
-        better = np.linalg.solve(information, up / sigma**2)
+        walls = (normals.T * weights) @ normals
+        better = np.linalg.solve(walls + np.eye(3) / sigma**2, up / sigma**2)
         better /= np.linalg.norm(better)
-    return better, len(normals)
+    return better, walls, len(normals)
 
 
 def level_rotation(up: Floats) -> Floats:
@@ -147,6 +174,8 @@ def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats
         assert plane is not None
         up, height = plane
         inside = lowest[np.abs(lowest @ up + height) < _BAND]
+        if len(inside) < 3:
+            return None
         centre = inside.mean(axis=0)
         normal = np.linalg.svd(inside - centre, full_matrices=False)[2][2]
         normal *= np.sign(normal[2]) or 1.0

@@ -10,7 +10,6 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import (
     Points,
     Pose,
-    exp_so3,
     interpolate,
     inverse,
     is_pose,
@@ -22,8 +21,10 @@ from coview_stream.geometry.transforms import (
 from coview_stream.geometry.validation import check_stamp, cloud_rows, finite_rows, to_array
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
-from coview_stream.odometry.gravity import Ground, find_ground, gravity_from_walls, level_rotation
+from coview_stream.odometry.gravity import Ground, find_ground, level_rotation
 from coview_stream.odometry.kiss_icp import KissRegistration, ScanRegistration
+from coview_stream.odometry.plumb import Surfaces
+from coview_stream.odometry.tilt_filter import TiltFilter, upright
 
 # set by hand, all of them
 _MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise and predicts nothing
@@ -31,14 +32,17 @@ _MIN_SWEEP_SECONDS = 1e-4  # times that differ by less are one
 _MAX_SWEEP_SECONDS = 1.0  # from the stamp: points farther away in time have another clock
 _SLACK = 0.5  # metres that a registration may always move: the first motion cannot be predicted
 _SLACK_ANGLE = np.radians(20.0)
-_TILT_DRIFT = float(np.radians(1.5))  # one sigma by which registration tilts a frame against the one before
+_FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame; walls and ground there make it better
+_GIVEN_GRAVITY = float(np.radians(0.5))  # one sigma of a direction that the user names
+_SHAKE = float(np.radians(2.0))  # one sigma by which a body tilts against its predicted motion
 
 
 class LidarOdometry:
     """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
 
     The odometry frame has z up, its origin where the first usable frame was taken and x where the body's x pointed
-    then, level. It drifts, but not in tilt where there are walls. The motion between two frames is predicted from the
+    then, level. It drifts, but not in tilt where there are walls
+    (:mod:`~coview_stream.odometry.tilt_filter`). The motion between two frames is predicted from the
     one before, over the time between their stamps, and deskews the frame as well. ``docs/odometry.md`` has the costs;
     kiss-icp holds the interpreter lock.
 
@@ -66,7 +70,10 @@ class LidarOdometry:
         self.points: Points = np.empty((0, 3), dtype=np.float32)
         self.restarts = 0
         self._pose: Pose | None = None
-        self._local = np.eye(4)  # the same in the local map, whose tilt drifts
+        self._local = np.eye(4)  # the same by registration in the local map, whose tilt drifts
+        self._T_odom_local = np.eye(4)
+        self._ground = self.ground  # of the newest frame that had one
+        self._tilt = TiltFilter(_FOUND_GRAVITY if self.config.gravity == "ground" else _GIVEN_GRAVITY)
         self._stamp = 0.0
         self._forget_motion()
         self._registration.clear()
@@ -104,15 +111,18 @@ class LidarOdometry:
         guess = self._local @ self._predicted_motion(seconds)
         if times is not None:
             finite = self._deskewed(finite, times)
+        around = self._surfaces(finite, guess) if self.config.keep_level else None
+        if around is not None:
+            guess = self._upright_guess(guess, around)
         local = self._registration.register(finite.astype(np.float64), guess)
         step = inverse(self._local) @ local
         self._check_motion(step, seconds)
         if seconds >= _MIN_MOTION_SECONDS:
             self._step, self._step_seconds = step, seconds
-        self._pose = orthonormal(self._pose @ step)
-        if self.config.level_with_walls:
-            self._level_with_walls(finite)
         self._local, self._stamp, self.points = orthonormal(local), stamp, finite
+        self._pose = orthonormal(self._T_odom_local @ self._local)
+        if around is not None:
+            self._level(around, float(np.linalg.norm(step[:3, 3])))
         return np.array(self._pose)
 
     def _begin(self, points: Points, stamp: float) -> Pose:
@@ -130,18 +140,29 @@ class LidarOdometry:
         start = pose_from(level_rotation(up), np.zeros(3))
         self._local = self._registration.register(points.astype(np.float64), start)
         self._pose, self._stamp, self.points = start, stamp, points
+        if self.config.keep_level:
+            self._tilt.update(self._surfaces(points, start).seen(start[:3, :3]), 0.0)
         return np.array(start)
 
-    def _level_with_walls(self, points: Points) -> None:
-        """Turn the pose about its position until walls are vertical again, by the weight they have."""
+    def _surfaces(self, points: Points, T_local_body: Pose) -> Surfaces:
+        around = Surfaces.around(points, (self._T_odom_local @ T_local_body)[2, :3], self._ground)
+        self._ground = around.ground or self._ground
+        return around
+
+    def _upright_guess(self, guess: Pose, around: Surfaces) -> Pose:
+        """Tilt a guess in the local map as the frame's own walls and ground have it: a body shakes unpredictably."""
+        R = self._T_odom_local[:3, :3]
+        tilt = self._tilt.expected(around.seen(R @ guess[:3, :3]), _SHAKE)
+        return pose_from(R.T @ upright(tilt) @ R @ guess[:3, :3], guess[:3, 3])
+
+    def _level(self, around: Surfaces, metres: float) -> None:
+        """Take what registration tilted out of the newest pose, and turn the odometry frame about it, slowly."""
         assert self._pose is not None
-        up = self._pose[2, :3]
-        better, _ = gravity_from_walls(points, up, _TILT_DRIFT)
-        axis = np.cross(better, up)
-        sine = float(np.linalg.norm(axis))
-        if sine > 0.0:
-            turn = exp_so3(axis * (np.arcsin(min(1.0, sine)) / sine))
-            self._pose[:3, :3] = self._pose[:3, :3] @ turn
+        R, here = self._pose[:3, :3], self._pose[:3, 3]
+        own = upright(self._tilt.update(around.seen(R), metres))
+        turn = upright(self._tilt.turn())
+        self._T_odom_local = pose_from(turn, here - turn @ here) @ self._T_odom_local
+        self._pose = orthonormal(pose_from(own @ turn @ R, here))
 
     def _predicted_motion(self, seconds: float) -> Pose:
         """Extrapolate the last motion (4, 4) to ``seconds``, which may be negative."""
@@ -170,8 +191,9 @@ class LidarOdometry:
     def _restart(self) -> None:
         assert self._pose is not None
         self.restarts += 1
-        self._local = self._pose
+        self._local, self._T_odom_local = self._pose, np.eye(4)
         self._registration.clear()
+        self._tilt.restart()
         self._forget_motion()
 
     def _forget_motion(self) -> None:

@@ -33,7 +33,7 @@ class Steady:
 
 
 def lidar():
-    return LidarOdometry(LidarOdometryConfig(gravity="level", level_with_walls=False), Steady())
+    return LidarOdometry(LidarOdometryConfig(gravity="level", keep_level=False), Steady())
 
 
 def sweep(k):

@@ -23,7 +23,7 @@ from coview_stream.stream.node.lidar_session import LidarSession
 from coview_stream.stream.node.node import Node
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
-LEVEL = LidarOdometryConfig(gravity="level", level_with_walls=False)
+LEVEL = LidarOdometryConfig(gravity="level", keep_level=False)
 CLOUD = np.random.default_rng(0).uniform(-30, 30, (500, 3)).astype(np.float32)
 FATAL = np.concatenate([CLOUD, CLOUD])
 

@@ -15,7 +15,7 @@ from coview_stream.stream.node.engines import open_engine
 from coview_stream.stream.node.jobs import FrameJob, OdometryJob
 from coview_stream.stream.node.odometry_engine import OdometryEngine
 
-LEVEL = LidarOdometryConfig(gravity="level", level_with_walls=False)
+LEVEL = LidarOdometryConfig(gravity="level", keep_level=False)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,199 @@
+"""Tilt of lidar odometry against gravity, as a state that changes slowly: a Kalman filter over the up direction.
+
+Registration gives each frame a roll and a pitch in its local map; walls are vertical there and the ground has a
+normal. Directions near z are written by their x and y, in the axes of the local map after the turns made so far. For
+frame k, two numbers each (radians):
+
+    d_k = d_{k-1} + drift          of the local map, all of it; drift ~ N(0, 0.2^2 N)
+    n_k ~ N(0, N)                  of this frame in the local map: registration's own error, forgotten with the frame
+    b_k = phi b_{k-1} + ...        of the walls, the same for the next metres: phi = exp(-metres / 10), variance W
+    w_k ~ N(0, kappa C_k)          of the walls, different in each frame; C_k by their number and the ways they face
+    s_k = psi s_{k-1} + v_k        slope of the ground; v_k ~ N(0, Q), and psi^2 = 1 - Q / (4 deg)^2 keeps it near level
+
+    up by walls    z_b = d + n + b + w
+    up by ground   z_s = d + n + s
+
+What is turned is d (all of the odometry frame, slowly) and n (this frame alone). A frame's jitter is then that of the
+better witness: where registration is good to 0.03 degrees and walls to 1, n stays what it is, 0; where rings on bare
+ground hold registration fast while the robot shakes, walls and ground outvote it.
+
+Who is how good is learnt. Three witnesses of one direction tell their own variances (Gray and Allan's three-cornered
+hat): N, Q and kappa are estimated from the innovations, each as the sum of its squared shares over its redundancy
+(Foerstner's variance components), fading over 60 frames. Each share has Student's t distribution with 4 degrees of
+freedom rather than a normal one: a kerb taken for the ground, or a parked lorry for a wall, is outvoted in that frame.
+
+The odometry frame turns by no more, per frame, than 1.5 times what the local map is thought to drift: what is learnt
+late about gravity (a first frame on a slope) comes in slowly, and a pose never jumps for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import exp_so3
+from coview_stream.odometry.plumb import Plumb
+
+# set by hand, all of them
+_DRIFT = 0.2  # of the local map in a frame, as a share of the frame's own error
+_LEAST_DRIFT = float(np.radians(0.005))  # likewise, at least: 0.15 degrees in 100 s at 10 Hz if it has no direction
+_MAX_TURN = 1.5  # sigmas of that drift by which the odometry frame turns in a frame
+_FRAME_TILT = float(np.radians(0.2))  # sigma of a frame's tilt by registration, before anything is learnt
+_SLOPE_STEP = float(np.radians(0.5))  # likewise of the ground's slope, from frame to frame
+_SLOPE = float(np.radians(4.0))  # one sigma of the ground's slope: gravity.SLOPE
+_WALL_METRES = 10.0  # over which walls err alike
+_NO_WALLS = float(np.radians(2.0))  # sigma of what walls err alike, while none are seen
+_LEAST = float(np.radians(0.01))  # sigma below which nothing is believed to be
+_LEAST_KAPPA = 1e-3
+_GROUND_FIT = float(np.radians(0.02))  # sigma of the plane's fit alone
+_FREEDOM = 4.0  # of Student's t
+_ROUNDS = 5  # of reweighting
+_FADE = 1.0 - 1.0 / 60.0  # of what was learnt, per frame
+_PRIOR = 2.0  # degrees of freedom of what is believed at the beginning: a frame's
+
+_EYE, _ZERO = np.eye(2), np.zeros((2, 2))
+_WALLS, _GROUND = slice(0, 2), slice(2, 4)  # rows of the measurement
+_MAP, _BIAS, _SLOPES = slice(0, 2), slice(2, 4), slice(4, 6)  # rows of the state
+_OF_STATE = np.block([[_EYE, _EYE, _ZERO], [_EYE, _ZERO, _EYE]])
+_OF_FRAME = np.vstack([_EYE, _EYE])
+_OF_WALLS = np.vstack([_EYE, _ZERO])
+_OF_GROUND = np.vstack([_ZERO, _EYE])
+
+
+@dataclass
+class _Variance:
+    """A variance that is learnt: squared shares over their redundancy, fading."""
+
+    value: float
+    least: float
+
+    def __post_init__(self) -> None:
+        self._squares, self._redundancy = _PRIOR * self.value, _PRIOR
+
+    def learn(self, squares: float, redundancy: float) -> None:
+        """Take in one frame's squares, in units of the variance as it is, and their redundancy."""
+        self._squares = _FADE * self._squares + self.value * squares
+        self._redundancy = _FADE * self._redundancy + max(0.0, redundancy)
+        self.value = max(self.least, self._squares / self._redundancy)
+
+
+class TiltFilter:
+    """The filter of the module's docstring."""
+
+    def __init__(self, sigma: float) -> None:
+        """Start with an up direction that is good to ``sigma`` radians."""
+        self._x = np.zeros(6)
+        self._P = np.diag(np.repeat([sigma**2, _NO_WALLS**2, _SLOPE**2], 2))
+        self._frame = _Variance(_FRAME_TILT**2, _LEAST**2)
+        self._slope = _Variance(_SLOPE_STEP**2, _LEAST**2)
+        self._kappa = _Variance(1.0, _LEAST_KAPPA)
+        self._first = True
+
+    @property
+    def frame_tilt(self) -> float:
+        """One sigma of a frame's tilt by registration, radians, as learnt so far."""
+        return float(np.sqrt(self._frame.value))
+
+    def restart(self) -> None:
+        """Forget the walls and the ground: the robot is elsewhere, but knows about as well where up is."""
+        tilt = self._P[_MAP, _MAP] + self._frame.value * _EYE
+        self._x[2:] = 0.0
+        self._P = np.diag(np.repeat([0.0, _NO_WALLS**2, _SLOPE**2], 2))
+        self._P[_MAP, _MAP] = tilt
+        self._first = True
+
+    def expected(self, seen: Plumb, sigma: float) -> Floats:
+        """Return the tilt (2,) of a frame whose pose is a guess, good to ``sigma`` radians; nothing is learnt."""
+        x, P, slope = self._predicted(seen, 0.0)
+        return self._split(x, P, seen, sigma**2, slope)[0]
+
+    def update(self, seen: Plumb, metres: float) -> Floats:
+        """Take in a registered frame, ``metres`` after the one before; return its own tilt n (2,), radians."""
+        x, P, slope = self._predicted(seen, metres)
+        frame = 0.0 if self._first else self._frame.value
+        tilt, self._x, self._P, learnt = self._split(x, P, seen, frame, slope)
+        if not self._first:
+            for variance, (squares, redundancy) in zip((self._frame, self._slope, self._kappa), learnt, strict=True):
+                variance.learn(squares, redundancy)
+        self._first = False
+        return tilt
+
+    def turn(self) -> Floats:
+        """Return by what (2,) to turn the odometry frame now, and take it for turned."""
+        tilt = self._x[_MAP].copy()
+        most = _MAX_TURN * self._drift()
+        tilt *= min(1.0, most / max(float(np.linalg.norm(tilt)), 1e-12))
+        self._x[_MAP] -= tilt
+        return tilt
+
+    def _drift(self) -> float:
+        """Return one sigma of the local map's drift in a frame, radians."""
+        return max(_LEAST_DRIFT, _DRIFT * self.frame_tilt)
+
+    def _predicted(self, seen: Plumb, metres: float) -> tuple[Floats, Floats, float]:
+        """Return state and covariance after ``metres``, before v, and v's variance."""
+        x, P = self._x.copy(), self._P.copy()
+        walls = _NO_WALLS**2
+        if seen.walls is not None:
+            walls = min(walls, self._kappa.value * float(np.trace(seen.covariance)) / 2.0)
+        if self._first:
+            P[_BIAS, _BIAS] = walls * _EYE
+            return x, P, 0.0
+        phi = np.exp(-metres / _WALL_METRES)
+        psi = np.sqrt(max(0.0, 1.0 - self._slope.value / _SLOPE**2))
+        change = np.repeat([1.0, phi, psi], 2)
+        x, P = change * x, change[:, None] * P * change
+        P[_MAP, _MAP] += self._drift() ** 2 * _EYE
+        P[_BIAS, _BIAS] += walls * (1.0 - phi**2) * _EYE
+        return x, P, self._slope.value
+
+    def _split(
+        self, x: Floats, P: Floats, seen: Plumb, frame: float, slope: float
+    ) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
+        """Share the innovation out among the state and the fresh errors n, v and w, outliers outvoted.
+
+        Returns:
+            n (2,), the state and its covariance, and for n, v and w squares and redundancy to learn from.
+        """
+        y, rows = seen.rows()
+        errors = [frame * _EYE, slope * _EYE, self._kappa.value * seen.covariance]
+        ways = [_OF_FRAME[rows], _OF_GROUND[rows], _OF_WALLS[rows]]
+        H = _OF_STATE[rows]
+        innovation = y[rows] - H @ x
+        known = H @ P @ H.T + _GROUND_FIT**2 * ways[1] @ ways[1].T
+        weights = [1.0, 1.0, 1.0]
+        for _ in range(_ROUNDS):
+            wide = [C / weight for C, weight in zip(errors, weights, strict=True)]
+            inverse = np.linalg.inv(known + sum(way @ C @ way.T for way, C in zip(ways, wide, strict=True)))
+            gain = inverse @ innovation
+            shares = [C @ way.T @ gain for way, C in zip(ways, wide, strict=True)]
+            left = [C - C @ way.T @ inverse @ way @ C for way, C in zip(ways, wide, strict=True)]
+            weights = [
+                (_FREEDOM + 2.0) / (_FREEDOM + _in_units_of(C, np.outer(share, share) + rest)) if C.any() else 1.0
+                for C, share, rest in zip(errors, shares, left, strict=True)
+            ]
+        cross = P @ H.T
+        cross[_SLOPES] += wide[1] @ ways[1].T
+        P = P.copy()
+        P[_SLOPES, _SLOPES] += wide[1]
+        P -= cross @ inverse @ cross.T
+        learnt = [
+            (_in_units_of(C, np.outer(share, share)), 2.0 - _in_units_of(C, rest))
+            if way.any() and C.any()
+            else (0.0, 0.0)
+            for C, share, rest, way in zip(wide, shares, left, ways, strict=True)
+        ]
+        return shares[0], x + cross @ gain, 0.5 * (P + P.T), learnt
+
+
+def upright(tilt: Floats) -> Floats:
+    """Return the rotation (3, 3) that turns the direction with x and y ``tilt`` (2,), z up, to z the shortest way."""
+    axis = np.array([tilt[1], -tilt[0], 0.0])
+    sine = float(np.linalg.norm(axis))
+    return exp_so3(axis * (np.arcsin(min(1.0, sine)) / sine if sine > 0.0 else 1.0))
+
+
+def _in_units_of(C: Floats, squares: Floats) -> float:
+    return float(np.trace(np.linalg.solve(C, squares)))
