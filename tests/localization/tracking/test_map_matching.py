@@ -140,3 +140,44 @@ def test_scan_beyond_surveyed_area_is_off_map(world_map, world_drive, scan):
 
 def test_range_image_of_a_scan_is_computed_once(scan):
     assert scan.range_image is scan.range_image
+
+
+# ---- held against what lies metres beside
+
+
+def held(world_map, scan, belief):
+    """The matches from a belief that may be metres off, the first with it as it is."""
+    pose_graph, matcher = PoseGraph(CONFIG.graph), MapMatcher(world_map, CONFIG)
+    pose_graph.start(*belief)
+    target = LocalMaps(world_map, 50.0).around(belief.T_map_body[:3, 3])
+    first = matcher.match(scan, belief, target, CONFIG.registration.track, pose_graph)
+    wider = Estimate(belief.T_map_body, belief.covariance + np.diag([0.01, 0.01, 0.1, 1.0, 1.0, 0.3]) ** 2)
+    return matcher.match_widely(first, scan, wider, target, pose_graph)
+
+
+def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_map, world_drive, scan):
+    truth = world_drive.T_map_body[4]
+    for x, y in ((1.6, 0.0), (-1.0, 2.2)):
+        tries = held(world_map, scan, Estimate(boxplus(truth, np.array([0.0, 0.0, 0.0, x, y, 0.0])), TIGHT))
+        best = max(tries, key=lambda each: each.verdict.ratio)
+        assert off(best.T_map_body, truth) < 0.02
+        assert best.verdict.verified
+        assert best is not tries[0]
+        assert not tries[0].verdict.verified
+        assert tries[0].verdict.observation.rival == pytest.approx(best.verdict.observation.ratio, abs=3.0)
+
+
+def test_right_place_stays_when_it_is_tried_again(world_map, world_drive, scan):
+    truth = world_drive.T_map_body[4]
+    tries = held(world_map, scan, Estimate(truth, TIGHT))
+    assert tries[0].verdict.verified
+    assert all(off(each.T_map_body, truth) < 0.05 for each in tries if each.verdict.verified)
+
+
+def test_place_that_fits_as_well_as_its_rival_says_so(world_map, world_drive, scan):
+    truth = world_drive.T_map_body[4]
+    matcher = MapMatcher(world_map, CONFIG)
+    seen = matched(world_map, scan, Estimate(truth, TIGHT)).verdict
+    twin = replace(seen.observation, rival=seen.observation.ratio + 1.0)
+    cause, reason = matcher._judge(twin, seen.evidence)
+    assert (cause, reason) == (RejectionReason.FITNESS, "what is seen fits as well metres beside")
