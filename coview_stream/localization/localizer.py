@@ -15,6 +15,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from, to_local
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, OdometryCorrection, tilt_variance
+from coview_stream.localization.calibration.frame_motion import FrameMotion
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.registration.verification import RangeImage
@@ -30,6 +31,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
+_RELEVEL = math.radians(0.3)  # keyframes that lean by less stay as they are; set by hand
 _LEVEL = math.radians(0.05)  # a frame that leans by less is not registered again for it; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
@@ -96,7 +98,9 @@ class Localizer:
         self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
         self._calibration = CalibrationEstimator()
+        self._buffered = self._calibration.calibration  # by which what is in the buffer has been levelled
         self._odometry = OdometryCorrection()
+        self._frame_motion = FrameMotion(self.config.registration, self.config.keyframe.distance)
         self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._calibration)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
         self._hints = PoseHints()
@@ -246,16 +250,34 @@ class Localizer:
     def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> _Frame:
         """Check a frame, and move the predicted pose on by its odometry."""
         raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
-        cloud, T = self._levelled(raw), self._odometry.correct(T_raw, self._calibration.calibration)
+        T = self._odometry.correct(T_raw, self._calibration.calibration)
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
         T = to_local(T, self._anchor)
+        if not self.state.has_place and self._frame_motion.is_due(T):
+            T = self._refine_motion(raw, T)
+        cloud = self._levelled(raw)
         voxels = self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
         # keyframes are for searching: a loss starts from nothing
         keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp)
         self._tracker.add_scan(voxels, T)
         self._newest = _Frame(raw, cloud, T, T_raw, stamp, voxels, keyframe)
         return self._newest
+
+    def _refine_motion(self, raw: Points, T_odom_body: Pose) -> Pose:
+        """Compare a keyframe with the one before; return its odometry, mended."""
+        assert self._anchor is not None  # there is a frame
+        points = self._voxel_filter(raw, np.eye(4))[0].copy()
+        T = self._frame_motion.refine(points, T_odom_body, self._calibration, self._tracker.drift.variances)
+        self._odometry.move_to(pose_from(T[:3, :3], T[:3, 3] + self._anchor))
+        now = self._calibration.calibration
+        if not self._buffer.keyframes:
+            self._buffered = now
+        elif now.turned_since(self._buffered) > _RELEVEL:
+            self._buffer.turn(now.R_body_cloud @ self._buffered.R_body_cloud.T)
+            self._buffered = now
+            self._next_epoch()
+        return T
 
     def _level(self, match: MapMatch, newest: _Frame) -> MapMatch:
         """Learn the sensor's tilt from the first registration at a place; level the newest frame, and match it again.
@@ -312,6 +334,7 @@ class Localizer:
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
+        self._frame_motion.clear()
         # the robot may have driven on or been carried since the keyframe
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
         if match.verdict.verified:
@@ -374,6 +397,7 @@ class Localizer:
             self._hints.odometry_continues(self._tracker.T_map_odom, self._anchor)
         self._anchor = None
         self._buffer.clear()
+        self._frame_motion.clear()
         self._odometry_check.clear()
         self._tracker.forget_odometry()
         self._next_epoch()
@@ -381,6 +405,7 @@ class Localizer:
     def _restart_search(self, stamp: float) -> None:
         """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
+        self._frame_motion.clear()
         self._tracker.forget_scans()
         self._next_epoch()
         self._handle(Event.SCANS_CONTRADICT)

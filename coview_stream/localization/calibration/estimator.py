@@ -54,6 +54,7 @@ _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.r
 _GROUPS = (_TILT, _SCALE, _TURN)
 
 _GRAVITY = math.radians(0.25)  # sigma of odometry's gravity, each of roll and pitch; set by hand
+_LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch; set by hand
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution; set by hand
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else; set by hand
 
@@ -123,6 +124,33 @@ class CalibrationEstimator:
         turn = exp_so3(np.array([0.0, 0.0, (now.turn - before.turn) * raw]))
         return pose_from(turn @ step[:3, :3], (1.0 + now.scale) / (1.0 + before.scale) * step[:3, 3])
 
+    def measure_frames(self, motion: Pose, step: Pose, variances: Floats, position: float, angle: float) -> Pose:
+        """Take in the motion from frame to frame that the lidar alone has seen (eq. C4).
+
+        Args:
+            motion: (4, 4) of the levelled body.
+            step: (4, 4) odometry's, as it has been corrected.
+            variances: (6,) of odometry's random walk meanwhile, over (rx, ry, rz, x, y, z).
+            position: sigma of ``motion``, metres.
+            angle: sigma of it, radians.
+
+        Returns:
+            ``step`` as it is corrected from now on.
+        """
+        t, before = step[:3, 3], self.calibration
+        applied = log_so3(before.R_body_cloud)[:2]
+        turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
+        # the motion's height, of which the tilt is the cause
+        H = np.array([[-t[1], t[0], 0.0, 0.0]])
+        rise = np.array([motion[2, 3] - t[2] + H[0, :2] @ applied])
+        self._update(rise, H, np.array([[variances[5] + position**2]]))
+        H = np.zeros((2, 4))
+        H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # odometry's heading is the worse one
+        self._update(turned[:2] + H[:, :2] @ applied, H, np.eye(2) * (variances[0] + (_LEAN * angle) ** 2))
+        noise = np.array([variances[3] + position**2, variances[2] + angle**2])
+        level = pose_from(self.calibration.R_body_cloud @ before.R_body_cloud.T, np.zeros(3))
+        return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise)
+
     def _walk(self, driven: float) -> None:
         """Let everything have changed a little over ``driven`` metres."""
         for group in _GROUPS:
@@ -133,7 +161,7 @@ class CalibrationEstimator:
         """Take in a measurement ``seen`` = H x + noise of covariance R, heavy-tailed."""
         gap = seen - H @ self._x
         distance = float(gap @ np.linalg.solve(H @ self._P @ H.T + R, gap))
-        R = R * max(1.0, (_FREEDOM + distance) / (_FREEDOM + len(gap)))
+        R = R * heavier(distance, len(gap))
         gain = np.linalg.solve(H @ self._P @ H.T + R, H @ self._P).T
         self._x = self._x + gain @ gap
         rest = np.eye(4) - gain @ H
@@ -154,6 +182,16 @@ class CalibrationEstimator:
             within = weight * np.trace(P) + (1.0 - weight) * about
             sigmas.append(math.sqrt((within + weight * (1.0 - weight) * float(x @ x)) / size))
         self.calibration = Calibration(*means.tolist(), *sigmas)
+
+
+def heavier(distance: float, size: int) -> float:
+    """Return what a variance is to be multiplied with under Student's t distribution.
+
+    Args:
+        distance: squared Mahalanobis distance of what was measured.
+        size: how many numbers that were.
+    """
+    return max(1.0, (_FREEDOM + distance) / (_FREEDOM + size))
 
 
 def tilt_variance(covariance: Floats) -> float:
@@ -183,6 +221,17 @@ class OdometryCorrection:
             self._position = self._position + (1.0 + calibration.scale) * (middle @ step)
             self._turned += turn
         self._before = T_odom_body
+        return self._corrected(T_odom_body)
+
+    def move_to(self, T_odom_body: Pose) -> Pose:
+        """Go on from another pose (4, 4) than the newest corrected one; its roll and pitch stay odometry's."""
+        assert self._before is not None  # there is a newest one
+        now = self._corrected(self._before)
+        self._turned += float(log_so3(T_odom_body[:3, :3] @ now[:3, :3].T)[2])
+        self._position = T_odom_body[:3, 3].copy()
+        return self._corrected(self._before)
+
+    def _corrected(self, T_odom_body: Pose) -> Pose:
         T = np.eye(4)
         T[:3, :3] = exp_so3(np.array([0.0, 0.0, self._turned])) @ T_odom_body[:3, :3]
         T[:3, 3] = self._position

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -114,6 +114,20 @@ class KeyframeBuffer:
         near = [_within(part, centre, radius) for part in self._parts]
         return self._unique(np.concatenate(near), voxel)
 
+    def turn(self, R_body: Floats) -> None:
+        """Turn all that is held by ``R_body`` (3, 3), in the body's axes and about where each keyframe was taken.
+
+        For a sensor of which it has been found out how it leans; what is older than the newest five is dropped.
+        """
+        held, pending = list(self.keyframes), self._pending
+        self.clear()
+        for keyframe in held:
+            turned = replace(keyframe, points=_turned(keyframe.points, keyframe.T_odom_body, R_body))
+            self.keyframes.append(turned)
+            self._gather(turned)
+        if held:
+            self._pending = [_turned(points, held[-1].T_odom_body, R_body) for points in pending]
+
     def clear(self) -> None:
         """Forget all keyframes, for odometry does not connect them with the next frame."""
         self.keyframes.clear()
@@ -123,6 +137,13 @@ class KeyframeBuffer:
 
     def _unique(self, points: Points, voxel: float | None = None) -> Points:
         return kernels.transform_unique(points, np.eye(4), voxel or self.config.voxel)[0]
+
+
+def _turned(points: Points, T_odom_body: Pose, R_body: Floats) -> Points:
+    """Turn points (N, 3), odometry frame, about the body by ``R_body`` (3, 3) in its axes."""
+    R = T_odom_body[:3, :3] @ R_body @ T_odom_body[:3, :3].T
+    centre = T_odom_body[:3, 3].astype(np.float32)
+    return (points - centre) @ R.T.astype(np.float32) + centre
 
 
 def _within(points: Points, centre: Floats, radius: float) -> Points:

@@ -78,8 +78,9 @@ def test_hint_refers_to_the_next_frame(world_map, world_drive, monkeypatch):
     request = localizer.add_frame(world_drive.clouds[1], world_drive.T_odom_body[1], 0.5)
     (T_map_odom,) = request.hints
     metres, degrees = pose_error(T_map_odom @ request.T_odom_body, world_drive.T_map_body[1])
-    assert metres == pytest.approx(0.1, abs=1e-6)
-    assert degrees < 1e-3
+    # but for what the lidar says of the motion between the two
+    assert metres == pytest.approx(0.1, abs=0.01)
+    assert degrees < 0.1
     assert tilt_of(T_map_odom) < 1e-9
 
 
