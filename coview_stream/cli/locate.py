@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 from coview_stream.cli.options import (
     acceptance_config,
     add_gravity,
+    add_mount,
     add_registration,
     add_reloc,
     add_risk,
     add_run_path,
     add_topics,
     lidar_config,
+    mount_of,
 )
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the run's, a file's, or made of the clouds (auto)",
     )
     add_gravity(parser)
+    add_mount(parser)
     add_topics(parser)
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
     add_registration(parser)
@@ -58,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.recordings.open_run import open_run
 
     acceptance = acceptance_config(args.risk)
+    mount = mount_of(args)
     lidar = _lidar_odometry(args.odometry, args.gravity)
     if args.registration == "gicp":
         library()  # before anything is read: it may be missing
@@ -74,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
             bar.total = total
             bar.update(done - bar.n)
 
-        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow)
+        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow, mount)
     for note in recorded.notes:
         print(note, file=sys.stderr)
     config = LocalizerConfig(

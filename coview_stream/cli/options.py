@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coview_stream.config import AcceptanceConfig
+    from coview_stream.config.mount import Mount
     from coview_stream.config.odometry import LidarOdometryConfig
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
@@ -113,12 +114,33 @@ def check_picture(option: str, path: Path | None) -> None:
         raise ConfigError(f"{option} {path}: {path.parent} is no directory; make it first")
 
 
+def add_mount(parser: argparse._ActionsContainer) -> None:
+    """Declare ``--mount``."""
+    parser.add_argument(
+        "--mount",
+        metavar="R,P,Y[,X,Y,Z]",
+        help="where the lidar sits on the body whose odometry it is: roll, pitch, yaw in degrees, and metres, as in "
+        "--mount=180,0,0 for upside down (the body's frame is the lidar's)",
+    )
+
+
+def mount_of(args: argparse.Namespace) -> Mount:
+    """Return ``--mount``.
+
+    Raises:
+        ConfigError: it is not three or six numbers in range.
+    """
+    from coview_stream.config.mount import Mount, parse_mount
+
+    return Mount() if args.mount is None else parse_mount(args.mount)
+
+
 def add_gravity(parser: argparse._ActionsContainer) -> None:
     """Declare ``--gravity``."""
     parser.add_argument(
         "--gravity",
         metavar="ground|level|X,Y,Z",
-        help="for kiss-icp: down is where the ground says, or the sensor's -z, or a vector in its frame, as in "
+        help="for kiss-icp: down is where the ground says, or the body's -z, or a vector in its frame, as in "
         "--gravity=-0.1,0,-9.8 (ground)",
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from coview_stream.cli.options import KISS_ICP, add_client_network, add_run_path, add_topics
+from coview_stream.cli.options import KISS_ICP, add_client_network, add_mount, add_run_path, add_topics, mount_of
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="auto|FILE|none",
         help="odometry to send: the run's, a file's, or none, for `serve --odometry kiss-icp` (auto)",
     )
+    add_mount(parser)
     add_topics(parser)
     parser.add_argument("--wait", type=float, default=10.0, metavar="SECONDS", help="for a node to subscribe (10)")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
@@ -63,13 +64,14 @@ def run(args: argparse.Namespace) -> int:
         )
     bare = args.odometry == _NO_ODOMETRY
     config = ReplayConfig(args.rate, args.speed, args.odometry_rate, clouds_only=bare, loop=args.loop)
+    mount = mount_of(args)
     keys = robot_keys(args.preset, args.base, args.robot)
     if bare:
         if args.odometry_topic is not None:
             raise ConfigError("--odometry none and --odometry-topic: give one of them")
-        recorded = open_bare_run(args.run_path, args.cloud_topic)
+        recorded = open_bare_run(args.run_path, args.cloud_topic, mount)
     else:
-        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic)
+        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, mount=mount)
     for note in recorded.notes:
         print(note, file=sys.stderr)
     transport = open_client(args.connect, args.listen, args.config)

@@ -12,12 +12,14 @@ from coview_stream.cli.options import (
     ROBOT,
     acceptance_config,
     add_gravity,
+    add_mount,
     add_registration,
     add_reloc,
     add_risk,
     add_state,
     check_codec,
     lidar_config,
+    mount_of,
     writable_state_folder,
 )
 from coview_stream.errors import ConfigError
@@ -78,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-payload", type=int, default=16 << 20, metavar="BYTES", help="larger is not looked at (16 MiB)"
     )
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
+    add_mount(limits)
     add_registration(parser)
     add_reloc(parser)
     add_risk(parser)
@@ -132,6 +135,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         dead_reckoning_timeout=args.coast,
         max_payload=args.max_payload,
         deskew=not args.no_deskew,
+        mount=mount_of(args),
     )
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,

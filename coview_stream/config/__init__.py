@@ -9,6 +9,7 @@ from __future__ import annotations
 from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.localizer import LocalizerConfig
 from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, map_preset
+from coview_stream.config.mount import Mount
 from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
 from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
 from coview_stream.config.tracking import GraphConfig, TrackingConfig
@@ -23,6 +24,7 @@ __all__ = [
     "LearnedConfig",
     "LocalizerConfig",
     "MapConfig",
+    "Mount",
     "Preset",
     "RegistrationConfig",
     "RegistrationMethod",

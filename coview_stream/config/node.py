@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from coview_stream.config.checks import all_positive, require
+from coview_stream.config.mount import Mount
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class NodeConfig:
         max_points: of a larger frame only every n-th point is used, so that no robot holds up the others.
         restart_after: stamps that run on steadily, but not from where they were, are a restarted clock after this.
         deskew: move points to the frame's stamp where the sender gives each point's time.
+        mount: where the robots' lidars sit: clouds are taken from there into the body frame as they come in.
     """
 
     pose_rate: float = 10.0
@@ -45,7 +47,8 @@ class NodeConfig:
     max_points: int = 200_000
     restart_after: float = 1.0
     deskew: bool = True
+    mount: Mount = field(default_factory=Mount)
 
     def __post_init__(self) -> None:
-        all_positive(self, "deskew")
+        all_positive(self, "deskew", "mount")
         require(self.pose_rate <= 200, self, "pose_rate", "at most 200 Hz")

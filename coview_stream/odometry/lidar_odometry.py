@@ -72,7 +72,7 @@ class LidarOdometry:
         self._pose: Pose | None = None
         self._local = np.eye(4)  # the same by registration in the local map, whose tilt drifts
         self._T_odom_local = np.eye(4)
-        self._ground = self.ground  # of the newest frame that had one
+        self._ground: Ground | None = None  # of the newest frame that had one
         self._tilt = TiltFilter(_FOUND_GRAVITY if self.config.gravity == "ground" else _GIVEN_GRAVITY)
         self._stamp = 0.0
         self._forget_motion()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coview_stream.geometry.arrays import Floats, Reals
+from coview_stream.geometry.arrays import Floats, Indices, Reals
 from coview_stream.odometry.gravity import Ground, ground_plane, wall_evidence
 
 # set by hand
@@ -28,7 +28,7 @@ class Plumb:
     covariance: Floats
     ground: Floats | None
 
-    def rows(self) -> tuple[Floats, Floats]:
+    def rows(self) -> tuple[Floats, Indices]:
         """Return the measurement (4,), zeros where there is none, and the indices of those that there are (K,)."""
         y = np.concatenate([np.zeros(2) if part is None else part for part in (self.walls, self.ground)])
         return y, np.flatnonzero(np.repeat([self.walls is not None, self.ground is not None], 2))
@@ -60,6 +60,6 @@ class Surfaces:
         information = (R @ self.information @ R.T)[:2, :2] + np.eye(2) / _UNSEEN**2
         return Plumb(
             None if self.walls is None else (R @ self.walls)[:2],
-            np.linalg.inv(information),
+            np.asarray(np.linalg.inv(information), dtype=np.float64),
             None if self.ground is None else (R @ self.ground.up)[:2],
         )

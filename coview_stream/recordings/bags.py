@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.trajectory import read_tum
+from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, MessageError, RunError
 from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.transforms import Points, Poses
@@ -40,6 +41,7 @@ def open_bag(
     cloud_topic: str | None = None,
     odometry_topic: str | None = None,
     from_clouds: OdometryFromClouds | None = None,
+    mount: Mount | None = None,
 ) -> Run:
     """Read all stamps and odometry of a recording in one pass, and keep where each cloud is.
 
@@ -51,17 +53,19 @@ def open_bag(
         cloud_topic: needed where there is more than one topic with PointCloud2.
         odometry_topic: likewise with Odometry.
         from_clouds: makes the odometry, also where the recording has some.
+        mount: where the lidar sits; clouds are read into the body frame.
 
     Raises:
         RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
     """
+    mount = mount or Mount()
     reader = BagReader(path)
     counts = reader.counts()
     clouds = _choose(path, counts, ros2.CLOUD, cloud_topic, "--cloud-topic")
     topics = {clouds: ros2.CLOUD}
     if from_clouds is not None:
         survey = _survey(reader, topics)
-        return _pair(reader, clouds, survey, from_clouds(_without_odometry(reader, clouds, survey)))
+        return _pair(reader, clouds, survey, from_clouds(_without_odometry(reader, clouds, survey, mount)), mount)
     if explicit is not None and odometry_topic is not None:
         raise RunError(f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them")
     # a single scan needs no odometry, as among files
@@ -69,7 +73,7 @@ def open_bag(
     if explicit is None and not lone:
         topics[_choose(path, counts, ros2.ODOMETRY, odometry_topic, "--odometry-topic")] = ros2.ODOMETRY
     survey = _survey(reader, topics)
-    return _pair(reader, clouds, survey, _track(path, survey, explicit, lone))
+    return _pair(reader, clouds, survey, _track(path, survey, explicit, lone), mount)
 
 
 class BagClouds:
@@ -78,8 +82,10 @@ class BagClouds:
     Read in order, they cost one pass over the recording; read in another order, each is sought by its arrival.
     """
 
-    def __init__(self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses) -> None:
-        self.reader, self.topic, self.track = reader, topic, track
+    def __init__(
+        self, reader: BagReader, topic: str, stamps: Ints, arrivals: Ints, track: Track, poses: Poses, mount: Mount
+    ) -> None:
+        self.reader, self.topic, self.track, self.mount = reader, topic, track, mount
         self.stamps, self.arrivals, self.poses = stamps, arrivals, poses
         self._lock = threading.Lock()  # a replay reads on another thread
         self._pending: Iterator[tuple[str, int, bytes]] = iter(())
@@ -95,14 +101,15 @@ class BagClouds:
         return builder.finish(self._name(index))
 
     def message(self, index: int) -> CloudMessage:
-        """Read frame ``index`` as it was recorded; CloudError if it is damaged."""
+        """Read frame ``index`` as it was recorded, but in the body frame; CloudError if it is damaged."""
         name = self._name(index)
         with self._lock, readable(name, CloudError):
             payload = self._payload(index)
         try:
-            return ros2.decode_cloud(Sample(self.topic, payload))
+            message = ros2.decode_cloud(Sample(self.topic, payload))
         except MessageError as error:
             raise CloudError(f"{name}: {error}; skip it, or repair the recording") from error
+        return replace(message, points=self.mount.to_body(message.points))
 
     def _name(self, index: int) -> str:
         return f"{self.reader.path}: cloud of {self.topic} at {_NS * int(self.stamps[index]):.6f}"
@@ -227,15 +234,15 @@ def _steady(path: Path, stamps: Ints, what: str) -> Bools:
     return ~strays
 
 
-def _without_odometry(reader: BagReader, topic: str, survey: _Survey) -> BagClouds:
+def _without_odometry(reader: BagReader, topic: str, survey: _Survey, mount: Mount) -> BagClouds:
     """Return all clouds that have a stamp of their own, without odometry."""
     order = _in_order(reader.path, survey)
     stamps, arrivals = order.stamps[order.fresh], order.arrivals[order.fresh]
     nowhere = np.tile(np.eye(4), (len(stamps), 1, 1))
-    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, nowhere), nowhere)
+    return BagClouds(reader, topic, stamps, arrivals, Track(stamps, nowhere), nowhere, mount)
 
 
-def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Run:
+def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: Mount) -> Run:
     """Return the run of the clouds in order of their stamps, those without odometry left out."""
     path = reader.path
     order = _in_order(path, survey)
@@ -258,12 +265,12 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track) -> Run:
         notes.append(f"{path}: {len(steady) - int(kept.sum())} of {len(steady)} clouds left out: {text}")
     if survey.damaged:
         notes.append(f"{path}: {survey.damaged} damaged messages left out")
-    if survey.lidar and survey.body and survey.lidar != survey.body:
+    if survey.lidar and survey.body and survey.lidar != survey.body and mount == Mount():
         notes.append(
             f"{path}: clouds are in frame {survey.lidar!r}, odometry moves {survey.body!r}: taken for one; "
-            "if the lidar is mounted away from it, write the odometry of the lidar (--odometry FILE)"
+            "if the lidar is mounted away from it, or turned, say how: --mount roll,pitch,yaw,x,y,z"
         )
-    source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept])
+    source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept], mount)
     return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.transforms import Pose, Poses
 from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -47,6 +48,7 @@ def open_lidar_run(
     cloud_topic: str | None = None,
     odometry_topic: str | None = None,
     progress: Progress | None = None,
+    mount: Mount | None = None,
 ) -> Run:
     """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, with odometry made of its clouds.
 
@@ -62,12 +64,12 @@ def open_lidar_run(
     if bag is None and cloud_topic is not None and path.exists():
         raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic out")
     if bag is not None:
-        return _of_bag(bag, lidar, cloud_topic, progress)
+        return _of_bag(bag, lidar, cloud_topic, progress, mount)
     layout = find_layout(path)
     if len(layout.frames) == 1:
-        return single_frame_run(layout)
+        return single_frame_run(layout, mount)
     lidar = lidar or LidarOdometry()
-    run = open_bare_run(path)
+    run = open_bare_run(path, mount=mount)
 
     def place(index: int) -> Pose:
         frame = run.read(index)
@@ -75,10 +77,12 @@ def open_lidar_run(
 
     placed = _place_all(path, lidar, len(run), place, progress)
     files = tuple(run.frames_paths[index] for index in placed.kept)
-    return Run(path, files, run.stamps[placed.kept], placed.poses, notes=(*run.notes, *placed.notes))
+    return Run(path, files, run.stamps[placed.kept], placed.poses, notes=(*run.notes, *placed.notes), mount=mount)
 
 
-def _of_bag(bag: Path, lidar: LidarOdometry | None, topic: str | None, progress: Progress | None) -> Run:
+def _of_bag(
+    bag: Path, lidar: LidarOdometry | None, topic: str | None, progress: Progress | None, mount: Mount | None
+) -> Run:
     odometry = lidar or LidarOdometry()
     notes: list[str] = []
 
@@ -91,7 +95,7 @@ def _of_bag(bag: Path, lidar: LidarOdometry | None, topic: str | None, progress:
         notes.extend(placed.notes)
         return Track(clouds.stamps[placed.kept], placed.poses)
 
-    run = open_bag(bag, None, topic, None, track)
+    run = open_bag(bag, None, topic, None, track, mount)
     return replace(run, notes=(*notes, *run.notes))
 
 
@@ -131,7 +135,7 @@ def _place_all(
     return Placed(kept, np.array(poses), tuple(notes))
 
 
-def open_bare_run(path: Path, cloud_topic: str | None = None) -> Run:
+def open_bare_run(path: Path, cloud_topic: str | None = None, mount: Mount | None = None) -> Run:
     """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, but with the identity for all poses.
 
     Stamps of frames in files are those of ``times.txt``, of an ``odometry.tum`` beside them, or else 0.1 s apart.
@@ -141,14 +145,14 @@ def open_bare_run(path: Path, cloud_topic: str | None = None) -> Run:
         RunError: no frames, or stamps that do not fit.
     """
     if (bag := find_bag(path)) is not None:
-        return open_bag(bag, None, cloud_topic, None, _identity_track)
+        return open_bag(bag, None, cloud_topic, None, _identity_track, mount)
     layout = find_layout(path)
     stamps = read_stamps(layout)
     notes: tuple[str, ...] = ()
     if stamps is None:
         stamps = _PERIOD * np.arange(len(layout.frames), dtype=np.float64)
         notes = (f"{path}: no times.txt; frames are taken for {_PERIOD:g} s apart",)
-    return Run(path, layout.frames, stamps, _identities(len(stamps)), notes=notes)
+    return Run(path, layout.frames, stamps, _identities(len(stamps)), notes=notes, mount=mount)
 
 
 def _identity_track(clouds: BagClouds) -> Track:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
 from coview_stream.recordings.layouts import find_bag, find_layout, read_odometry
 from coview_stream.recordings.run import Run, single_frame_run
@@ -26,6 +27,7 @@ def open_run(
     odometry_topic: str | None = None,
     lidar: LidarOdometry | None = None,
     progress: Progress | None = None,
+    mount: Mount | None = None,
 ) -> Run:
     """Open a run and validate all but the clouds themselves.
 
@@ -44,6 +46,7 @@ def open_run(
         odometry_topic: which odometry of a recording, if it has several topics with Odometry.
         lidar: makes the odometry that ``"kiss-icp"`` asks for, instead of a ``LidarOdometry()``.
         progress: called with (frames done, frames) while it does.
+        mount: where the lidar sits; clouds are read into the body frame, whose odometry it is.
 
     Raises:
         RunError: no frames, no odometry or odometry that does not fit; the message names file and line.
@@ -54,21 +57,21 @@ def open_run(
     if odometry == KISS_ICP:
         from coview_stream.recordings.lidar_runs import open_lidar_run
 
-        return open_lidar_run(path, lidar, cloud_topic, odometry_topic, progress)
+        return open_lidar_run(path, lidar, cloud_topic, odometry_topic, progress, mount)
     if (bag := find_bag(path)) is not None:
         from coview_stream.recordings.bags import open_bag
 
-        return open_bag(bag, explicit, cloud_topic, odometry_topic)
+        return open_bag(bag, explicit, cloud_topic, odometry_topic, mount=mount)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):
         raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out")
     layout = find_layout(path)
     count = len(layout.frames)
     if explicit is None and layout.odometry is None:
         if count == 1:
-            return single_frame_run(layout)
+            return single_frame_run(layout, mount)
         raise RunError(
             f"{path}: {count} frames but no odometry; add {path / 'odometry.tum'} "
             "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
         )
     stamps, poses = read_odometry(layout, explicit)
-    return Run(path, layout.frames, stamps, poses)
+    return Run(path, layout.frames, stamps, poses, mount=mount)

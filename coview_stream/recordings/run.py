@@ -11,6 +11,7 @@ import numpy as np
 
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.files import read_cloud
+from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses
@@ -59,6 +60,7 @@ class Run:
         poses: (N, 4, 4), odometry <- body, metres.
         source: reads the clouds of a recording; None if each is a file.
         notes: what was left out or taken for granted when the run was opened, a line each.
+        mount: where the lidar sits that the files' clouds are of; None where they are in the body frame.
     """
 
     path: Path
@@ -67,6 +69,7 @@ class Run:
     poses: Poses
     source: CloudSource | None = None
     notes: tuple[str, ...] = ()
+    mount: Mount | None = None
 
     def __len__(self) -> int:
         return len(self.frames_paths)
@@ -91,11 +94,14 @@ class Run:
                 f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "
                 "write frames relative to the sensor"
             )
-        return Frame(
-            index, float(self.stamps[index]), cloud.points, self.poses[index], cloud.origin, path, cloud.dropped
-        )
+        points = cloud.points
+        if self.mount is not None and self.source is None:
+            if cloud.origin.any():
+                raise CloudError(f"{path}: is in map-like coordinates, not the sensor's; leave --mount out")
+            points = self.mount.to_body(points)
+        return Frame(index, float(self.stamps[index]), points, self.poses[index], cloud.origin, path, cloud.dropped)
 
 
-def single_frame_run(layout: Layout) -> Run:
+def single_frame_run(layout: Layout, mount: Mount | None = None) -> Run:
     """Return the run of one frame, which needs no odometry."""
-    return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None])
+    return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None], mount=mount)

@@ -7,6 +7,7 @@ robot's. Every method may be called from any thread.
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError
@@ -82,10 +83,12 @@ class Session:
         except MessageError as error:
             self._count_undecodable(error, sample.key)
             return
+        message = message.limited(self.config.max_points)
+        message = replace(message, points=self.config.mount.to_body(message.points))
         with self._lock:
             self.counters.received += 1
             self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
-            self._add_cloud(message.limited(self.config.max_points), now)
+            self._add_cloud(message, now)
 
     def _add_cloud(self, message: CloudMessage, now: float) -> None:
         """Pair a cloud with the odometry that there is, or let it wait."""

@@ -1,0 +1,80 @@
+"""Mounting of a lidar on the robot's body."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from coview_stream.config.checks import require
+from coview_stream.errors import ConfigError
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
+
+MAX_LEVER = 100.0
+"""Metres from the body's origin to the sensor; farther is another unit. Set by hand."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a lidar sits and how it is turned: T_body_sensor, body x forward and z up.
+
+    Points are rolled about the body's x first, then pitched about its y (positive: nose down), then turned about its z.
+
+    Attributes:
+        roll: radians, at most a full turn either way; pi is upside down.
+        pitch: radians, likewise.
+        yaw: radians, likewise.
+        x: metres forward of the body's origin.
+        y: metres to its left.
+        z: metres above it.
+    """
+
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("roll", "pitch", "yaw"):
+            require(abs(getattr(self, name)) <= 2 * math.pi + 1e-9, self, name, "at most 360 degrees, in radians")
+        for name in ("x", "y", "z"):
+            require(abs(getattr(self, name)) <= MAX_LEVER, self, name, f"at most {MAX_LEVER:g} m")
+
+    @property
+    def T_body_sensor(self) -> Pose:
+        """(4, 4), body <- sensor, metres."""
+        pitched = exp_so3([0.0, self.pitch, 0.0]) @ exp_so3([self.roll, 0.0, 0.0])
+        return pose_from(rot_z(self.yaw) @ pitched, [self.x, self.y, self.z])
+
+    def to_body(self, points: Points) -> Points:
+        """Return a cloud (N, 3), sensor frame, metres, in the body frame; the cloud itself where they are one."""
+        if not any(getattr(self, f.name) for f in fields(self)):
+            return points
+        with np.errstate(invalid="ignore", over="ignore"):  # missing returns may be infinite
+            return transform(self.T_body_sensor, points)
+
+
+def parse_mount(text: str) -> Mount:
+    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres.
+
+    Raises:
+        ConfigError: not three or six numbers, an angle beyond 360 degrees, or a sensor 100 m away.
+    """
+    given = f"--mount={text}"
+    shape = "give roll,pitch,yaw in degrees, or roll,pitch,yaw,x,y,z with metres, such as --mount=180,0,0"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(f"{given}: {shape}") from error
+    if len(numbers) not in (3, 6):
+        raise ConfigError(f"{given}: {len(numbers)} number{'s' * (len(numbers) != 1)}; {shape}")
+    if not all(math.isfinite(number) for number in numbers):
+        raise ConfigError(f"{given}: not finite; {shape}")
+    if max(abs(angle) for angle in numbers[:3]) > 360.0:
+        raise ConfigError(f"{given}: an angle is beyond 360 degrees; {shape}")
+    if any(abs(metres) > MAX_LEVER for metres in numbers[3:]):
+        raise ConfigError(f"{given}: a sensor {MAX_LEVER:g} m away is no mount; metres follow the angles")
+    return Mount(*(math.radians(angle) for angle in numbers[:3]), *numbers[3:])

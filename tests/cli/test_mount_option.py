@@ -1,0 +1,106 @@
+"""``--mount`` of ``locate``, ``serve`` and ``replay``: clouds of a turned lidar are those of the body."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from coview_stream.cli import build_parser, main, replay, serve
+from coview_stream.clouds.files import read_cloud, write_cloud
+from coview_stream.clouds.trajectory import read_tum
+from coview_stream.config.mount import parse_mount
+from coview_stream.config.node import NodeConfig
+from coview_stream.geometry.transforms import inverse, transform
+from coview_stream.messages import encode_cloud
+from coview_stream.messages.types import CloudMessage, Sample
+from coview_stream.recordings.lidar_runs import open_bare_run
+from coview_stream.recordings.open_run import open_run
+from coview_stream.stream.node.session import Session
+from coview_stream.stream.transport.keys import robot_keys
+
+MOUNT = "180,10,90,0.3,-0.2,0.5"
+
+
+def turned(points):
+    """The same scan by a lidar that hangs upside down, pitched, turned and away from the body's origin."""
+    return transform(inverse(parse_mount(MOUNT).T_body_sensor), points.astype(np.float64)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def turned_run(world_run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("turned") / "run"
+    shutil.copytree(world_run, folder)
+    for path in sorted((folder / "frames").iterdir()):
+        write_cloud(path, turned(read_cloud(path).points))
+    return folder
+
+
+def test_run_of_a_turned_lidar_is_localized_as_that_of_the_body(world_file, world_run, turned_run, tmp_path, capsys):
+    command = ["locate", str(world_file)]
+    assert main([*command, str(world_run), "-o", str(tmp_path / "a"), "--no-pictures"]) == 0
+    assert main([*command, str(turned_run), "-o", str(tmp_path / "b"), "--no-pictures", f"--mount={MOUNT}"]) == 0
+    assert capsys.readouterr().err == ""
+    (stamps, poses), (again, same) = (read_tum(tmp_path / name / "trajectory.tum") for name in "ab")
+    assert (stamps == again).all()
+    assert np.abs(poses - same).max() < 5e-3  # float32 of the turned points
+
+
+def test_clouds_of_a_turned_lidar_are_read_into_the_body_frame(world_run, turned_run):
+    mount = parse_mount(MOUNT)
+    for run in (open_run(turned_run, mount=mount), open_bare_run(turned_run, mount=mount)):
+        for here, there in zip(open_run(world_run), run, strict=True):
+            assert np.allclose(here.points, there.points, atol=1e-4)
+    assert (open_run(turned_run, mount=mount).poses == open_run(world_run).poses).all()
+
+
+def test_live_clouds_are_turned_as_they_come(monkeypatch):
+    points = np.random.default_rng(0).uniform(-20, 20, (200, 3)).astype(np.float32)
+    seen = []
+    monkeypatch.setattr(Session, "_add_cloud", lambda self, message, now: seen.append(message))
+    session = Session(robot_keys("native", "coview", "r1"), "0" * 64, NodeConfig(mount=parse_mount(MOUNT)))
+    encoded = encode_cloud(CloudMessage(1, turned(points)), "xyz")
+    session.on_cloud(Sample(session.keys.cloud, encoded.payload, encoded.encoding, encoded.attachment), 0.0)
+    assert np.allclose(seen[0].points, points, atol=1e-4)
+
+
+def test_serve_and_replay_pass_the_option_on(world_file, world_run, monkeypatch):
+    asked = []
+    monkeypatch.setattr(serve, "_serve", lambda options, *_: asked.append(options.node.mount) or True)
+    assert main(["serve", str(world_file), "--robot", "r1", "--no-state", f"--mount={MOUNT}"]) == 0
+    assert main(["serve", str(world_file), "--robot", "r1", "--no-state"]) == 0
+    assert asked == [parse_mount(MOUNT), NodeConfig().mount]
+
+
+@pytest.mark.parametrize(("given", "opener"), [([], "open_run"), (["--odometry", "none"], "open_bare_run")])
+def test_replay_reads_clouds_into_the_body_frame(world_run, monkeypatch, given, opener):
+    def stop(*args, mount=None):
+        raise _Stopped(mount or args[-1])
+
+    module = sys.modules[{"open_run": open_run, "open_bare_run": open_bare_run}[opener].__module__]
+    monkeypatch.setattr(module, opener, stop)
+    command = ["replay", str(world_run), "--robot", "r1", f"--mount={MOUNT}", *given]
+    with pytest.raises(_Stopped) as caught:
+        replay.run(build_parser().parse_args(command))
+    assert caught.value.args == (parse_mount(MOUNT),)
+
+
+class _Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("wrong", ["1,2", "0,0,x", "0,400,0", ""])
+def test_wrong_mount_is_refused_before_anything_is_read(tmp_path, capsys, wrong):
+    none = str(tmp_path / "not-even-looked-for")
+    commands = (
+        ["locate", none, none, "-o", str(tmp_path / "o")],
+        ["serve", none, "--robot", "r1", "--no-state"],
+        ["replay", none, "--robot", "r1"],
+    )
+    for command in commands:
+        assert main([*command, f"--mount={wrong}"]) == 2
+        said = capsys.readouterr().err
+        assert f"--mount={wrong}: " in said
+        assert said.count("\n") == 1
