@@ -15,12 +15,14 @@ from coview_stream.recordings.open_run import open_run
 from coview_stream.sim import Dirt, SimulationConfig, parse_dirt, simulate
 from coview_stream.sim.dirt import KINDS_OF_DIRT, real
 from coview_stream.sim.dirt.streams import Stream, stream
+from coview_stream.sim.dirt.survey import Density
 from coview_stream.sim.simulate import frames, scene_of, trajectories
 
 TINY = SimulationConfig(scene="village", sensor="vlp16", seed=5, size=80.0, length=0.5, density=2.0)
 BASE_POINTS, FRAME_POINTS = 12759, [24385, 24316, 24337, 24366]
 TRUTH = ["1000.300000", "-8.652942", "11.659302", "-0.467424"]
 ODOMETRY = ["1000.300000", "-274.298736", "240.661939", "-39.517563"]
+THIN = Density(1.0, 5.0)  # a survey that is done quickly
 OFF_SENSOR = ("gravity", "odometry", "slip", "strips", "density", "seasons", "years")
 
 
@@ -31,6 +33,7 @@ def clean(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_a_clean_world_is_what_it_was_before_there_was_dirt(clean):
     """Figures of the code before dirt; a few points may differ where another processor rounds otherwise."""
     assert len(read_cloud(clean / "base.laz")) == pytest.approx(BASE_POINTS, abs=3)
@@ -67,6 +70,7 @@ def test_unknown_dirt_is_refused(text):
         parse_dirt(text)
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_dirt(tmp_path, capsys):
     argv = ["simulate", str(tmp_path / "w"), "--scene", "village", "--seed", "5", "--size", "80", "--density", "2"]
     assert main([*argv, "--length", "0.3", "--dirt", "rain,mounting:3", "--dirt-seed", "4"]) == 0
@@ -96,7 +100,7 @@ def test_each_kind_changes_what_it_should_and_never_the_truth(name, clean, tmp_p
 @pytest.mark.slow
 def test_equal_seeds_give_equal_dirt(tmp_path):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        simulate(tmp_path / name, replace(TINY, dirt=real(seed)))
+        simulate(tmp_path / name, replace(TINY, dirt=replace(real(seed), density=THIN)))
     for file in ("run/odometry.tum", "run/frames/000002.pcd", "run/frames/000003.pcd"):
         a, b, c = ((tmp_path / name / file).read_bytes() for name in "abc")
         assert a == b
@@ -113,7 +117,7 @@ def test_equal_seeds_give_equal_dirt(tmp_path):
     [("town", "os64"), ("campus", "mid360"), ("industrial", "vlp16"), ("forest", "vlp16"), ("forest", "mid360")],
 )
 def test_all_dirt_at_once_leaves_a_run_to_work_with(scene, sensor, tmp_path):
-    simulate(tmp_path / "w", replace(TINY, scene=scene, sensor=sensor, length=0.35, dirt=real()))
+    simulate(tmp_path / "w", replace(TINY, scene=scene, sensor=sensor, length=0.35, dirt=replace(real(), density=THIN)))
     run = open_run(tmp_path / "w" / "run")
     assert len(run) == 3
     for frame in run:
@@ -130,6 +134,7 @@ def test_one_kind_leaves_the_random_numbers_of_another():
     assert stream(1, 0, Stream.SLIP).random() != stream(1, 1, Stream.SLIP).random()
 
 
+@pytest.mark.slow
 def test_frames_without_odometry_are_deskewed_by_the_truth():
     config = replace(TINY, dirt=parse_dirt("motion"))
     scene = scene_of(config)

@@ -35,6 +35,7 @@ def off_the_walls(motion, odometry=None):
     return float(np.median(distance_to_surfaces(scene, points[points[:, 2] > 0.5])))
 
 
+@pytest.mark.slow
 def test_a_turning_sweep_is_bent_without_deskewing_and_lies_on_the_walls_after_it():
     bent, straight = off_the_walls(Motion(deskewed=False)), off_the_walls(Motion())
     assert straight < 0.03
@@ -81,6 +82,7 @@ def test_a_single_frame_stands_still():
     np.testing.assert_allclose(inverse(truth[0]) @ track.true(STAMPS[:1] - 0.05)[0], np.eye(4), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_recording_holds_raw_sweeps_that_the_reader_deskews(tmp_path):
     scene, truth = yard(*WALLS), turning()
     scanner = Scanner(scene, vlp16(), Dirt(motion=Motion()), 1.5, lambda _: np.random.default_rng(1))
