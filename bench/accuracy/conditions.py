@@ -151,9 +151,15 @@ def cells(details: dict[str, Any]) -> list[str]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs, and the code that was measured."""
+    """All runs, what was asked of them, and the code that was measured."""
     shown = [cells(row.details) for row in rows if row.details]
     if not shown:
         raise InputError("no run was measured")
+    targets = [
+        [row.name.removeprefix("conditions/"), row.target, row.said, "met" if row.holds else "missed"]
+        for row in rows
+        if row.target
+    ]
+    judged_now = table(("target", "asked", "measured", "verdict"), targets)
     before = f"Before the arrow: commit {asked.before[:7]}. " if asked.before else ""
-    return {"": f"{table(_HEAD, shown)}\n\n{before}{code_line()}"}
+    return {"": f"{table(_HEAD, shown)}\n\n{judged_now}\n\n{before}{code_line()}"}

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from argparse import Namespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.accuracy.conditions import cells, share, verdicts
+from bench.accuracy.conditions import cells, share, tables, verdicts
 from bench.accuracy.real_runs import RealSet, scored
 from bench.accuracy.spoil import Variant, rings, spoilt
+from bench.harness.rows import informs
 from coview_stream.clouds import read_cloud, read_tum, write_cloud, write_tum
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
@@ -140,3 +142,7 @@ def test_verdicts_name_the_run_that_misses(run):
     assert least.said == "25.0 (street, pitch:2)"
     assert judged["conditions/false frames"].holds
     assert cells(found[1])[3:5] == ["5 > 5", "- > 25"]
+    rows = [informs("conditions/street", 1.0, "%", each) for each in found] + list(verdicts(found))
+    page = tables(rows, Namespace(before="0123456789"))[""]
+    assert "25.0 (street, pitch:2) |  missed" in page
+    assert "commit 0123456." in page
