@@ -9,6 +9,7 @@ import numpy as np
 
 from coview_stream.config.checks import require
 from coview_stream.errors import ConfigError
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
 
 MAX_LEVER = 100.0
@@ -48,6 +49,20 @@ class Mount:
         """(4, 4), body <- sensor, metres."""
         pitched = exp_so3([0.0, self.pitch, 0.0]) @ exp_so3([self.roll, 0.0, 0.0])
         return pose_from(rot_z(self.yaw) @ pitched, [self.x, self.y, self.z])
+
+    def turned(self, R: Floats) -> Mount:
+        """Return the mount of this lidar if its clouds in the body frame have to be turned by ``R`` (3, 3) as well."""
+        T = pose_from(R, np.zeros(3)) @ self.T_body_sensor
+        roll, pitch = math.atan2(T[2, 1], T[2, 2]), -math.asin(max(-1.0, min(1.0, float(T[2, 0]))))
+        return Mount(roll, pitch, math.atan2(T[1, 0], T[0, 0]), *T[:3, 3].tolist())
+
+    @property
+    def option(self) -> str:
+        """Text that :func:`parse_mount` reads, to a tenth of a degree and a centimetre."""
+        degrees = [math.degrees(angle) for angle in (self.roll, self.pitch, self.yaw)]
+        metres = [self.x, self.y, self.z]
+        numbers = [round(angle, 1) for angle in degrees] + [round(m, 2) for m in metres] * any(metres)
+        return ",".join(f"{number + 0.0:g}" for number in numbers)
 
     def to_body(self, points: Points) -> Points:
         """Return a cloud (N, 3), sensor frame, metres, in the body frame; the cloud itself where they are one."""

@@ -14,6 +14,7 @@ from coview_stream.descriptors.coview import Descriptor
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from, to_local
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, OdometryCorrection, tilt_variance
 from coview_stream.localization.calibration.frame_motion import FrameMotion
 from coview_stream.localization.registration.local_map import LocalMaps
@@ -238,6 +239,14 @@ class Localizer:
         local = validate_pose(T_map_body, self.base_map.origin)
         if not self.state.has_place:
             self._hints.robot_at(local)
+
+    def hint_calibration(self, known: Calibration) -> None:
+        """Begin with what was known of this robot before, less well; it goes on being measured.
+
+        Ignored while a place is known.
+        """
+        if not self.state.has_place:
+            self._calibration.restore(known.doubted())
 
     def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""

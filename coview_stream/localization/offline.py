@@ -16,11 +16,12 @@ import numpy as np
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.trajectory import write_tum
-from coview_stream.config import Channel, LocalizerConfig
+from coview_stream.config import Channel, LocalizerConfig, Mount
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, pose_from_tum
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
@@ -48,6 +49,7 @@ class RunResult:
         sources: recognizers that named places: "coview", "learned"; empty if that is not known.
         query: descriptors of the keyframe that won the first fix, if there was one.
         winner: its evidence: station and shift.
+        mount: where the run's lidar sits; None for the body itself.
         driven: metres that odometry had driven at the first fix; None if that is not known.
     """
 
@@ -60,11 +62,17 @@ class RunResult:
     winner: KeyframeEvidence | None = None
     sources: tuple[str, ...] = ()
     driven: float | None = None
+    mount: Mount | None = None
 
     @property
     def posed(self) -> list[Fix]:
         """Fixes that have a pose."""
         return [fix for fix in self.fixes if fix.T_map_body is not None]
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What was corrected of the sensor and of odometry in the end; None if that was never known."""
+        return self.posed[-1].calibration if self.posed else None
 
     @property
     def state(self) -> State:
@@ -87,6 +95,7 @@ class RunResult:
             "state": self.state.reported,
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
+            "calibration": None if self.calibration is None else self.calibration.to_json(self.mount),
             "first_fix_stamp": None if self.first is None else self.first.stamp,
             "confidence": None if self.first is None else self.first.confidence,
             "first_fix_m": None if self.driven is None else round(self.driven, 3),
@@ -112,7 +121,7 @@ def locate(
     """
     localizer = Localizer(base_map, config)
     localizer.prepare()
-    located = RunResult(len(run), sources=localizer.sources)
+    located = RunResult(len(run), sources=localizer.sources, mount=run.mount)
     driven, before = 0.0, None
     for index in range(len(run)):
         try:
@@ -220,6 +229,8 @@ def summary(located: RunResult) -> str:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
         lines.append(f"{'found':<18} {_found(located, posed[0])}")
+        if located.calibration is not None:
+            lines.extend(f"{'calibration':<18} {clause}" for clause in located.calibration.describe(located.mount))
     elif located.keyframes:
         lines.append(f"{'reason':<18} {located.keyframes[-1].reason}")
     if located.skipped:

@@ -271,7 +271,7 @@ def _pair(reader: BagReader, topic: str, survey: _Survey, track: Track, mount: M
             "if the lidar is mounted away from it, or turned, say how: --mount roll,pitch,yaw,x,y,z"
         )
     source = BagClouds(reader, topic, stamps[kept], order.arrivals[kept], track, poses[kept], mount)
-    return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes))
+    return Run(path, (path,) * len(source.stamps), source.stamps / 1e9, source.poses, source, tuple(notes), mount)
 
 
 def _is_of(payload: bytes, stamp_ns: int) -> bool:

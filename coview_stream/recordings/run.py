@@ -60,7 +60,7 @@ class Run:
         poses: (N, 4, 4), odometry <- body, metres.
         source: reads the clouds of a recording; None if each is a file.
         notes: what was left out or taken for granted when the run was opened, a line each.
-        mount: where the lidar sits that the files' clouds are of; None where they are in the body frame.
+        mount: where the lidar sits, whose clouds are read into the body frame; None where it is the body.
     """
 
     path: Path

@@ -62,6 +62,15 @@ def test_mount_that_is_none_is_refused_in_one_line(text, said):
     assert "\n" not in str(caught.value)
 
 
+def test_correction_is_said_as_an_option_that_has_it():
+    mount = parse_mount("180,10,90,0.3,-0.2,0.5")
+    R = Mount(roll=0.02, pitch=-0.05).T_body_sensor[:3, :3]
+    found = parse_mount(mount.turned(R).option)
+    assert np.allclose(found.T_body_sensor[:3, :3], R @ mount.T_body_sensor[:3, :3], atol=2e-3)
+    assert np.allclose(found.T_body_sensor[:3, 3], R @ mount.T_body_sensor[:3, 3], atol=6e-3)
+    assert Mount().turned(Mount(pitch=math.radians(2.9)).T_body_sensor[:3, :3]).option == "0,2.9,0"
+
+
 @pytest.mark.parametrize("wrong", [{"roll": 7.0}, {"yaw": math.nan}, {"x": 1000.0}, {"z": math.inf}])
 def test_mount_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):

@@ -12,8 +12,10 @@ from small_world import pose_error
 
 from coview_stream.clouds.files import write_cloud
 from coview_stream.clouds.trajectory import read_tum
+from coview_stream.config.mount import Mount
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.offline import RunResult, locate, summary, write
 from coview_stream.localization.result import Fix
 from coview_stream.localization.state import State
@@ -77,6 +79,17 @@ def test_summary_has_state_place_and_time(located):
     nothing = RunResult(3, [Fix(0.0, State.SEARCHING)], skipped=["000001.ply: empty"])
     assert "0 of 3 frames" in summary(nothing)
     assert "000001.ply: empty" in summary(nothing)
+
+
+def test_calibration_is_written_and_summarized_as_the_mount_that_it_adds_to(world_map):
+    leaning = Calibration(pitch=np.radians(2.9))
+    fix = Fix(1.0, State.TRACKING, np.eye(4), np.eye(4), np.eye(6), calibration=leaning)
+    upside_down = RunResult(1, [fix], mount=Mount(roll=np.pi))
+    found = json.loads(json.dumps(upside_down.to_json(world_map)))["calibration"]
+    assert found["pitch_deg"] == 2.9
+    assert "set --mount=180,2.9,0 to silence" in found["says"][0]
+    assert found["says"][0] in summary(upside_down)
+    assert RunResult(1, []).to_json(world_map)["calibration"] is None
 
 
 def test_damaged_frames_are_skipped_and_listed(world_map, world_run, world_drive, tmp_path):

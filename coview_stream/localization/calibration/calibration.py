@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import exp_so3
 
 _WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next two
 _SCALE = 0.01
 _TURN = math.radians(0.05)  # per metre
+_MOVED_TILT = math.radians(1.0)  # sigmas of what was known of a robot before it was out of sight; set by hand
+_MOVED_SCALE = 0.02
+_MOVED_TURN = math.radians(0.02)  # per metre
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,11 @@ class Calibration:
         """Return by how much the levelling differs from another's, radians."""
         return math.hypot(self.roll - other.roll, self.pitch - other.pitch)
 
-    def describe(self) -> list[str]:
+    def describe(self, mount: Mount | None = None) -> list[str]:
         """Say in plain words, a clause each, what is corrected; nothing where sensor and odometry are as they should.
 
-        A sensor that leans by a *positive* pitch looks down, as ``--mount`` counts it.
+        A sensor that leans by a *positive* pitch looks down, as ``--mount`` counts it. ``mount`` is the one that clouds
+        have been read with already.
         """
         said: list[str] = []
         leans = [
@@ -59,8 +64,8 @@ class Calibration:
             if abs(angle) >= _WORTH_TELLING
         ]
         if leans:
-            mount = f"{math.degrees(self.roll):.1f},{math.degrees(self.pitch):.1f},0"
-            said.append(f"sensor leans {' and '.join(leans)}: corrected; set --mount={mount} to silence this")
+            option = (mount or Mount()).turned(self.R_body_cloud).option
+            said.append(f"sensor leans {' and '.join(leans)}: corrected; set --mount={option} to silence this")
         if abs(self.scale) >= _SCALE:
             what = "short" if self.scale > 0 else "long"
             said.append(f"odometry measures {abs(self.scale):.1%} too {what}: corrected")
@@ -69,8 +74,17 @@ class Calibration:
             said.append(f"odometry turns {abs(math.degrees(self.turn)):.2f} deg per metre too far {side}: corrected")
         return said
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain data, degrees and per cent."""
+    def doubted(self) -> Calibration:
+        """Return the same, known less well: it is from before the node started, and the sensor may have been moved."""
+        return replace(
+            self,
+            sigma_tilt=max(self.sigma_tilt, _MOVED_TILT),
+            sigma_scale=max(self.sigma_scale, _MOVED_SCALE),
+            sigma_turn=max(self.sigma_turn, _MOVED_TURN),
+        )
+
+    def to_json(self, mount: Mount | None = None) -> dict[str, Any]:
+        """Plain data: degrees, metres, factors, and what :meth:`describe` says of it."""
         deg = math.degrees
         return {
             "roll_deg": round(deg(self.roll), 2),
@@ -80,4 +94,5 @@ class Calibration:
             "odometry_scale_sigma": round(self.sigma_scale, 4),
             "odometry_turn_deg_per_m": round(deg(self.turn), 3),
             "odometry_turn_sigma_deg_per_m": round(deg(self.sigma_turn), 3),
+            "says": self.describe(mount),
         }

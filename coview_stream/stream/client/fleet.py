@@ -115,7 +115,7 @@ def _row(view: RobotView, now: float) -> list[str]:
         *_pose_cells(view.fresh_pose(now), view.pose_rate(now)),
         f"{_number(latency.get('p50'), 0)}/{_number(latency.get('p99'), 0)}",
         _number(counters.get("dropped"), 0),
-        printable(view.status.get("reason") or ""),
+        printable("; ".join([str(view.status.get("reason") or ""), *_says(view.status)])),
     ]
 
 
@@ -151,6 +151,12 @@ def _odds(wrong: float) -> str:
 def _mapping(status: dict[str, Any], name: str) -> dict[str, Any]:
     value = status.get(name)
     return value if isinstance(value, dict) else {}
+
+
+def _says(status: dict[str, Any]) -> list[str]:
+    """Return what the node says of the robot's sensor and odometry."""
+    says = _mapping(status, "calibration").get("says")
+    return [str(clause) for clause in says] if isinstance(says, list) else []
 
 
 def _number(value: object, digits: int) -> str:

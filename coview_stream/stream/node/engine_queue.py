@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.request import Epoch, SearchRequest
 from coview_stream.localization.state import State
@@ -99,12 +100,18 @@ class EngineQueue:
         """Whether a frame may be taken."""
         return self._frame is not None and self._frame_under_way is None
 
-    def take_frame(self, require_verification: bool, hint: Pose | None = None) -> FrameJob | None:
+    def take_frame(
+        self, require_verification: bool, hint: Pose | None = None, calibration: Calibration | None = None
+    ) -> FrameJob | None:
         """Hand out the newest frame, with the result of a search if one has come; None while one is under way."""
         if self._frame is None or self._frame_under_way is not None:
             return None
         job = replace(
-            self._frame.job, require_verification=require_verification, search_result=self._search_result, hint=hint
+            self._frame.job,
+            require_verification=require_verification,
+            search_result=self._search_result,
+            hint=hint,
+            calibration=None if hint is None else calibration,
         )
         self._frame_under_way = replace(self._frame, job=job)
         self._frame = self._search_result = None

@@ -93,6 +93,8 @@ class TrackEngine:
             localizer.apply_search_result(job.search_result)
         if job.require_verification:
             localizer.require_verification()
+        if job.calibration is not None:
+            localizer.hint_calibration(job.calibration)
         if job.hint is not None:
             with contextlib.suppress(RunError):  # a hint of no use is no reason to drop the frame
                 localizer.hint_pose(job.hint)

@@ -8,6 +8,7 @@ from typing import TypeAlias
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.request import SearchRequest
@@ -31,6 +32,7 @@ class FrameJob:
         search_result: of an earlier search, to be applied first.
         defer: frames wait for the engine: put off what need not be done at this one.
         hint: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis.
+        calibration: what was known of its sensor and odometry there; goes with ``hint``, a prior.
     """
 
     robot: str
@@ -44,6 +46,7 @@ class FrameJob:
     search_result: SearchResult | None = None
     defer: bool = False
     hint: Pose | None = None
+    calibration: Calibration | None = None
 
 
 @dataclass(frozen=True)

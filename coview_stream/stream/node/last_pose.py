@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -18,6 +19,7 @@ import numpy as np
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import Pose, is_pose
+from coview_stream.localization.calibration.calibration import Calibration
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +27,7 @@ VERSION = 1
 
 _FORMAT = "coview_stream last pose"
 _MAX_BYTES = 65_536  # of a file; what we write has 500; set by hand
+_MAX_LEAN = float(np.radians(45.0))  # of a sensor against its mount; set by hand
 _MAX_NAME = 60  # characters of a robot's name in that of its file; set by hand
 
 
@@ -37,12 +40,14 @@ class LastPose:
         map_sha256: of the base map, 64 hexadecimal digits.
         stamp_ns: sensor time, nanoseconds.
         T_map_body: (4, 4) float64 in the frame of the map's sources, metres.
+        calibration: what was corrected of its sensor and odometry there; None if that was not known.
     """
 
     robot: str
     map_sha256: str
     stamp_ns: int
     T_map_body: Pose
+    calibration: Calibration | None = None
 
 
 def save(folder: Path, last: LastPose) -> Path:
@@ -60,6 +65,8 @@ def save(folder: Path, last: LastPose) -> Path:
         "stamp_ns": int(last.stamp_ns),
         "T_map_body": np.asarray(last.T_map_body, dtype=np.float64).tolist(),
     }
+    if last.calibration is not None:
+        document["calibration"] = asdict(last.calibration)  # radians and metres
     folder.mkdir(parents=True, exist_ok=True)
     # a robot's day usually ends with a power cut: synced, and one name for all, so that at most one is left behind
     with atomic_file(path, sync=True, temporary=path.with_suffix(".part")) as file:
@@ -149,7 +156,22 @@ def _parsed(data: bytes) -> LastPose:
     T = np.asarray(document["T_map_body"], dtype=np.float64)
     if not is_pose(T):
         raise ValueError("T_map_body is not a finite rigid 4x4 transform")
-    return LastPose(str(document["robot"]), str(document["map_sha256"]), int(document["stamp_ns"]), T)
+    known = _calibration(document.get("calibration"))
+    return LastPose(str(document["robot"]), str(document["map_sha256"]), int(document["stamp_ns"]), T, known)
+
+
+def _calibration(plain: Any) -> Calibration | None:
+    """Return a calibration as :func:`save` wrote it; ValueError, TypeError or KeyError for another thing."""
+    if plain is None:
+        return None
+    if not isinstance(plain, dict):
+        raise ValueError("its calibration is something else")
+    names = {f.name for f in fields(Calibration)}
+    known = Calibration(**{name: float(value) for name, value in plain.items() if name in names})
+    sigmas = all(0 < s < 1 for s in (known.sigma_tilt, known.sigma_scale, known.sigma_turn))
+    if not (sigmas and math.hypot(known.roll, known.pitch) < _MAX_LEAN and abs(known.scale) + abs(known.turn) < 1):
+        raise ValueError("its calibration is none of a robot")
+    return known
 
 
 @dataclass(frozen=True)
@@ -160,11 +182,13 @@ class LastKnownPose:
         forgotten: how often a client has asked to forget it.
         stamp_ns: sensor time, nanoseconds; None unless the robot is TRACKING.
         T_map_body: (4, 4) in the frame of the map's sources; None likewise.
+        calibration: what is corrected of its sensor and odometry; None where that is not known.
     """
 
     forgotten: int
     stamp_ns: int | None = None
     T_map_body: Pose | None = None
+    calibration: Calibration | None = None
 
 
 class PoseHint:
@@ -175,10 +199,12 @@ class PoseHint:
 
     Attributes:
         forgotten: how often a client has asked.
+        calibration: what was known of the sensor and odometry there; goes with the pose, as a prior.
     """
 
     def __init__(self) -> None:
         self.forgotten = 0
+        self.calibration: Calibration | None = None
         self._T_map_body: Pose | None = None
         self._pending = False
 
@@ -187,13 +213,13 @@ class PoseHint:
         """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
         return self._T_map_body if self._pending else None
 
-    def update(self, T_map_body: Pose) -> None:
+    def update(self, T_map_body: Pose, calibration: Calibration | None = None) -> None:
         """Take over a pose that the engine itself has verified."""
-        self._T_map_body, self._pending = T_map_body, False
+        self._T_map_body, self.calibration, self._pending = T_map_body, calibration, False
 
-    def offer(self, T_map_body: Pose) -> None:
+    def offer(self, T_map_body: Pose, calibration: Calibration | None = None) -> None:
         """Take over a pose from before this session, which the engine does not know."""
-        self._T_map_body, self._pending = T_map_body, True
+        self._T_map_body, self.calibration, self._pending = T_map_body, calibration, True
 
     def begin_epoch(self) -> None:
         """Offer the pose again: the engine forgets all with an odometry frame, but the robot stands where it stood."""
@@ -206,7 +232,7 @@ class PoseHint:
 
     def drop(self) -> None:
         """Never offer this pose again; only a new one."""
-        self._T_map_body, self._pending = None, False
+        self._T_map_body, self.calibration, self._pending = None, None, False
 
     def forget(self) -> None:
         """Drop the pose because a client asks; the file for the next start is to go as well."""

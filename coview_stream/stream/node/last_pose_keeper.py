@@ -64,7 +64,7 @@ class LastPoseKeeper:
         if last is not None:
             x, y = last.T_map_body[:2, 3]
             log.info("%s: was last at %.1f, %.1f on this map: tried first, as a hypothesis", robot, x, y)
-            session.hint_pose(last.T_map_body)
+            session.hint_pose(last.T_map_body, last.calibration)
 
     def _keep(self, session: Session) -> None:
         robot, sha256 = session.keys.robot, session.map_sha256
@@ -76,7 +76,7 @@ class LastPoseKeeper:
                 self._kept.pop(robot, None)
             if now.T_map_body is None or now.stamp_ns is None or self._stands_still(robot, now.T_map_body):
                 return
-            save(self.folder, LastPose(robot, sha256, now.stamp_ns, now.T_map_body))
+            save(self.folder, LastPose(robot, sha256, now.stamp_ns, now.T_map_body, now.calibration))
             self._kept[robot] = now.T_map_body
         except OSError as error:
             if not self._failing:

@@ -10,6 +10,7 @@ from typing import Any
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
 from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.registration.covariance import propagate, swap_rotation_translation
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import Event, State, next_state
@@ -36,6 +37,7 @@ class RobotState:
     Attributes:
         state: of the robot; there is a pose while it is TRACKING.
         last_frame_ns: stamp of the newest processed frame; None before the first.
+        calibration: what is corrected of its sensor and odometry, also while it is lost; None before that is known.
     """
 
     def __init__(self, robot: str, map_sha256: str, counters: Counters, hint: PoseHint) -> None:
@@ -44,6 +46,7 @@ class RobotState:
         self.map_sha256 = map_sha256
         self.state = State.SEARCHING
         self.last_frame_ns: int | None = None
+        self.calibration: Calibration | None = None
         self._hint = hint
         self._counters = counters
         self._loss_reason = ""
@@ -93,7 +96,8 @@ class RobotState:
         if verified:
             self._counters.fixes += before is not State.TRACKING
             self._correction = OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned)
-            self._hint.update(self._correction.T_map_body)
+            self.calibration = fix.calibration or self.calibration
+            self._hint.update(self._correction.T_map_body, self.calibration)
 
     def restart_search(self, reason: str) -> None:
         """Forget the place: there is another odometry frame."""
@@ -174,7 +178,9 @@ class RobotState:
         """Return where the robot is, if that is known, for the next start of the node."""
         correction, forgotten = self.correction, self._hint.forgotten
         pose = None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
-        return LastKnownPose(forgotten, pose.stamp_ns, pose.T_map_body) if pose else LastKnownPose(forgotten)
+        if pose is None:
+            return LastKnownPose(forgotten)
+        return LastKnownPose(forgotten, pose.stamp_ns, pose.T_map_body, self.calibration)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from coview_stream.config.node import NodeConfig
 from coview_stream.errors import MessageError
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry
@@ -186,11 +187,14 @@ class Session:
             self._hint.forget()
             self._clear()
 
-    def hint_pose(self, T_map_body: Pose) -> None:
-        """Hand the engine (4, 4) where the robot may be, as a hypothesis; ignored once the place is known."""
+    def hint_pose(self, T_map_body: Pose, calibration: Calibration | None = None) -> None:
+        """Hand the engine (4, 4) where the robot may be, as a hypothesis; ignored once the place is known.
+
+        ``calibration``, what was known of its sensor and odometry, goes with it.
+        """
         with self._lock:
             if self.robot_state.correction is None and not self._hint.forgotten:
-                self._hint.offer(T_map_body)
+                self._hint.offer(T_map_body, calibration)
 
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
         """Note that an engine has forgotten all it knew; only that of ``track`` knew where the robot is."""
@@ -207,7 +211,9 @@ class Session:
     def take_frame(self) -> FrameJob | None:
         """Hand the newest frame to the tracking engine."""
         with self._lock:
-            return self.queue.take_frame(self.robot_state.requires_verification, self._hint.pending)
+            return self.queue.take_frame(
+                self.robot_state.requires_verification, self._hint.pending, self._hint.calibration
+            )
 
     def take_search_request(self) -> SearchJob | None:
         """Hand the newest keyframe to the search engine."""
@@ -267,6 +273,12 @@ class Session:
                 has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
                 reason = status_text(self.keys, self.counters, has_odometry)
             return self.robot_state.state, reason
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What is corrected of the robot's sensor and odometry; None before anything was measured."""
+        with self._lock:
+            return self.robot_state.calibration
 
     def age(self) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""

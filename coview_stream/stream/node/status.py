@@ -115,7 +115,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
     """Return the plain data of ``out/status``; its ``stamp_ns`` is the node's wall clock, all others the robot's."""
     state, reason = session.state()
     age, level = session.age(), session.protection_level()
-    known, queue = session.robot_state, session.queue
+    known, queue, calibration = session.robot_state, session.queue, session.calibration
     return {
         "robot": session.keys.robot,
         "stamp_ns": time.time_ns(),
@@ -127,6 +127,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
         "uptime_s": round(uptime, 1),
         "last_frame_ns": known.last_frame_ns,
         "evidence": None if known.evidence is None else known.evidence.to_json(),
+        "calibration": None if calibration is None else calibration.to_json(session.config.mount),
         "transitions": session.history.to_json(),
         "pose": {
             "rate_hz": rate,

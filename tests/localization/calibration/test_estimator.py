@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from coview_stream.config.mount import Mount
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, OdometryCorrection
@@ -73,6 +74,21 @@ def test_scale_of_odometry_is_found(scale):
     found = drive(scale=scale)
     assert (1.0 + found.scale) * scale == pytest.approx(1.0, abs=0.005)
     assert any("too short" in c if scale < 1 else "too long" in c for c in found.describe())
+
+
+def test_lean_is_told_as_the_mount_that_silences_it():
+    leaning = Calibration(pitch=np.radians(2.9))
+    assert leaning.describe() == ["sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0 to silence this"]
+    assert "--mount=180,2.9,0 " in leaning.describe(Mount(roll=np.pi))[0]
+    assert leaning.to_json()["says"] == leaning.describe()
+
+
+def test_what_was_known_before_is_a_prior_and_no_more():
+    before = drive((0.0, 3.0))
+    assert np.degrees(before.doubted().sigma_tilt) == pytest.approx(1.0)
+    estimator = CalibrationEstimator()
+    estimator.restore(before.doubted())
+    assert np.degrees(estimator.calibration.pitch) == pytest.approx(3.0, abs=0.5)
 
 
 def test_turn_of_odometry_is_found():

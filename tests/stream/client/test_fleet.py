@@ -39,6 +39,16 @@ def test_tracking_robot_shows_its_pose():
     ]
 
 
+def test_what_the_node_says_of_the_sensor_stands_behind_the_reason():
+    fleet = FleetTable()
+    says = "sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0 to silence this"
+    fleet.add_status("r1", {**STATUS, "calibration": {"says": [says, "b\x1b[2J"]}}, 9.0)
+    assert fleet.table(9.1)[1].endswith(f"all well; {says}; b [2J")
+    for odd in (None, 5, {"says": "x"}, {"says": None}, {}):
+        fleet.add_status("r1", {**STATUS, "calibration": odd}, 9.0)
+        assert fleet.table(9.1)[1].endswith("all well")
+
+
 def test_stale_pose_is_hidden():
     fleet = FleetTable()
     fleet.add_pose(POSE, 10.0)

@@ -12,6 +12,7 @@ from se3 import exp_se3
 
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.stream.node import last_pose
 from coview_stream.stream.node.last_pose import LastPose, default_folder, file_of, forget, load, save
 
@@ -31,6 +32,31 @@ def test_last_pose_round_trip(tmp_path):
     found = load(tmp_path / "made" / "now", "r1", SHA)
     same(found, LAST)
     assert found.T_map_body.dtype == np.float64
+
+
+def test_calibration_comes_back_with_the_pose(tmp_path):
+    known = Calibration(0.01, -0.05, 0.03, 1e-4, 0.002, 0.001, 1e-5)
+    save(tmp_path, replace(LAST, calibration=known))
+    assert load(tmp_path, "r1", SHA).calibration == known
+    save(tmp_path, LAST)
+    assert load(tmp_path, "r1", SHA).calibration is None
+
+
+@pytest.mark.parametrize(
+    "wrong", [5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": 0.0}, {"scale": float("nan")}, {"turn": None}]
+)
+def test_calibration_of_no_robot_spoils_the_file(tmp_path, caplog, wrong):
+    path = save(tmp_path, LAST)
+    document = json.loads(path.read_text()) | {"calibration": wrong}
+    path.write_text(json.dumps(document))
+    assert load(tmp_path, "r1", SHA) is None
+    assert "no last pose to be used" in caplog.text
+
+
+def test_calibration_with_fields_of_another_release_is_read(tmp_path):
+    path = save(tmp_path, LAST)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"calibration": {"pitch": 0.05, "phase_of_moon": 3}}))
+    assert load(tmp_path, "r1", SHA).calibration == Calibration(pitch=0.05)
 
 
 def test_newer_pose_replaces_older_file(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fake_robot import SHA, T_MAP_ODOM, Robot, ns, pose, tracking, unknown
 from sockets import until
 
 from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.stream.node import last_pose
 from coview_stream.stream.node import last_pose_keeper as memory
 from coview_stream.stream.node.engines import TrackEngine
@@ -43,6 +45,42 @@ def test_pose_hint_goes_with_one_frame(robot):
     first, *others = jobs_of(robot)
     assert first is BEFORE
     assert others == [None, None]
+
+
+def test_calibration_goes_with_the_pose_hint_alone(robot):
+    known = Calibration(pitch=0.05)
+    robot.session.hint_pose(BEFORE, known)
+    jobs = [robot.frame(0.1 + 0.1 * k, unknown) for k in range(2)]
+    assert [job.calibration for job in jobs] == [known, None]
+    robot.session.relocalize()
+    assert robot.frame(0.5, unknown).calibration is None
+
+
+def test_calibration_is_kept_with_the_pose_and_begins_the_next_start(robot, tmp_path):
+    known = Calibration(pitch=0.05, sigma_tilt=0.002)
+
+    def calibrated(job):
+        result = tracking(job)
+        return replace(result, fix=replace(result.fix, calibration=known))
+
+    robot.frame(0.1, calibrated)
+    assert robot.session.calibration == known
+    robot.frame(0.2, unknown)
+    assert robot.session.calibration == known  # of the robot, not of the place
+    robot.frame(0.3, calibrated)
+    LastPoseKeeper(tmp_path, [robot.session]).keep()
+    later = Robot()
+    LastPoseKeeper(tmp_path, [later.session]).hint()
+    later.moved(0.0)
+    assert later.frame(0.1, unknown).calibration == known
+
+
+def test_calibration_is_offered_again_with_each_odometry_frame(robot):
+    known = Calibration(pitch=0.05)
+    robot.session.hint_pose(BEFORE, known)
+    assert robot.frame(0.1, unknown).calibration == known
+    robot.session.engine_restarted()
+    assert robot.frame(0.3, unknown).calibration == known
 
 
 def test_pose_hint_waits_while_a_frame_is_running(robot):

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 
+import numpy as np
 import pytest
 from fake_node import STEP, THREADS, Site, publish_statuses
 from fake_robot import SHA, ns
@@ -13,6 +14,7 @@ from sockets import until
 
 from coview_stream import __version__
 from coview_stream.config.node import NodeConfig
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.messages import decode_pose
 from coview_stream.messages.types import Sample
 from coview_stream.stream.node.counters import Counters
@@ -56,6 +58,19 @@ def test_status_has_all_documented_fields(site):
     assert status["counters"]["unknown_encoding"] == 1
     assert any("video/raw" in text for text in status["errors"])
     assert status["connection"] == {"routers": ["memory"], "peers": [], "reconnects": 0}
+
+
+def test_status_tells_what_is_corrected_and_stays_small(site):
+    assert site.status("r1")["calibration"] is None
+    site.frame("r1", 0.0)
+    known = Calibration(np.radians(-4.1), np.radians(2.9), -0.051, 0.002)
+    site.sessions["r1"].robot_state.calibration = known
+    calibration = site.status("r1")["calibration"]
+    assert calibration["pitch_deg"] == 2.9
+    assert calibration["odometry_scale"] == 0.949
+    assert calibration["says"] == known.describe()
+    assert len(calibration["says"]) == 3
+    assert len(site.net.samples("coview/r1/out/status")[-1].payload) < 3500
 
 
 def test_status_is_plain_json(site):
