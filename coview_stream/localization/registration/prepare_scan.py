@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -31,16 +31,24 @@ class RegistrationCloud:
         points: (N, 3) float32, gravity-aligned frame, metres.
         above: (N,) which of them stand above the ground; the others lie on it.
         height: (N,) metres above the lowest ground nearby.
+        ground_offset: metres by which the points on the ground have been lowered.
     """
 
     points: Points
     above: Bools
     height: Floats32
+    ground_offset: float = 0.0
+
+    def lowered(self, metres: float) -> RegistrationCloud:
+        """Return the scan with its ground lowered, to lie where the survey has it; negative metres raise it."""
+        points = self.points.copy()
+        points[~self.above, 2] -= np.float32(metres)
+        return replace(self, points=points, ground_offset=self.ground_offset + metres)
 
     def every(self, nth: int) -> RegistrationCloud:
         """Return a thinner scan: every ``nth`` point of each kind."""
         order = np.concatenate((np.flatnonzero(self.above), np.flatnonzero(~self.above)))[::nth]
-        return RegistrationCloud(self.points[order], self.above[order], self.height[order])
+        return replace(self, points=self.points[order], above=self.above[order], height=self.height[order])
 
     @cached_property
     def surfaces(self) -> list[Surfaces]:

@@ -18,6 +18,7 @@ from coview_stream.localization.registration.covariance import (
     registration_covariance,
     swap_rotation_translation,
 )
+from coview_stream.localization.registration.ground_offset import GroundOffset
 from coview_stream.localization.registration.local_map import LocalMap, LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
@@ -43,6 +44,7 @@ class Tracker:
 
     Attributes:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
+        ground: by how much the robot's ground lies above the survey's, metres.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class Tracker:
         self.config = config
         self.local_maps = local_maps
         self.T_map_odom: Pose = np.eye(4)
+        self.ground = GroundOffset()
         self._graph = PoseGraph(config.graph)
         self._calibration = calibration
         self._levelled = calibration.calibration  # what the newest registered cloud was corrected by
@@ -127,6 +130,7 @@ class Tracker:
         It may not have converged yet: its own covariance is not believed.
         """
         self._matcher.clear()
+        self.ground.clear()
         self._odometry.forget_registration()
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.clear()
@@ -168,6 +172,7 @@ class Tracker:
             verdict = MatchVerdict(RejectionReason.OFF_MAP, "the map is empty here")
             return MapMatch.without_registration(verdict, belief)
         points = prepare_scan(self._scans.window(), T_odom_body[:3, 3], self.config.registration)
+        points = self.ground.lower(points)
         newest = self._scans.newest
         # older frames' points fill up a sparse newest one, but cannot stand in for one that sees nothing
         seen = 0 if newest is None else min(len(points.points), len(newest))
@@ -280,6 +285,7 @@ class Tracker:
         if self.travelled - self._learned_at >= self.config.tracking.distance:  # one view tells the same again
             self._learned_at = self.travelled
             self._matcher.place.learn(seen)
+            self.ground.learn(scan.cloud, self.T_map_odom, target)
         self._odometry.learn(match.T_map_body, match.covariance)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)

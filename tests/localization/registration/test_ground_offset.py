@@ -1,0 +1,82 @@
+"""The ground offset follows what structure shows of the height, and is nothing where structure shows none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.localization.registration.ground_offset import GroundOffset
+from coview_stream.localization.registration.local_map import LocalMap
+from coview_stream.localization.registration.prepare_scan import RegistrationCloud
+
+RNG = np.random.default_rng(5)
+
+
+def site(canopies=True, count=24):
+    """Points (N, 3), normals (N, 3) and which stand above the ground: flat ground, boxes, perhaps flat tops on them."""
+    xy = np.stack(np.meshgrid(*[np.arange(-30, 30, 0.5)] * 2), axis=-1).reshape(-1, 2)
+    parts = [(np.column_stack([xy, np.zeros(len(xy))]), (0, 0, 1))]
+    for x, y in RNG.uniform(-27, 27, (count, 2)):
+        along, up = (v.ravel() for v in np.meshgrid(np.arange(-1.5, 1.6, 0.25), np.arange(0.6, 4.0, 0.25)))
+        parts.append((np.column_stack([x + 0 * along, y + along, up]), (1, 0, 0)))
+        if canopies:
+            u, v = (w.ravel() for w in np.meshgrid(np.arange(-1.5, 1.6, 0.25), np.arange(-1.5, 1.6, 0.25)))
+            parts.append((np.column_stack([x + u, y + v, np.full(u.size, 4.0)]), (0, 0, 1)))
+    points = np.concatenate([part for part, _ in parts]).astype(np.float32)
+    normals = np.concatenate([np.tile(np.float32(n), (len(part), 1)) for part, n in parts])
+    return points, normals, np.arange(len(points)) >= len(xy)
+
+
+def learned(lift, canopies=True, times=30):
+    """Learn from a robot whose ground lies ``lift`` metres above the survey's, registered half way between the two."""
+    points, normals, above = site(canopies)
+    noisy = points + RNG.normal(0.0, 0.02, points.shape).astype(np.float32)
+    noisy[~above, 2] += np.float32(lift)
+    cloud = RegistrationCloud(noisy, above, points[:, 2].copy())
+    T, offset, target = np.eye(4), GroundOffset(), LocalMap(points, normals)
+    T[2, 3] = -0.5 * lift
+    for _ in range(times):
+        offset.learn(offset.lower(cloud), T, target)
+    return offset
+
+
+@pytest.mark.parametrize("lift", [0.3, -0.3])
+def test_structure_tells_by_how_much_the_ground_has_risen(lift):
+    offset = learned(lift)
+    assert offset.metres == pytest.approx(lift, abs=0.06)
+    assert offset.probability > 0.9
+    assert offset.sigma < 0.15
+
+
+def test_without_an_offset_nothing_is_corrected():
+    offset = learned(0.0)
+    assert offset.metres == pytest.approx(0.0, abs=1e-9)
+    assert offset.probability < 0.5
+
+
+def test_walls_show_no_height():
+    offset = learned(0.3, canopies=False)
+    assert abs(offset.metres) < 0.1
+
+
+def test_one_registration_moves_the_height_a_little():
+    assert 0.0 < abs(learned(0.3, times=1).metres) < 0.12 or learned(0.3, times=1).metres == 0.0
+
+
+def test_too_few_points_tell_nothing_and_clear_forgets():
+    points = np.zeros((3, 3), dtype=np.float32)
+    offset = learned(0.3)
+    offset.clear()
+    offset.learn(RegistrationCloud(points, np.ones(3, bool), np.full(3, 2.0, np.float32)), np.eye(4), None)
+    assert offset.metres == 0.0
+    assert offset.probability == pytest.approx(0.1)
+
+
+def test_the_ground_alone_is_lowered():
+    points = np.float32([[0, 0, 0], [1, 0, 3]])
+    cloud = RegistrationCloud(points, np.array([False, True]), np.float32([0, 3]))
+    lowered = cloud.lowered(0.25).lowered(0.05)
+    np.testing.assert_allclose(lowered.points[:, 2], [-0.3, 3.0], atol=1e-6)
+    assert lowered.ground_offset == pytest.approx(0.3)
+    assert lowered.every(1).ground_offset == pytest.approx(0.3)
+    assert cloud.points[0, 2] == 0.0
