@@ -32,7 +32,7 @@ class LidarOdometryConfig:
         max_gap: seconds without a usable frame after which the local map is begun anew, where the last frame was:
             how far the robot went meanwhile is not known.
         max_speed: metres per second; what says more is refused, and the local map begun anew.
-        max_turn_rate: radians per second, likewise.
+        max_turn_rate: radians per second, likewise; a faster turn is registration that spins with its own prediction.
         keep_level: keep roll and pitch from drifting, and from registration's errors, by the walls and the ground
             around.
         threads: of kiss-icp.
@@ -47,7 +47,7 @@ class LidarOdometryConfig:
     min_points: int = 100
     max_gap: float = 1.5
     max_speed: float = 50.0
-    max_turn_rate: float = 10.0
+    max_turn_rate: float = 4.0
     keep_level: bool = True
     threads: int = 1
     convergence: float = 1e-3

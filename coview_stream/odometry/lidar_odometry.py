@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from coview_stream.config.odometry import LidarOdometryConfig, down
@@ -24,7 +26,7 @@ from coview_stream.odometry.deskew import deskew
 from coview_stream.odometry.gravity import Ground, find_ground, level_rotation
 from coview_stream.odometry.kiss_icp import KissRegistration, ScanRegistration
 from coview_stream.odometry.plumb import Surfaces
-from coview_stream.odometry.tilt_filter import TiltFilter, upright
+from coview_stream.odometry.tilt_filter import Since, TiltFilter, upright
 
 # set by hand, all of them
 _MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise and predicts nothing
@@ -34,7 +36,8 @@ _SLACK = 0.5  # metres that a registration may always move: the first motion can
 _SLACK_ANGLE = np.radians(20.0)
 _FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame; walls and ground there make it better
 _GIVEN_GRAVITY = float(np.radians(0.5))  # one sigma of a direction that the user names
-_SHAKE = float(np.radians(2.0))  # one sigma by which a body tilts against its predicted motion
+_SHAKE = float(np.radians(2.0))  # one sigma by which a body tilts from one frame to the next
+_SHAKE_SECONDS = 0.1  # in which it does; over longer, as a random walk
 
 
 class LidarOdometry:
@@ -120,9 +123,11 @@ class LidarOdometry:
         if seconds >= _MIN_MOTION_SECONDS:
             self._step, self._step_seconds = step, seconds
         self._local, self._stamp, self.points = orthonormal(local), stamp, finite
-        self._pose = orthonormal(self._T_odom_local @ self._local)
+        before, self._pose = self._pose, orthonormal(self._T_odom_local @ self._local)
         if around is not None:
-            self._level(around, float(np.linalg.norm(step[:3, 3])))
+            shake = _SHAKE * math.sqrt(max(1.0, seconds / _SHAKE_SECONDS))
+            since = Since(self._pose[:2, 2] - before[:2, 2], shake)
+            self._level(around, float(np.linalg.norm(step[:3, 3])), since)
         return np.array(self._pose)
 
     def _begin(self, points: Points, stamp: float) -> Pose:
@@ -155,11 +160,11 @@ class LidarOdometry:
         tilt = self._tilt.expected(around.seen(R @ guess[:3, :3]), _SHAKE)
         return pose_from(R.T @ upright(tilt) @ R @ guess[:3, :3], guess[:3, 3])
 
-    def _level(self, around: Surfaces, metres: float) -> None:
+    def _level(self, around: Surfaces, metres: float, since: Since) -> None:
         """Take what registration tilted out of the newest pose, and turn the odometry frame about it, slowly."""
         assert self._pose is not None
         R, here = self._pose[:3, :3], self._pose[:3, 3]
-        own = upright(self._tilt.update(around.seen(R), metres))
+        own = upright(self._tilt.update(around.seen(R), metres, since))
         turn = upright(self._tilt.turn())
         self._T_odom_local = pose_from(turn, here - turn @ here) @ self._T_odom_local
         self._pose = orthonormal(pose_from(own @ turn @ R, here))

@@ -10,8 +10,11 @@ frame k, two numbers each (radians):
     w_k ~ N(0, kappa C_k)          of the walls, different in each frame; C_k by their number and the ways they face
     s_k = psi s_{k-1} + v_k        slope of the ground; v_k ~ N(0, Q), and psi^2 = 1 - Q / (4 deg)^2 keeps it near level
 
+    m_k ~ N(0, M)                  of the body, really, since the frame before: 2 degrees in 0.1 s, and no heavy tail
+
     up by walls    z_b = d + n + b + w
     up by ground   z_s = d + n + s
+    tilted since   z_m = n + m     the frame before, in its pose as it was given
 
 What is turned is d (all of the odometry frame, slowly) and n (this frame alone). A frame's jitter is then that of the
 better witness: where registration is good to 0.03 degrees and walls to 1, n stays what it is, 0; where rings on bare
@@ -19,8 +22,10 @@ ground hold registration fast while the robot shakes, walls and ground outvote i
 
 Who is how good is learnt. Three witnesses of one direction tell their own variances (Gray and Allan's three-cornered
 hat): N, Q and kappa are estimated from the innovations, each as the sum of its squared shares over its redundancy
-(Foerstner's variance components), fading over 60 frames. Each share has Student's t distribution with 4 degrees of
+(Foerstner's variance components), fading over 60 frames. n, v and w have Student's t distribution with 4 degrees of
 freedom rather than a normal one: a kerb taken for the ground, or a parked lorry for a wall, is outvoted in that frame.
+So is a registration that turns a covered sensor over by 27 degrees: it may be that wrong, the body cannot be that fast.
+As such a likelihood has several maxima, two are looked for, with n as usual and with n an outlier.
 
 The odometry frame turns by no more, per frame, than 1.5 times what the local map is thought to drift: what is learnt
 late about gravity (a first frame on a slope) comes in slowly, and a pose never jumps for it.
@@ -28,6 +33,7 @@ late about gravity (a first frame on a slope) comes in slowly, and a pose never 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,16 +56,31 @@ _LEAST_KAPPA = 1e-3
 _GROUND_FIT = float(np.radians(0.02))  # sigma of the plane's fit alone
 _FREEDOM = 4.0  # of Student's t
 _ROUNDS = 5  # of reweighting
+_STARTS = ((1.0, 1.0, 1.0), (1e-4, 1.0, 1.0))  # weights of n, v and w that it begins with
 _FADE = 1.0 - 1.0 / 60.0  # of what was learnt, per frame
 _PRIOR = 2.0  # degrees of freedom of what is believed at the beginning: a frame's
 
 _EYE, _ZERO = np.eye(2), np.zeros((2, 2))
 _WALLS, _GROUND = slice(0, 2), slice(2, 4)  # rows of the measurement
 _MAP, _BIAS, _SLOPES = slice(0, 2), slice(2, 4), slice(4, 6)  # rows of the state
-_OF_STATE = np.block([[_EYE, _EYE, _ZERO], [_EYE, _ZERO, _EYE]])
-_OF_FRAME = np.vstack([_EYE, _EYE])
-_OF_WALLS = np.vstack([_EYE, _ZERO])
-_OF_GROUND = np.vstack([_ZERO, _EYE])
+_OF_STATE = np.block([[_EYE, _EYE, _ZERO], [_EYE, _ZERO, _EYE], [_ZERO, _ZERO, _ZERO]])
+_OF_FRAME = np.vstack([_EYE, _EYE, _EYE])
+_OF_WALLS = np.vstack([_EYE, _ZERO, _ZERO])
+_OF_GROUND = np.vstack([_ZERO, _EYE, _ZERO])
+_OF_BODY = np.vstack([_ZERO, _ZERO, _EYE])
+
+
+@dataclass(frozen=True)
+class Since:
+    """Tilt of a frame's body axis z against that of the frame before, whose pose is known.
+
+    Attributes:
+        tilt: (2,) difference of the axes' x and y in the level frame.
+        sigma: by which the body may have tilted meanwhile, radians.
+    """
+
+    tilt: Floats
+    sigma: float
 
 
 @dataclass
@@ -109,11 +130,14 @@ class TiltFilter:
         x, P, slope = self._predicted(seen, 0.0)
         return self._split(x, P, seen, sigma**2, slope)[0]
 
-    def update(self, seen: Plumb, metres: float) -> Floats:
-        """Take in a registered frame, ``metres`` after the one before; return its own tilt n (2,), radians."""
+    def update(self, seen: Plumb, metres: float, since: Since | None = None) -> Floats:
+        """Take in a registered frame, ``metres`` after the one before; return its own tilt n (2,), radians.
+
+        ``since``: how it is tilted against the frame before.
+        """
         x, P, slope = self._predicted(seen, metres)
         frame = 0.0 if self._first else self._frame.value
-        tilt, self._x, self._P, learnt = self._split(x, P, seen, frame, slope)
+        tilt, self._x, self._P, learnt = self._split(x, P, seen, frame, slope, since)
         if not self._first:
             for variance, (squares, redundancy) in zip((self._frame, self._slope, self._kappa), learnt, strict=True):
                 variance.learn(squares, redundancy)
@@ -150,7 +174,7 @@ class TiltFilter:
         return x, P, self._slope.value
 
     def _split(
-        self, x: Floats, P: Floats, seen: Plumb, frame: float, slope: float
+        self, x: Floats, P: Floats, seen: Plumb, frame: float, slope: float, since: Since | None = None
     ) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
         """Share the innovation out among the state and the fresh errors n, v and w, outliers outvoted.
 
@@ -158,22 +182,19 @@ class TiltFilter:
             n (2,), the state and its covariance, and for n, v and w squares and redundancy to learn from.
         """
         y, rows = seen.rows()
+        y = np.concatenate([y, np.zeros(2) if since is None else since.tilt])
+        rows = rows if since is None else np.concatenate([rows, [4, 5]])
         errors = [frame * _EYE, slope * _EYE, self._kappa.value * seen.covariance]
         ways = [_OF_FRAME[rows], _OF_GROUND[rows], _OF_WALLS[rows]]
-        H = _OF_STATE[rows]
+        H, body = _OF_STATE[rows], _OF_BODY[rows]
+        shake = 0.0 if since is None else since.sigma**2
+        known = H @ P @ H.T + _GROUND_FIT**2 * ways[1] @ ways[1].T + shake * body @ body.T
         innovation = y[rows] - H @ x
-        known = H @ P @ H.T + _GROUND_FIT**2 * ways[1] @ ways[1].T
-        weights = [1.0, 1.0, 1.0]
-        for _ in range(_ROUNDS):
-            wide = [C / weight for C, weight in zip(errors, weights, strict=True)]
-            inverse = np.linalg.inv(known + sum(way @ C @ way.T for way, C in zip(ways, wide, strict=True)))
-            gain = inverse @ innovation
-            shares = [C @ way.T @ gain for way, C in zip(ways, wide, strict=True)]
-            left = [C - C @ way.T @ inverse @ way @ C for way, C in zip(ways, wide, strict=True)]
-            weights = [
-                (_FREEDOM + 2.0) / (_FREEDOM + _in_units_of(C, np.outer(share, share) + rest)) if C.any() else 1.0
-                for C, share, rest in zip(errors, shares, left, strict=True)
-            ]
+        least = np.inf
+        for start in _STARTS if since is not None else _STARTS[:1]:
+            trial = _reweighted(innovation, known, errors, ways, start)
+            if trial[0] < least:
+                least, inverse, gain, wide, shares, left = trial
         cross = P @ H.T
         cross[_SLOPES] += wide[1] @ ways[1].T
         P = P.copy()
@@ -186,6 +207,40 @@ class TiltFilter:
             for C, share, rest, way in zip(wide, shares, left, ways, strict=True)
         ]
         return shares[0], x + cross @ gain, 0.5 * (P + P.T), learnt
+
+
+def _reweighted(
+    innovation: Floats, known: Floats, errors: list[Floats], ways: list[Floats], weights: tuple[float, ...]
+) -> tuple[float, Floats, Floats, list[Floats], list[Floats], list[Floats]]:
+    """Find a maximum of the likelihood of an innovation (K,) that several errors share (EM), from ``weights``.
+
+    Args:
+        innovation: what is to be explained.
+        known: (K, K) covariance of what is normal in it.
+        errors: (2, 2) covariance of each that has Student's t distribution, all zero for none.
+        ways: (K, 2) how each gets into the innovation.
+        weights: of each to begin with; its covariance is divided by that.
+
+    Returns:
+        Minus the log-likelihood but for a constant, the innovation's inverse covariance, that times the innovation,
+        and of each error its covariance as weighed, its share (2,) and what is left of its covariance.
+    """
+    for _ in range(_ROUNDS):
+        wide = [C / weight for C, weight in zip(errors, weights, strict=True)]
+        total = known + sum(way @ C @ way.T for way, C in zip(ways, wide, strict=True))
+        inverse = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        gain = inverse @ innovation
+        shares = [C @ way.T @ gain for way, C in zip(ways, wide, strict=True)]
+        left = [C - C @ way.T @ inverse @ way @ C for way, C in zip(ways, wide, strict=True)]
+        weights = tuple(
+            (_FREEDOM + 2.0) / (_FREEDOM + _in_units_of(C, np.outer(share, share) + rest)) if C.any() else 1.0
+            for C, share, rest in zip(errors, shares, left, strict=True)
+        )
+    cost = 0.5 * float(gain @ known @ gain)
+    for C, share in zip(errors, shares, strict=True):
+        if C.any():
+            cost += 0.5 * (_FREEDOM + 2.0) * math.log1p(_in_units_of(C, np.outer(share, share)) / _FREEDOM)
+    return cost, inverse, gain, wide, shares, left
 
 
 def upright(tilt: Floats) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.odometry.plumb import Plumb
-from coview_stream.odometry.tilt_filter import TiltFilter, upright
+from coview_stream.odometry.tilt_filter import Since, TiltFilter, upright
 
 DEGREE = np.radians(1.0)
 METRES = 0.5
@@ -88,6 +88,26 @@ def test_guess_is_tilted_as_walls_have_it_and_nothing_is_learnt():
     before = filtered.frame_tilt
     assert filtered.expected(seen, 2.0 * DEGREE) / DEGREE == pytest.approx([1.0, -2.0], abs=0.25)
     assert filtered.frame_tilt == before
+
+
+@pytest.mark.parametrize(("degrees", "believed"), [(27.0, False), (4.0, True)])
+def test_body_is_not_turned_over_in_an_instant(degrees, believed):
+    filtered = TiltFilter(0.5 * DEGREE)
+    nothing, still = Plumb(None, np.eye(2), None), Since(np.zeros(2), 2.0 * DEGREE)
+    for _ in range(50):
+        filtered.update(nothing, METRES, still)
+    seen = np.array([degrees, 0.0]) * DEGREE
+    tilt = filtered.update(nothing, METRES, Since(seen, 2.0 * DEGREE))
+    assert np.linalg.norm(tilt - (0.0 if believed else seen)) < 1.5 * DEGREE
+
+
+def test_body_that_walls_and_ground_have_tilted_is_tilted():
+    filtered = TiltFilter(0.5 * DEGREE)
+    upright_seen = Plumb(np.zeros(2), (0.2 * DEGREE) ** 2 * np.eye(2), np.zeros(2))
+    for _ in range(50):
+        filtered.update(upright_seen, METRES, Since(np.zeros(2), 2.0 * DEGREE))
+    tilt = filtered.update(upright_seen, METRES, Since(np.array([10.0, 0.0]) * DEGREE, 2.0 * DEGREE))
+    assert np.linalg.norm(tilt) < 0.5 * DEGREE
 
 
 def test_frames_without_walls_and_ground_are_left_alone():
