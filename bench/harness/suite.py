@@ -68,6 +68,7 @@ BENCHMARKS = {
     ),
     "accuracy": Benchmark("accuracy.accuracy", "errors, runs localised and false fixes in held-out worlds"),
     "conditions": Benchmark("accuracy.conditions", "real runs under a leaning sensor, bad odometry, fewer beams, gaps"),
+    "lidar_odometry": Benchmark("accuracy.lidar_odometry", "lidar odometry: jitter in roll and pitch, lean, steps"),
     "airborne_real": Benchmark("accuracy.airborne_real", "real runs on airborne-like maps of the same places"),
     "field": Benchmark("accuracy.field", "the likelihood field beside the exact verification", page=True),
     "ablation": Benchmark("accuracy.ablation", "what each choice of the method is worth"),
