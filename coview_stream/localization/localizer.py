@@ -32,7 +32,9 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
-_RELEVEL = math.radians(0.3)  # keyframes that lean by less stay as they are; set by hand
+_LEADER_TILT = math.radians(1.0)  # sigma of a leading place's roll and pitch, if it is the right one; set by hand
+_ANY_TILT = math.radians(4.0)  # and if it is not
+_RELEVEL = math.radians(1.0)  # keyframes that lean by less stay as they are; set by hand
 _LEVEL = math.radians(0.05)  # a frame that leans by less is not registered again for it; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
@@ -307,6 +309,14 @@ class Localizer:
         self._tracker.start_levelled(T_map_body, match.covariance, newest.T_odom_body, voxels)
         return self._tracker.match_to_map(cloud, newest.T_odom_body)
 
+    def _learn_lean(self, result: SearchResult) -> None:
+        """Learn the sensor's tilt from a place that leads, as far as it is probable: the next keyframe is levelled."""
+        probability = result.evidence.confidence or 0.0
+        if result.leader is None or result.evidence.evidence is None or probability <= 0.0:
+            return
+        variance = _LEADER_TILT**2 + (1.0 - probability) / probability * _ANY_TILT**2
+        self._calibration.measure_attitude(result.leader @ result.T_odom_body, result.T_odom_body, variance)
+
     def _levelled(self, cloud: Points) -> Points:
         """Turn a cloud (N, 3) by what is known of the sensor's tilt."""
         R = self._calibration.calibration.R_body_cloud
@@ -334,6 +344,7 @@ class Localizer:
             return None
         self._evidence = result.evidence
         if result.accepted is None:
+            self._learn_lean(result)
             proposed = result.evidence.state is State.AMBIGUOUS
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None

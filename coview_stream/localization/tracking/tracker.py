@@ -230,17 +230,20 @@ class Tracker:
     def _against_odometry(self, match: MapMatch, belief: Estimate, scan: ScanInput, tries: list[MapMatch]) -> MapMatch:
         """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
 
-        Where the two places are so near that either is good enough, what the lidar sees is believed.
+        Where the two places are so near that either is good enough, what the lidar sees is believed. Where odometry is
+        known to drift so far, it contradicts nothing: the other place is what registration from there comes to.
         """
-        metres, degrees = off_by(match.T_map_body, belief.T_map_body)
+        plausible = match.innovation <= self.config.acceptance.max_innovation
+        led = tries[0].T_map_body if plausible and not self._disputed else belief.T_map_body
+        metres, degrees = off_by(match.T_map_body, led)
         moves = not matters(metres, degrees)
-        if moves and match.innovation <= self.config.acceptance.max_innovation:
+        if moves and plausible:
             return match
         if not moves:
             places = [each.T_map_body for each in tries if each.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]
             risk = self.config.acceptance.risk
-            right = self._dispute.settle(scan, belief.T_map_body, places, self.travelled, risk)
+            right = self._dispute.settle(scan, led, places, self.travelled, risk)
             moves = right is not None and not matters(*off_by(right, match.T_map_body))
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         if not moves:
