@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +14,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from, to_local
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.estimator import CalibrationEstimator, OdometryCorrection, tilt_variance
-from coview_stream.localization.calibration.frame_motion import FrameMotion
+from coview_stream.localization.calibration.frame_correction import FrameCorrection
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.registration.verification import RangeImage
@@ -32,10 +30,6 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
-_LEADER_TILT = math.radians(1.0)  # sigma of a leading place's roll and pitch, if it is the right one; set by hand
-_ANY_TILT = math.radians(4.0)  # and if it is not
-_RELEVEL = math.radians(1.0)  # keyframes that lean by less stay as they are; set by hand
-_LEVEL = math.radians(0.05)  # a frame that leans by less is not registered again for it; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
 
@@ -100,11 +94,8 @@ class Localizer:
         radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
         self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
-        self._calibration = CalibrationEstimator()
-        self._buffered = self._calibration.calibration  # by which what is in the buffer has been levelled
-        self._odometry = OdometryCorrection()
-        self._frame_motion = FrameMotion(self.config.registration, self.config.keyframe.distance)
-        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._calibration)
+        self._correction = FrameCorrection(self.config)
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._correction.estimator)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
         self._hints = PoseHints()
         self._odometry_check = OdometryCheck()
@@ -216,7 +207,7 @@ class Localizer:
             evidence,
             self._tracker.drift,
             self._tracker.protection_level(),
-            self._calibration.calibration,
+            self._correction.calibration,
         )
 
     def take_events(self) -> tuple[Event, ...]:
@@ -248,7 +239,7 @@ class Localizer:
         Ignored while a place is known.
         """
         if not self.state.has_place:
-            self._calibration.restore(known.doubted())
+            self._correction.estimator.restore(known.doubted())
 
     def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
@@ -261,13 +252,13 @@ class Localizer:
     def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> _Frame:
         """Check a frame, and move the predicted pose on by its odometry."""
         raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
-        T = self._odometry.correct(T_raw, self._calibration.calibration)
+        T = self._correction.odometry(T_raw)
         if self._anchor is None:
             self._anchor = T[:3, 3].copy()
         T = to_local(T, self._anchor)
-        if not self.state.has_place and self._frame_motion.is_due(T):
-            T = self._refine_motion(raw, T)
-        cloud = self._levelled(raw)
+        if not self.state.has_place and self._correction.is_due(T):
+            T = self._refine_motion(raw, T, self._anchor)
+        cloud = self._correction.level(raw)
         voxels = self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
         # keyframes are for searching: a loss starts from nothing
         keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp)
@@ -275,52 +266,26 @@ class Localizer:
         self._newest = _Frame(raw, cloud, T, T_raw, stamp, voxels, keyframe)
         return self._newest
 
-    def _refine_motion(self, raw: Points, T_odom_body: Pose) -> Pose:
-        """Compare a keyframe with the one before; return its odometry, mended."""
-        assert self._anchor is not None  # there is a frame
+    def _refine_motion(self, raw: Points, T_odom_body: Pose, anchor: Floats) -> Pose:
+        """Compare a keyframe with the one before; return its odometry, mended, and level what has been gathered."""
         points = self._voxel_filter(raw, np.eye(4))[0].copy()
-        T = self._frame_motion.refine(points, T_odom_body, self._calibration, self._tracker.drift.variances)
-        self._odometry.move_to(pose_from(T[:3, :3], T[:3, 3] + self._anchor))
-        now = self._calibration.calibration
-        if not self._buffer.keyframes:
-            self._buffered = now
-        elif now.turned_since(self._buffered) > _RELEVEL:
-            self._buffer.turn(now.R_body_cloud @ self._buffered.R_body_cloud.T)
-            self._buffered = now
+        T = self._correction.refine(points, T_odom_body, anchor, self._tracker.drift.variances)
+        turned = self._correction.level_gathered(bool(self._buffer.keyframes))
+        if turned is not None:
+            self._buffer.turn(turned)
             self._next_epoch()
         return T
 
     def _level(self, match: MapMatch, newest: _Frame) -> MapMatch:
-        """Learn the sensor's tilt from the first registration at a place; level the newest frame, and match it again.
-
-        Returns:
-            The match of the levelled frame; ``match`` itself where nothing leans.
-        """
-        before = self._calibration.calibration
-        self._calibration.measure_attitude(match.T_map_body, newest.T_odom_body, tilt_variance(match.covariance))
-        now = self._calibration.calibration
-        if now.turned_since(before) < _LEVEL:
+        """Level the newest frame by its first registration at a place, and match it again, unless nothing leans."""
+        T_map_body = self._correction.learn_found(match.T_map_body, match.covariance, newest.T_odom_body)
+        if T_map_body is None:
             return match
-        cloud = self._levelled(newest.raw)
+        cloud = self._correction.level(newest.raw)
         voxels = self._voxel_filter(cloud, newest.T_odom_body)[0].copy()
         self._newest = replace(newest, cloud=cloud, voxels=voxels)
-        R = match.T_map_body[:3, :3] @ before.R_body_cloud @ now.R_body_cloud.T
-        T_map_body = pose_from(R, match.T_map_body[:3, 3])
         self._tracker.start_levelled(T_map_body, match.covariance, newest.T_odom_body, voxels)
         return self._tracker.match_to_map(cloud, newest.T_odom_body)
-
-    def _learn_lean(self, result: SearchResult) -> None:
-        """Learn the sensor's tilt from a place that leads, as far as it is probable: the next keyframe is levelled."""
-        probability = result.evidence.confidence or 0.0
-        if result.leader is None or result.evidence.evidence is None or probability <= 0.0:
-            return
-        variance = _LEADER_TILT**2 + (1.0 - probability) / probability * _ANY_TILT**2
-        self._calibration.measure_attitude(result.leader @ result.T_odom_body, result.T_odom_body, variance)
-
-    def _levelled(self, cloud: Points) -> Points:
-        """Turn a cloud (N, 3) by what is known of the sensor's tilt."""
-        R = self._calibration.calibration.R_body_cloud
-        return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
 
     def _search_request(self, frame: _Frame) -> SearchRequest | None:
         """Return what has to be searched for: the keyframe that a frame completes."""
@@ -344,7 +309,9 @@ class Localizer:
             return None
         self._evidence = result.evidence
         if result.accepted is None:
-            self._learn_lean(result)
+            if result.leader is not None and result.evidence.evidence is not None:  # it has been registered
+                seen, probability = result.leader @ result.T_odom_body, result.evidence.confidence or 0.0
+                self._correction.learn_leader(seen, result.T_odom_body, probability)
             proposed = result.evidence.state is State.AMBIGUOUS
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None
@@ -354,7 +321,7 @@ class Localizer:
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
-        self._frame_motion.clear()
+        self._correction.forget_frame()
         # the robot may have driven on or been carried since the keyframe
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
         if match.verdict.verified:
@@ -417,7 +384,7 @@ class Localizer:
             self._hints.odometry_continues(self._tracker.T_map_odom, self._anchor)
         self._anchor = None
         self._buffer.clear()
-        self._frame_motion.clear()
+        self._correction.forget_frame()
         self._odometry_check.clear()
         self._tracker.forget_odometry()
         self._next_epoch()
@@ -425,7 +392,7 @@ class Localizer:
     def _restart_search(self, stamp: float) -> None:
         """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
-        self._frame_motion.clear()
+        self._correction.forget_frame()
         self._tracker.forget_scans()
         self._next_epoch()
         self._handle(Event.SCANS_CONTRADICT)

@@ -29,8 +29,17 @@ from coview_stream.localization.evidence.observed_scan import Share
 
 # set by hand
 _KEPT = np.linspace(0.05, 1.0, 20)  # shares q that are summed over
-_SURVEYS = np.array([[0.3, 0.15, 0.45, 0.1], [0.5, 0.25, 0.15, 0.1], [0.65, 0.25, 0.05, 0.05], [0.8, 0.17, 0.02, 0.01]])
-"""Outcomes of what is there: on, near, under an edge, unexplained; from an airborne survey to one of the same kind."""
+_SURVEYS = np.array(
+    [
+        [0.1, 0.25, 0.6, 0.05],
+        [0.3, 0.15, 0.45, 0.1],
+        [0.5, 0.25, 0.15, 0.1],
+        [0.65, 0.25, 0.05, 0.05],
+        [0.8, 0.17, 0.02, 0.01],
+    ]
+)
+"""Outcomes of what is there: on, near, under an edge, unexplained; from an airborne survey, of a canopy that hides what
+stands below it and then of streets, to one of the same kind."""
 _LEAKS = np.array([0.05, 0.3, 0.6])  # of the background's passed rays, those that pass what stands there
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
 _OPEN = 0.01  # share of chance places that are as clear of structure and as level as the right one: an open road

@@ -8,7 +8,8 @@ import pytest
 from coview_stream.config.mount import Mount
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.estimator import CalibrationEstimator, OdometryCorrection
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
+from coview_stream.localization.calibration.odometry_correction import OdometryCorrection
 
 NOISE = np.array([0.02**2, np.radians(0.1) ** 2])  # along the way, of the heading
 
