@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import fft
 
-from bench.forest.query import APART, BEST, Chain, distinct, of_places, of_volume, query_of
+from bench.forest.query import APART, BEST, Chain, distinct, errors, of_places, of_volume, query_of
 from bench.forest.worlds import Drive
 from bench.harness.clock import Clock
 from coview_stream.basemap.basemap import BaseMap
@@ -17,12 +17,14 @@ from coview_stream.descriptors.birds_eye_view import CELL, SLABS, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
 from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points, Pose, rot_z, to_local, transform
+from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.votes import robust_zscore
 
-METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "verified")
+METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "verified", "search")
 """In the tables' order."""
 
 BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
@@ -43,6 +45,8 @@ class Methods:
         self._retrieval.prepare()
         self._canopy = Canopy(base_map.points)
         self._chain = Chain(base_map, self.config)
+        maps = LocalMaps(base_map, self.config.registration.source_range)
+        self._search = GlobalSearch(base_map, replace(self.config, reloc="learned"), maps)
         area = len(base_map.stations) * base_map.config.block**2
         # share of the places that the map knows from which 10 m reach the right one, if one of them is drawn
         self._chance = float(min(1.0, np.pi * APART**2 / area))
@@ -56,6 +60,7 @@ class Methods:
         named = self._by_hand(query, clock)
         places = {name: _in_turn(hypotheses, query) for name, hypotheses in named.items()}
         metric = self._by_features(query, truth, clock, places)
+        places["search"], found = self._searched(query, truth)
         scan, chains = self._chain.scan(query), {}
         for name in BASELINES:
             spent = Clock()
@@ -69,6 +74,7 @@ class Methods:
             "off": {name: np.round(values, 2).tolist() for name, values in apart.items()},
             "chains": chains,
             **metric,
+            "found": found,
             "ms": _milliseconds(clock),
         }
 
@@ -109,6 +115,18 @@ class Methods:
         places["dense"] = distinct(stations[named, :2], -vote.at(named, shifts))
         places["verified"] = _in_turn(verified, query)
         return self._chain.metric(voted, judged, truth, query)
+
+    def _searched(self, query: SearchRequest, truth: Pose) -> tuple[Floats, tuple[float, float] | None]:
+        """Return the place (1, 2) that the product's search by learned features has for the most probable.
+
+        With it the errors of its pose there, metres and degrees, if it is given, by this one keyframe.
+        """
+        self._search.reset()
+        result = self._search.update(query)
+        if result.leader is None:
+            return np.empty((0, 2)), None
+        found = None if result.accepted is None else errors(result.leader, truth, query)[2:]
+        return (result.leader @ query.T_odom_body)[None, :2, 3], found
 
 
 def _milliseconds(clock: Clock) -> dict[str, float]:
