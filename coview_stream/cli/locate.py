@@ -86,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
         registration=RegistrationConfig(method=args.registration),
         acceptance=acceptance,
         reloc=args.reloc if missing is None else "coview",
+        sensor_leans=lidar is None,
     )
     with tqdm(total=len(recorded), desc="locating", unit="frame", disable=quiet) as bar:
 

@@ -27,6 +27,8 @@ class LocalizerConfig:
         learned: how learned features are looked up.
         reloc: which place recognition names places, see :data:`coview_stream.config.Reloc`; ``auto`` goes without
             learned features where map or installation lack them.
+        sensor_leans: whether the sensor may lean against odometry's gravity, which is then estimated; no where odometry
+            is made of the sensor's own clouds: what leans is odometry's frame then.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)
@@ -38,6 +40,7 @@ class LocalizerConfig:
     graph: GraphConfig = field(default_factory=GraphConfig)
     learned: LearnedConfig = field(default_factory=LearnedConfig)
     reloc: Reloc = "auto"
+    sensor_leans: bool = True
 
     def __post_init__(self) -> None:
         known = get_args(Reloc)

@@ -66,15 +66,19 @@ class CalibrationEstimator:
         calibration: what is applied.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, sensor_leans: bool = True) -> None:
+        """Begin with nothing known; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
+        self._sensor_leans = sensor_leans
         self._x = np.zeros(4)
         self._P = np.diag(np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide**2) for g in _GROUPS]))
+        self._stand_straight()
         self._mix()
 
     def restore(self, known: Calibration) -> None:
         """Begin with what was known of this robot before; it goes on being measured."""
         self._x = np.array([known.roll, known.pitch, known.scale, known.turn])
         self._P = np.diag(np.square([known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]))
+        self._stand_straight()
         self._mix()
 
     def motion_covariance(self, step: Floats) -> Floats:
@@ -156,6 +160,13 @@ class CalibrationEstimator:
         for group in _GROUPS:
             axes = np.arange(4)[group.axes]
             self._P[axes, axes] = np.minimum(self._P[axes, axes] + group.walk**2 * driven, group.wide**2)
+        self._stand_straight()
+
+    def _stand_straight(self) -> None:
+        """Know for sure that the sensor does not lean, if it cannot: then what leans is odometry's gravity."""
+        if not self._sensor_leans:
+            self._x[:2] = 0.0
+            self._P[:2], self._P[:, :2] = 0.0, 0.0
 
     def _update(self, seen: Floats, H: Floats, R: Floats) -> None:
         """Take in a measurement ``seen`` = H x + noise of covariance R, heavy-tailed."""

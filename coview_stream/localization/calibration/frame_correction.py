@@ -29,7 +29,7 @@ class FrameCorrection:
 
     def __init__(self, config: LocalizerConfig) -> None:
         """Begin with nothing known."""
-        self.estimator = CalibrationEstimator()
+        self.estimator = CalibrationEstimator(config.sensor_leans)
         self._odometry = OdometryCorrection()
         self._motion = FrameMotion(config.registration, config.keyframe.distance)
         self._gathered = self.calibration  # by which the keyframes of the search have been levelled

@@ -30,6 +30,7 @@ class Opening(NamedTuple):
         registration: method of registration.
         reloc: recognizers that propose the places to search at.
         risk: probability of a wrong place below which a search gives one.
+        sensor_leans: whether sensors may lean against odometry's gravity.
     """
 
     map_path: str
@@ -37,6 +38,7 @@ class Opening(NamedTuple):
     registration: str
     reloc: str
     risk: float
+    sensor_leans: bool = True
 
 
 class EngineChild:

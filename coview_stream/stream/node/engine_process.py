@@ -66,6 +66,7 @@ class EngineProcess:
         registration: its method; small_gicp, if that is it, holds the interpreter lock in the child only.
         reloc: recognizers that propose the places to search at.
         risk: probability of a wrong place below which a search gives one.
+        sensor_leans: whether sensors may lean against odometry's gravity.
         job_timeout: seconds after which a job counts as hung; set by hand.
         open_timeout: seconds after which opening the map, or preparing for the first job, does; set by hand.
         child: started before, to be the first one; None starts one.
@@ -82,6 +83,7 @@ class EngineProcess:
         registration: RegistrationMethod = "trimmed-icp",
         reloc: Reloc = "auto",
         risk: float = AcceptanceConfig.risk,
+        sensor_leans: bool = True,
         child: EngineChild | None = None,
     ) -> None:
         self.kind = kind
@@ -93,6 +95,7 @@ class EngineProcess:
         self.registration = registration
         self.reloc = reloc
         self.risk = risk
+        self.sensor_leans = sensor_leans
         self._started = child
         self._closed = False
         self._lock = threading.Lock()
@@ -115,7 +118,8 @@ class EngineProcess:
             self._child, self._pipe = started.take()
             self._awaited = ["ready", "prepared"]
             with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
-                self._pipe.send(Opening(self.map_path, self.sha256, self.registration, self.reloc, self.risk))
+                asked = (self.registration, self.reloc, self.risk, self.sensor_leans)
+                self._pipe.send(Opening(self.map_path, self.sha256, *asked))
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
         """Wait until the child has opened the map.

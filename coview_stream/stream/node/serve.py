@@ -96,7 +96,8 @@ def open_node(
         for kind, child in children.items():
             engines[kind] = EngineProcess(
                 kind, str(options.map_path), base_map.sha256, None,
-                registration=options.registration, reloc=reloc, risk=options.risk, child=child,
+                registration=options.registration, reloc=reloc, risk=options.risk,
+                sensor_leans=options.lidar is None, child=child,
             )  # fmt: skip
         for engine in engines.values():
             engine.start()

@@ -52,7 +52,9 @@ def main(argv: list[str]) -> int:
         try:
             method = RegistrationConfig(method=opening.registration)  # any text; it checks, as do the others
             rule = AcceptanceConfig(risk=opening.risk)
-            config = LocalizerConfig(registration=method, acceptance=rule, reloc=opening.reloc)
+            config = LocalizerConfig(
+                registration=method, acceptance=rule, reloc=opening.reloc, sensor_leans=opening.sensor_leans
+            )
             engine = open_engine(kind, opening.map_path, opening.sha256, config)
             pipe.send(("ready", None))
             engine.prepare()

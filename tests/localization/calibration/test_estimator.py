@@ -92,6 +92,18 @@ def test_what_was_known_before_is_a_prior_and_no_more():
     assert np.degrees(estimator.calibration.pitch) == pytest.approx(3.0, abs=0.5)
 
 
+def test_sensor_that_cannot_lean_does_not():
+    estimator = CalibrationEstimator(sensor_leans=False)
+    estimator.restore(Calibration(pitch=0.1))
+    leaning = pose_from(exp_so3(np.radians([0.0, 3.0, 0.0])), np.zeros(3))
+    for _ in range(20):
+        estimator.measure_attitude(leaning, np.eye(4), 1e-6)
+        estimator.measure_motion(np.eye(4), pose_from(np.eye(3), [2.1, 0, 0]), pose_from(np.eye(3), [2.0, 0, 0]), NOISE)
+    assert (estimator.calibration.roll, estimator.calibration.pitch) == (0.0, 0.0)
+    assert estimator.calibration.sigma_tilt < np.radians(0.01)
+    assert estimator.calibration.scale > 0.02  # the rest is learnt all the same
+
+
 def test_turn_of_odometry_is_found():
     found = drive(turn=0.1)
     assert np.degrees(found.turn) == pytest.approx(-0.1, abs=0.03)
