@@ -28,7 +28,7 @@ class AcceptanceConfig:
     """
 
     risk: float = 1e-4
-    max_tilt: float = math.radians(8)
+    max_tilt: float = math.radians(15)
     max_innovation: float = 40.0
     max_doubt_s: float = 5.0
     max_blind_s: float = 60.0

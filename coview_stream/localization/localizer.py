@@ -30,6 +30,7 @@ from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import LossMonitor, RejectionReason, Ruling
 from coview_stream.localization.tracking.tracker import Tracker
 
+_FOUND = np.diag(np.square([*np.radians([0.5, 0.5, 0.5]), 0.1, 0.1, 0.1]))  # of an accepted place; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
 
@@ -103,6 +104,7 @@ class Localizer:
         self._newest: _Frame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search that found the place
+        self._levelled = True  # whether a registration at the place has told how the sensor leans
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
@@ -277,15 +279,30 @@ class Localizer:
         return T
 
     def _level(self, match: MapMatch, newest: _Frame) -> MapMatch:
-        """Level the newest frame by its first registration at a place, and match it again, unless nothing leans."""
+        """Level the newest frame by the first registration at a place that fits, and match it again, if it leans."""
+        if self._levelled or not match.verdict.verified:
+            return match
+        self._levelled = True
         T_map_body = self._correction.learn_found(match.T_map_body, match.covariance, newest.T_odom_body)
         if T_map_body is None:
             return match
+        newest = self._start_levelled(T_map_body, match.covariance, newest)
+        return self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
+
+    def _level_found(self, T_map_odom: Pose, T_odom_body: Pose, newest: _Frame) -> _Frame:
+        """Level the newest frame by an accepted place, registered for the keyframe at ``T_odom_body`` (4, 4)."""
+        T_map_body = self._correction.learn_found(T_map_odom @ T_odom_body, _FOUND, T_odom_body)
+        if T_map_body is None:
+            return newest
+        return self._start_levelled(T_map_body @ inverse(T_odom_body) @ newest.T_odom_body, _FOUND, newest)
+
+    def _start_levelled(self, T_map_body: Pose, covariance: Floats, newest: _Frame) -> _Frame:
+        """Begin again at a pose of the newest frame, (4, 4) with its covariance, once that is levelled."""
         cloud = self._correction.level(newest.raw)
         voxels = self._voxel_filter(cloud, newest.T_odom_body)[0].copy()
-        self._newest = replace(newest, cloud=cloud, voxels=voxels)
-        self._tracker.start_levelled(T_map_body, match.covariance, newest.T_odom_body, voxels)
-        return self._tracker.match_to_map(cloud, newest.T_odom_body)
+        self._newest = newest = replace(newest, cloud=cloud, voxels=voxels)
+        self._tracker.start_levelled(T_map_body, covariance, newest.T_odom_body, voxels)
+        return newest
 
     def _search_request(self, frame: _Frame) -> SearchRequest | None:
         """Return what has to be searched for: the keyframe that a frame completes."""
@@ -318,15 +335,15 @@ class Localizer:
         self._handle(Event.PLACE_ACCEPTED)
         self._confidence = result.evidence.confidence or 0.0
         self._tracker.start(result.accepted.registration, newest.T_odom_body, result.travelled)
+        newest = self._level_found(result.accepted.T_map_odom, result.T_odom_body, newest)
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
         self._correction.forget_frame()
         # the robot may have driven on or been carried since the keyframe
+        self._levelled = False
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
-        if match.verdict.verified:
-            match = self._level(match, newest)
-        return replace(match, confirms_search=True)
+        return replace(self._level(match, newest), confirms_search=True)
 
     def _match_to_map(self, frame: _Frame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
@@ -335,7 +352,8 @@ class Localizer:
         waited = frame.stamp - self._registered_at >= patience * self.config.tracking.seconds
         newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
         if due or waited or newest_only:
-            return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
+            match = self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
+            return self._level(match, frame)
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 

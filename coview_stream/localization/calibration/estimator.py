@@ -1,12 +1,14 @@
 """Estimation of the calibration: a Kalman filter over what is constant about a robot, or nearly so.
 
-The state is x = (roll, pitch, s, w): the tilt of the sensor against odometry's gravity, the scale of odometry's
-distances less one, and the turn of its heading per metre. It is what is left of the pose graph's errors when those that
-are independent from step to step (:class:`coview_stream.localization.tracking.motion.Drift`) are taken away. Each
-registration to the map that is believed measures two things:
+The state is x = (roll, pitch, s, w, g): the tilt of the sensor against odometry's gravity, the scale of odometry's
+distances less one, the turn of its heading per metre, and how odometry's frame leans against the map (2). It is what is
+left of the pose graph's errors when those that are independent from step to step
+(:class:`coview_stream.localization.tracking.motion.Drift`) are taken away. Each registration to the map that is
+believed measures two things:
 
 * its attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the tilt
-  that is left is u_map x u_odometry (eq. C1), but for the registration's error and odometry's own error in gravity;
+  that is left is u_map x u_odometry (eq. C1). The sensor's turns with the body, that of odometry's frame does not; the
+  latter is left to the pose graph, which follows it;
 * the motion since the registration before against odometry's. Along the way they differ by s times the distance, in
   heading by w times the distance (eq. C2), but for both registrations' errors and odometry's random walk.
 
@@ -51,9 +53,12 @@ class _Prior(NamedTuple):
 _TILT = _Prior(slice(0, 2), math.radians(0.15), math.radians(4.0), 0.5, math.radians(0.03))
 _SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4)
 _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4))
-_GROUPS = (_TILT, _SCALE, _TURN)
+_GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))
+_GROUPS = (_TILT, _SCALE, _TURN)  # that are corrected
+_WIDE = np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide) for g in (*_GROUPS, _GRAVITY)])
+_SIZE = len(_WIDE)
 
-_GRAVITY = math.radians(0.25)  # sigma of odometry's gravity, each of roll and pitch; set by hand
+_ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch beside its own; set by hand
 _LEAN = 3.0  # times its heading's error that a motion from frame to frame is off in roll and pitch; set by hand
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution; set by hand
 _MIN_STEP = 0.2  # metres; over less, the registrations' noise hides all else; set by hand
@@ -69,15 +74,17 @@ class CalibrationEstimator:
     def __init__(self, sensor_leans: bool = True) -> None:
         """Begin with nothing known; ``sensor_leans``: whether the sensor may lean against odometry's gravity."""
         self._sensor_leans = sensor_leans
-        self._x = np.zeros(4)
-        self._P = np.diag(np.concatenate([np.full(g.axes.stop - g.axes.start, g.wide**2) for g in _GROUPS]))
+        self._x = np.zeros(_SIZE)
+        self._P = np.diag(_WIDE**2)
         self._stand_straight()
         self._mix()
 
     def restore(self, known: Calibration) -> None:
         """Begin with what was known of this robot before; it goes on being measured."""
-        self._x = np.array([known.roll, known.pitch, known.scale, known.turn])
-        self._P = np.diag(np.square([known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]))
+        self._x = np.array([known.roll, known.pitch, known.scale, known.turn, 0.0, 0.0])
+        self._P = np.diag(_WIDE**2)
+        sigmas = [known.sigma_tilt, known.sigma_tilt, known.sigma_scale, known.sigma_turn]
+        self._P[:4, :4] = np.diag(np.square(sigmas))
         self._stand_straight()
         self._mix()
 
@@ -99,8 +106,11 @@ class CalibrationEstimator:
         left = np.cross(T_map_body[2, :3], T_odom_body[2, :3])
         left[2] = 0.0
         seen = log_so3(exp_so3(left) @ self.calibration.R_body_cloud)[:2]
-        H = np.eye(2, 4)
-        self._update(seen, H, np.eye(2) * (variance + _GRAVITY**2))
+        H = np.eye(2, _SIZE)
+        H[:, 4:] = T_odom_body[:2, :2].T  # what leans with odometry's frame turns as the body does
+        R = np.eye(2) * (variance + _ATTITUDE**2)
+        self._doubt_tilt(seen - H @ self._x, H @ self._P @ H.T + R)
+        self._update(seen, H, R)
 
     def measure_motion(self, T_map_before: Pose, T_map_body: Pose, step: Pose, noise: Floats) -> Pose:
         """Take in the motion between two registrations (eq. C2); return the step as it is corrected from now on.
@@ -121,7 +131,7 @@ class CalibrationEstimator:
         before = self.calibration
         raw = driven / (1.0 + before.scale)
         for axis, gap, applied in ((2, along, before.scale), (3, turned, before.turn)):
-            H = np.zeros((1, 4))
+            H = np.zeros((1, _SIZE))
             H[0, axis] = raw
             self._update(np.array([gap + applied * raw]), H, np.array([[noise[axis - 2]]]))
         now = self.calibration
@@ -145,10 +155,11 @@ class CalibrationEstimator:
         applied = log_so3(before.R_body_cloud)[:2]
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
         # the motion's height, of which the tilt is the cause
-        H = np.array([[-t[1], t[0], 0.0, 0.0]])
+        H = np.zeros((1, _SIZE))
+        H[0, :2] = -t[1], t[0]
         rise = np.array([motion[2, 3] - t[2] + H[0, :2] @ applied])
         self._update(rise, H, np.array([[variances[5] + position**2]]))
-        H = np.zeros((2, 4))
+        H = np.zeros((2, _SIZE))
         H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # odometry's heading is the worse one
         self._update(turned[:2] + H[:, :2] @ applied, H, np.eye(2) * (variances[0] + (_LEAN * angle) ** 2))
         noise = np.array([variances[3] + position**2, variances[2] + angle**2])
@@ -157,8 +168,8 @@ class CalibrationEstimator:
 
     def _walk(self, driven: float) -> None:
         """Let everything have changed a little over ``driven`` metres."""
-        for group in _GROUPS:
-            axes = np.arange(4)[group.axes]
+        for group in (*_GROUPS, _GRAVITY):
+            axes = np.arange(_SIZE)[group.axes]
             self._P[axes, axes] = np.minimum(self._P[axes, axes] + group.walk**2 * driven, group.wide**2)
         self._stand_straight()
 
@@ -168,6 +179,14 @@ class CalibrationEstimator:
             self._x[:2] = 0.0
             self._P[:2], self._P[:, :2] = 0.0, 0.0
 
+    def _doubt_tilt(self, gap: Floats, spread: Floats) -> None:
+        """Widen a tilt that a measurement contradicts by far: it is as probably right as what the state came from."""
+        factor = heavier(float(gap @ np.linalg.solve(spread, gap)), 2)
+        widest = _TILT.wide**2 / max(float(self._P[0, 0]), float(self._P[1, 1]), 1e-30)
+        wider = math.sqrt(min(factor, max(widest, 1.0)))
+        self._P[:2] *= wider
+        self._P[:, :2] *= wider
+
     def _update(self, seen: Floats, H: Floats, R: Floats) -> None:
         """Take in a measurement ``seen`` = H x + noise of covariance R, heavy-tailed."""
         gap = seen - H @ self._x
@@ -175,7 +194,7 @@ class CalibrationEstimator:
         R = R * heavier(distance, len(gap))
         gain = np.linalg.solve(H @ self._P @ H.T + R, H @ self._P).T
         self._x = self._x + gain @ gap
-        rest = np.eye(4) - gain @ H
+        rest = np.eye(_SIZE) - gain @ H
         self._P = rest @ self._P @ rest.T + gain @ R @ gain.T
         self._mix()
 

@@ -148,8 +148,9 @@ class Tracker:
             T_odom_body: (4, 4) odometry of the frame.
             points: (N, 3) its points, levelled, odometry frame; all others are dropped.
         """
-        self._scans.clear()
-        self._scans.add(points, self.travelled)
+        if self._scans.newest is not None:  # no frame, where only later ones may verify the place
+            self._scans.clear()
+            self._scans.add(points, self.travelled)
         self._restart(T_map_body, covariance + _START, T_odom_body)
 
     def match_to_map(
