@@ -209,7 +209,7 @@ class Localizer:
             evidence,
             self._tracker.drift,
             self._tracker.protection_level(),
-            self._correction.calibration,
+            replace(self._correction.calibration, ground=self._tracker.ground.metres),
         )
 
     def take_events(self) -> tuple[Event, ...]:

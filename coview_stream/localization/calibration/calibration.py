@@ -12,9 +12,10 @@ from coview_stream.config.mount import Mount
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import exp_so3
 
-_WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next two
+_WORTH_TELLING = math.radians(0.5)  # lean of a sensor; set by hand, as are the next three
 _SCALE = 0.01
 _TURN = math.radians(0.05)  # per metre
+_GROUND = 0.1  # metres
 _MOVED_TILT = math.radians(1.0)  # sigmas of what was known of a robot before it was out of sight; set by hand
 _MOVED_SCALE = 0.02
 _MOVED_TURN = math.radians(0.02)  # per metre
@@ -32,6 +33,7 @@ class Calibration:
         sigma_tilt: radians, one sigma, each of roll and pitch.
         sigma_scale: of the scale.
         sigma_turn: radians per metre.
+        ground: metres by which the ground that the robot sees lies above the survey's, at this site.
     """
 
     roll: float = 0.0
@@ -41,6 +43,7 @@ class Calibration:
     sigma_tilt: float = math.radians(4.0)
     sigma_scale: float = 0.03
     sigma_turn: float = math.radians(0.05)
+    ground: float = 0.0
 
     @property
     def R_body_cloud(self) -> Floats:
@@ -72,6 +75,11 @@ class Calibration:
         if abs(self.turn) >= _TURN:
             side = "left" if self.turn < 0 else "right"
             said.append(f"odometry turns {abs(math.degrees(self.turn)):.2f} deg per metre too far {side}: corrected")
+        if abs(self.ground) >= _GROUND:
+            side = "above" if self.ground > 0 else "below"
+            said.append(
+                f"the ground lies {abs(self.ground):.2f} m {side} the survey's (grass, snow): heights follow the rest"
+            )
         return said
 
     def doubted(self) -> Calibration:
@@ -94,5 +102,6 @@ class Calibration:
             "odometry_scale_sigma": round(self.sigma_scale, 4),
             "odometry_turn_deg_per_m": round(deg(self.turn), 3),
             "odometry_turn_sigma_deg_per_m": round(deg(self.sigma_turn), 3),
+            "ground_offset_m": round(self.ground, 3),
             "says": self.describe(mount),
         }

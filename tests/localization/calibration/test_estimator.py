@@ -153,3 +153,9 @@ def test_corrected_odometry_keeps_its_gravity():
     for T in truth_of(10, 3.0, rng):
         corrected = correction.correct(T, Calibration(scale=0.05, turn=0.02))
         np.testing.assert_allclose(corrected[2, :3], T[2, :3], atol=1e-12)
+
+
+def test_ground_above_the_surveys_is_told():
+    assert Calibration(ground=0.05).describe() == []
+    assert "0.25 m above the survey's" in Calibration(ground=0.25).describe()[0]
+    assert Calibration(ground=0.25).to_json()["ground_offset_m"] == 0.25
