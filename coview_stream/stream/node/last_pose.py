@@ -168,8 +168,13 @@ def _calibration(plain: Any) -> Calibration | None:
         raise ValueError("its calibration is something else")
     names = {f.name for f in fields(Calibration)}
     known = Calibration(**{name: float(value) for name, value in plain.items() if name in names})
-    sigmas = all(0 < s < 1 for s in (known.sigma_tilt, known.sigma_scale, known.sigma_turn))
-    if not (sigmas and math.hypot(known.roll, known.pitch) < _MAX_LEAN and abs(known.scale) + abs(known.turn) < 1):
+    sigmas = all(0 <= s < 1 for s in (known.sigma_tilt, known.sigma_scale, known.sigma_turn))
+    if not (
+        sigmas
+        and math.hypot(known.roll, known.pitch) < _MAX_LEAN
+        and abs(known.scale) + abs(known.turn) < 1
+        and abs(known.ground) < 10
+    ):
         raise ValueError("its calibration is none of a robot")
     return known
 

@@ -13,6 +13,7 @@ from se3 import exp_se3
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.stream.node import last_pose
 from coview_stream.stream.node.last_pose import LastPose, default_folder, file_of, forget, load, save
 
@@ -42,8 +43,16 @@ def test_calibration_comes_back_with_the_pose(tmp_path):
     assert load(tmp_path, "r1", SHA).calibration is None
 
 
+def test_calibration_of_a_robot_whose_sensor_cannot_lean_comes_back(tmp_path):
+    """Lidar odometry knows the tilt for sure: its sigma is zero."""
+    known = CalibrationEstimator(sensor_leans=False).calibration
+    save(tmp_path, replace(LAST, calibration=known))
+    assert load(tmp_path, "r1", SHA).calibration == known
+
+
 @pytest.mark.parametrize(
-    "wrong", [5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": 0.0}, {"scale": float("nan")}, {"turn": None}]
+    "wrong",
+    [5, [1.0], {"roll": "x"}, {"pitch": 1.5}, {"sigma_tilt": -0.1}, {"scale": float("nan")}, {"ground": float("nan")}],
 )
 def test_calibration_of_no_robot_spoils_the_file(tmp_path, caplog, wrong):
     path = save(tmp_path, LAST)
