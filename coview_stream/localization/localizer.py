@@ -17,6 +17,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.frame_correction import FrameCorrection
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
+from coview_stream.localization.registration.result import Registration
 from coview_stream.localization.registration.verification import RangeImage
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
@@ -31,6 +32,7 @@ from coview_stream.localization.tracking.monitor import LossMonitor, RejectionRe
 from coview_stream.localization.tracking.tracker import Tracker
 
 _FOUND = np.diag(np.square([*np.radians([0.5, 0.5, 0.5]), 0.1, 0.1, 0.1]))  # of an accepted place; set by hand
+_SMEARED = np.radians(1.0)  # keyframes that lean by less are not levelled again while searching; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
 
 
@@ -43,6 +45,7 @@ class _Frame:
         cloud: (N, 3) float32, body frame, levelled.
         T_odom_body: (4, 4) odometry about the anchor, corrected.
         T_odom_raw: (4, 4) odometry as it came.
+        R_body_cloud: (3, 3) rotation that the cloud has been levelled by.
         stamp: seconds.
         voxels: (M, 3) float32, one point per voxel, odometry frame about the anchor.
         keyframe: the one that it completes; None while a place is known, and between keyframes.
@@ -52,6 +55,7 @@ class _Frame:
     cloud: Points
     T_odom_body: Pose
     T_odom_raw: Pose
+    R_body_cloud: Floats
     stamp: float
     voxels: Points
     keyframe: Keyframe | None
@@ -88,6 +92,15 @@ class Localizer:
 
     def reset(self, epoch: int = 0) -> None:
         """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
+        self._correction = FrameCorrection(self.config)
+        self.restart(epoch)
+
+    def restart(self, epoch: int = 0) -> None:
+        """Search from nothing for the same robot, in another odometry frame, which ``epoch`` numbers.
+
+        What is known of its sensor and odometry stays.
+        """
+        self._correction.restart()
         self.state = State.SEARCHING
         self._events: list[Event] = []  # that have changed the state since take_events
         self._epoch = Epoch(epoch, self._epoch.restart + 1)
@@ -95,7 +108,6 @@ class Localizer:
         radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
         self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
-        self._correction = FrameCorrection(self.config)
         self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._correction.estimator)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
         self._hints = PoseHints()
@@ -104,7 +116,7 @@ class Localizer:
         self._newest: _Frame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search that found the place
-        self._levelled = True  # whether a registration at the place has told how the sensor leans
+        self._lean_is_told = True  # by a registration at the place
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
@@ -194,8 +206,9 @@ class Localizer:
         newest, evidence = self._newest, self._evidence
         if newest is None:
             raise RuntimeError("no frame yet; call add_frame or step first")
+        calibration = replace(self._correction.calibration, ground=self._tracker.ground.metres)
         if self.state is not State.TRACKING or self._anchor is None:
-            return Fix(newest.stamp, self.state, evidence=evidence)
+            return Fix(newest.stamp, self.state, evidence=evidence, calibration=calibration)
         T_map_local = orthonormal(self._tracker.T_map_odom)
         T_map_local = T_map_local @ newest.T_odom_body
         T_map_body = pose_from(T_map_local[:3, :3], T_map_local[:3, 3] + self.base_map.origin)
@@ -209,7 +222,7 @@ class Localizer:
             evidence,
             self._tracker.drift,
             self._tracker.protection_level(),
-            replace(self._correction.calibration, ground=self._tracker.ground.metres),
+            calibration,
         )
 
     def take_events(self) -> tuple[Event, ...]:
@@ -260,49 +273,64 @@ class Localizer:
         T = to_local(T, self._anchor)
         if not self.state.has_place and self._correction.is_due(T):
             T = self._refine_motion(raw, T, self._anchor)
-        cloud = self._correction.level(raw)
+        cloud, R_body_cloud = self._correction.level(raw), self._correction.calibration.R_body_cloud
         voxels = self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
         # keyframes are for searching: a loss starts from nothing
-        keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp)
+        keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp, R_body_cloud)
         self._tracker.add_scan(voxels, T)
-        self._newest = _Frame(raw, cloud, T, T_raw, stamp, voxels, keyframe)
+        self._newest = _Frame(raw, cloud, T, T_raw, R_body_cloud, stamp, voxels, keyframe)
         return self._newest
 
     def _refine_motion(self, raw: Points, T_odom_body: Pose, anchor: Floats) -> Pose:
         """Compare a keyframe with the one before; return its odometry, mended, and level what has been gathered."""
         points = self._voxel_filter(raw, np.eye(4))[0].copy()
         T = self._correction.refine(points, T_odom_body, anchor, self._tracker.drift.variances)
-        turned = self._correction.level_gathered(bool(self._buffer.keyframes))
-        if turned is not None:
-            self._buffer.turn(turned)
+        R_body_cloud = self._correction.calibration.R_body_cloud
+        if self._buffer.lean(R_body_cloud) > _SMEARED:
+            self._buffer.level(R_body_cloud)
             self._next_epoch()
         return T
 
-    def _level(self, match: MapMatch, newest: _Frame) -> MapMatch:
-        """Level the newest frame by the first registration at a place that fits, and match it again, if it leans."""
-        if self._levelled or not match.verdict.verified:
-            return match
-        self._levelled = True
-        T_map_body = self._correction.learn_found(match.T_map_body, match.covariance, newest.T_odom_body)
-        if T_map_body is None:
-            return match
-        newest = self._start_levelled(T_map_body, match.covariance, newest)
-        return self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
+    def _start_tracking(self, found: Registration, result: SearchResult, newest: _Frame) -> _Frame:
+        """Begin at an accepted place, registered for a keyframe; return the newest frame, levelled by what that tells.
 
-    def _level_found(self, T_map_odom: Pose, T_odom_body: Pose, newest: _Frame) -> _Frame:
-        """Level the newest frame by an accepted place, registered for the keyframe at ``T_odom_body`` (4, 4)."""
-        T_map_body = self._correction.learn_found(T_map_odom @ T_odom_body, _FOUND, T_odom_body)
-        if T_map_body is None:
-            return newest
-        return self._start_levelled(T_map_body @ inverse(T_odom_body) @ newest.T_odom_body, _FOUND, newest)
-
-    def _start_levelled(self, T_map_body: Pose, covariance: Floats, newest: _Frame) -> _Frame:
-        """Begin again at a pose of the newest frame, (4, 4) with its covariance, once that is levelled."""
-        cloud = self._correction.level(newest.raw)
-        voxels = self._voxel_filter(cloud, newest.T_odom_body)[0].copy()
-        self._newest = newest = replace(newest, cloud=cloud, voxels=voxels)
-        self._tracker.start_levelled(T_map_body, covariance, newest.T_odom_body, voxels)
+        The keyframe may be seconds old, and its clouds levelled otherwise than by what is known now.
+        """
+        T_odom_found, R_body_cloud = result.T_odom_body, result.R_body_cloud
+        seen = found.T_map_source @ T_odom_found
+        levelled = self._correction.learn_found(seen, _FOUND, T_odom_found, R_body_cloud)
+        newest = self._levelled(newest)
+        found = replace(found, T_map_source=levelled @ inverse(T_odom_found))
+        self._tracker.start(found, newest.T_odom_body, result.travelled, T_odom_found)
         return newest
+
+    def _level(
+        self, match: MapMatch, frame: _Frame, standing_still: bool = False, newest_only: bool = False
+    ) -> MapMatch:
+        """Level the newest frame by the first registration at a place that fits, and match it again, if it leans.
+
+        The last two are those of :meth:`Tracker.match_to_map`.
+        """
+        if self._lean_is_told or not match.verdict.verified:
+            return match
+        self._lean_is_told = True
+        T_odom_body = frame.T_odom_body
+        T_map_body = self._correction.learn_found(match.T_map_body, match.covariance, T_odom_body, frame.R_body_cloud)
+        levelled = self._levelled(frame)
+        if levelled is frame:
+            return match
+        self._tracker.start_levelled(T_map_body, match.covariance, T_odom_body)
+        return self._tracker.match_to_map(levelled.cloud, T_odom_body, standing_still, newest_only)
+
+    def _levelled(self, newest: _Frame) -> _Frame:
+        """Return the newest frame, levelled by what is known now; the same if it stands straight."""
+        if not self._correction.leans(newest.R_body_cloud):
+            return newest
+        cloud, R_body_cloud = self._correction.level(newest.raw), self._correction.calibration.R_body_cloud
+        voxels = self._voxel_filter(cloud, newest.T_odom_body)[0].copy()
+        self._newest = replace(newest, cloud=cloud, voxels=voxels, R_body_cloud=R_body_cloud)
+        self._tracker.level_newest_scan(voxels)
+        return self._newest
 
     def _search_request(self, frame: _Frame) -> SearchRequest | None:
         """Return what has to be searched for: the keyframe that a frame completes."""
@@ -328,20 +356,19 @@ class Localizer:
         if result.accepted is None:
             if result.leader is not None and result.evidence.evidence is not None:  # it has been registered
                 seen, probability = result.leader @ result.T_odom_body, result.evidence.confidence or 0.0
-                self._correction.learn_leader(seen, result.T_odom_body, probability)
+                self._correction.learn_leader(seen, result.T_odom_body, probability, result.R_body_cloud)
             proposed = result.evidence.state is State.AMBIGUOUS
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None
         self._handle(Event.PLACE_ACCEPTED)
         self._confidence = result.evidence.confidence or 0.0
-        self._tracker.start(result.accepted.registration, newest.T_odom_body, result.travelled)
-        newest = self._level_found(result.accepted.T_map_odom, result.T_odom_body, newest)
+        newest = self._start_tracking(result.accepted.registration, result, newest)
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
         self._correction.forget_frame()
         # the robot may have driven on or been carried since the keyframe
-        self._levelled = False
+        self._lean_is_told = False
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
         return replace(self._level(match, newest), confirms_search=True)
 
@@ -353,7 +380,7 @@ class Localizer:
         newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
         if due or waited or newest_only:
             match = self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only)
-            return self._level(match, frame)
+            return self._level(match, frame, not due, newest_only)
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 

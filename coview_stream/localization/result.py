@@ -110,7 +110,8 @@ class Fix:
         drift: how fast odometry seems to drift, to go on from this pose with; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:
             see docs/tracking.md; None unless TRACKING.
-        calibration: what is corrected of the sensor's tilt and of odometry; None before anything was measured.
+        calibration: what is corrected of the sensor's tilt and of odometry, in any state: it is estimated from the
+            first two keyframes on.
     """
 
     stamp: float

@@ -50,10 +50,6 @@ class Calibration:
         """(3, 3) rotation that levels clouds."""
         return exp_so3(np.array([self.roll, self.pitch, 0.0]))
 
-    def turned_since(self, other: Calibration) -> float:
-        """Return by how much the levelling differs from another's, radians."""
-        return math.hypot(self.roll - other.roll, self.pitch - other.pitch)
-
     def describe(self, mount: Mount | None = None) -> list[str]:
         """Say in plain words, a clause each, what is corrected; nothing where sensor and odometry are as they should.
 

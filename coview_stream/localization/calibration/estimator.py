@@ -88,6 +88,12 @@ class CalibrationEstimator:
         self._stand_straight()
         self._mix()
 
+    def begin_odometry(self) -> None:
+        """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
+        self._x[_GRAVITY.axes] = 0.0
+        self._P[_GRAVITY.axes], self._P[:, _GRAVITY.axes] = 0.0, 0.0
+        self._P[_GRAVITY.axes, _GRAVITY.axes] = np.eye(2) * _GRAVITY.wide**2
+
     def motion_covariance(self, step: Floats) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) of a motion by ``step`` (3,) metres, in the axes of that."""
         along = np.concatenate([np.zeros(3), step])
@@ -95,17 +101,18 @@ class CalibrationEstimator:
         spread[2, 2] += (self.calibration.sigma_turn * float(np.linalg.norm(step))) ** 2
         return np.asarray(spread)
 
-    def measure_attitude(self, T_map_body: Pose, T_odom_body: Pose, variance: float) -> None:
+    def measure_attitude(self, T_map_body: Pose, T_odom_body: Pose, variance: float, R_body_cloud: Floats) -> None:
         """Take in the attitude of a registration (eq. C1).
 
         Args:
-            T_map_body: (4, 4) as the map alone has it, of a cloud that has been corrected.
+            T_map_body: (4, 4) as the map alone has it, of a cloud that has been levelled.
             T_odom_body: (4, 4) odometry of the same body.
             variance: of the registration's roll and pitch, rad^2.
+            R_body_cloud: (3, 3) rotation that the cloud has been levelled by, which may be known better by now.
         """
         left = np.cross(T_map_body[2, :3], T_odom_body[2, :3])
         left[2] = 0.0
-        seen = log_so3(exp_so3(left) @ self.calibration.R_body_cloud)[:2]
+        seen = log_so3(exp_so3(left) @ R_body_cloud)[:2]
         H = np.eye(2, _SIZE)
         H[:, 4:] = T_odom_body[:2, :2].T  # what leans with odometry's frame turns as the body does
         R = np.eye(2) * (variance + _ATTITUDE**2)

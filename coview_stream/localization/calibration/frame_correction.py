@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, pose_from
+from coview_stream.geometry.transforms import Points, Pose, pose_from, rotation_angle
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator, tilt_variance
 from coview_stream.localization.calibration.frame_motion import FrameMotion, Variances
@@ -16,7 +16,6 @@ from coview_stream.localization.calibration.odometry_correction import OdometryC
 
 _LEADER_TILT = math.radians(1.0)  # sigma of a leading place's roll and pitch, if it is the right one; set by hand
 _ANY_TILT = math.radians(4.0)  # and if it is not
-_GATHERED = math.radians(1.0)  # keyframes that lean by less stay as they are; set by hand
 _LEVEL = math.radians(0.05)  # a frame that leans by less is not registered again for it; set by hand
 
 
@@ -32,7 +31,6 @@ class FrameCorrection:
         self.estimator = CalibrationEstimator(config.sensor_leans)
         self._odometry = OdometryCorrection()
         self._motion = FrameMotion(config.registration, config.keyframe.distance)
-        self._gathered = self.calibration  # by which the keyframes of the search have been levelled
 
     @property
     def calibration(self) -> Calibration:
@@ -47,6 +45,16 @@ class FrameCorrection:
         """Return a cloud (N, 3), body frame, turned by what is known of the sensor's tilt."""
         R = self.calibration.R_body_cloud
         return cloud if np.array_equal(R, np.eye(3)) else cloud @ R.T.astype(np.float32)
+
+    def leans(self, R_body_cloud: Floats) -> bool:
+        """Tell whether a frame that has been levelled by a rotation (3, 3) leans enough to be registered again."""
+        return rotation_angle(self.calibration.R_body_cloud.T @ R_body_cloud) >= _LEVEL
+
+    def restart(self) -> None:
+        """Go on in another frame of odometry, with what is known of the robot."""
+        self.estimator.begin_odometry()
+        self._odometry = OdometryCorrection()
+        self._motion.clear()
 
     # ---- while no place is known
 
@@ -71,37 +79,27 @@ class FrameCorrection:
         """Compare the next frame with none before it."""
         self._motion.clear()
 
-    def level_gathered(self, anything: bool) -> Floats | None:
-        """Return the rotation (3, 3), body axes, that keyframes gathered so far need, None if none, and count it done.
+    def learn_leader(self, T_map_body: Pose, T_odom_body: Pose, probability: float, R_body_cloud: Floats) -> None:
+        """Learn the tilt from a place that leads, (4, 4) as registered, as far as it is probable.
 
-        ``anything`` says whether there are any.
+        Args:
+            T_map_body: (4, 4) of a keyframe.
+            T_odom_body: (4, 4) corrected odometry of the same keyframe.
+            probability: that it is the right place.
+            R_body_cloud: (3, 3) rotation that its clouds had been levelled by.
         """
-        before, now = self._gathered, self.calibration
-        if anything and now.turned_since(before) <= _GATHERED:
-            return None
-        self._gathered = now
-        return now.R_body_cloud @ before.R_body_cloud.T if anything else None
-
-    def learn_leader(self, T_map_body: Pose, T_odom_body: Pose, probability: float) -> None:
-        """Learn the tilt from a place that leads, (4, 4) as registered, as far as it is probable."""
         if probability > 0.0:
             variance = _LEADER_TILT**2 + (1.0 - probability) / probability * _ANY_TILT**2
-            self.estimator.measure_attitude(T_map_body, T_odom_body, variance)
+            self.estimator.measure_attitude(T_map_body, T_odom_body, variance, R_body_cloud)
 
-    def learn_found(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> Pose | None:
-        """Learn the tilt from the first registration at an accepted place.
+    def learn_found(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose, R_body_cloud: Floats) -> Pose:
+        """Learn the tilt from the first registration at an accepted place; return its pose (4, 4), levelled anew.
 
         Args:
             T_map_body: (4, 4) as registered.
             covariance: (6, 6) of that.
             T_odom_body: (4, 4) corrected odometry of the same frame.
-
-        Returns:
-            The pose of the frame once it is levelled anew; None where that changes nothing.
+            R_body_cloud: (3, 3) rotation that its cloud had been levelled by.
         """
-        before = self.calibration
-        self.estimator.measure_attitude(T_map_body, T_odom_body, tilt_variance(covariance))
-        now = self.calibration
-        if now.turned_since(before) < _LEVEL:
-            return None
-        return pose_from(T_map_body[:3, :3] @ before.R_body_cloud @ now.R_body_cloud.T, T_map_body[:3, 3])
+        self.estimator.measure_attitude(T_map_body, T_odom_body, tilt_variance(covariance), R_body_cloud)
+        return pose_from(T_map_body[:3, :3] @ R_body_cloud @ self.calibration.R_body_cloud.T, T_map_body[:3, 3])

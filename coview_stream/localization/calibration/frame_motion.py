@@ -98,29 +98,19 @@ class FrameMotion:
             drift: of odometry.
         """
         reference = self._reference
-        if reference is not None:
-            before = reference.T_odom_body
-            far = float(np.linalg.norm(T_odom_body[:3, 3] - before[:3, 3]))
-            seen = self._registered(points, T_odom_body, estimator) if far <= _LONGEST else None
-            if seen is not None:
-                level = estimator.calibration.R_body_cloud
-                motion, step = inverse(before) @ seen, inverse(before) @ T_odom_body
-                variances = drift(far, abs(yaw_of(step)))
-                position = math.hypot(_POSITION, _POSITION_METRE * far)
-                right = _probability_right(motion, step, variances, estimator.calibration, position)
-                sigmas = position / math.sqrt(right), _ANGLE / math.sqrt(right)
-                step = estimator.measure_frames(motion, step, variances, *sigmas)
-                motion = _turned(motion, estimator.calibration.R_body_cloud @ level.T)
-                T_odom_body = _fused(before @ step, before @ motion, variances, *sigmas)
+        seen = None if reference is None else self._registered(reference, points, T_odom_body, estimator)
+        if reference is not None and seen is not None:
+            T_odom_body = _mended(reference.T_odom_body, T_odom_body, seen, estimator, drift)
         on_surfaces, normals = surface_points(points)
         self._reference = _Reference(on_surfaces, normals, T_odom_body)
         return T_odom_body
 
-    def _registered(self, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator) -> Pose | None:
+    def _registered(
+        self, reference: _Reference, points: Points, T_odom_body: Pose, estimator: CalibrationEstimator
+    ) -> Pose | None:
         """Return where the keyframe before sees this one, (4, 4) odometry <- body; None if nothing can be told."""
-        reference = self._reference
-        assert reference is not None  # the caller's
-        if len(reference.points) < MIN_PAIRS:
+        far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
+        if len(reference.points) < MIN_PAIRS or far > _LONGEST:
             return None
         level = pose_from(estimator.calibration.R_body_cloud, np.zeros(3))
         then = reference.T_odom_body @ level
@@ -131,11 +121,32 @@ class FrameMotion:
         scan = prepare_scan(transform(T_odom_body @ level, points), T_odom_body[:3, 3], self._config)
         if len(scan.points) < MIN_PAIRS:
             return None
-        far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
         free = _FREE + np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * _FREE_METRE * far
         prior = Prior(np.eye(4), np.diag(free**-2.0))
         found = register(scan, np.eye(4), target, self._config, _SCALES, prior, T_odom_body[:3, 3])
         return None if found is None else found.T_map_source @ T_odom_body
+
+
+def _mended(before: Pose, T_odom_body: Pose, seen: Pose, estimator: CalibrationEstimator, drift: Variances) -> Pose:
+    """Teach the estimator a registered motion; return the newest frame's odometry (4, 4), mended by both.
+
+    Args:
+        before: (4, 4) odometry of the keyframe before.
+        T_odom_body: (4, 4) odometry of the newest, corrected by the estimator's calibration.
+        seen: (4, 4) where the keyframe before sees the newest.
+        estimator: learns from it.
+        drift: of odometry.
+    """
+    level = estimator.calibration.R_body_cloud
+    motion, step = inverse(before) @ seen, inverse(before) @ T_odom_body
+    far = float(np.linalg.norm(step[:3, 3]))
+    variances = drift(far, abs(yaw_of(step)))
+    position = math.hypot(_POSITION, _POSITION_METRE * far)
+    right = _probability_right(motion, step, variances, estimator.calibration, position)
+    sigmas = position / math.sqrt(right), _ANGLE / math.sqrt(right)
+    step = estimator.measure_frames(motion, step, variances, *sigmas)
+    motion = _turned(motion, estimator.calibration.R_body_cloud @ level.T)
+    return _fused(before @ step, before @ motion, variances, *sigmas)
 
 
 def surface_points(points: Points) -> tuple[Points, Floats32]:

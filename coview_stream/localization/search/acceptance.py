@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from coview_stream.config import AcceptanceConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.result import KeyframeEvidence
@@ -33,6 +34,7 @@ class SearchResult:
         T_odom_body: (4, 4) of the keyframe.
         leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
             without any place.
+        R_body_cloud: (3, 3) rotation that the keyframe's clouds have been levelled by.
     """
 
     accepted: Candidate | None
@@ -42,6 +44,7 @@ class SearchResult:
     rivals: Rivals = field(default_factory=Rivals.none)
     leader: Pose | None = None
     T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
+    R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
 
 
 def decide(
@@ -59,9 +62,7 @@ def decide(
     state, reason = _verdict(scored, leader, rule, undecided)
     if not scored.places:
         evidence = KeyframeEvidence(request.stamp, state, reason)
-        return SearchResult(
-            None, evidence, request.travelled, request.epoch, scored.rivals, T_odom_body=request.T_odom_body
-        )  # fmt: skip
+        return _result(request, None, evidence, scored.rivals)
     best = scored.places[0]
     own = best.hypothesis
     if own.station is None and best.hinted:
@@ -75,9 +76,16 @@ def decide(
     )  # fmt: skip
     accepted = leader if state is State.TRACKING else None
     T_map_odom = own.T_map_odom if leader is None else leader.T_map_odom
+    return _result(request, accepted, evidence, scored.rivals, T_map_odom)
+
+
+def _result(
+    request: SearchRequest, accepted: Candidate | None, evidence: KeyframeEvidence, rivals: Rivals,
+    leader: Pose | None = None,
+) -> SearchResult:  # fmt: skip
     return SearchResult(
-        accepted, evidence, request.travelled, request.epoch, scored.rivals, T_map_odom, request.T_odom_body
-    )  # fmt: skip
+        accepted, evidence, request.travelled, request.epoch, rivals, leader, request.T_odom_body, request.R_body_cloud
+    )
 
 
 def _verdict(scored: Scored, leader: Candidate | None, rule: AcceptanceConfig, undecided: float) -> tuple[State, str]:

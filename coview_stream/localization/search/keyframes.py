@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import KeyframeConfig
 from coview_stream.geometry.arrays import Floats, Ints
-from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.geometry.transforms import Points, Pose, rotation_angle
 
 _PENDING_POINTS = 200_000  # re-voxelise the frames of a robot that stands still beyond this many points; set by hand
 _RECENT = 5  # keyframes whose points are kept as they are: as many as anybody asks for
@@ -35,16 +35,27 @@ class Keyframe:
         stamp: seconds, of the newest frame.
         T_odom_body: (4, 4) of the newest frame.
         points: (N, 3) float32 odometry-frame coordinates, metres.
+        R_body_cloud: (3, 3) rotation that its clouds have been levelled by.
     """
 
     stamp: float
     T_odom_body: Pose
     points: Points
+    R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
 
     @property
     def position(self) -> Floats:
         """(3,) sensor position in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
+
+    def levelled(self, R_body_cloud: Floats) -> Keyframe:
+        """Return the same, levelled by another rotation (3, 3), about where it was taken."""
+        if np.array_equal(R_body_cloud, self.R_body_cloud):
+            return self
+        R = self.T_odom_body[:3, :3] @ R_body_cloud @ self.R_body_cloud.T @ self.T_odom_body[:3, :3].T
+        centre = self.position.astype(np.float32)
+        points = (self.points - centre) @ R.T.astype(np.float32) + centre
+        return replace(self, points=points, R_body_cloud=R_body_cloud)
 
 
 class KeyframeBuffer:
@@ -67,25 +78,29 @@ class KeyframeBuffer:
         self.config = config
         self.reach = reach
         self.keyframes: deque[Keyframe] = deque(maxlen=min(config.capacity, _RECENT))
-        self._pending: list[Points] = []
+        self._pending: list[Keyframe] = []  # frames since the newest keyframe
         # the points of so many keyframes each, one per voxel, which are dropped as a whole
         self._part_size = max(1, config.capacity // _PARTS)
         self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)
         self._in_part = 0  # keyframes in the newest of them
 
-    def add(self, points: Points, T_odom_body: Pose, stamp: float) -> Keyframe | None:
+    def add(
+        self, points: Points, T_odom_body: Pose, stamp: float, R_body_cloud: Floats | None = None
+    ) -> Keyframe | None:
         """Add a frame's points (N, 3), odometry frame, which are kept; return the keyframe that it completes, if any.
 
-        :func:`~coview_stream.localization.registration.prepare_scan.voxelized` makes the points of a cloud.
+        :func:`~coview_stream.localization.registration.prepare_scan.voxelized` makes the points of a cloud, which has
+        been levelled by ``R_body_cloud`` (3, 3), if at all.
         """
-        self._pending.append(points)
-        if sum(map(len, self._pending)) > _PENDING_POINTS:
-            self._pending = [self._unique(np.concatenate(self._pending))]
+        frame = Keyframe(stamp, T_odom_body, points, np.eye(3) if R_body_cloud is None else R_body_cloud)
+        self._pending.append(frame)
+        if sum(len(each.points) for each in self._pending) > _PENDING_POINTS:
+            self._pending = [self._merged(frame)]
         if self.keyframes:
             moved = float(np.linalg.norm(T_odom_body[:3, 3] - self.keyframes[-1].position))
             if moved < self.config.distance:
                 return None
-        keyframe = Keyframe(stamp, T_odom_body, self._unique(np.concatenate(self._pending)))
+        keyframe = self._merged(frame)
         self.keyframes.append(keyframe)
         self._pending = []
         self._gather(keyframe)
@@ -103,7 +118,7 @@ class KeyframeBuffer:
 
     def recent(self, count: int) -> Points:
         """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since."""
-        parts = [k.points for k in list(self.keyframes)[-count:]] + self._pending
+        parts = [each.points for each in (*list(self.keyframes)[-count:], *self._pending)]
         return np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.float32)
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
@@ -114,19 +129,18 @@ class KeyframeBuffer:
         near = [_within(part, centre, radius) for part in self._parts]
         return self._unique(np.concatenate(near), voxel)
 
-    def turn(self, R_body: Floats) -> None:
-        """Turn all that is held by ``R_body`` (3, 3), in the body's axes and about where each keyframe was taken.
+    def lean(self, R_body_cloud: Floats) -> float:
+        """Return by how much a keyframe that is held was levelled otherwise than by a rotation (3, 3), at most, rad."""
+        return max((rotation_angle(R_body_cloud.T @ each.R_body_cloud) for each in self.keyframes), default=0.0)
 
-        For a sensor of which it has been found out how it leans; what is older than the newest five is dropped.
-        """
+    def level(self, R_body_cloud: Floats) -> None:
+        """Level all that is held by a rotation (3, 3) that is known better now; all but the newest five is dropped."""
         held, pending = list(self.keyframes), self._pending
         self.clear()
         for keyframe in held:
-            turned = replace(keyframe, points=_turned(keyframe.points, keyframe.T_odom_body, R_body))
-            self.keyframes.append(turned)
-            self._gather(turned)
-        if held:
-            self._pending = [_turned(points, held[-1].T_odom_body, R_body) for points in pending]
+            self.keyframes.append(keyframe.levelled(R_body_cloud))
+            self._gather(self.keyframes[-1])
+        self._pending = [frame.levelled(R_body_cloud) for frame in pending]
 
     def clear(self) -> None:
         """Forget all keyframes, for odometry does not connect them with the next frame."""
@@ -135,15 +149,13 @@ class KeyframeBuffer:
         self._parts.clear()
         self._in_part = 0
 
+    def _merged(self, newest: Keyframe) -> Keyframe:
+        """Return all frames since the newest keyframe as one, levelled as the newest of them."""
+        frames = [frame.levelled(newest.R_body_cloud).points for frame in self._pending]
+        return replace(newest, points=self._unique(np.concatenate(frames)))
+
     def _unique(self, points: Points, voxel: float | None = None) -> Points:
         return kernels.transform_unique(points, np.eye(4), voxel or self.config.voxel)[0]
-
-
-def _turned(points: Points, T_odom_body: Pose, R_body: Floats) -> Points:
-    """Turn points (N, 3), odometry frame, about the body by ``R_body`` (3, 3) in its axes."""
-    R = T_odom_body[:3, :3] @ R_body @ T_odom_body[:3, :3].T
-    centre = T_odom_body[:3, 3].astype(np.float32)
-    return (points - centre) @ R.T.astype(np.float32) + centre
 
 
 def _within(points: Points, centre: Floats, radius: float) -> Points:

@@ -64,6 +64,7 @@ class SearchRequest:
         hints: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
         surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
             compared.
+        R_body_cloud: (3, 3) rotation that ``cloud`` has been levelled by.
     """
 
     stamp: float
@@ -75,6 +76,7 @@ class SearchRequest:
     epoch: Epoch = FIRST_EPOCH
     hints: tuple[Pose, ...] = ()
     surroundings: Points = field(default_factory=_no_points)
+    R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
 
     @property
     def position(self) -> Floats:
@@ -100,7 +102,8 @@ class SearchRequest:
             surroundings = buffer.virtual_scan(keyframe.position, spec.reach, buffer.config.voxel)
         submap = buffer.recent(_SUBMAP_KEYFRAMES)
         return cls(
-            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, surroundings
+            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, surroundings,
+            keyframe.R_body_cloud,
         )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.rivals import Rival, find_rivals
 from coview_stream.localization.tracking.slip import matters, off_by
 
-_BESIDE = 2  # rivals that are looked for where something is wrong; set by hand
+_MAX_RIVALS = 2  # that are looked for where something is wrong; set by hand
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class MapMatcher:
             Two or three matches, ``first`` being the first.
         """
         scales = self.config.registration.search[1:]
-        tries = [first, self.match(scan, belief, target, scales, graph, _BESIDE)]
+        tries = [first, self.match(scan, belief, target, scales, graph, _MAX_RIVALS)]
         rivals = sorted((rival for each in tries for rival in each.rivals), key=lambda rival: -rival.ratio)
         for rival in rivals:
             T_map_body = rival.T_map_odom @ scan.T_odom_body

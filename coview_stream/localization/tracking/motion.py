@@ -139,10 +139,18 @@ class _Mark:
 
 @dataclass(frozen=True)
 class _Registered:
-    """A verified registration: the pose (4, 4) as the map alone has it, its variances (6,), and where odometry was."""
+    """A verified registration.
+
+    Attributes:
+        T_map_body: (4, 4) as the map alone has it.
+        covariance: (6, 6) of that.
+        R_body_cloud: (3, 3) rotation that its cloud had been levelled by.
+        mark: where odometry was.
+    """
 
     T_map_body: Pose
-    variances: Floats
+    covariance: Floats
+    R_body_cloud: Floats
     mark: _Mark
 
 
@@ -163,6 +171,7 @@ class OdometryTracker:
         self._keyframe = _Mark(np.eye(4), 0.0, 0.0)
         self._estimator = DriftEstimator(config)
         self._registered: _Registered | None = None
+        self._unconfirmed: _Registered | None = None  # the one that odometry contradicts
 
     def add_pose(self, T_odom_body: Pose) -> None:
         """Add the pose (4, 4) of a frame."""
@@ -193,31 +202,46 @@ class OdometryTracker:
         """Rates of odometry's drift, as measured so far."""
         return self._estimator.drift
 
-    def learn(self, T_map_body: Pose, covariance: Floats) -> None:
+    def learn(self, T_map_body: Pose, covariance: Floats, R_body_cloud: Floats) -> None:
         """Learn calibration and drift from a verified registration at the newest keyframe.
 
         Args:
             T_map_body: (4, 4) as the map alone has it.
             covariance: (6, 6) of that.
+            R_body_cloud: (3, 3) rotation that its cloud had been levelled by.
         """
-        before, now = self._registered, self._keyframe
-        variances = np.diag(covariance)
-        if before is not None:
-            driven, turned = now.travelled - before.mark.travelled, now.turned - before.mark.turned
-            if not worth_learning(driven, turned):
-                return
-            step = inverse(before.mark.T_odom_body) @ now.T_odom_body
-            noise = _OWN_NOISE * (variances + before.variances)
-            expected = self.drift.variances(driven, turned) + noise
-            step = self._calibration.measure_motion(before.T_map_body, T_map_body, step, expected[[3, 2]])
-            gap = boxminus(T_map_body, before.T_map_body @ step)
-            self._estimator.add(gap, noise, driven, turned)
-            self._calibration.measure_attitude(T_map_body, now.T_odom_body, tilt_variance(covariance))
-        self._registered = _Registered(T_map_body, variances, now)
+        self._confirm()
+        self._learn(_Registered(T_map_body, covariance, R_body_cloud, self._keyframe))
+
+    def learn_once_confirmed(self, T_map_body: Pose, covariance: Floats, R_body_cloud: Floats) -> None:
+        """Do the same once another registration has followed: odometry contradicts this one. Args as there."""
+        self._confirm()
+        self._unconfirmed = _Registered(T_map_body, covariance, R_body_cloud, self._keyframe)
 
     def forget_registration(self) -> None:
         """Compare the next registration with none before it; the rates stay."""
-        self._registered = None
+        self._registered = self._unconfirmed = None
+
+    def _confirm(self) -> None:
+        before, self._unconfirmed = self._unconfirmed, None
+        if before is not None:
+            self._learn(before)
+
+    def _learn(self, now: _Registered) -> None:
+        before = self._registered
+        if before is not None:
+            driven, turned = now.mark.travelled - before.mark.travelled, now.mark.turned - before.mark.turned
+            if not worth_learning(driven, turned):
+                return
+            step = inverse(before.mark.T_odom_body) @ now.mark.T_odom_body
+            noise = _OWN_NOISE * np.diag(now.covariance + before.covariance)
+            expected = self.drift.variances(driven, turned) + noise
+            step = self._calibration.measure_motion(before.T_map_body, now.T_map_body, step, expected[[3, 2]])
+            gap = boxminus(now.T_map_body, before.T_map_body @ step)
+            self._estimator.add(gap, noise, driven, turned)
+            tilt = tilt_variance(now.covariance)
+            self._calibration.measure_attitude(now.T_map_body, now.mark.T_odom_body, tilt, now.R_body_cloud)
+        self._registered = now
 
 
 @dataclass(frozen=True)

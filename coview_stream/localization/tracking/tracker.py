@@ -11,7 +11,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.protection import ProtectionLevel, protection_level
-from coview_stream.geometry.transforms import Points, Pose, inverse, transform
+from coview_stream.geometry.transforms import Points, Pose, inverse, rotation_angle, transform, yaw_of
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.registration.covariance import (
     propagate,
@@ -57,7 +57,8 @@ class Tracker:
         self.ground = GroundOffset()
         self._graph = PoseGraph(config.graph)
         self._calibration = calibration
-        self._levelled = calibration.calibration  # what the newest registered cloud was corrected by
+        self._R_body_cloud = np.eye(3)  # that the newest cloud has been levelled by
+        self._R_keyframe = np.eye(3)  # and that of the newest keyframe
         self._odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)
         self._dispute = Dispute(self._matcher.place, config.tracking.distance)
@@ -82,10 +83,18 @@ class Tracker:
     # ---- scans
 
     def add_scan(self, points: Points, T_odom_body: Pose) -> None:
-        """Add a frame's points (N, 3), one per voxel, odometry frame, and how far odometry has driven."""
+        """Add a frame's points (N, 3), one per voxel, odometry frame, levelled as is known now, and its odometry."""
         self._odometry.add_pose(T_odom_body)
+        self._R_body_cloud = self._calibration.calibration.R_body_cloud
         self._scans.add(points, self.travelled)
         self._unregistered += 1
+
+    def level_newest_scan(self, points: Points) -> None:
+        """Replace the newest frame's points by (N, 3) that are levelled as is known now; all others are dropped."""
+        self._R_body_cloud = self._calibration.calibration.R_body_cloud
+        if self._scans.newest is not None:  # no frame, where only later ones may verify the place
+            self._scans.clear()
+            self._scans.add(points, self.travelled)
 
     def forget_odometry(self) -> None:
         """Drop the scans and the newest odometry: what lost the place may be an odometry that jumped."""
@@ -124,10 +133,16 @@ class Tracker:
 
     # ---- the belief
 
-    def start(self, registration: Registration, T_odom_body: Pose, travelled: float) -> None:
-        """Begin with an accepted place, found where odometry had driven ``travelled`` metres, at the newest frame.
+    def start(
+        self, registration: Registration, T_odom_body: Pose, travelled: float, T_odom_found: Pose | None = None
+    ) -> None:
+        """Begin with an accepted place; it may not have converged yet: its own covariance is not believed.
 
-        It may not have converged yet: its own covariance is not believed.
+        Args:
+            registration: of the keyframe that it was found with.
+            T_odom_body: (4, 4) odometry of the newest frame.
+            travelled: metres that odometry had driven at that keyframe.
+            T_odom_found: (4, 4) odometry of that keyframe; None if it is the newest frame.
         """
         self._matcher.clear()
         self.ground.clear()
@@ -136,21 +151,21 @@ class Tracker:
         self._displacement.clear()
         self._shared_error.clear()
         own = registration_covariance(registration.information, self.config.registration)
-        drifted = self.drift.covariance(self.travelled - travelled, 0.0)
-        self._restart(registration.T_map_source @ T_odom_body, own + drifted + _START, T_odom_body)
+        found = T_odom_body if T_odom_found is None else T_odom_found
+        step = registration.T_map_source[:3, :3] @ (T_odom_body[:3, 3] - found[:3, 3])
+        drifted = self.drift.covariance(self.travelled - travelled, abs(yaw_of(inverse(found) @ T_odom_body)))
+        drifted += self._calibration.motion_covariance(step)
+        covariance = propagate(own + _START, step) + drifted
+        self._restart(registration.T_map_source @ T_odom_body, covariance, T_odom_body)
 
-    def start_levelled(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose, points: Points) -> None:
+    def start_levelled(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose) -> None:
         """Begin again at the newest frame's first registration, once it is known how the sensor leans.
 
         Args:
             T_map_body: (4, 4) pose of that registration, of the levelled frame.
             covariance: (6, 6) of it.
             T_odom_body: (4, 4) odometry of the frame.
-            points: (N, 3) its points, levelled, odometry frame; all others are dropped.
         """
-        if self._scans.newest is not None:  # no frame, where only later ones may verify the place
-            self._scans.clear()
-            self._scans.add(points, self.travelled)
         self._restart(T_map_body, covariance + _START, T_odom_body)
 
     def match_to_map(
@@ -198,7 +213,7 @@ class Tracker:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # odometry has slipped, or drifts as it has done before; go on where the lidar says
-            self._odometry.learn(match.T_map_body, match.covariance)
+            self._odometry.learn_once_confirmed(match.T_map_body, match.covariance, self._R_body_cloud)
             self._restart(match.T_map_body, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
             self._dispute.clear()
@@ -260,6 +275,7 @@ class Tracker:
         self._dispute.clear()
         self._graph.start(T_map_body, covariance)
         self._odometry.set_keyframe(T_odom_body)
+        self._R_keyframe = self._R_body_cloud
         self._set_belief(T_odom_body)
 
     def _predict(self, T_odom_body: Pose, standing_still: bool) -> Estimate:
@@ -269,8 +285,8 @@ class Tracker:
         motion = self._odometry.motion(T_odom_body)
         step = self._graph.estimate.T_map_body[:3, :3] @ motion[:3, 3]
         spread += self._calibration.motion_covariance(step)
-        before, self._levelled = self._levelled, self._calibration.calibration
-        spread[:2, :2] += np.eye(2) * before.turned_since(self._levelled) ** 2
+        spread[:2, :2] += np.eye(2) * rotation_angle(self._R_keyframe.T @ self._R_body_cloud) ** 2
+        self._R_keyframe = self._R_body_cloud
         self._graph.move(motion, spread)
         self._odometry.set_keyframe(T_odom_body)
         return self._graph.estimate
@@ -290,7 +306,7 @@ class Tracker:
             self._learned_at = self.travelled
             self._matcher.place.learn(seen)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
-        self._odometry.learn(match.T_map_body, match.covariance)
+        self._odometry.learn(match.T_map_body, match.covariance, self._R_body_cloud)
         self._shared_error.learn(scan.cloud, self.T_map_odom, target, position)
         self._displacement.learn(newest, position, self.T_map_odom, target)
 

@@ -114,12 +114,12 @@ class TrackEngine:
         _ = self.base_map.field.layers
 
     def _localizer(self, job: FrameJob) -> Localizer:
-        """Return the robot's localizer, which forgets all but the map with a new epoch."""
+        """Return the robot's localizer, which knows of the robot only its calibration with a new epoch."""
         epoch, localizer = self._robots.get(job.robot, (None, None))
         if localizer is None:
             localizer = Localizer(self.base_map, self.config, self._local_maps, self._index)
         if epoch != job.epoch:
-            localizer.reset(job.epoch)
+            localizer.restart(job.epoch)
         self._robots[job.robot] = job.epoch, localizer
         return localizer
 

@@ -48,7 +48,7 @@ def drive(tilt=(0.0, 0.0), scale=1.0, turn=0.0, steps=40, metres=2.0, seed=0):
         if before is not None:
             T_seen, T_before = before
             estimator.measure_motion(T_seen, seen, inverse(T_before) @ T_odom, NOISE)
-        estimator.measure_attitude(seen, T_odom, np.radians(0.05) ** 2)
+        estimator.measure_attitude(seen, T_odom, np.radians(0.05) ** 2, estimator.calibration.R_body_cloud)
         before = seen, T_odom
     return estimator.calibration
 
@@ -97,7 +97,7 @@ def test_sensor_that_cannot_lean_does_not():
     estimator.restore(Calibration(pitch=0.1))
     leaning = pose_from(exp_so3(np.radians([0.0, 3.0, 0.0])), np.zeros(3))
     for _ in range(20):
-        estimator.measure_attitude(leaning, np.eye(4), 1e-6)
+        estimator.measure_attitude(leaning, np.eye(4), 1e-6, estimator.calibration.R_body_cloud)
         estimator.measure_motion(np.eye(4), pose_from(np.eye(3), [2.1, 0, 0]), pose_from(np.eye(3), [2.0, 0, 0]), NOISE)
     assert (estimator.calibration.roll, estimator.calibration.pitch) == (0.0, 0.0)
     assert estimator.calibration.sigma_tilt < np.radians(0.01)
@@ -124,7 +124,7 @@ def test_small_lean_is_odometrys_gravity_rather_than_the_sensor():
     """Odometry's gravity is good to a quarter of a degree: what is no more than that is not corrected."""
     estimator = CalibrationEstimator()
     lean = pose_from(exp_so3(np.radians([0.2, 0.0, 0.0])), np.zeros(3))
-    estimator.measure_attitude(lean, np.eye(4), np.radians(0.05) ** 2)
+    estimator.measure_attitude(lean, np.eye(4), np.radians(0.05) ** 2, estimator.calibration.R_body_cloud)
     assert abs(np.degrees(estimator.calibration.roll)) < 0.05
 
 

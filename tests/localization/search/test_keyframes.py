@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from coview_stream.config import KeyframeConfig
-from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z, transform
 from coview_stream.localization.registration.prepare_scan import voxelized
 from coview_stream.localization.search import keyframes
 from coview_stream.localization.search.keyframes import KeyframeBuffer
@@ -124,3 +125,27 @@ def test_clear_drops_all_keyframes():
     assert len(buffer.recent(5)) == len(buffer._parts) == 0
     # the next frame is a keyframe wherever it is
     assert add(buffer, cloud(2), at(1.0), 0.2) is not None
+
+
+def test_each_keyframe_is_levelled_from_what_it_was_levelled_by_before():
+    """Whatever was known when a frame was taken: levelled anew, all lie as if it had been known from the beginning."""
+    known = [exp_so3(np.radians([0.0, pitch, 0.0])) for pitch in (0.0, 1.2, 2.6)]
+    leaning, straight = (KeyframeBuffer(KeyframeConfig(distance=1.0)) for _ in range(2))
+    for k, R in enumerate(known):
+        T, points = at(1.5 * k, 0.3 * k), cloud(k, 300)
+        for buffer, level in ((leaning, R), (straight, known[-1])):
+            seen = transform(T, (points @ level.T).astype(np.float32))
+            assert buffer.add(seen, T, float(k), level) is not None
+            assert buffer.add(seen[:50], at(1.5 * k + 0.4, 0.3 * k), k + 0.5, level) is None
+    assert leaning.lean(known[-1]) == pytest.approx(np.radians(2.6), abs=1e-6)
+    leaning.level(known[-1])
+    assert leaning.lean(known[-1]) == pytest.approx(0.0, abs=1e-6)
+    for a, b in zip(leaning.keyframes, straight.keyframes, strict=True):
+        apart = cKDTree(b.points).query(a.points)[0]
+        assert np.median(apart) < 0.01, a.stamp
+    assert len(leaning.recent(1)) == pytest.approx(len(straight.recent(1)), rel=0.1)
+
+
+def test_buffer_without_keyframes_does_not_lean():
+    buffer = KeyframeBuffer(KeyframeConfig())
+    assert buffer.lean(exp_so3(np.array([0.1, 0.0, 0.0]))) == 0.0
