@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,11 +10,10 @@ import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
-from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from, to_local
-from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
+from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
+from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.calibration.frame_correction import FrameCorrection
+from coview_stream.localization.frame import Frame, FramePreparation
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import thinned
 from coview_stream.localization.registration.result import Registration
@@ -34,31 +33,6 @@ from coview_stream.localization.tracking.tracker import Tracker
 _FOUND = np.diag(np.square([*np.radians([0.5, 0.5, 0.5]), 0.1, 0.1, 0.1]))  # of an accepted place; set by hand
 _SMEARED = np.radians(1.0)  # keyframes that lean by less are not levelled again while searching; set by hand
 _DEFERRED = 3.0  # times as far apart are registrations that are deferred; set by hand
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """One frame, checked.
-
-    Attributes:
-        raw: (N, 3) float32, body frame, as it came.
-        cloud: (N, 3) float32, body frame, levelled.
-        T_odom_body: (4, 4) odometry about the anchor, corrected.
-        T_odom_raw: (4, 4) odometry as it came.
-        R_body_cloud: (3, 3) rotation that the cloud has been levelled by.
-        stamp: seconds.
-        voxels: (M, 3) float32, one point per voxel, odometry frame about the anchor.
-        keyframe: the one that it completes; None while a place is known, and between keyframes.
-    """
-
-    raw: Points
-    cloud: Points
-    T_odom_body: Pose
-    T_odom_raw: Pose
-    R_body_cloud: Floats
-    stamp: float
-    voxels: Points
-    keyframe: Keyframe | None
 
 
 class Localizer:
@@ -86,13 +60,12 @@ class Localizer:
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
         self._search = GlobalSearch(base_map, self.config, self._local_maps, index)
-        self._voxel_filter = kernels.VoxelFilter(self.config.keyframe.voxel, self.config.keyframe.range_min)
         self._epoch = Epoch()
         self.reset()
 
     def reset(self, epoch: int = 0) -> None:
         """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
-        self._correction = FrameCorrection(self.config)
+        self._frames = FramePreparation(self.config)
         self.restart(epoch)
 
     def restart(self, epoch: int = 0) -> None:
@@ -100,7 +73,7 @@ class Localizer:
 
         What is known of its sensor and odometry stays.
         """
-        self._correction.restart()
+        self._frames.restart()
         self.state = State.SEARCHING
         self._events: list[Event] = []  # that have changed the state since take_events
         self._epoch = Epoch(epoch, self._epoch.restart + 1)
@@ -108,12 +81,11 @@ class Localizer:
         radius = 0.0 if spec.descriptor is None else spec.descriptor.radius
         self._buffer = KeyframeBuffer(self.config.keyframe, max(radius, spec.reach or 0.0))
         self._search.reset()
-        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._correction.estimator)
+        self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.correction.estimator)
         self._monitor = LossMonitor(self.config.acceptance, self.config.tracking)
         self._hints = PoseHints()
         self._odometry_check = OdometryCheck()
-        self._anchor: Floats | None = None  # origin of odometry in use, so that float32 stays exact
-        self._newest: _Frame | None = None
+        self._newest: Frame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search that found the place
         self._lean_is_told = True  # by a registration at the place
@@ -156,11 +128,11 @@ class Localizer:
             CloudError: the cloud has another shape or fewer than 10 finite points. RunError: the pose or stamp is not
                 finite or not rigid. Neither changes the localizer: count the frame, skip it and go on.
         """
-        frame = self._predict(cloud, T_odom_body, stamp)  # T_map_odom T_odom_body
+        frame, keyframe = self._predict(cloud, T_odom_body, stamp)  # T_map_odom T_odom_body
         match = None
         if self.state.has_place:
             match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
-        elif (request := self._search_request(frame)) is not None:
+        elif (request := self._search_request(frame, keyframe)) is not None:
             match = self._begin_tracking(self._search.update(request))  # eqs 1-13, over the whole map
         if match is not None:
             ruling = self._verify(match)  # what its verdict and those before mean for the place
@@ -184,9 +156,9 @@ class Localizer:
         Raises:
             CloudError, RunError: as for :meth:`step`.
         """
-        frame = self._predict(cloud, T_odom_body, stamp)
+        frame, keyframe = self._predict(cloud, T_odom_body, stamp)
         if not self.state.has_place:
-            return self._search_request(frame)
+            return self._search_request(frame, keyframe)
         match = self._match_to_map(frame, defer)
         if match is not None:
             self._update(match, self._verify(match))
@@ -206,8 +178,8 @@ class Localizer:
         newest, evidence = self._newest, self._evidence
         if newest is None:
             raise RuntimeError("no frame yet; call add_frame or step first")
-        calibration = replace(self._correction.calibration, ground=self._tracker.ground.metres)
-        if self.state is not State.TRACKING or self._anchor is None:
+        calibration = replace(self._frames.correction.calibration, ground=self._tracker.ground.metres)
+        if self.state is not State.TRACKING or self._frames.anchor is None:
             return Fix(newest.stamp, self.state, evidence=evidence, calibration=calibration)
         T_map_local = orthonormal(self._tracker.T_map_odom)
         T_map_local = T_map_local @ newest.T_odom_body
@@ -254,7 +226,7 @@ class Localizer:
         Ignored while a place is known.
         """
         if not self.state.has_place:
-            self._correction.estimator.restore(known.doubted())
+            self._frames.correction.estimator.restore(known.doubted())
 
     def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""
@@ -264,48 +236,38 @@ class Localizer:
 
     # ---- the steps
 
-    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> _Frame:
-        """Check a frame, and move the predicted pose on by its odometry."""
-        raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
-        T = self._correction.odometry(T_raw)
-        if self._anchor is None:
-            self._anchor = T[:3, 3].copy()
-        T = to_local(T, self._anchor)
-        if not self.state.has_place and self._correction.is_due(T):
-            T = self._refine_motion(raw, T, self._anchor)
-        cloud, R_body_cloud = self._correction.level(raw), self._correction.calibration.R_body_cloud
-        voxels = self._voxel_filter(cloud, T)[0].copy()  # the next frame overwrites the filter's array
-        # keyframes are for searching: a loss starts from nothing
-        keyframe = None if self.state.has_place else self._buffer.add(voxels, T, stamp, R_body_cloud)
-        self._tracker.add_scan(voxels, T)
-        self._newest = _Frame(raw, cloud, T, T_raw, R_body_cloud, stamp, voxels, keyframe)
-        return self._newest
+    def _predict(self, cloud: Points, T_odom_body: Pose, stamp: float) -> tuple[Frame, Keyframe | None]:
+        """Check a frame, and move the predicted pose on by its odometry; return it with the keyframe it completes.
 
-    def _refine_motion(self, raw: Points, T_odom_body: Pose, anchor: Floats) -> Pose:
-        """Compare a keyframe with the one before; return its odometry, mended, and level what has been gathered."""
-        points = self._voxel_filter(raw, np.eye(4))[0].copy()
-        T = self._correction.refine(points, T_odom_body, anchor, self._tracker.drift.variances)
-        R_body_cloud = self._correction.calibration.R_body_cloud
-        if self._buffer.lean(R_body_cloud) > _SMEARED:
-            self._buffer.level(R_body_cloud)
-            self._next_epoch()
-        return T
+        Keyframes are for searching: none while a place is known, and a loss starts from nothing.
+        """
+        searching = not self.state.has_place
+        frame = self._frames.prepare(cloud, T_odom_body, stamp, self._tracker.drift.variances if searching else None)
+        keyframe = None
+        if searching:
+            if self._buffer.lean(frame.R_body_cloud) > _SMEARED:
+                self._buffer.level(frame.R_body_cloud)
+                self._next_epoch()
+            keyframe = self._buffer.add(frame.voxels, frame.T_odom_body, stamp, frame.R_body_cloud)
+        self._tracker.add_scan(frame.voxels, frame.T_odom_body)
+        self._newest = frame
+        return frame, keyframe
 
-    def _start_tracking(self, found: Registration, result: SearchResult, newest: _Frame) -> _Frame:
+    def _start_tracking(self, found: Registration, result: SearchResult, newest: Frame) -> Frame:
         """Begin at an accepted place, registered for a keyframe; return the newest frame, levelled by what that tells.
 
         The keyframe may be seconds old, and its clouds levelled otherwise than by what is known now.
         """
         T_odom_found, R_body_cloud = result.T_odom_body, result.R_body_cloud
         seen = found.T_map_source @ T_odom_found
-        levelled = self._correction.learn_found(seen, _FOUND, T_odom_found, R_body_cloud)
+        levelled = self._frames.correction.learn_found(seen, _FOUND, T_odom_found, R_body_cloud)
         newest = self._levelled(newest)
         found = replace(found, T_map_source=levelled @ inverse(T_odom_found))
         self._tracker.start(found, newest.T_odom_body, result.travelled, T_odom_found)
         return newest
 
     def _level(
-        self, match: MapMatch, frame: _Frame, standing_still: bool = False, newest_only: bool = False
+        self, match: MapMatch, frame: Frame, standing_still: bool = False, newest_only: bool = False
     ) -> MapMatch:
         """Level the newest frame by the first registration at a place that fits, and match it again, if it leans.
 
@@ -315,35 +277,34 @@ class Localizer:
             return match
         self._lean_is_told = True
         T_odom_body = frame.T_odom_body
-        T_map_body = self._correction.learn_found(match.T_map_body, match.covariance, T_odom_body, frame.R_body_cloud)
+        T_map_body = self._frames.correction.learn_found(
+            match.T_map_body, match.covariance, T_odom_body, frame.R_body_cloud
+        )
         levelled = self._levelled(frame)
         if levelled is frame:
             return match
         self._tracker.start_levelled(T_map_body, match.covariance, T_odom_body)
         return self._tracker.match_to_map(levelled.cloud, T_odom_body, standing_still, newest_only)
 
-    def _levelled(self, newest: _Frame) -> _Frame:
+    def _levelled(self, newest: Frame) -> Frame:
         """Return the newest frame, levelled by what is known now; the same if it stands straight."""
-        if not self._correction.leans(newest.R_body_cloud):
-            return newest
-        cloud, R_body_cloud = self._correction.level(newest.raw), self._correction.calibration.R_body_cloud
-        voxels = self._voxel_filter(cloud, newest.T_odom_body)[0].copy()
-        self._newest = replace(newest, cloud=cloud, voxels=voxels, R_body_cloud=R_body_cloud)
-        self._tracker.level_newest_scan(voxels)
+        self._newest = self._frames.level_again(newest)
+        if self._newest is not newest:
+            self._tracker.level_newest_scan(self._newest.voxels)
         return self._newest
 
-    def _search_request(self, frame: _Frame) -> SearchRequest | None:
-        """Return what has to be searched for: the keyframe that a frame completes."""
-        assert self._anchor is not None  # there is a frame
-        hints = self._hints.about(self._anchor, frame.T_odom_body)
+    def _search_request(self, frame: Frame, keyframe: Keyframe | None) -> SearchRequest | None:
+        """Return what has to be searched for: the keyframe that a frame completes, if any."""
+        assert self._frames.anchor is not None  # there is a frame
+        hints = self._hints.about(self._frames.anchor, frame.T_odom_body)
         if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
             self._restart_search(frame.stamp)
             return None
-        if frame.keyframe is None:
+        if keyframe is None:
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
         rays = RangeImage.rays(frame.cloud)
-        request = SearchRequest.of(self._buffer, frame.keyframe, rays, spec, travelled, self._epoch, hints)
+        request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints)
         # what the search would begin with: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
 
@@ -356,7 +317,7 @@ class Localizer:
         if result.accepted is None:
             if result.leader is not None and result.evidence.evidence is not None:  # it has been registered
                 seen, probability = result.leader @ result.T_odom_body, result.evidence.confidence or 0.0
-                self._correction.learn_leader(seen, result.T_odom_body, probability, result.R_body_cloud)
+                self._frames.correction.learn_leader(seen, result.T_odom_body, probability, result.R_body_cloud)
             proposed = result.evidence.state is State.AMBIGUOUS
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None
@@ -366,13 +327,13 @@ class Localizer:
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._hints.clear()
         self._buffer.clear()
-        self._correction.forget_frame()
+        self._frames.correction.forget_frame()
         # the robot may have driven on or been carried since the keyframe
         self._lean_is_told = False
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
         return replace(self._level(match, newest), confirms_search=True)
 
-    def _match_to_map(self, frame: _Frame, defer: bool = False) -> MapMatch | None:
+    def _match_to_map(self, frame: Frame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
         patience = _DEFERRED if defer else 1.0
         due = self._tracker.needs_registration(patience)
@@ -425,11 +386,10 @@ class Localizer:
 
         It may also be the sensor or the map, so where odometry says that the robot is now is worth a try.
         """
-        if self._anchor is not None:
-            self._hints.odometry_continues(self._tracker.T_map_odom, self._anchor)
-        self._anchor = None
+        if self._frames.anchor is not None:
+            self._hints.odometry_continues(self._tracker.T_map_odom, self._frames.anchor)
+        self._frames.forget_odometry()
         self._buffer.clear()
-        self._correction.forget_frame()
         self._odometry_check.clear()
         self._tracker.forget_odometry()
         self._next_epoch()
@@ -437,7 +397,7 @@ class Localizer:
     def _restart_search(self, stamp: float) -> None:
         """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
-        self._correction.forget_frame()
+        self._frames.correction.forget_frame()
         self._tracker.forget_scans()
         self._next_epoch()
         self._handle(Event.SCANS_CONTRADICT)

@@ -33,7 +33,7 @@ def misled(localizer, drive, monkeypatch):
 
     def wrong():
         newest = localizer._newest.T_odom_body
-        k = int(np.argmin([abs(T[:3, 3] - localizer._anchor - newest[:3, 3]).sum() for T in drive.T_odom_body]))
+        k = int(np.argmin([abs(T[:3, 3] - localizer._frames.anchor - newest[:3, 3]).sum() for T in drive.T_odom_body]))
         there = drive.T_map_body[k][:3, 3]
         return [each for each in found() if np.linalg.norm((each.T_map_odom @ newest)[:3, 3] - there) > 8.0]
 
