@@ -60,7 +60,7 @@ class Dispute:
             T_map_predicted: (4, 4) pose of the body where odometry leads.
             T_map_seen: (4, 4) each, where it was registered.
             travelled: metres driven.
-            risk: probability that it is another one of them.
+            risk: probability that it is another one of them, so far off that it matters.
         """
         if travelled - self._begun >= self._view:
             self._begun = travelled
@@ -73,9 +73,12 @@ class Dispute:
         np.maximum.at(self._newest, owners[1:], ratios[len(self._poses) :])
         total = self._before + self._newest
         best = int(total.argmax())
-        if best == 0 or total[best] - np.logaddexp.reduce(np.delete(total, best)) < -math.log(risk):
+        here = [each @ scan.T_odom_body for each in self._poses]
+        # what has come so near to the best that either is good enough does not contradict it, but for odometry
+        apart = np.array([k == 0 or matters(*off_by(each, here[best])) for k, each in enumerate(here)])
+        if best == 0 or total[best] - np.logaddexp.reduce(total[apart]) < -math.log(risk):
             return None
-        return self._poses[best] @ scan.T_odom_body
+        return here[best]
 
     def _assign(self, T_map_body: Sequence[Pose], T_odom_body: Pose) -> list[int]:
         """Return which place each pose (4, 4) is nearest to, and move that there; those that are at none are new."""

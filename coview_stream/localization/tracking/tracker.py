@@ -260,7 +260,11 @@ class Tracker:
             places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]
             risk = self.config.acceptance.risk
             right = self._dispute.settle(scan, led, places, self.travelled, risk)
-            moves = right is not None and not matters(*off_by(right, match.T_map_body))
+            if right is not None:
+                found = [each for each in tries if each.verdict.verified]
+                match = min(found, key=lambda each: off_by(right, each.T_map_body)[0], default=match)
+                moves = not matters(*off_by(right, match.T_map_body))
+                metres, degrees = off_by(match.T_map_body, led)
         reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
         if not moves:
             reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"

@@ -93,6 +93,13 @@ def test_place_that_is_not_registered_again_is_weighed_all_the_same(scan):
     assert settled(dispute, scan[0], [1.02], 3.0) is None
 
 
+def test_places_that_come_near_each_other_contradict_each_other_no_more(scan):
+    dispute = Dispute(Told(x0=-8.0, x1=5.0, x2=4.0), 1.0)
+    assert settled(dispute, scan[0], [1.0, 1.6], 0.0) is None  # 1.6 is told like 2
+    assert settled(dispute, scan[0], [1.0, 1.55], 0.5) is None
+    assert settled(dispute, scan[0], [1.15, 1.6], 0.8) == pytest.approx(1.15)
+
+
 def test_places_within_half_of_the_alert_limit_need_no_decision():
     here = np.eye(4)
     assert off_by(here, pose_from(rot_z(np.radians(2.0)), [0.3, 0.4, 0.0])) == pytest.approx((0.5, 2.0))
