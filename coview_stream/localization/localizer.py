@@ -227,6 +227,7 @@ class Localizer:
         """
         if not self.state.has_place:
             self._frames.correction.estimator.restore(known.doubted())
+            self._tracker.ground.restore(known.ground)
 
     def require_verification(self) -> None:
         """Give no pose until later frames alone have verified the place: the robot may have been carried meanwhile."""

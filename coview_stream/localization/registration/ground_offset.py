@@ -7,8 +7,8 @@ as far as there is any that shows a height; where there is none, the offset is t
 
 Most sites have none, and structure seen from below differs by centimetres from what a survey from above shows. So two
 hypotheses are compared, that there is no offset but the survey's own error and that there is one, of some decimetres,
-with what structure says blurred by that much; the more probable one holds. Less than a decimetre or two is not told
-from none, and the height then follows the ground.
+with what structure says blurred by that much; the offset is the mean of both, weighed by how probable they are. Of
+less than two decimetres little is told from none, and the height then follows the ground for the most part.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _NONE_SIGMA, _SIGMA = 0.02, 0.2  # metres, of the two hypotheses
 _VIEWED = 0.07  # metres, one sigma, by which structure seen from below differs in height from that seen from above
 _INDEPENDENT = 0.3  # observations for each patch: neighbours err alike
 _KEPT = 0.9  # of what earlier registrations told, from one to the next
-_FOLLOWED = 0.25  # of a change, at each registration: the height follows it smoothly
+_FOLLOWED = 0.25  # of a change, at each registration but the first ones: the height follows it smoothly
+_STILL, _CHANGED = 0.8, 0.1  # probability that an offset known before is still there; metres by which it may be another
 
 
 class GroundOffset:
@@ -50,12 +51,24 @@ class GroundOffset:
     """
 
     def __init__(self) -> None:
+        self._none, self._some = _NONE * _ZERO, (1.0 - _NONE) * _ANY
+        self.clear()
+
+    def restore(self, metres: float) -> None:
+        """Begin, now and at each place that is found, with the offset that was known at this site before.
+
+        It is a third hypothesis, the most probable one until registrations tell another; next to nothing restores none.
+        """
+        if abs(metres) > 2.0 * _NONE_SIGMA:
+            known = _normal(_CHANGED, _OFFSETS - np.clip(metres, _OFFSETS[0], _OFFSETS[-1]))
+            self._some = _STILL * known + (1.0 - _STILL) * (1.0 - _NONE) * _ANY
+            self._none = (1.0 - _STILL) * _NONE * _ZERO
         self.clear()
 
     def clear(self) -> None:
-        """Forget what is known: the site is another."""
-        self._told = np.zeros(len(_OFFSETS))
-        self.metres, self.sigma, self.probability = 0.0, _SIGMA, 1.0 - _NONE
+        """Forget what has been learned: the place is another."""
+        self._told, self._views = np.zeros(len(_OFFSETS)), 0
+        self.metres = self._weigh()
 
     def lower(self, cloud: RegistrationCloud) -> RegistrationCloud:
         """Return a scan with its ground lowered by the offset, to where the survey has it."""
@@ -72,14 +85,19 @@ class GroundOffset:
         told = log_likelihoods(cloud, T_map_source, target)
         if told is None:
             return
-        self._told = _KEPT * self._told + _INDEPENDENT * told
+        self._told, self._views = _KEPT * self._told + _INDEPENDENT * told, self._views + 1
+        # the first ones are averaged: as yet there is no height to be followed smoothly
+        self.metres += max(_FOLLOWED, 1.0 / self._views) * (self._weigh() - self.metres)
+
+    def _weigh(self) -> float:
+        """Weigh the hypotheses by what has been told; return the mean of both, metres."""
         likelihoods = _blurred(np.exp(self._told - self._told.max()))
-        some, none = likelihoods * _SOME_PRIOR, likelihoods * _NONE_PRIOR
+        some, none = likelihoods * self._some, likelihoods * self._none
         self.probability = float(some.sum() / (some.sum() + none.sum()))
-        weights = some / some.sum() if self.probability > 0.5 else none / none.sum()
-        mean = float(weights @ _OFFSETS) if self.probability > 0.5 else 0.0
-        self.metres += _FOLLOWED * (mean - self.metres)
+        mean = self.probability * float(some @ _OFFSETS / some.sum())
+        weights = (some + none) / (some + none).sum()
         self.sigma = float(np.sqrt(weights @ (_OFFSETS - mean) ** 2))
+        return mean
 
 
 def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMap) -> Floats | None:
@@ -141,5 +159,4 @@ def _blurred(likelihoods: Floats) -> Floats:
     return np.convolve(likelihoods, _normal(_VIEWED, _OFFSETS), mode="same")
 
 
-_NONE_PRIOR = _NONE * _normal(_NONE_SIGMA, _OFFSETS)
-_SOME_PRIOR = (1.0 - _NONE) * _normal(_SIGMA, _OFFSETS)
+_ZERO, _ANY = _normal(_NONE_SIGMA, _OFFSETS), _normal(_SIGMA, _OFFSETS)

@@ -36,3 +36,12 @@ def test_known_calibration_changes_nothing_once_the_place_is_known(world_map, wo
         fix = localizer.step(cloud, T, 0.5 * k)
     localizer.hint_calibration(Calibration(pitch=0.1))
     assert localizer.fix().calibration == fix.calibration
+
+
+def test_ground_offset_of_the_site_is_restored(world_map):
+    localizer = Localizer(world_map)
+    localizer.hint_calibration(Calibration(ground=0.35))
+    offset = localizer._tracker.ground
+    assert offset.metres > 0.2
+    offset.clear()  # as at each place that is found
+    assert offset.metres > 0.2
