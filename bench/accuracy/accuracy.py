@@ -118,6 +118,8 @@ def options(parser: ArgumentParser) -> None:
     """Add which part is measured, and with which dirt."""
     parser.add_argument("--only", choices=("worlds", "dirt"), help="one of the two parts")
     parser.add_argument("--kinds", nargs="+", default=list(dirt.KINDS), choices=dirt.KINDS, metavar="DIRT")
+    drives = range(1, len(dirt.WORLDS) + 1)
+    parser.add_argument("--drives", type=int, default=drives[-1], choices=drives, help="so many of the dirty drives")
 
 
 def rows(asked: Namespace) -> Iterator[Row]:
@@ -125,7 +127,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     if asked.only != "dirt":
         yield from _worlds(asked)
     if asked.only != "worlds":
-        yield from dirt.rows(asked.quick, asked.kinds)
+        yield from dirt.rows(1 if asked.quick else asked.drives, asked.kinds)
 
 
 def _worlds(asked: Namespace) -> Iterator[Row]:

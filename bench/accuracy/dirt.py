@@ -99,11 +99,11 @@ def cells(figures: Run) -> list[str]:
     ]  # fmt: skip
 
 
-def rows(quick: bool, kinds: Sequence[str]) -> Iterator[Row]:
-    """Yield a row per kind with all figures, then how many frames were false in all of them."""
+def rows(drives: int, kinds: Sequence[str]) -> Iterator[Row]:
+    """Yield a row per kind with all figures, over so many drives, then how many frames were false in all of them."""
     false = 0
     for kind in kinds:
-        row = total(kind, [run_one(folder(), world, kind) for world in (WORLDS[:1] if quick else WORLDS)])
+        row = total(kind, [run_one(folder(), world, kind) for world in WORLDS[:drives]])
         false += row.details["false_frames"]
         yield row
     yield judged("accuracy/dirt: false frames", str(false), "0", false == 0, false)

@@ -80,7 +80,7 @@ def test_a_crash_costs_one_run_and_says_why(tmp_path):
 def test_false_frames_of_any_kind_miss_the_target(monkeypatch):
     for false in (0, 3):
         monkeypatch.setattr(dirt, "run_one", lambda _, __, kind, n=false: run(false_frames=n * (kind == "glass")))
-        found = list(dirt.rows(True, ["none", "glass"]))
+        found = list(dirt.rows(1, ["none", "glass"]))
         assert len(found) == 3
         assert found[-1].holds is (false == 0)
 
