@@ -22,6 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes that simulate (2)")
     parser.add_argument("--threads", type=int, default=0, metavar="N", help="threads that train (PyTorch's choice)")
     parser.add_argument(
+        "--dirt", action="store_true", help="drives with leaning sensors, wide and noisy beams, grass, bare trees"
+    )
+    parser.add_argument(
         "--smoke", action="store_true", help="a minute's training of tiny networks, to see that all of it works"
     )
 
@@ -31,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.training.train import DEFAULT, SMOKE, train_session
 
     plan = SMOKE if args.smoke else DEFAULT
+    plan = plan.with_dirt() if args.dirt else plan
     card = train_session(
         args.out,
         plan.with_numbers(args.worlds, args.steps, args.first_world, args.seed),

@@ -9,6 +9,7 @@ import numpy as np
 
 from coview_stream.errors import ConfigError
 from coview_stream.sim.kinds import KINDS
+from coview_stream.training.dirt import TRAINED_DIRT
 from coview_stream.training.sensors import TRAINED_SENSORS
 
 Range = tuple[float, float]
@@ -98,6 +99,7 @@ class Recipe:
         scale_error: drift of its odometry, a share.
         yaw_walk: drift of its odometry, degrees per square root of a metre.
         rays: maximum of beams cast for a submap, thinned evenly.
+        dirt: kinds of :data:`~coview_stream.training.dirt.TRAINED_DIRT` that drives have.
 
     Raises:
         ConfigError: a value out of its range, or an unknown kind or sensor.
@@ -141,6 +143,7 @@ class Recipe:
     scale_error: Range = (0.0, 0.02)
     yaw_walk: Range = (0.0, 0.2)
     rays: int = 160_000
+    dirt: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, bounds in _BOUNDS.items():
@@ -149,6 +152,8 @@ class Recipe:
             values = getattr(self, name)
             if not values or not set(values) <= set(known):
                 raise ConfigError(f"{name}: {values!r}; use one or more of {', '.join(known)}")
+        if not set(self.dirt) <= set(TRAINED_DIRT):
+            raise ConfigError(f"dirt: {self.dirt!r}; use none or some of {', '.join(TRAINED_DIRT)}")
 
     def draw(self, rng: np.random.Generator, name: str) -> float:
         """Draw one value of the range ``name``, evenly."""

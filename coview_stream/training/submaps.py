@@ -15,6 +15,7 @@ from coview_stream.sim.caster import Caster
 from coview_stream.sim.layout import directions
 from coview_stream.sim.odometry import OdometryConfig, drifting_odometry
 from coview_stream.sim.sensors import FRAME_PERIOD
+from coview_stream.training.dirt import DriveDirt
 from coview_stream.training.paths import STEP
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import trained_sensor
@@ -87,10 +88,17 @@ def scanned(
         offset=0.0,
     )
     odometry = drifting_odometry(T, config, rng)
-    clouds = tuple(
-        lidar.scan(caster, true, int(frame), rng, porosity=porosity, noise=noise)
-        for frame, true in zip(frames, T, strict=True)
-    )
+    if recipe.dirt:
+        dirt = DriveDirt.draw(recipe.dirt, rng.spawn(1)[0])
+        clouds = tuple(
+            dirt.scan(lidar, caster, ground, true, int(frame), porosity, noise)
+            for frame, true in zip(frames, T, strict=True)
+        )
+    else:
+        clouds = tuple(
+            lidar.scan(caster, true, int(frame), rng, porosity=porosity, noise=noise)
+            for frame, true in zip(frames, T, strict=True)
+        )
     lean = np.radians(recipe.draw(rng, "gravity_error")) * rng.normal(size=2)
     return Frames(T, odometry, clouds, lean, (len(path) - 1) * STEP)
 

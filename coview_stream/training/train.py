@@ -14,6 +14,7 @@ import numpy as np
 from coview_stream.config.checks import counts
 from coview_stream.errors import ConfigError, InputError, require_library
 from coview_stream.training.dataset import WorldViews, read_world, write_dataset
+from coview_stream.training.dirt import TRAINED_DIRT
 from coview_stream.training.recipe import Recipe
 from coview_stream.training.training_config import TrainingConfig
 from coview_stream.version import __version__
@@ -64,6 +65,10 @@ class Plan:
     def held_out(self) -> range:
         """Seeds of the worlds to evaluate on."""
         return range(_HELD_OUT, _HELD_OUT + self.validation)
+
+    def with_dirt(self) -> Plan:
+        """Return the plan with all kinds of dirt in its drives, and the seasons mixed evenly."""
+        return replace(self, recipe=replace(self.recipe, dirt=TRAINED_DIRT, leaf_off=0.5))
 
     def with_numbers(self, worlds: int | None, steps: int | None, first: int, seed: int) -> Plan:
         """Return the plan with other numbers; None keeps the plan's own."""
