@@ -8,7 +8,8 @@ as far as there is any that shows a height; where there is none, the offset is t
 Most sites have none, and structure seen from below differs by centimetres from what a survey from above shows. So two
 hypotheses are compared, that there is no offset but the survey's own error and that there is one, of some decimetres,
 with what structure says blurred by that much; the offset is the mean of both, weighed by how probable they are. Of
-less than two decimetres little is told from none, and the height then follows the ground for the most part.
+less than two decimetres little is told from none, and the height then follows the ground for the most part. A ground
+that lies below the survey's looks like trees that have grown since, which is more probable: little of it is corrected.
 """
 
 from __future__ import annotations
@@ -38,7 +39,13 @@ _VIEWED = 0.07  # metres, one sigma, by which structure seen from below differs 
 _INDEPENDENT = 0.3  # observations for each patch: neighbours err alike
 _KEPT = 0.9  # of what earlier registrations told, from one to the next
 _FOLLOWED = 0.25  # of a change, at each registration but the first ones: the height follows it smoothly
-_STILL, _CHANGED = 0.8, 0.1  # probability that an offset known before is still there; metres by which it may be another
+_STILL, _CHANGED = 0.6, 0.1  # probability that an offset known before is still there; metres by which it may be another
+
+
+# what has grown since the survey looks as if the ground had sunk: a nuisance, summed over; set by hand
+_HEIGHTS, _PARTS = 0.1 * np.arange(1, 7), (0.5, 1.0)  # metres of growth, share of the patches
+_GROWTHS = np.array([(0.0, 0.0), *((height, part) for height in _HEIGHTS for part in _PARTS)])
+_GROWN = 0.5  # prior probability of any growth
 
 
 class GroundOffset:
@@ -67,7 +74,7 @@ class GroundOffset:
 
     def clear(self) -> None:
         """Forget what has been learned: the place is another."""
-        self._told, self._views = np.zeros(len(_OFFSETS)), 0
+        self._told, self._views = np.zeros((len(_GROWTHS), len(_OFFSETS))), 0
         self.metres = self._weigh()
 
     def lower(self, cloud: RegistrationCloud) -> RegistrationCloud:
@@ -91,7 +98,7 @@ class GroundOffset:
 
     def _weigh(self) -> float:
         """Weigh the hypotheses by what has been told; return the mean of both, metres."""
-        likelihoods = _blurred(np.exp(self._told - self._told.max()))
+        likelihoods = _blurred(_GROWTH_PRIOR @ np.exp(self._told - self._told.max()))
         some, none = likelihoods * self._some, likelihoods * self._none
         self.probability = float(some.sum() / (some.sum() + none.sum()))
         mean = self.probability * float(some @ _OFFSETS / some.sum())
@@ -101,7 +108,7 @@ class GroundOffset:
 
 
 def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMap) -> Floats | None:
-    """Return the log-likelihoods (51,) of offsets from -0.5 to 0.5 m; None where there is no structure or no ground."""
+    """Return the log-likelihoods (G, 51) of growths and offsets, -0.5 to 0.5 m; None without structure or ground."""
     structure = _some(cloud.points[cloud.height > STRUCTURE_HEIGHT])
     ground = _some(cloud.points[~cloud.above])
     if len(structure) < _FEW or len(ground) < _FEW:
@@ -110,9 +117,19 @@ def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalM
     fits = _fits(structure, T_map_source, target)
     patch, count = _patches(structure)
     shares = np.stack([np.bincount(patch, column, len(count)) for column in fits.T], axis=1) / count[:, None]
-    of_structure = np.log(_CHANCE + shares[count >= _FEW]).sum(axis=0)
+    shares = shares[count >= _FEW]
     # where structure is right, the ground is as far off as the two differ by
-    return np.asarray(np.interp(_OFFSETS + level - cloud.ground_offset, _SHIFTS, of_structure))
+    at = _OFFSETS + level - cloud.ground_offset
+    still = _between(shares, at)
+    told = [np.log(_CHANCE + (1.0 - q) * still + q * _between(shares, at - g)).sum(axis=0) for g, q in _GROWTHS]
+    return np.stack(told)
+
+
+def _between(profiles: Floats, at: Reals) -> Floats:
+    """Return profiles (P, K) over the shifts at other ones (S,), linearly: (P, S)."""
+    where = np.clip((at - _SHIFTS[0]) / (_SHIFTS[1] - _SHIFTS[0]), 0.0, len(_SHIFTS) - 1.001)
+    k = where.astype(np.int64)
+    return np.asarray(profiles[:, k] * (1.0 - where + k) + profiles[:, k + 1] * (where - k))
 
 
 def _fits(points: Points, T_map_source: Pose, target: LocalMap) -> Floats:
@@ -159,4 +176,5 @@ def _blurred(likelihoods: Floats) -> Floats:
     return np.convolve(likelihoods, _normal(_VIEWED, _OFFSETS), mode="same")
 
 
+_GROWTH_PRIOR = np.array([1.0 - _GROWN, *np.full(len(_GROWTHS) - 1, _GROWN / (len(_GROWTHS) - 1))])
 _ZERO, _ANY = _normal(_NONE_SIGMA, _OFFSETS), _normal(_SIGMA, _OFFSETS)
