@@ -66,14 +66,19 @@ class Localizer:
     def reset(self, epoch: int = 0) -> None:
         """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
         self._frames = FramePreparation(self.config)
-        self.restart(epoch)
+        self._begin(epoch)
 
     def restart(self, epoch: int = 0) -> None:
         """Search from nothing for the same robot, in another odometry frame, which ``epoch`` numbers.
 
-        What is known of its sensor and odometry stays.
+        What is known of its sensor, its odometry and the site's ground stays.
         """
+        ground = self._tracker.ground.metres
         self._frames.restart()
+        self._begin(epoch)
+        self._tracker.ground.restore(ground)
+
+    def _begin(self, epoch: int) -> None:
         self.state = State.SEARCHING
         self._events: list[Event] = []  # that have changed the state since take_events
         self._epoch = Epoch(epoch, self._epoch.restart + 1)
@@ -96,6 +101,11 @@ class Localizer:
     def sources(self) -> tuple[str, ...]:
         """Names of the recognizers that propose places: "coview", "learned" or both."""
         return self._search.names
+
+    @property
+    def calibration(self) -> Calibration:
+        """What is corrected now of the sensor's tilt and of odometry, and of the site's ground."""
+        return replace(self._frames.correction.calibration, ground=self._tracker.ground.metres)
 
     @property
     def last_query(self) -> dict[Channel, Descriptor]:
@@ -178,7 +188,7 @@ class Localizer:
         newest, evidence = self._newest, self._evidence
         if newest is None:
             raise RuntimeError("no frame yet; call add_frame or step first")
-        calibration = replace(self._frames.correction.calibration, ground=self._tracker.ground.metres)
+        calibration = self.calibration
         if self.state is not State.TRACKING or self._frames.anchor is None:
             return Fix(newest.stamp, self.state, evidence=evidence, calibration=calibration)
         T_map_local = orthonormal(self._tracker.T_map_odom)
@@ -223,10 +233,14 @@ class Localizer:
     def hint_calibration(self, known: Calibration) -> None:
         """Begin with what was known of this robot before, less well; it goes on being measured.
 
-        Ignored while a place is known.
+        Ignored while a place is known, and as far as it is known better here.
         """
-        if not self.state.has_place:
-            self._frames.correction.estimator.restore(known.doubted())
+        if self.state.has_place:
+            return
+        doubted = known.doubted()
+        if doubted.sigma_tilt + doubted.sigma_scale < self.calibration.sigma_tilt + self.calibration.sigma_scale:
+            self._frames.correction.estimator.restore(doubted)
+        if abs(self._tracker.ground.metres) < abs(known.ground):
             self._tracker.ground.restore(known.ground)
 
     def require_verification(self) -> None:

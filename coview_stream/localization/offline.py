@@ -26,7 +26,7 @@ from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import State
-from coview_stream.recordings.run import Frame, Run
+from coview_stream.recordings.run import Frame, Run, SweepCorrection
 
 Progress = Callable[[int, int, Fix | None], None]
 """Called with (frames done, frames, newest fix)."""
@@ -125,7 +125,8 @@ def locate(
     driven, before = 0.0, None
     for index in range(len(run)):
         try:
-            frame = run.read(index)
+            known = localizer.calibration
+            frame = run.read(index, SweepCorrection(known.R_body_cloud, known.scale))
             begin = time.perf_counter()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         except (CloudError, RunError) as error:

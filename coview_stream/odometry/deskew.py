@@ -12,8 +12,16 @@ _STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 
 _INSTANT = 1e-4  # seconds: times that differ by less are one; set by hand
 
 
-def deskew(points: Points, times: Floats, segment: Segment, stamp_ns: int, T_odom_body: Pose) -> Points:
-    """Return the points (N, 3) in the body frame at ``stamp_ns``.
+def deskew(
+    points: Points,
+    times: Floats,
+    segment: Segment,
+    stamp_ns: int,
+    T_odom_body: Pose,
+    R_body_cloud: Floats | None = None,
+    scale: float = 0.0,
+) -> Points:
+    """Return the points (N, 3) in the body frame at ``stamp_ns``; a cloud that leans goes on leaning.
 
     Args:
         points: (N, 3) float32, each in the body frame at its own time, metres.
@@ -21,6 +29,8 @@ def deskew(points: Points, times: Floats, segment: Segment, stamp_ns: int, T_odo
         segment: odometry that covers the sweep; with fewer than two samples nothing moves.
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.
+        R_body_cloud: (3, 3) rotation that levels a cloud whose sensor leans against the body; None for none.
+        scale: what odometry's distances have to be multiplied with, less one.
     """
     if len(segment.stamps) < 2 or not len(points):
         return points
@@ -33,7 +43,12 @@ def deskew(points: Points, times: Floats, segment: Segment, stamp_ns: int, T_odo
     relative = inverse(T_odom_body) @ segment.poses
     k = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, len(at) - 2)
     share = (grid - at[k]) / (at[k + 1] - at[k])
-    motion = interpolate(relative[k], relative[k + 1], share).astype(np.float32)
+    body = interpolate(relative[k], relative[k + 1], share)
+    body[:, :3, 3] *= 1.0 + scale
+    if R_body_cloud is not None:
+        body[:, :3, :3] = R_body_cloud.T @ body[:, :3, :3] @ R_body_cloud
+        body[:, :3, 3] = body[:, :3, 3] @ R_body_cloud  # each row by the transposed rotation
+    motion = body.astype(np.float32)
     step = np.rint((known - low) * ((_STEPS - 1) / max(high - low, _INSTANT))).astype(np.intp)
     moved = np.einsum("nij,nj->ni", motion[step, :3, :3], points) + motion[step, :3, 3]
     return np.asarray(moved, dtype=np.float32)

@@ -25,7 +25,7 @@ from coview_stream.messages.types import CloudMessage, Sample
 from coview_stream.odometry.deskew import deskew
 from coview_stream.recordings.bag_reader import BagReader, frame_id, header_stamp, readable
 from coview_stream.recordings.odometry_track import SAME_NS, Track
-from coview_stream.recordings.run import Run
+from coview_stream.recordings.run import Run, SweepCorrection
 
 _NS = 1e-9
 _MAX_SETBACK_NS = 5_000_000_000  # set by hand: stamps that go back by less are messages out of order
@@ -91,13 +91,17 @@ class BagClouds:
         self._pending: Iterator[tuple[str, int, bytes]] = iter(())
         self._next = -1
 
-    def read(self, index: int) -> Cloud:
-        """Read frame ``index`` in the body frame at its stamp; CloudError if damaged or without a usable point."""
+    def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
+        """Read frame ``index`` in the body frame at its stamp, deskewed by odometry, which ``correction`` corrects.
+
+        Raises:
+            CloudError: it is damaged or has no usable point.
+        """
         message = self.message(index)
         # false for NaN as well
         usable: Bools = np.all(np.abs(message.points) < MAX_COORDINATE, axis=1)
         builder = CloudBuilder(dropped=int((~usable).sum()))
-        builder.add(self._deskewed(index, message, usable))
+        builder.add(self._deskewed(index, message, usable, correction or SweepCorrection()))
         return builder.finish(self._name(index))
 
     def message(self, index: int) -> CloudMessage:
@@ -128,13 +132,14 @@ class BagClouds:
             reads_on = False
         raise ValueError("it is not there any more")
 
-    def _deskewed(self, index: int, message: CloudMessage, usable: Bools) -> Points:
+    def _deskewed(self, index: int, message: CloudMessage, usable: Bools, known: SweepCorrection) -> Points:
         points = message.points[usable]
         if message.times is None or not len(points):
             return points
         stamp, times = message.stamp_ns, message.times[usable]
         begin, end = (stamp + round(t / _NS) for t in (min(0.0, times.min()), max(0.0, times.max())))
-        return deskew(points, times, self.track.around(begin, end, stamp), stamp, self.poses[index])
+        sweep = self.track.around(begin, end, stamp)
+        return deskew(points, times, sweep, stamp, self.poses[index], known.R_body_cloud, known.scale)
 
 
 @dataclass

@@ -41,10 +41,23 @@ class Frame:
     dropped: int = 0
 
 
+@dataclass(frozen=True)
+class SweepCorrection:
+    """What is known of sensor and odometry when a sweep is deskewed.
+
+    Attributes:
+        R_body_cloud: (3, 3) rotation that levels the sensor's clouds; None for none.
+        scale: what odometry's distances have to be multiplied with, less one.
+    """
+
+    R_body_cloud: Floats | None = None
+    scale: float = 0.0
+
+
 class CloudSource(Protocol):
     """Reader of a run's clouds, where they are not in a file each."""
 
-    def read(self, index: int) -> Cloud:
+    def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
         """Read frame ``index`` in the body frame at its stamp, metres; CloudError if it is damaged."""
         ...
 
@@ -78,8 +91,8 @@ class Run:
         """Yield every frame in order; raises like ``read`` (use ``read`` to skip a damaged frame)."""
         return (self.read(index) for index in range(len(self)))
 
-    def read(self, index: int) -> Frame:
-        """Read frame ``index``.
+    def read(self, index: int, correction: SweepCorrection | None = None) -> Frame:
+        """Read frame ``index``; a raw sweep of a recording is deskewed by odometry, which ``correction`` corrects.
 
         Raises:
             IndexError: there is no such frame.
@@ -88,7 +101,7 @@ class Run:
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path}: no frame {index} among {len(self)}")
         path = self.frames_paths[index]
-        cloud = read_cloud(path) if self.source is None else self.source.read(index)
+        cloud = read_cloud(path) if self.source is None else self.source.read(index, correction)
         if len(self) > 1 and cloud.origin.any():
             raise CloudError(
                 f"{path}: coordinates near {cloud.origin.tolist()} cannot be in the body frame; "

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fake_robot import ns, pose
 
-from coview_stream.geometry.transforms import inverse, transform
+from coview_stream.geometry.transforms import exp_so3, inverse, transform
 from coview_stream.odometry.buffer import Segment
 from coview_stream.odometry.deskew import deskew
 
@@ -123,3 +123,21 @@ def test_deskew_with_all_points_off_the_stamp(times):
     moved = deskew(points, np.array(times), segment(lambda t: pose(10.0 * t), (0.0, 0.1)), ns(0.0), pose(0.0))
     expected = points + np.array([10.0 * min(times[0], 0.1), 0.0, 0.0])
     np.testing.assert_allclose(moved, expected, atol=0.02)
+
+
+@pytest.mark.slow
+def test_leaning_sweep_with_wrong_odometry_is_straight_only_with_the_calibration():
+    """A sensor that looks down by four degrees, odometry that measures 7 % too long."""
+    world, lean = wall(), exp_so3(np.radians([1.0, 4.0, 0.0]))
+    times = np.random.default_rng(1).uniform(-0.1, 0.0, len(world))
+    swept = (measured(world, straight, times) @ lean.T).astype(np.float32)
+    at_once = measured(world, straight, np.zeros(len(world))) @ lean.T
+
+    def too_long(t):
+        return ODOM_FAR @ pose(1.07 * SPEED * t, 0.0, 0.0)
+
+    sweep = segment(too_long, np.arange(-0.14, 0.141, 0.02))
+    known = deskew(swept, times, sweep, ns(0.0), too_long(0.0), lean.T, 1.0 / 1.07 - 1.0)
+    assert apart(known, at_once) < 0.01
+    assert apart(deskew(swept, times, sweep, ns(0.0), too_long(0.0)), at_once) > 0.05
+    assert apart(deskew(swept, times, sweep, ns(0.0), too_long(0.0), lean.T), at_once) > 0.05

@@ -90,7 +90,7 @@ class EngineQueue:
         self._counters.dropped += before is not None
         job = FrameJob(
             self.robot, self.epoch, message.stamp_ns, message.points, frame.T_odom_body, message.times,
-            frame.segment, defer=before is not None,
+            frame.segment, defer=before is not None, first_epoch=self._first_epoch,
         )  # fmt: skip
         waiting_since = now if before is None else before.waiting_since
         self._frame = QueuedFrame(job, frame.received, waiting_since, travelled, turned)

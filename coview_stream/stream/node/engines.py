@@ -70,7 +70,7 @@ class TrackEngine:
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range, _CROPS)
-        self._robots: dict[str, tuple[int, Localizer]] = {}
+        self._robots: dict[str, tuple[int, int, Localizer]] = {}  # first epoch, epoch
         # without its weights: it says what requests have to bring, and the search engine searches
         self._index = SearchIndex.of(base_map, self.config, load=False)
 
@@ -86,9 +86,6 @@ class TrackEngine:
             raise TypeError(f"{type(job).__name__}: the tracking engine does frames")
         begin = time.perf_counter()
         localizer = self._localizer(job)
-        points = job.points
-        if job.times is not None and job.segment is not None:
-            points = deskew(points, job.times, job.segment, job.stamp_ns, job.T_odom_body)
         if job.search_result is not None:
             localizer.apply_search_result(job.search_result)
         if job.require_verification:
@@ -98,6 +95,12 @@ class TrackEngine:
         if job.hint is not None:
             with contextlib.suppress(RunError):  # a hint of no use is no reason to drop the frame
                 localizer.hint_pose(job.hint)
+        points = job.points
+        if job.times is not None and job.segment is not None:
+            known = localizer.calibration
+            points = deskew(
+                points, job.times, job.segment, job.stamp_ns, job.T_odom_body, known.R_body_cloud, known.scale
+            )
         request = localizer.add_frame(points, job.T_odom_body, job.stamp_ns * 1e-9, job.defer)
         return FrameResult(localizer.fix(), request, time.perf_counter() - begin, localizer.take_events())
 
@@ -115,12 +118,14 @@ class TrackEngine:
 
     def _localizer(self, job: FrameJob) -> Localizer:
         """Return the robot's localizer, which knows of the robot only its calibration with a new epoch."""
-        epoch, localizer = self._robots.get(job.robot, (None, None))
+        first, epoch, localizer = self._robots.get(job.robot, (None, None, None))
         if localizer is None:
             localizer = Localizer(self.base_map, self.config, self._local_maps, self._index)
-        if epoch != job.epoch:
+        if first != job.first_epoch:
+            localizer.reset(job.epoch)
+        elif epoch != job.epoch:
             localizer.restart(job.epoch)
-        self._robots[job.robot] = job.epoch, localizer
+        self._robots[job.robot] = job.first_epoch, job.epoch, localizer
         return localizer
 
 

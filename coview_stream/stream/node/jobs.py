@@ -33,6 +33,8 @@ class FrameJob:
         defer: frames wait for the engine: put off what need not be done at this one.
         hint: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis.
         calibration: what was known of its sensor and odometry there; goes with ``hint``, a prior.
+        first_epoch: the first one after a client asked to forget the robot; another one makes the engine forget what it
+            knows of the sensor and the odometry, too.
     """
 
     robot: str
@@ -47,6 +49,7 @@ class FrameJob:
     defer: bool = False
     hint: Pose | None = None
     calibration: Calibration | None = None
+    first_epoch: int = 0
 
 
 @dataclass(frozen=True)

@@ -170,8 +170,8 @@ def test_damaged_frames_are_skipped_and_counted(run_folder, tmp_path):
 def test_frame_without_finite_points_is_skipped(run, monkeypatch):
     inner = Run.read
 
-    def read(self, index):
-        frame = inner(self, index)
+    def read(self, index, correction=None):
+        frame = inner(self, index, correction)
         return replace(frame, points=frame.points * np.float32(np.nan)) if index == 1 else frame
 
     monkeypatch.setattr(Run, "read", read)

@@ -14,6 +14,7 @@ from coview_kernels.launch import Launch
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.errors import CloudError, MapError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform
+from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.state import Event, State
 from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine, open_engine
@@ -249,7 +250,7 @@ def test_points_with_times_are_deskewed(engines, world_drive):
     segment = Segment(np.array([900_000_000, 1_000_000_000], np.int64), np.array(along))
     engine = engines[0]
     engine.run(FrameJob("moving", 1, 1_000_000_000, swept, T, times, segment))
-    cloud = engine._robots["moving"][1]._newest.cloud
+    cloud = engine._robots["moving"][2]._newest.cloud
     np.testing.assert_allclose(cloud, points, atol=0.01)
 
 
@@ -271,3 +272,18 @@ def test_engines_open_from_a_map_file(world_file, tmp_path):
         open_engine("track", world_file, "0" * 64)
     with pytest.raises(MapError, match="none"):
         open_engine("track", tmp_path / "none.coview", sha256)
+
+
+def test_engine_forgets_the_sensor_only_when_a_client_asks(engines, world_drive):
+    """Another odometry frame is the same robot's."""
+    engine = engines[0]
+    known = Calibration(pitch=0.05, sigma_tilt=0.001, sigma_scale=0.001)
+    cloud, T = world_drive.clouds[0], world_drive.T_odom_body[0]
+    told = [
+        engine.run(FrameJob("leaning", epoch, 1_000_000_000, cloud, T, calibration=hint, first_epoch=first))
+        for epoch, first, hint in ((4, 4, known), (5, 4, None), (6, 6, None))
+    ]
+    pitches = [result.fix.calibration.pitch for result in told]
+    assert pitches[0] > 0.02
+    assert pitches[1] == pitches[0]
+    assert pitches[2] == 0.0
