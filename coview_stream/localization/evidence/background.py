@@ -73,6 +73,24 @@ def scatter(observed: Floats32) -> Floats:
     return np.asarray(np.maximum(reach.max(axis=0), 1e-3) ** 2)
 
 
+def left_in_mean(observed: Floats32) -> Floats:
+    """Return how much of the variances of :func:`scatter` is left in the mean over keyframes: 1 if they see the same.
+
+    Keyframes see much of the same surroundings, and a place that fits by chance goes on to fit: so much is measured, at
+    places that are wrong. It is what is left of all places' variance, or of that of their tail, whichever is more.
+
+    Args:
+        observed: (N, W, 7) at the same chance places by W keyframes.
+    """
+    count, width = observed.shape[:2]
+    if count < _MANY or width < 2:
+        return np.ones(4)
+    each = np.stack([_compared(observed[:, k]) for k in range(width)])
+    whole = each.mean(axis=0).var(axis=0) / np.maximum(each.var(axis=1).mean(axis=0), 1e-9)
+    every = np.mean([scatter(observed[:, k]) for k in range(width)], axis=0)
+    return np.asarray(np.clip(np.maximum(whole, scatter(observed.mean(axis=1)) / every), 1.0 / width, 1.0))
+
+
 def _compared(observed: Floats32) -> Floats:
     covered = np.maximum(observed[:, Share.COVERED], _COVERED)
     near = observed[:, Share.NEAR]

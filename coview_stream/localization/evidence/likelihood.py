@@ -7,9 +7,10 @@ rest, chance explains what it explains anywhere. So an outcome has the probabili
 
 with b the background's and d what a survey of this kind shows of what is there. q (the site may have changed), d (a
 survey from above shows roofs, one from the ground facades) and the share of rays that pass through what stands
-(foliage) are nuisances: they are summed over, evenly. With n the effective number of observations of a kind and s the
-shares of their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that explains no more than chance
-cannot gain, as q >= 0. What the map does not cover adds nothing; a rival that has it covered gains by it.
+(foliage) are nuisances: they are summed over. Most sites are much as the survey has them, so a share q has the density
+2 q; and what chance shows of edges and of walls tells something of d. With n the effective number of observations of a
+kind and s the shares of their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that explains no more
+than chance cannot gain, as q >= 0. What the map does not cover adds nothing; a rival that has it covered gains by it.
 
 The ground is one observation of a place, not many, for a road is level everywhere: its share is held against the Beta
 distribution of the chance places' shares. One chance place in a hundred is presumed to be as clear and as level as the
@@ -29,9 +30,11 @@ from coview_stream.localization.evidence.observed_scan import Share
 
 # set by hand
 _KEPT = np.linspace(0.05, 1.0, 20)  # shares q that are summed over
+_KEPT_PRIOR = _KEPT / _KEPT.sum()
 _SURVEYS = np.array(
     [
         [0.1, 0.25, 0.6, 0.05],
+        [0.2, 0.4, 0.35, 0.05],
         [0.3, 0.15, 0.45, 0.1],
         [0.5, 0.25, 0.15, 0.1],
         [0.65, 0.25, 0.05, 0.05],
@@ -39,7 +42,9 @@ _SURVEYS = np.array(
     ]
 )
 """Outcomes of what is there: on, near, under an edge, unexplained; from an airborne survey, of a canopy that hides what
-stands below it and then of streets, to one of the same kind."""
+stands below it, of hedges and crowns that few pulses have met, and then of streets, to one of the same kind."""
+_EDGES = _SURVEYS[:, 2] / _SURVEYS[:, :3].sum(axis=1)  # of what they explain, the share that is below an edge
+_EDGES_WIDTH = 0.1  # where that is more than what chance has, its odds fall e-fold for each so much more
 _LEAKS = np.array([0.05, 0.3, 0.6])  # of the background's passed rays, those that pass what stands there
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
 _OPEN = 0.01  # share of chance places that are as clear of structure and as level as the right one: an open road
@@ -63,7 +68,19 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> tuple[F
     best = _KEPT[each.max(axis=(2, 3)).argmax(axis=1)]
     flat = each.reshape(len(each), -1)
     top = flat.max(axis=1)
-    return np.log(np.exp(flat - top[:, None]).mean(axis=1)) + top, best
+    return np.log(np.exp(flat - top[:, None]) @ nuisance_prior(background).ravel()) + top, best
+
+
+def nuisance_prior(background: Background) -> Floats:
+    """Return the probabilities (Q, D, L) of the nuisances before a place is looked at; they add up to one.
+
+    By chance, too, a scan falls on map structure where the survey shows walls, and below edges where it does not: of
+    what the right place explains, no greater share is below edges than of what chance explains, or not by much.
+    """
+    chance = background.structure[2] / background.structure[:3].sum()
+    kinds = 1.0 / (1.0 + np.exp((_EDGES - chance) / _EDGES_WIDTH))
+    each = _KEPT_PRIOR[:, None, None] * (kinds / kinds.sum())[:, None]
+    return np.asarray(np.repeat(each, len(_LEAKS), axis=2) / len(_LEAKS))
 
 
 def log_likelihoods(observed: Floats32, background: Background) -> Floats:

@@ -10,7 +10,6 @@ observations (:mod:`coview_stream.localization.evidence.likelihood`), against th
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
-from coview_stream.localization.evidence.background import estimate_background, scatter
+from coview_stream.localization.evidence.background import estimate_background, left_in_mean, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observed_scan import ObservedScan, Share
@@ -31,7 +30,9 @@ from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # of them, those that stay by their evidence, however the newest keyframe ranks them
-_KEYFRAMES = 8  # newest keyframes whose observations a place has
+_KEYFRAMES = 12  # whose observations a place has: the newest, and those before that are farthest apart
+_LOOK = 8  # keyframes: each so many are another chance of an error, and a part that moved is looked for in so many
+_CHANCE = 128  # places at which the earlier keyframes are asked as well, how far chance goes on to fit
 _CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share what it explains
 BASIN_DISTANCE, BASIN_ANGLE = (
     SAME_DISTANCE,
@@ -176,15 +177,15 @@ class PlaceScorer:
 
     @property
     def scans(self) -> list[ObservedScan]:
-        """Newest keyframes, the newest last."""
-        return list(self._scans)
+        """Newest keyframes that are kept, eight at most, the newest last."""
+        return self._scans[-_LOOK:]
 
     def clear(self) -> None:
         """Forget all places and keyframes."""
         self._followed = _Followed.none()
         self._seen = 0  # keyframes
-        self._scans: deque[ObservedScan] = deque(maxlen=_KEYFRAMES)
-        self._scatter: deque[Floats] = deque(maxlen=_KEYFRAMES)
+        self._scans: list[ObservedScan] = []
+        self._scatter: list[Floats] = []
 
     def score(self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ScanInput) -> Scored:
         """Observe the map from a keyframe's hypotheses and from the places that are followed.
@@ -212,7 +213,8 @@ class PlaceScorer:
         self._seen += 1
         self._scans.append(seen)
         self._followed = followed = followed[order]
-        chances = posterior(ratios[order], followed.votes, len(first), 1 + self._seen // _KEYFRAMES)
+        self._thin_out()
+        chances = posterior(ratios[order], followed.votes, len(first), 1 + self._seen // _LOOK)
         numbers = zip(order, chances.place, followed.newest, strict=True)
         places = [
             ScoredPlace(
@@ -229,6 +231,19 @@ class PlaceScorer:
         second = next((place for place, other in zip(places, elsewhere, strict=True) if other), None)
         by_chance = expected_by_chance(places[0].ratio, len(first))
         return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
+
+    def _thin_out(self) -> None:
+        """Forget one of too many keyframes: the one that is nearest to those beside it, for it saw least of its own.
+
+        The newest is kept, and the first: what was seen far from here is the least like what is seen now.
+        """
+        if len(self._scans) <= _KEYFRAMES:
+            return
+        steps = np.linalg.norm(np.diff([scan.body for scan in self._scans], axis=0), axis=1)
+        least = 1 + int((steps[:-1] + steps[1:]).argmin())
+        del self._scans[least], self._scatter[least]
+        kept = np.arange(self._followed.observed.shape[1]) != least
+        self._followed = replace(self._followed, observed=self._followed.observed[:, kept])
 
     def _around_leader(self) -> list[Hypothesis]:
         """Return hypotheses beside the most probable place: along a corridor it may be anywhere."""
@@ -278,8 +293,7 @@ class PlaceScorer:
         past = np.empty((len(chosen), len(self._scans), len(Share)), dtype=np.float32)
         of = np.array(known, dtype=np.int64)
         if len(self._scans):
-            width = before.observed.shape[1]
-            past[of >= 0] = before.observed[of[of >= 0], width - len(self._scans) :]
+            past[of >= 0] = before.observed[of[of >= 0]]
             past[of < 0] = self._ask_earlier(T[newest[of < 0]])
         shares = np.concatenate([past, observed.shares[newest][:, None]], axis=1)
         return _Followed(hypotheses, votes, shares, newest, np.array(hinted, dtype=bool))
@@ -305,9 +319,10 @@ class PlaceScorer:
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, kept = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
         self._scatter.append(scatter(observed.shares[first]))
+        asked, over_time = self._over_time(observed, first, seen)
         for last in (False, True):
             known = [each for each in self._scatter if np.isfinite(each).all()] or [self._scatter[-1]]
-            spread = np.mean(known, axis=0)
+            spread = np.mean(known, axis=0) * left_in_mean(over_time[chance[asked]])
             background = estimate_background(observed.shares[first][chance], spread, mean[kept], patches)
             ratios, q = log_likelihood_ratios(mean, background)
             if last:
@@ -317,6 +332,12 @@ class PlaceScorer:
             chance, kept = (_apart(each, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for each in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
         return ratios, q
+
+    def _over_time(self, observed: _Observed, first: Ints, seen: ObservedScan) -> tuple[Ints, Floats32]:
+        """Return numbers (N,) of some of the places, and the observations (N, W, 7) of all keyframes there."""
+        some = np.linspace(0, len(first) - 1, min(len(first), _CHANCE)).astype(np.int64)
+        past = self._ask_earlier(seen.transforms(observed.poses[first[some]]))
+        return some, np.concatenate([past, observed.shares[first[some]][:, None]], axis=1)
 
 
 _NOTHING = np.empty((0, len(Share)), dtype=np.float32)

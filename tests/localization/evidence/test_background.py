@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation
+from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation, places_of_their_own, what_was_seen_before
 
-from coview_stream.localization.evidence.background import estimate_background, outcomes, scatter
+from coview_stream.localization.evidence.background import estimate_background, left_in_mean, outcomes, scatter
 from coview_stream.localization.evidence.observed_scan import Share
 
 NOTHING = np.empty((0, len(Share)), dtype=np.float32)
@@ -112,3 +112,28 @@ def test_ground_parameters_follow_the_chance_places(rng, level):
     places = observation(np.tile(CHANCE, (200, 1)), ground=np.clip(rng.normal(level, 0.05, 200), 0, 1))
     a, b = estimate_background(places, scatter(places), places).ground
     assert a / (a + b) == pytest.approx(level, abs=0.06)
+
+
+# ---- several keyframes
+
+
+def test_keyframes_that_see_something_else_each_leave_less_of_the_scatter(rng):
+    left = left_in_mean(chance_places(rng, 500, keyframes=4))
+    assert ((left > 0.2) & (left < 0.5)).all()  # a quarter, but for how uncertain it is
+
+
+def test_keyframes_that_see_the_same_leave_all_of_the_scatter(rng):
+    same = np.repeat(chance_places(rng, 200), 5, axis=1)
+    np.testing.assert_allclose(left_in_mean(same), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("draw", [places_of_their_own, what_was_seen_before])
+def test_places_that_go_on_to_fit_leave_most_of_the_scatter(rng, draw):
+    left = left_in_mean(draw(rng, 300, keyframes=4))
+    assert (left > 0.5).all()
+    assert (left <= 1.0).all()
+
+
+@pytest.mark.parametrize(("count", "keyframes"), [(300, 1), (5, 4), (0, 3)])
+def test_one_keyframe_or_few_places_tell_nothing_of_it(rng, count, keyframes):
+    np.testing.assert_array_equal(left_in_mean(chance_places(rng, count, keyframes=keyframes)), 1.0)

@@ -13,7 +13,7 @@ from made_up_scans import chance_places, mostly_nothing, places_of_their_own, tw
 from scipy.stats import binom
 
 from coview_stream.localization.evidence import background
-from coview_stream.localization.evidence.background import estimate_background, scatter
+from coview_stream.localization.evidence.background import estimate_background, left_in_mean, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.posterior import posterior
 
@@ -30,7 +30,8 @@ def smallest_error(places, rng):
         others = np.ones(count, dtype=bool)
         spreads.append(scatter(now))
         for last in (False, True):
-            known = estimate_background(now[others], np.mean(spreads, axis=0), mean[others])
+            spread = np.mean(spreads, axis=0) * left_in_mean(places[others, : k + 1])
+            known = estimate_background(now[others], spread, mean[others])
             ratios, _ = log_likelihood_ratios(mean, known)
             if not last:  # the leader is not among what it is compared with
                 others = np.arange(count) != np.argmin(np.log1p(votes) - ratios)

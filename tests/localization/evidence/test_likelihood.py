@@ -13,7 +13,7 @@ from scipy.stats import beta
 
 from coview_stream.localization.evidence import likelihood
 from coview_stream.localization.evidence.background import Background, estimate_background, scatter
-from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.likelihood import log_likelihood_ratios, nuisance_prior
 from coview_stream.localization.evidence.observed_scan import Share
 from coview_stream.localization.evidence.posterior import posterior
 
@@ -41,8 +41,11 @@ def plain_sum(row, background):
     ground = min(gains) if share < background.ground[0] / sum(background.ground) else gains[0]
     ground *= float(row[Share.COVERED_GROUND])
     total = 0.0
-    nuisances = list(product(likelihood._KEPT, likelihood._SURVEYS, likelihood._LEAKS))
-    for q, survey, leak in nuisances:
+    edges = background.structure[2] / sum(background.structure[:3])
+    kinds = [1 / (1 + math.exp((d[2] / sum(d[:3]) - edges) / likelihood._EDGES_WIDTH)) for d in likelihood._SURVEYS]
+    kinds = [each / sum(kinds) for each in kinds]
+    nuisances = list(product(likelihood._KEPT, zip(kinds, likelihood._SURVEYS, strict=True), likelihood._LEAKS))
+    for q, (kind, survey), leak in nuisances:
         log = 0.0
         for share, there, by_chance in zip(shares, survey, background.structure, strict=True):
             log += background.number[0] * share * math.log((q * there + (1 - q) * by_chance) / by_chance)
@@ -51,7 +54,7 @@ def plain_sum(row, background):
         free += background.number[1] * clear * math.log((1 - hit) / (1 - background.passed))
         beside = free + ground
         log += beside - math.log(1 - likelihood._OPEN + likelihood._OPEN * math.exp(beside))
-        total += math.exp(log) / len(nuisances)
+        total += math.exp(log) * q / sum(likelihood._KEPT) * kind / len(likelihood._LEAKS)
     return math.log(total)
 
 
@@ -64,6 +67,20 @@ def test_ratio_is_the_plain_sum_over_the_nuisances():
     found, kept = log_likelihood_ratios(rows, BACKGROUND)
     np.testing.assert_allclose(found, [plain_sum(row, BACKGROUND) for row in rows], rtol=1e-4, atol=1e-4)
     assert ((kept > 0) & (kept <= 1)).all()
+
+
+def test_nuisances_have_a_prior_that_what_chance_shows_of_edges_decides():
+    few, many = (
+        nuisance_prior(replace(BACKGROUND, structure=np.array(b)))
+        for b in ([0.3, 0.25, 0.05, 0.4], [0.07, 0.2, 0.43, 0.3])
+    )
+    for prior in (few, many):
+        assert prior.shape == likelihood.NUISANCES
+        assert prior.sum() == pytest.approx(1.0)
+    assert few.sum(axis=(0, 2))[-1] > 0.2 > 0.02 > few.sum(axis=(0, 2))[0]  # a survey from the ground, or of a canopy
+    assert many.sum(axis=(0, 2))[0] > 0.05
+    kept = few.sum(axis=(1, 2))
+    np.testing.assert_allclose(kept / kept[-1], likelihood.steps_of_kept())
 
 
 def test_the_more_is_explained_the_higher_the_ratio():

@@ -64,7 +64,8 @@ def off(found: Modes) -> float:
 def test_equal_modes_leave_it_undecided(row_map, points):
     found = look(row_map, points, 0.0, 6.0, 0.0)
     assert found.undecided > 0.5
-    assert found.distances.max() == pytest.approx(2.0, abs=0.1)  # two posts on
+    # two posts on; which of the modes within a third of a metre is the best is chance
+    assert found.distances.max() == pytest.approx(2.0, abs=0.35)
     assert found.probabilities.max() < 0.5
     assert found.probabilities.sum() == pytest.approx(1.0)
 

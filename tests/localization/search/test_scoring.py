@@ -191,3 +191,14 @@ def test_observations_are_kept_for_a_bounded_number_of_keyframes(world_map, worl
     assert len(scorer._scans) < 24
     # the same scan again and again is no new evidence: chance repeats itself as well
     assert max(ratios) < 2.0 * ratios[0]
+
+
+def test_keyframes_far_apart_are_kept(world_map, world_drive):
+    """What saw least of its own is forgotten: of many keyframes at one place most."""
+    scorer = PlaceScorer(world_map)
+    scans = [scan_of(world_drive, k) for k in (0, *[2] * 18, 4)]
+    for scan in scans:
+        scored(scorer, some_places(scan, 12), scan)
+    seen = np.array([each.body for each in scorer._scans])
+    assert len(seen) == scorer._followed.observed.shape[1] == len(scorer._scatter) < len(scans)
+    np.testing.assert_allclose(seen[[0, -1]], [scans[0].T_odom_body[:3, 3], scans[-1].T_odom_body[:3, 3]])
