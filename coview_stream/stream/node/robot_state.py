@@ -37,7 +37,7 @@ class RobotState:
     Attributes:
         state: of the robot; there is a pose while it is TRACKING.
         last_frame_ns: stamp of the newest processed frame; None before the first.
-        calibration: what is corrected of its sensor and odometry, also while it is lost; None before that is known.
+        calibration: what is corrected of its sensor and odometry at the newest frame, in every state.
     """
 
     def __init__(self, robot: str, map_sha256: str, counters: Counters, hint: PoseHint) -> None:
@@ -83,6 +83,7 @@ class RobotState:
         stamp_ns = self.last_frame_ns = frame.job.stamp_ns
         before, lost_before = self.state, self._fix is not None and self._fix.state is State.LOST
         self._fix = fix
+        self.calibration = fix.calibration or self.calibration
         asked = frame.job.require_verification
         if asked and self._verify_from_ns is not None and stamp_ns >= self._verify_from_ns:
             self._verify_from_ns = None  # from here on a doubt is the engine's own
@@ -96,7 +97,6 @@ class RobotState:
         if verified:
             self._counters.fixes += before is not State.TRACKING
             self._correction = OdomCorrection.of(fix, stamp_ns, frame.travelled, frame.turned)
-            self.calibration = fix.calibration or self.calibration
             self._hint.update(self._correction.T_map_body, self.calibration)
 
     def restart_search(self, reason: str) -> None:

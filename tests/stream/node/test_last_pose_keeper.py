@@ -15,6 +15,7 @@ from sockets import until
 
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.state import State
 from coview_stream.stream.node import last_pose
 from coview_stream.stream.node import last_pose_keeper as memory
 from coview_stream.stream.node.engines import TrackEngine
@@ -73,6 +74,31 @@ def test_calibration_is_kept_with_the_pose_and_begins_the_next_start(robot, tmp_
     LastPoseKeeper(tmp_path, [later.session]).hint()
     later.moved(0.0)
     assert later.frame(0.1, unknown).calibration == known
+
+
+def test_calibration_of_a_robot_without_a_place_is_told_but_not_kept(robot, tmp_path):
+    """What is corrected is learnt anew while it searches; only a place that was accepted vouches for it."""
+    known, relearnt = Calibration(pitch=0.05), Calibration(pitch=-0.03)
+
+    def told(answer, calibration):
+        def run(job):
+            result = answer(job)
+            return replace(result, fix=replace(result.fix, calibration=calibration))
+
+        return run
+
+    def lost(job):
+        return unknown(job, State.LOST)
+
+    robot.frame(0.1, told(tracking, known))
+    keeper = LastPoseKeeper(tmp_path, [robot.session])
+    keeper.keep()
+    robot.frame(0.2, told(lost, relearnt))
+    assert robot.session.calibration == relearnt
+    keeper.keep()
+    assert load(tmp_path, robot.session.keys.robot, SHA).calibration == known
+    robot.session.reset()
+    assert robot.session.calibration is None
 
 
 def test_calibration_is_offered_again_with_each_odometry_frame(robot):
