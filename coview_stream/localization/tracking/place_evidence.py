@@ -1,10 +1,11 @@
 """Evidence of a tracked place: the search's log-likelihood ratio, with nuisances that are known from before.
 
 In a search nothing is known of how much of the site is as the map has it, of what the survey shows of it, and of how
-foliage lets rays through: these are summed over evenly. A robot that has been here for some metres knows them, for they
-change slowly along its way: what was learned at one registration, spread a little, is presumed at the next. So what is
-usual here is part of the likelihood (docs/integrity.md, eq. 6): explaining half of the scan speaks for a place in a
-street where half of everything has changed, and against it where nearly all was explained a metre before.
+foliage lets rays through: these are summed over, and so they are here at first, evenly. A robot that has been here for
+some metres knows them, for they change slowly along its way: what was learned at one registration, spread a little, is
+presumed at the next. So what is usual here is part of the likelihood (docs/integrity.md, eq. 6): explaining half of
+the scan speaks for a place in a street where half of everything has changed, and against it where nearly all was
+explained a metre before.
 """
 
 from __future__ import annotations
