@@ -10,7 +10,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
-from coview_stream.localization.registration.register import ScanInput
+from coview_stream.localization.registration.register import ScanInput, register
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 from coview_stream.localization.tracking.rivals import find_rivals, rings
 from coview_stream.localization.tracking.slip import matters, off_by
@@ -37,11 +37,24 @@ def rivals(world_map, scan, off, count=1):
 
 @pytest.mark.parametrize(
     ("off", "count"),
-    [([0.9, 0.0, 0.0], 1), ([-1.2, 1.0, 0.0], 1), ([0.4, -2.4, 0.0], 1), ([0.5, 3.1, 4.0], 3), ([-1.6, 0.0, -7.0], 3)],
+    [
+        ([3.2, 0.0, 0.0], 1),
+        ([0.0, -3.3, 0.0], 1),
+        ([-2.3, -2.3, 0.0], 1),
+        ([2.4, -2.1, 0.0], 1),
+        ([0.5, 3.1, 4.0], 3),
+        ([-3.1, 0.0, -4.0], 3),
+        ([2.2, 2.2, -4.0], 3),
+    ],
 )
 def test_right_place_is_the_best_rival_of_one_beside_it(world_map, scan, off, count):
+    """From where registration alone does not come there."""
     x, y, degrees = off
     found, T, place = rivals(world_map, scan, pose_from(rot_z(np.radians(degrees)), [x, y, 0.0]), count)
+    alone = register(
+        scan[0].cloud, T, LocalMaps(world_map, 50.0).around(scan[1][:3, 3]), CONFIG.registration, (1.0, 0.5)
+    )
+    assert alone is None or pose_error(alone.T_map_source @ scan[0].T_odom_body, scan[1])[0] > 0.5
     metres, turn = pose_error(found[0].T_map_odom @ scan[0].T_odom_body, scan[1])
     assert metres < 0.05
     assert turn < 0.3
