@@ -7,15 +7,17 @@ import sys
 
 import numpy as np
 import pytest
+from fake_robot import Robot
 
 from coview_stream.cli import build_parser, main, replay, serve
 from coview_stream.clouds.files import read_cloud, write_cloud
 from coview_stream.clouds.trajectory import read_tum
-from coview_stream.config.mount import parse_mount
+from coview_stream.config.mount import Mount, parse_mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.geometry.transforms import inverse, transform
 from coview_stream.messages import encode_cloud
 from coview_stream.messages.types import CloudMessage, Sample
+from coview_stream.odometry.deskew import deskew
 from coview_stream.recordings.lidar_runs import open_bare_run
 from coview_stream.recordings.open_run import open_run
 from coview_stream.stream.node.session import Session
@@ -64,6 +66,24 @@ def test_live_clouds_are_turned_as_they_come(monkeypatch):
     encoded = encode_cloud(CloudMessage(1, turned(points)), "xyz")
     session.on_cloud(Sample(session.keys.cloud, encoded.payload, encoded.encoding, encoded.attachment), 0.0)
     assert np.allclose(seen[0].points, points, atol=1e-4)
+
+
+def test_live_sweep_of_a_turned_lidar_is_deskewed_as_that_of_the_body():
+    """The lever arm swings with the body: clouds are turned before they are deskewed."""
+    points = np.random.default_rng(0).uniform(-20, 20, (200, 3)).astype(np.float32)
+    times = np.linspace(-0.1, 0.0, 200)
+
+    def deskewed(seen, mount):
+        robot = Robot(NodeConfig(mount=mount))
+        for k in range(12):
+            robot.moved(0.05 * k, x=0.5 * k, yaw=0.05 * k)
+        robot.saw(0.5, points=seen, times=times, codec="foxglove")
+        job = robot.session.take_frame()
+        return deskew(job.points, job.times, job.segment, job.stamp_ns, job.T_odom_body)
+
+    body = deskewed(points, Mount())
+    assert np.abs(body - points).max() > 0.5  # there is something to deskew
+    assert np.allclose(deskewed(turned(points), parse_mount(MOUNT)), body, atol=1e-3)
 
 
 def test_serve_and_replay_pass_the_option_on(world_file, world_run, monkeypatch):
