@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from scipy import fft
-from scipy.spatial import cKDTree
 
 from bench.forest.query import APART, BEST, Chain, distinct, errors, of_places, of_volume, query_of
 from bench.forest.worlds import Drive
@@ -16,24 +15,17 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.birds_eye_view import CELL, SLABS, birds_eye_view
 from coview_stream.descriptors.coview import describe, ground_below
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.transforms import Points, Pose, rot_z, to_local, transform
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.learned.canopy import CanopyMatcher
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.votes import Vote, robust_zscore
+from coview_stream.localization.search.votes import robust_zscore
 
-METHODS = (
-    "scan context", "co-view", "both", "canopy", "canopy vote", "global", "global, neighbours", "dense",
-    "dense, neighbours", "verified", "search",
-)  # fmt: skip
+METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "verified", "search")
 """In the tables' order."""
-
-NEIGHBOURS = 0.5
-"""Share of a place's score that is its neighbours' on the map's grid, where they re-rank (arXiv 2606.18583)."""
 
 BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
 
@@ -50,9 +42,6 @@ class Methods:
         assert retrieval is not None
         self._learned, self._retrieval = learned, retrieval
         self._learned.prepare()
-        block = base_map.config.block
-        self._vote = CanopyMatcher(base_map.points, base_map.stations, self.config.learned, block=block)
-        self._vote.prepare()
         self._retrieval.prepare()
         self._canopy = Canopy(base_map.points)
         self._chain = Chain(base_map, self.config)
@@ -121,27 +110,11 @@ class Methods:
             judged = self._chain.register(voted, self._chain.scan(query))
         verified = [Hypothesis(c.T_map_odom, 0, 0, -c.evidence.score) for c in judged[1]]
         features = self._learned.features
-        alike = features.place.astype(np.float32) @ view.place
-        places["global"] = distinct(features.place_at, alike)
-        places["global, neighbours"] = distinct(features.place_at, _with_neighbours(features.place_at, alike))
+        places["global"] = distinct(features.place_at, features.place.astype(np.float32) @ view.place)
         named, shifts = vote.candidates()
         places["dense"] = distinct(stations[named, :2], -vote.at(named, shifts))
-        places["dense, neighbours"] = distinct(stations[named, :2], -self._around(vote, named, shifts))
-        with clock("canopy vote"):
-            heights = self._vote.encode(query.surroundings, centre)
-            canopy = None if heights is None else self._vote.vote(heights)
-        named, shifts = (np.empty(0, dtype=np.int64),) * 2 if canopy is None else canopy.candidates()
-        scores = np.empty(0) if canopy is None else -canopy.at(named, shifts)
-        places["canopy vote"] = distinct(stations[named, :2], scores)
         places["verified"] = _in_turn(verified, query)
         return self._chain.metric(voted, judged, truth, query)
-
-    def _around(self, vote: Vote, stations: Ints, shifts: Ints) -> Floats:
-        """Return z-scores (K,) of stations, half of each their neighbours' mean at the same shift."""
-        at, grid = self.base_map.stations[stations].astype(np.float64), self.base_map.station_grid
-        steps = self.base_map.config.block * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-        beside = np.mean([vote.at(grid.at(at + step), shifts) for step in steps], axis=0)
-        return np.asarray((1.0 - NEIGHBOURS) * vote.at(stations, shifts) + NEIGHBOURS * beside)
 
     def _searched(self, query: SearchRequest, truth: Pose) -> tuple[Floats, tuple[float, float] | None]:
         """Return the place (1, 2) that the product's search by learned features has for the most probable.
@@ -154,15 +127,6 @@ class Methods:
             return np.empty((0, 2)), None
         found = None if result.accepted is None else errors(result.leader, truth, query)[2:]
         return (result.leader @ query.T_odom_body)[None, :2, 3], found
-
-
-def _with_neighbours(at: Floats, scores: Floats32) -> Floats:
-    """Return scores (N,) of places (N, 2) on a grid, half of each the mean of the best four of its neighbours."""
-    step = float(np.diff(np.unique(at[:, 0])).min())
-    near = cKDTree(at).query_ball_point(at, 1.5 * step)
-    others = [np.sort(scores[[k for k in some if k != own]])[-4:] for own, some in enumerate(near)]
-    beside = np.array([each.mean() if len(each) else score for each, score in zip(others, scores, strict=True)])
-    return np.asarray((1.0 - NEIGHBOURS) * scores + NEIGHBOURS * beside)
 
 
 def _milliseconds(clock: Clock) -> dict[str, float]:

@@ -46,9 +46,9 @@ class GlobalSearch:
         # many places a keyframe: GICP would have to prepare the map at each, and tracking starts with it anyway
         self.config = replace(config, registration=replace(config.registration, method="trimmed-icp"))
         index = index or SearchIndex.of(base_map, config)
-        self.coview, self.learned, canopy = _recognizers(base_map, config, index)
+        self.coview, self.learned = _recognizers(base_map, config, index)
         self._recognizers: list[CoViewRecognizer | PlaceRecognizer] = [
-            each for each in (self.coview, self.learned, canopy) if each is not None
+            each for each in (self.coview, self.learned) if each is not None
         ]
         self._local_maps = local_maps
         self._index = index
@@ -154,16 +154,14 @@ class GlobalSearch:
 
 def _recognizers(
     base_map: BaseMap, config: LocalizerConfig, index: SearchIndex
-) -> tuple[CoViewRecognizer | None, PlaceRecognizer | None, PlaceRecognizer | None]:
-    """Return the recognizers by descriptors, learned features and the canopy, each None where it is not used."""
+) -> tuple[CoViewRecognizer | None, PlaceRecognizer | None]:
+    """Return the recognizers by descriptors and by learned features, each None where it is not used."""
     learned: PlaceRecognizer | None = None
-    canopy: PlaceRecognizer | None = None
     if index.learned is not None:
-        from coview_stream.localization.search.learned.recognizer import CanopyRecognizer, LearnedRecognizer
+        from coview_stream.localization.search.learned.recognizer import LearnedRecognizer
 
         learned = LearnedRecognizer(base_map, config, index.learned)
-        canopy = None if index.canopy is None else CanopyRecognizer(base_map, config, index.canopy)
     # on an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums, too
     peaks = round(config.consensus.peaks * max(1.0, (len(base_map) / _ORDINARY) ** 0.25))
     coview = None if index.retrieval is None else CoViewRecognizer(base_map, config, index.retrieval, peaks)
-    return coview, learned, canopy
+    return coview, learned

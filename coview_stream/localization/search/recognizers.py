@@ -15,7 +15,6 @@ from coview_stream.localization.search.retrieval import Retrieval
 from coview_stream.localization.search.smallest_distance import SmallestDistance
 
 if TYPE_CHECKING:  # imports SciPy, which takes a while
-    from coview_stream.localization.search.learned.canopy import CanopyMatcher
     from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
 
@@ -46,13 +45,10 @@ class SearchIndex:
     Attributes:
         retrieval: comparison with the stations' co-view descriptors.
         learned: the map's learned features.
-        canopy: the heights of what stands on it; where learned features are used, on a map small enough for them to be
-            compared all over.
     """
 
     retrieval: Retrieval | None
     learned: FeatureMatcher | None
-    canopy: CanopyMatcher | None = None
 
     @classmethod
     def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> SearchIndex:
@@ -69,14 +65,10 @@ class SearchIndex:
             warnings.warn(missing, stacklevel=2)
         if missing is not None or config.reloc == "coview" or base_map.learned is None:
             return cls(retrieval, None)
-        from coview_stream.localization.search.learned.canopy import CanopyMatcher
         from coview_stream.localization.search.learned.matcher import FeatureMatcher
 
         block = base_map.config.block
-        learned = FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block)
-        if not learned.dense:
-            return cls(retrieval, learned)
-        return cls(retrieval, learned, CanopyMatcher(base_map.points, base_map.stations, config.learned, block=block))
+        return cls(retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block))
 
     def prepare(self) -> None:
         """Load and compute what the first query would; raises :class:`CoViewError` if something is missing."""
@@ -84,8 +76,6 @@ class SearchIndex:
             self.retrieval.prepare()
         if self.learned is not None:
             self.learned.prepare()
-        if self.canopy is not None:
-            self.canopy.prepare()
 
 
 class CoViewRecognizer:

@@ -22,7 +22,7 @@ from coview_stream.localization.search.learned.feature_vote import FeatureVote, 
 from coview_stream.localization.search.learned.rasters import FeatureRasters, TurnedQuery, turn_query
 from coview_stream.localization.search.votes import argsmallest
 
-SIZE = 64.0
+_SIZE = 64.0
 """Metres along the edge of a query's image."""
 
 _ROUNDING = 1e-6  # cells
@@ -47,7 +47,7 @@ class QueryFeatures:
     @property
     def corner(self) -> Floats:
         """(2,) lower corner of the image, metres from the centre."""
-        return np.full(2, -0.5 * SIZE)
+        return np.full(2, -0.5 * _SIZE)
 
     @property
     def place(self) -> Floats32:
@@ -57,22 +57,34 @@ class QueryFeatures:
         return np.asarray(mean / (np.linalg.norm(mean) + 1e-9), dtype=np.float32)
 
 
-class RasterMatcher:
-    """A map's raster of features, and the stations on it: comparison of a query with both, coarse to fine.
+class FeatureMatcher:
+    """A map's learned features, ready to be searched, and the ground network: what searches of one map share.
 
-    Nothing is made before the first query.
+    Nothing is loaded or made before the first query, or :meth:`prepare`.
     """
 
-    def __init__(self, stations: Floats32, config: LearnedConfig, block: float) -> None:
-        """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres."""
+    def __init__(self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0) -> None:
+        """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
+
+        Raises:
+            MapError: the features were made by other weights than the installed ones.
+            InputError: there are no weights.
+        """
+        features.check()
+        self.features = features
         self.stations = stations
         self.config = config
         self._block = block
 
     @cached_property
+    def network(self) -> Network:
+        """The ground encoder; one thread is enough for 64 m."""
+        return network("ground", 1)
+
+    @cached_property
     def rasters(self) -> FeatureRasters:
-        """The map's features, fine and coarse."""
-        raise NotImplementedError
+        """The map's features in the few dimensions that matter, fine and coarse."""
+        return FeatureRasters.of(self.features, self.config.cell, round(0.5 * _SIZE / self.config.cell))
 
     @property
     def index(self) -> FeatureIndex:
@@ -98,74 +110,6 @@ class RasterMatcher:
         cell = np.where(inside, row * self.index.width + column, -1)
         order = np.argsort(cell, kind="stable")
         return order, np.searchsorted(cell[order], np.arange(self.index.height * self.index.width + 1))
-
-    def compare(self, centre: Floats, local: Floats32, weight: Floats32, blocks: Ints) -> FeatureVote:
-        """Return the vote of a query; its candidates are found in ``blocks`` of the index.
-
-        Args:
-            centre: (3,) in the middle of the query's image, on the ground; odometry frame, metres.
-            local: (C, h, w) the query's features.
-            weight: (h, w) of its cells, of a metre.
-            blocks: numbers (K,).
-        """
-        ratio = round(self.config.cell / LOCAL_CELL)
-        yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
-        turned = turn_query(local, weight, self.rasters, ratio, yaws)
-        coarse = correlate_turned(turned.coarse, self.index, True, blocks)
-        named, groups = self._named(coarse, turned)
-        return FeatureVote(centre, self.rasters.fine, self.cells, turned.images, named, groups)
-
-    def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
-        """Return stations and shifts (N,) in and around the best coarse cells and headings (2 K, H, W).
-
-        Of each cell the best heading of each half turn counts. The second array (N,) numbers cells and half turns.
-        """
-        order, begin = self._by_coarse_cell
-        halves = coarse.reshape(2, len(turned.headings), -1)
-        heading = halves.argmax(axis=1)
-        best = np.take_along_axis(halves, heading[:, None], axis=1)[:, 0]
-        best[:, begin[1:] == begin[:-1]] = -np.inf  # cells without stations
-        count = max(_NAMED, int(_NAMED_SHARE * np.isfinite(best).sum()))
-        chosen = argsmallest(-best.ravel(), count)
-        chosen = chosen[np.isfinite(best.ravel()[chosen])]
-        half, cell = np.divmod(chosen, best.shape[1])
-        shift = turned.headings[heading.ravel()[chosen]] + half * (self.config.yaws // 2)
-        # every station of a chosen cell, at its heading and those up to the next
-        number = begin[cell + 1] - begin[cell]
-        group = np.repeat(np.arange(len(chosen)), number)
-        station = order[np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number) + begin[cell][group]]
-        step = int(turned.headings[1] - turned.headings[0])
-        off = np.arange(-(step // 2), step // 2 + 1)
-        shifts = (shift[group, None] + off) % self.config.yaws
-        return (np.repeat(station, len(off)), shifts.ravel()), np.repeat(group, len(off))
-
-
-class FeatureMatcher(RasterMatcher):
-    """A map's learned features, ready to be searched, and the ground network: what searches of one map share.
-
-    Nothing is loaded or made before the first query, or :meth:`prepare`.
-    """
-
-    def __init__(self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0) -> None:
-        """Prepare to search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
-
-        Raises:
-            MapError: the features were made by other weights than the installed ones.
-            InputError: there are no weights.
-        """
-        features.check()
-        super().__init__(stations, config, block)
-        self.features = features
-
-    @cached_property
-    def network(self) -> Network:
-        """The ground encoder; one thread is enough for 64 m."""
-        return network("ground", 1)
-
-    @cached_property
-    def rasters(self) -> FeatureRasters:
-        """The map's features in the few dimensions that matter, fine and coarse."""
-        return FeatureRasters.of(self.features, self.config.cell, round(0.5 * SIZE / self.config.cell))
 
     @cached_property
     def _feature_blocks(self) -> Ints:
@@ -194,9 +138,9 @@ class FeatureMatcher(RasterMatcher):
         Raises:
             InputError, DependencyError: as :meth:`prepare`.
         """
-        size = round(SIZE / CELL)
-        features = self.network(birds_eye_view(points, centre[:2] - 0.5 * SIZE, (size, size)))
-        axis = (np.arange(features.sigma.shape[0]) + 0.5) * LOCAL_CELL - 0.5 * SIZE
+        size = round(_SIZE / CELL)
+        features = self.network(birds_eye_view(points, centre[:2] - 0.5 * _SIZE, (size, size)))
+        axis = (np.arange(features.sigma.shape[0]) + 0.5) * LOCAL_CELL - 0.5 * _SIZE
         inside = np.hypot(axis[:, None], axis[None]) <= self.config.reach
         weight = np.where(inside, 1.0 / features.sigma, 0.0).astype(np.float32)
         return QueryFeatures(features, weight, centre)
@@ -207,8 +151,37 @@ class FeatureMatcher(RasterMatcher):
         Its candidates are found by correlating coarse cells with the query at some headings. On a map too large to be
         searched all over that is done around the tiles most similar to the query, and around ``near`` (N, 2), metres.
         """
+        ratio = round(self.config.cell / LOCAL_CELL)
+        yaws = yaw_of_shift(np.arange(self.config.yaws), self.config.yaws)
+        turned = turn_query(query.features.local, query.weight, self.rasters, ratio, yaws)
         blocks = self._feature_blocks if self.dense else self._similar_blocks(query, near)
-        return self.compare(query.centre, query.features.local, query.weight, blocks)
+        coarse = correlate_turned(turned.coarse, self.index, True, blocks)
+        named, groups = self._named(coarse, turned)
+        return FeatureVote(query.centre, self.rasters.fine, self.cells, turned.images, named, groups)
+
+    def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
+        """Return stations and shifts (N,) in and around the best coarse cells and headings (2 K, H, W).
+
+        Of each cell the best heading of each half turn counts. The second array (N,) numbers cells and half turns.
+        """
+        order, begin = self._by_coarse_cell
+        halves = coarse.reshape(2, len(turned.headings), -1)
+        heading = halves.argmax(axis=1)
+        best = np.take_along_axis(halves, heading[:, None], axis=1)[:, 0]
+        best[:, begin[1:] == begin[:-1]] = -np.inf  # cells without stations
+        count = max(_NAMED, int(_NAMED_SHARE * np.isfinite(best).sum()))
+        chosen = argsmallest(-best.ravel(), count)
+        chosen = chosen[np.isfinite(best.ravel()[chosen])]
+        half, cell = np.divmod(chosen, best.shape[1])
+        shift = turned.headings[heading.ravel()[chosen]] + half * (self.config.yaws // 2)
+        # every station of a chosen cell, at its heading and those up to the next
+        number = begin[cell + 1] - begin[cell]
+        group = np.repeat(np.arange(len(chosen)), number)
+        station = order[np.arange(len(group)) - np.repeat(np.cumsum(number) - number, number) + begin[cell][group]]
+        step = int(turned.headings[1] - turned.headings[0])
+        off = np.arange(-(step // 2), step // 2 + 1)
+        shifts = (shift[group, None] + off) % self.config.yaws
+        return (np.repeat(station, len(off)), shifts.ravel()), np.repeat(group, len(off))
 
     def _similar_blocks(self, query: QueryFeatures, near: npt.ArrayLike) -> Ints:
         """Find the blocks of the index around ``near`` (N, 2) and around the tiles most similar to the query."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_kernels import WindowImages, WindowRaster
 from coview_stream.descriptors.feature_map import FeatureMap
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.localization.search.learned.correlation import downsample, rotate_images
 from coview_stream.localization.search.learned.feature_index import FeatureIndex
 from coview_stream.localization.search.learned.feature_vote import WEIGHT
@@ -45,13 +45,7 @@ class FeatureRasters:
         """Make them of a map, in cells of ``cell`` metres, for queries that reach ``half`` cells from their middle."""
         axes = principal_axes(features.sample(_TILES), _ENERGY, WEIGHT)
         fine, corner = features.coarse(cell, axes)
-        return cls.of_image(fine, np.asarray((fine != 0).any(axis=0)), corner, cell, half, axes)
-
-    @classmethod
-    def of_image(
-        cls, fine: Floats32, known: Bools, corner: Floats, cell: float, half: int, axes: Floats32
-    ) -> FeatureRasters:
-        """Make them of features (D, H, W), zero where they are not ``known`` (H, W); H and W are even."""
+        known = np.asarray((fine != 0).any(axis=0))
         raster = np.zeros((*known.shape, WEIGHT + 1), dtype=np.int8)
         raster[..., : len(axes)] = _bytes(_BYTE * fine).transpose(1, 2, 0)
         raster[..., WEIGHT] = _BYTE * known

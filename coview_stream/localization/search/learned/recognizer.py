@@ -1,4 +1,4 @@
-"""Place recognizers by views from above, learned or not; in a module of their own: SciPy takes a while to import."""
+"""Place recognizer by learned features; in a module of its own, for it imports SciPy, which takes a while."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.descriptors.coview import on_ground
 from coview_stream.geometry.transforms import transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
-from coview_stream.localization.search.learned.canopy import CanopyMatcher
 from coview_stream.localization.search.learned.matcher import FeatureMatcher
 from coview_stream.localization.search.request import SearchRequest
 
 _MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other; set by hand
-_CANOPY_PEAKS = 0.25  # of the learned features' number of peaks; set by hand: where it tells anything, it ranks high
 
 
 class LearnedRecognizer:
@@ -56,36 +54,6 @@ class LearnedRecognizer:
                 T[2, 3] += float(grid.stations[station, 2] - grid.stations[peak.station, 2])
                 out.append(replace(peak, T_map_odom=T, station=station))
         return out
-
-    def clear(self) -> None:
-        """Forget all votes."""
-        self.consensus.clear()
-
-    def __len__(self) -> int:
-        """Return how many keyframes have voted."""
-        return len(self.consensus)
-
-
-class CanopyRecognizer:
-    """Recognizer by the heights of the canopy."""
-
-    def __init__(self, base_map: BaseMap, config: LocalizerConfig, canopy: CanopyMatcher) -> None:
-        self.config = config
-        self.canopy = canopy
-        count = max(1, round(_CANOPY_PEAKS * config.learned.peaks))
-        self.consensus = Consensus(base_map.station_grid, replace(config.consensus, mode="consensus", peaks=count))
-
-    def vote(self, request: SearchRequest) -> None:
-        """Compare the heights around the robot with the map's."""
-        if len(request.surroundings) < self.config.keyframe.min_points:
-            return
-        query = self.canopy.encode(request.surroundings, on_ground(request.surroundings, request.position))
-        if query is not None:
-            self.consensus.vote(self.canopy.vote(query))
-
-    def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks."""
-        return [replace(peak, shift=None) for peak in self.consensus.hypotheses()]
 
     def clear(self) -> None:
         """Forget all votes."""
