@@ -260,10 +260,12 @@ class Localizer:
         frame = self._frames.prepare(cloud, T_odom_body, stamp, self._tracker.drift.variances if searching else None)
         keyframe = None
         if searching:
-            if self._buffer.lean(frame.R_body_cloud) > _SMEARED:
+            # what has been searched with leant: level it, and search again at once
+            leant = self._buffer.lean(frame.R_body_cloud) > _SMEARED
+            if leant:
                 self._buffer.level(frame.R_body_cloud)
                 self._next_epoch()
-            keyframe = self._buffer.add(frame.voxels, frame.T_odom_body, stamp, frame.R_body_cloud)
+            keyframe = self._buffer.add(frame.voxels, frame.T_odom_body, stamp, frame.R_body_cloud, leant)
         self._tracker.add_scan(frame.voxels, frame.T_odom_body)
         self._newest = frame
         return frame, keyframe
@@ -331,8 +333,7 @@ class Localizer:
         self._evidence = result.evidence
         if result.accepted is None:
             if result.leader is not None and result.evidence.evidence is not None:  # it has been registered
-                seen, probability = result.leader @ result.T_odom_body, result.evidence.confidence or 0.0
-                self._frames.correction.learn_leader(seen, result.T_odom_body, probability, result.R_body_cloud)
+                self._learn_leader(result.leader @ result.T_odom_body, result)
             proposed = result.evidence.state is State.AMBIGUOUS
             self._handle(Event.PLACE_PROPOSED if proposed else Event.NO_PLACE)
             return None
@@ -347,6 +348,13 @@ class Localizer:
         self._lean_is_told = False
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
         return replace(self._level(match, newest), confirms_search=True)
+
+    def _learn_leader(self, T_map_body: Pose, result: SearchResult) -> None:
+        """Learn the tilt from a place that leads, (4, 4) as registered, which a search that begins anew tries, too."""
+        probability, R_body_cloud = result.evidence.confidence or 0.0, result.R_body_cloud
+        levelled = self._frames.correction.learn_leader(T_map_body, result.T_odom_body, probability, R_body_cloud)
+        if self._frames.anchor is not None:
+            self._hints.place_led(levelled @ inverse(result.T_odom_body), self._frames.anchor)
 
     def _match_to_map(self, frame: Frame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""

@@ -15,7 +15,6 @@ from coview_stream.localization.calibration.frame_motion import FrameMotion, Var
 from coview_stream.localization.calibration.odometry_correction import OdometryCorrection
 
 _LEADER_TILT = math.radians(1.0)  # sigma of a leading place's roll and pitch, if it is the right one; set by hand
-_ANY_TILT = math.radians(4.0)  # and if it is not
 _LEVEL = math.radians(0.05)  # a frame that leans by less is not registered again for it; set by hand
 
 
@@ -79,18 +78,17 @@ class FrameCorrection:
         """Compare the next frame with none before it."""
         self._motion.clear()
 
-    def learn_leader(self, T_map_body: Pose, T_odom_body: Pose, probability: float, R_body_cloud: Floats) -> None:
-        """Learn the tilt from a place that leads, (4, 4) as registered, as far as it is probable.
+    def learn_leader(self, T_map_body: Pose, T_odom_body: Pose, probability: float, R_body_cloud: Floats) -> Pose:
+        """Learn the tilt from a place that leads, as far as it is probable; return its pose (4, 4), levelled anew.
 
         Args:
-            T_map_body: (4, 4) of a keyframe.
+            T_map_body: (4, 4) of a keyframe, as registered.
             T_odom_body: (4, 4) corrected odometry of the same keyframe.
             probability: that it is the right place.
             R_body_cloud: (3, 3) rotation that its clouds had been levelled by.
         """
-        if probability > 0.0:
-            variance = _LEADER_TILT**2 + (1.0 - probability) / probability * _ANY_TILT**2
-            self.estimator.measure_attitude(T_map_body, T_odom_body, variance, R_body_cloud)
+        self.estimator.suppose_attitude(T_map_body, T_odom_body, _LEADER_TILT**2, R_body_cloud, probability)
+        return self._levelled(T_map_body, R_body_cloud)
 
     def learn_found(self, T_map_body: Pose, covariance: Floats, T_odom_body: Pose, R_body_cloud: Floats) -> Pose:
         """Learn the tilt from the first registration at an accepted place; return its pose (4, 4), levelled anew.
@@ -102,4 +100,7 @@ class FrameCorrection:
             R_body_cloud: (3, 3) rotation that its cloud had been levelled by.
         """
         self.estimator.measure_attitude(T_map_body, T_odom_body, tilt_variance(covariance), R_body_cloud)
+        return self._levelled(T_map_body, R_body_cloud)
+
+    def _levelled(self, T_map_body: Pose, R_body_cloud: Floats) -> Pose:
         return pose_from(T_map_body[:3, :3] @ R_body_cloud @ self.calibration.R_body_cloud.T, T_map_body[:3, 3])

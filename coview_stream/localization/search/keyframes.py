@@ -85,18 +85,19 @@ class KeyframeBuffer:
         self._in_part = 0  # keyframes in the newest of them
 
     def add(
-        self, points: Points, T_odom_body: Pose, stamp: float, R_body_cloud: Floats | None = None
-    ) -> Keyframe | None:
+        self, points: Points, T_odom_body: Pose, stamp: float, R_body_cloud: Floats | None = None,
+        complete: bool = False,
+    ) -> Keyframe | None:  # fmt: skip
         """Add a frame's points (N, 3), odometry frame, which are kept; return the keyframe that it completes, if any.
 
         :func:`~coview_stream.localization.registration.prepare_scan.voxelized` makes the points of a cloud, which has
-        been levelled by ``R_body_cloud`` (3, 3), if at all.
+        been levelled by ``R_body_cloud`` (3, 3), if at all. ``complete`` makes it a keyframe wherever the last one was.
         """
         frame = Keyframe(stamp, T_odom_body, points, np.eye(3) if R_body_cloud is None else R_body_cloud)
         self._pending.append(frame)
         if sum(len(each.points) for each in self._pending) > _PENDING_POINTS:
             self._pending = [self._merged(frame)]
-        if self.keyframes:
+        if self.keyframes and not complete:
             moved = float(np.linalg.norm(T_odom_body[:3, 3] - self.keyframes[-1].position))
             if moved < self.config.distance:
                 return None

@@ -27,10 +27,11 @@ class PoseHints:
     def __init__(self) -> None:
         self._awaited: Pose | None = None  # T_map_body at the next frame
         self._known: tuple[Pose, ...] = ()
+        self._led: tuple[Pose, ...] = ()
 
     def clear(self) -> None:
         """Forget them all: a place has been accepted."""
-        self._awaited, self._known = None, ()
+        self._awaited, self._known, self._led = None, (), ()
 
     def robot_at(self, T_map_body: Pose) -> None:
         """Hint that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
@@ -38,7 +39,11 @@ class PoseHints:
 
     def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
         """Hint, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
-        self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
+        self._awaited, self._known, self._led = None, (T_map_odom @ pose_from(np.eye(3), -anchor),), ()
+
+    def place_led(self, T_map_odom: Pose, anchor: Floats) -> None:
+        """Hint that ``T_map_odom`` (4, 4) about ``anchor`` (3,) led a search that has begun anew; one at a time."""
+        self._led = (T_map_odom @ pose_from(np.eye(3), -anchor),)
 
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""
@@ -48,7 +53,7 @@ class PoseHints:
             turn = rot_z(yaw_of(T_map_body @ inverse(T_odom_body)))
             T = pose_from(turn, T_map_body[:3, 3] - turn @ T_odom_body[:3, 3])
             self._known = (*self._known, T @ pose_from(np.eye(3), -anchor))
-        return tuple(T @ pose_from(np.eye(3), anchor) for T in self._known)
+        return tuple(T @ pose_from(np.eye(3), anchor) for T in (*self._known, *self._led))
 
 
 class HintSchedule:

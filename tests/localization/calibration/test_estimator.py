@@ -159,3 +159,40 @@ def test_ground_above_the_surveys_is_told():
     assert Calibration(ground=0.05).describe() == []
     assert "0.25 m above the survey's" in Calibration(ground=0.25).describe()[0]
     assert Calibration(ground=0.25).to_json()["ground_offset_m"] == 0.25
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.5, 0.9, 0.999])
+def test_place_that_leads_tells_the_lean_as_far_as_it_is_probable(probability):
+    lean = exp_so3(np.radians([0.0, 3.0, 0.0]))
+    estimator, sure = CalibrationEstimator(), CalibrationEstimator()
+    for _ in range(5):  # the same scans, looked at again, tell nothing new
+        estimator.suppose_attitude(
+            pose_from(lean, np.zeros(3)), np.eye(4), np.radians(1.0) ** 2, np.eye(3), probability
+        )
+    sure.measure_attitude(pose_from(lean, np.zeros(3)), np.eye(4), np.radians(1.0) ** 2, np.eye(3))
+    assert abs(sure.calibration.pitch) > np.radians(1.5)
+    assert estimator.calibration.pitch == pytest.approx(probability * sure.calibration.pitch, rel=1e-6)
+
+
+def test_known_place_does_away_with_what_was_supposed():
+    wrong, right = (pose_from(exp_so3(np.radians([0.0, pitch, 0.0])), np.zeros(3)) for pitch in (-6.0, 2.0))
+    supposed, fresh = CalibrationEstimator(), CalibrationEstimator()
+    supposed.suppose_attitude(wrong, np.eye(4), np.radians(1.0) ** 2, np.eye(3), 0.9)
+    for estimator in (supposed, fresh):
+        estimator.measure_attitude(right, np.eye(4), np.radians(0.5) ** 2, np.eye(3))
+    assert supposed.calibration == fresh.calibration
+
+
+def test_motion_from_frame_to_frame_refutes_a_supposed_lean():
+    """Of a robot that drives straight ahead on flat ground, and whose sensor stands straight."""
+    wrong = pose_from(exp_so3(np.radians([0.0, 6.0, 0.0])), np.zeros(3))
+    estimator = CalibrationEstimator()
+    estimator.suppose_attitude(wrong, np.eye(4), np.radians(1.0) ** 2, np.eye(3), 0.9)
+    before = abs(estimator.calibration.pitch)
+    step = pose_from(np.eye(3), [2.0, 0.0, 0.0])
+    for _ in range(8):
+        level = pose_from(estimator.calibration.R_body_cloud, np.zeros(3))
+        motion = level @ step @ np.linalg.inv(level)
+        estimator.measure_frames(motion, step, np.full(6, 1e-5), 0.02, np.radians(0.2))
+    assert before > np.radians(3.0)
+    assert abs(estimator.calibration.pitch) < np.radians(0.5)

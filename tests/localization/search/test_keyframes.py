@@ -149,3 +149,12 @@ def test_each_keyframe_is_levelled_from_what_it_was_levelled_by_before():
 def test_buffer_without_keyframes_does_not_lean():
     buffer = KeyframeBuffer(KeyframeConfig())
     assert buffer.lean(exp_so3(np.array([0.1, 0.0, 0.0]))) == 0.0
+
+
+def test_keyframe_may_be_completed_where_the_last_one_was():
+    buffer = KeyframeBuffer(CONFIG)
+    assert buffer.add(cloud(0), at(0.0), 0.0) is not None
+    assert buffer.add(cloud(1), at(0.1), 0.1) is None
+    made = buffer.add(cloud(2), at(0.2), 0.2, complete=True)
+    assert made is not None
+    assert len(made.points) > len(cloud(2))  # of both frames since

@@ -14,7 +14,7 @@ from coview_stream.clouds.files import write_cloud
 from coview_stream.errors import RunError
 from coview_stream.geometry.transforms import pose_from, rot_z, tilt_of
 from coview_stream.localization.localizer import Localizer
-from coview_stream.localization.search.pose_hints import FROM_THERE
+from coview_stream.localization.search.pose_hints import FROM_THERE, PoseHints
 from coview_stream.localization.state import State
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -176,3 +176,15 @@ def test_farthest_accepted_hint_does_no_harm(world_map, world_drive, world_fixes
     localizer = Localizer(world_map)
     localizer.hint_pose(pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6]))
     assert first_fix(follow(localizer, world_drive, 4)) == first_fix(world_fixes)
+
+
+def test_place_that_led_is_one_hint_beside_the_others():
+    hints = PoseHints()
+    hints.odometry_continues(pose_from(rot_z(0.3), [5.0, 1.0, 0.0]), np.array([100.0, 0.0, 0.0]))
+    for x in (1.0, 2.0):
+        hints.place_led(pose_from(rot_z(0.1), [x, 0.0, 0.0]), np.array([100.0, 0.0, 0.0]))
+    continued, led = hints.about(np.array([100.0, 0.0, 0.0]), np.eye(4))
+    np.testing.assert_allclose(continued, pose_from(rot_z(0.3), [5.0, 1.0, 0.0]), atol=1e-9)
+    np.testing.assert_allclose(led, pose_from(rot_z(0.1), [2.0, 0.0, 0.0]), atol=1e-9)
+    hints.clear()
+    assert hints.about(np.zeros(3), np.eye(4)) == ()
