@@ -7,9 +7,10 @@ as far as there is any that shows a height; where there is none, the offset is t
 
 Most sites have none, and structure seen from below differs by centimetres from what a survey from above shows. So two
 hypotheses are compared, that there is no offset but the survey's own error and that there is one, of some decimetres,
-with what structure says blurred by that much; the offset is the mean of both, weighed by how probable they are. Of
-less than two decimetres little is told from none, and the height then follows the ground for the most part. A ground
-that lies below the survey's looks like trees that have grown since, which is more probable: little of it is corrected.
+with what structure says blurred by that much; the more probable one holds, for a mean of both would leave every site
+without an offset some centimetres too high. Less than two decimetres are hardly told from none, and the height then
+follows the ground. A ground that lies below the survey's looks like trees that have grown since, which is more
+probable: little of it is corrected.
 """
 
 from __future__ import annotations
@@ -97,11 +98,11 @@ class GroundOffset:
         self.metres += max(_FOLLOWED, 1.0 / self._views) * (self._weigh() - self.metres)
 
     def _weigh(self) -> float:
-        """Weigh the hypotheses by what has been told; return the mean of both, metres."""
+        """Weigh the hypotheses by what has been told; return the mean of the more probable one, metres."""
         likelihoods = _blurred(_GROWTH_PRIOR @ np.exp(self._told - self._told.max()))
         some, none = likelihoods * self._some, likelihoods * self._none
         self.probability = float(some.sum() / (some.sum() + none.sum()))
-        mean = self.probability * float(some @ _OFFSETS / some.sum())
+        mean = float(some @ _OFFSETS / some.sum()) if self.probability > 0.5 else 0.0
         weights = (some + none) / (some + none).sum()
         self.sigma = float(np.sqrt(weights @ (_OFFSETS - mean) ** 2))
         return mean

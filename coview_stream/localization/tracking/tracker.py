@@ -247,14 +247,15 @@ class Tracker:
         """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
 
         Where the two places are so near that either is good enough, what the lidar sees is believed. Where odometry is
-        known to drift so far, it contradicts nothing: the other place is what registration from there comes to.
+        known to drift so far, it contradicts nothing: the other place is what registration from there comes to. Where
+        the headings alone differ, it is odometry's that is wrong: what has been moved does not turn about the robot.
         """
         plausible = match.innovation <= self.config.acceptance.max_innovation
         led = tries[0].T_map_body if plausible and not self._disputed else belief.T_map_body
         metres, degrees = off_by(match.T_map_body, led)
-        moves = not matters(metres, degrees)
-        if moves and plausible:
-            return match
+        if not matters(metres, degrees):
+            return replace(match, moves_place=not plausible)
+        moves = not matters(metres, 0.0)
         if not moves:
             places = [each.T_map_body for each in tries if each.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]
