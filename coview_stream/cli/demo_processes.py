@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import queue
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from coview_stream.errors import TransportError
+from coview_stream.stream.node.engine_child import python_command, python_environment
 
 ROBOT = "demo"
 
@@ -95,14 +94,13 @@ def _free_port() -> int:
 
 @contextlib.contextmanager
 def _process(log: Path, *args: str) -> Iterator[subprocess.Popen[bytes]]:
-    paths = os.pathsep.join(p for p in sys.path if p)
     with log.open("wb") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "coview_stream", *args],
+            python_command("coview_stream", *args),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE if args[0] == "watch" else subprocess.DEVNULL,
             stderr=errors,
-            env=os.environ | {"PYTHONPATH": paths},
+            env=python_environment(),
             start_new_session=True,  # this process passes an interrupt at the terminal on
         )
         try:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -16,6 +15,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
+from coview_stream.stream.node.engine_child import python_command, python_environment
 
 _TIMEOUT = 120.0  # seconds, set by hand; compiling all kernels takes 3 to 10 on two cores
 
@@ -29,15 +30,14 @@ _CODECS = {
 
 def probe(name: str) -> dict[str, Any]:
     """Run one of :data:`PROBES` in a process of its own; ``{"error": ...}`` if it fails, crashes or hangs."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     try:
         done = subprocess.run(
-            [sys.executable, "-m", __name__, name],
+            python_command(__name__, name),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
             errors="replace",
-            env=environment,
+            env=python_environment(),
             timeout=_TIMEOUT,
             check=False,
         )

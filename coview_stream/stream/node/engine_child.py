@@ -53,8 +53,8 @@ class EngineChild:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "coview_stream.stream.node.worker", str(theirs.fileno()), kind,
-                 str(NICE[kind] if nice is None else nice)],
+                python_command("coview_stream.stream.node.worker", str(theirs.fileno()), kind,
+                               str(NICE[kind] if nice is None else nice)),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 env=_environment(kind),
@@ -91,14 +91,23 @@ def end(process: subprocess.Popen[bytes] | None, pipe: Connection | None) -> Non
             pipe.close()
 
 
+def python_command(module: str, *args: str) -> list[str]:
+    """Return the command that runs one of our modules; nothing is imported from the current directory."""
+    return [sys.executable, "-P", "-m", module, *args]
+
+
+def python_environment() -> dict[str, str]:
+    """Return our environment for such a command: this package in reach, the current directory not searched."""
+    paths = os.pathsep.join(p for p in sys.path if p)
+    return os.environ | {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1"}
+
+
 def _environment(kind: str) -> dict[str, str]:
     """Return our environment, with this package in reach and threads so few that engines leave each other the cores.
 
     BLAS has one. The kernels and networks of searches have all cores but one, unless ``COVIEW_THREADS`` says otherwise:
     they are always busy where a robot is off the map, and what has deadlines needs a core that is free.
     """
-    paths = [p for p in sys.path if p]
-    ours = {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"}
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = {"COVIEW_THREADS": str(max(1, cores - 1))} if kind == "search" else {}
-    return threads | os.environ | ours
+    return threads | python_environment() | {"OPENBLAS_NUM_THREADS": "1"}
