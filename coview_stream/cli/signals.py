@@ -8,7 +8,10 @@ import select
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+
+_ASKED = b"."
+_ENDING = frozenset((signal.SIGINT, signal.SIGTERM, ord(_ASKED)))  # bytes of the pipe: a signal's number, or ours
 
 
 class Stop:
@@ -21,23 +24,39 @@ class Stop:
     def __init__(self) -> None:
         self.requested = False
         self._read, self._write = os.pipe()
+        os.set_blocking(self._read, False)
         os.set_blocking(self._write, False)
 
     def request(self) -> None:
         """Ask to end; safe in a signal handler."""
         self.requested = True
         with contextlib.suppress(OSError):  # full or closed: it has been asked before
-            os.write(self._write, b".")
+            os.write(self._write, _ASKED)
 
     def now(self) -> float:
         """Return the steady clock, seconds."""
         return time.monotonic()
 
     def wait(self, seconds: float) -> bool:
-        """Let ``seconds`` pass; True as soon as the end is requested."""
-        if not self.requested and seconds > 0:
-            select.select([self._read], [], [], seconds)
+        """Let ``seconds`` pass; True as soon as the end is requested, False as soon as another signal has come."""
+        if not self.requested and seconds > 0 and select.select([self._read], [], [], seconds)[0]:
+            with contextlib.suppress(OSError):  # another thread has read it
+                if _ENDING.intersection(os.read(self._read, 4096)):
+                    self.request()  # the byte stays for all who wait
         return self.requested
+
+    @contextlib.contextmanager
+    def woken_by_signals(self) -> Iterator[None]:
+        """Have every signal wake the waits, whichever thread the kernel hands it to; the main thread only.
+
+        A handler written in Python runs on the main thread, which may sleep in a system call while another thread takes
+        the signal; the interpreter writes its number to the pipe at once, on any thread.
+        """
+        before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(before)
 
     def close(self) -> None:
         """Release the pipe."""
@@ -46,24 +65,31 @@ class Stop:
 
 
 @contextlib.contextmanager
-def stop_on_signals() -> Iterator[Stop]:
+def stop_on_signals(on_hangup: Callable[[], None] | None = None) -> Iterator[Stop]:
     """Give a :class:`Stop` that SIGINT and SIGTERM request; a second SIGINT interrupts for good.
 
     Outside the main thread, where Python delivers no signals, it is an ordinary one.
+
+    Args:
+        on_hangup: called at SIGHUP, on the main thread; None leaves that signal as it is.
     """
     stop = Stop()
+    interrupted = False
 
     def handler(number: int, _frame: object) -> None:
-        if stop.requested and number == signal.SIGINT:
+        nonlocal interrupted
+        if interrupted and number == signal.SIGINT:
             raise KeyboardInterrupt
+        interrupted = True
         stop.request()
 
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.callback(stop.close)
+        if threading.current_thread() is threading.main_thread():
+            stack.enter_context(stop.woken_by_signals())
+            for number in (signal.SIGINT, signal.SIGTERM):
+                stack.callback(signal.signal, number, signal.signal(number, handler))
+            if on_hangup is not None and hasattr(signal, "SIGHUP"):
+                hangup = signal.signal(signal.SIGHUP, lambda _number, _frame: on_hangup())
+                stack.callback(signal.signal, signal.SIGHUP, hangup)
         yield stop
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
-        stop.close()

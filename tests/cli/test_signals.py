@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -59,3 +63,51 @@ def test_stop_clock_is_monotonic():
     assert stop.wait(-1.0) is False
     assert stop.now() >= before + 0.02
     stop.close()
+
+
+WAITS = """
+import threading, time
+from coview_stream.cli.signals import stop_on_signals
+threading.Thread(target=time.sleep, args=(90,), daemon=True).start()
+with stop_on_signals() as stop:
+    print("waits", flush=True)
+    print(stop.wait(60), flush=True)
+"""
+
+
+def signal_another_thread(pid, number):
+    """Have the kernel hand a signal to a thread of a process that is not its first."""
+    other = next(int(task.name) for task in Path(f"/proc/{pid}/task").iterdir() if int(task.name) != pid)
+    assert ctypes.CDLL(None).tgkill(pid, other, number) == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="chooses the thread by tgkill")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_that_another_thread_takes_ends_the_wait(number):
+    paths = os.pathsep.join(p for p in sys.path if p)
+    command = [sys.executable, "-c", WAITS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": paths}) as process:
+        try:
+            assert process.stdout.readline() == b"waits\n"
+            time.sleep(0.2)  # it may not have come to the wait yet, which no line could tell
+            signal_another_thread(process.pid, number)
+            assert process.wait(20.0) == 0  # not sixty
+            assert process.stdout.read() == b"True\n"
+        finally:
+            process.kill()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no such signal")
+def test_hangup_wakes_the_wait_and_does_not_end_it():
+    hangups = []
+    wakeup, before = signal.set_wakeup_fd(-1), signal.getsignal(signal.SIGHUP)
+    with stop_on_signals(lambda: hangups.append(1)) as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert stop.wait(30.0) is False
+        assert hangups == [1]
+        assert stop.wait(0.001) is False
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.wait(30.0) is True
+        assert stop.wait(30.0) is True
+    assert signal.getsignal(signal.SIGHUP) is before
+    assert signal.set_wakeup_fd(wakeup) == -1
