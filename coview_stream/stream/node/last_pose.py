@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import hashlib
 import json
 import logging
 import math
 import os
+import stat
 import sys
 import tempfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 import numpy as np
 
-from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.transforms import Pose, is_pose
 from coview_stream.localization.calibration.calibration import Calibration
@@ -67,11 +69,49 @@ def save(folder: Path, last: LastPose) -> Path:
     }
     if last.calibration is not None:
         document["calibration"] = asdict(last.calibration)  # radians and metres
-    folder.mkdir(parents=True, exist_ok=True)
-    # a robot's day usually ends with a power cut: synced, and one name for all, so that at most one is left behind
-    with atomic_file(path, sync=True, temporary=path.with_suffix(".part")) as file:
-        file.write(json.dumps(document, indent=1).encode())
+    _make(folder)
+    _write_whole(path, json.dumps(document, indent=1).encode())
     return path
+
+
+def _make(folder: Path) -> None:
+    """Make a directory that only its owner may enter; one that is there keeps its mode."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Write a file that only its owner may read: beside its place under a name that nobody can foresee, then renamed.
+
+    A robot's day usually ends with a power cut: the bytes are on the disk before the name changes. What a cut leaves
+    behind is removed by the next :func:`load`.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.stem}.", suffix=".part")  # 0600, no link followed
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)  # a link in its place is replaced, not followed
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _open_regular(path: Path) -> BinaryIO:
+    """Open a file to read; OSError for a link, and for what is no file and could block, such as a pipe."""
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    file = os.fdopen(os.open(path, flags), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError("it is no file")
+    return file
+
+
+def _remove_parts(path: Path) -> None:
+    """Delete what writes of ``path`` that were cut short have left behind."""
+    with contextlib.suppress(OSError):
+        for part in path.parent.glob(f"{glob.escape(path.stem)}*.part"):
+            part.unlink(missing_ok=True)
 
 
 def try_out(folder: Path) -> None:
@@ -80,7 +120,7 @@ def try_out(folder: Path) -> None:
     Raises:
         OSError: one of these cannot be done.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    _make(folder)
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".try-") as file:
         file.write(b"x")
 
@@ -93,8 +133,9 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPose | None:
         another version, or not of this robot and map.
     """
     path = file_of(folder, robot, map_sha256)
+    _remove_parts(path)
     try:
-        with path.open("rb") as file:
+        with _open_regular(path) as file:
             last = _parsed(file.read(_MAX_BYTES + 1))
         if (last.robot, last.map_sha256) != (robot, map_sha256):
             raise ValueError("it is of another robot or map")

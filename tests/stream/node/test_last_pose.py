@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -174,6 +175,44 @@ def test_failed_save_raises_and_keeps_the_old_pose(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="file"):
         save(tmp_path / "file", LAST)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes and links as in POSIX")
+def test_only_the_owner_may_read_and_no_link_is_followed(tmp_path):
+    folder = tmp_path / "state"
+    foreign = tmp_path / "foreign"
+    foreign.write_text("mine")
+    path = save(folder, LAST)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert path.stat().st_mode & 0o777 == 0o600
+    path.unlink()
+    path.symlink_to(foreign)
+    path.with_suffix(".part").symlink_to(foreign)
+    save(folder, LAST)
+    assert foreign.read_text() == "mine"
+    assert not path.is_symlink()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links and pipes as in POSIX")
+@pytest.mark.parametrize("what", ["link", "pipe"])
+def test_link_or_pipe_in_place_of_the_file_is_a_warning(tmp_path, caplog, what):
+    path = file_of(tmp_path, "r1", SHA)
+    if what == "link":
+        path.symlink_to(save(tmp_path / "elsewhere", LAST))
+    else:
+        os.mkfifo(path)
+    assert load(tmp_path, "r1", SHA) is None
+    assert "cannot be read" in caplog.text
+
+
+def test_what_a_power_cut_left_behind_is_removed(tmp_path):
+    path = save(tmp_path, LAST)
+    path.with_suffix(".part").write_text("of an earlier release")
+    (tmp_path / f"{path.stem}.k2j3h4.part").write_text("half")
+    other = tmp_path / f"r2-{SHA[:16]}.abc.part"
+    other.write_text("of another robot")
+    same(load(tmp_path, "r1", SHA), LAST)
+    assert {p.name for p in tmp_path.iterdir()} == {path.name, other.name}
 
 
 def test_forget_deletes_the_file_of_one_robot(tmp_path):
