@@ -1,4 +1,4 @@
-"""Engine in a process of its own, which is started again when it dies, and a watchdog that ends one that hangs.
+"""Engine in a process of its own, which is started again when it dies, and ended when it hangs.
 
 Native code (registration, BLAS, tree building) may hold the interpreter lock for long; a process of its own is the only
 thing that keeps the pose clock of this one steady.
@@ -9,16 +9,17 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.errors import CoViewError
 from coview_stream.stream.node.engine_child import EngineChild, Opening, end
+from coview_stream.stream.node.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from coview_stream.stream.node.engines import Engine
@@ -48,6 +49,14 @@ class EngineRunner(Protocol):
 
     def run(self, job: Job) -> Result:
         """Do one job and wait for it."""
+        ...
+
+    def watch(self) -> None:
+        """Look after the engine while it has no job, never waiting; one that died is reported once, then started."""
+        ...
+
+    def end_stopped(self) -> None:
+        """End an engine that somebody has stopped, which may do no more jobs; called from any thread, now and then."""
         ...
 
     def close(self) -> None:
@@ -102,6 +111,7 @@ class EngineProcess:
         self._child: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
         self._awaited: list[str] = []  # messages that a fresh child has yet to send
+        self._stopped: int | None = None  # process that was seen stopped when last looked at
         self._watchdog = Watchdog(f"coview-watch-{kind}", self._kill)
 
     @property
@@ -152,6 +162,44 @@ class EngineProcess:
             kind, value = pipe.recv()
         return unwrap(kind, value)
 
+    def watch(self) -> None:
+        """Look after the child while there is no job, without waiting: it may have become ready, or died.
+
+        A child that died is reaped and reported once; the next call starts another one, so that the next job finds it.
+        By the thread that runs the jobs.
+
+        Raises:
+            DiedError: it died, or could not open the map, and says why.
+        """
+        child, pipe = self._child, self._pipe
+        if child is None or pipe is None:
+            self.start()
+            return
+        try:
+            while self._awaited and pipe.poll():
+                self._await(self._awaited[0])
+        except CoViewError as error:
+            self._end()
+            raise DiedError(str(error)) from error
+        except OSError as error:  # closed by another thread meanwhile
+            self._end()
+            raise DiedError(f"the {self.kind} engine died") from error
+        if child.poll() is not None:
+            self._end()
+            raise DiedError(f"the {self.kind} engine died ({_cause(child.returncode)})")
+
+    def end_stopped(self) -> None:
+        """Kill a child that has been stopped (SIGSTOP, a full terminal) for two calls in a row; Linux only.
+
+        It would hold up the jobs until the time limit of one, and robots with them.
+        """
+        child = self._child
+        pid = None if child is None or child.returncode is not None else child.pid
+        stopped = pid if pid is not None and _is_stopped(pid) else None
+        if child is not None and stopped is not None and stopped == self._stopped:
+            child.kill()
+        self._stopped = stopped
+
     def close(self) -> None:
         """Kill the child at once; it keeps nothing that would have to be saved."""
         with self._lock:
@@ -197,6 +245,19 @@ class EngineProcess:
         end(child, pipe)
 
 
+def _cause(code: int) -> str:
+    """Return how a process ended, by its exit code."""
+    return f"by signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether a process is stopped by a signal; False where there is no ``/proc``. One that a debugger holds is not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[:1] == ["T"]
+    except OSError:
+        return False
+
+
 def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
     """Do a job; return ``done`` and the result, or ``rejected`` or ``failed`` and why."""
     try:
@@ -215,58 +276,3 @@ def unwrap(kind: str, value: Any) -> Result:
         result: Result = value
         return result
     raise (RejectedError if kind == "rejected" else FailedError)(str(value))
-
-
-class Watchdog:
-    """Time limit of one block at a time, kept by one thread that sleeps as long as all goes well.
-
-    Args:
-        name: of its thread.
-        act: called, once, when the time of the block is over; meanwhile the block cannot end.
-    """
-
-    def __init__(self, name: str, act: Callable[[], None]) -> None:
-        self._name = name
-        self._act = act
-        self._condition = threading.Condition()
-        self._deadline: float | None = None
-        self._sleeps_until: float | None = None
-        self._thread: threading.Thread | None = None
-        self._closed = False
-        self.acted = False
-
-    @contextmanager
-    def limit(self, seconds: float) -> Iterator[None]:
-        """Allow the block ``seconds``; :attr:`acted` says afterwards whether it needed more."""
-        self._arm(time.monotonic() + seconds)
-        try:
-            yield
-        finally:
-            with self._condition:
-                self._deadline = None
-
-    def close(self) -> None:
-        """End the thread."""
-        with self._condition:
-            self._closed = True
-            self._condition.notify_all()
-
-    def _arm(self, deadline: float) -> None:
-        with self._condition:
-            self._deadline, self.acted = deadline, False
-            if self._thread is None and not self._closed:
-                self._thread = threading.Thread(target=self._watch, name=self._name, daemon=True)
-                self._thread.start()
-            # a thread that wakes too early looks at the new deadline: most jobs cost no switch of threads
-            if self._sleeps_until is None or self._sleeps_until > deadline:
-                self._condition.notify_all()
-
-    def _watch(self) -> None:
-        with self._condition:
-            while not self._closed:
-                now = time.monotonic()
-                if self._deadline is not None and now >= self._deadline:
-                    self._deadline, self.acted = None, True
-                    self._act()
-                self._sleeps_until = self._deadline
-                self._condition.wait(None if self._deadline is None else self._deadline - now)

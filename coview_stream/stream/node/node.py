@@ -1,4 +1,4 @@
-"""The node: endpoints of the robots on the network, and threads and clocks between their sessions and the engines.
+"""The node: threads and clocks between the sessions of the robots and the engines.
 
 Who waits for whom: the transport's threads decode and queue; one thread feeds each engine and waits for it; the pose
 clock and the status clock wait for neither.
@@ -11,26 +11,24 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.messages import encode_pose
-from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.node.counters import last_line
 from coview_stream.stream.node.engine_process import DiedError, EngineRunner, FailedError, RejectedError
 from coview_stream.stream.node.jobs import Job
+from coview_stream.stream.node.robot_endpoints import RobotEndpoints
 from coview_stream.stream.node.scheduling import Rate, RoundRobin, search_order
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
-from coview_stream.stream.transport import rmw
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
-from coview_stream.stream.transport.transport import Publisher, Transport
+from coview_stream.stream.transport.transport import Transport
 
 log = logging.getLogger("coview_stream.node")
 
-_ROS_NODE = "coview_stream"
 _MAX_POSE_TICKS = 200.0  # of the pose clock, per second; set by hand, as are those below
 _MAX_RESTART_PAUSE = 10.0  # seconds before an engine that keeps dying is started again
+_LIFE = 60.0  # seconds that an engine lived after which its death is not one in a row
+_STOPPED_INTERVAL = 1.0  # seconds between two looks whether an engine is stopped; the second one ends it
 _ERROR_PAUSE = 0.2  # seconds after an unexpected error
 _IDLE_WAIT = 0.05  # seconds; an engine without work is woken earlier by a job
 _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
@@ -68,6 +66,7 @@ class Node:
         self._engines = {"track": track, "search": search} | ({"odometry": odometry} if odometry else {})
         self._turns = {name: RoundRobin(len(self.sessions)) for name in self._engines}
         self._deaths = dict.fromkeys(self._engines, 0)  # in a row
+        self._died_at = dict.fromkeys(self._engines, float("-inf"))  # local time
         self._wake = {name: threading.Event() for name in self._engines}  # there may be a job
         self._errors = RateLimitedErrors(log)
         self._stopping = threading.Event()
@@ -87,6 +86,7 @@ class Node:
         self.declare()
         for engine in self._engines:
             self._start_thread(engine, self._feed, engine)
+        self._start_thread("stopped", self._end_stopped_engines)
         self._start_thread("poses", self._run_pose_clock)
         self._start_thread("status", self._reporter.run, self.config.status_rate, self._stopping)
         for name, run in self._background.items():
@@ -150,8 +150,21 @@ class Node:
         found = self.next_job(engine)
         if found is not None:
             self.work(engine, *found)
-        else:
-            self._wake[engine].wait(timeout=_IDLE_WAIT)
+        elif not self._wake[engine].wait(timeout=_IDLE_WAIT):
+            self.watch(engine)
+
+    def watch(self, engine: str) -> None:
+        """Look after an engine without a job: one that died is reported and started again before it is needed."""
+        try:
+            self._engines[engine].watch()
+        except DiedError as error:
+            self._engine_died(engine, error)
+
+    def _end_stopped_engines(self) -> None:
+        while not self._stopping.wait(_STOPPED_INTERVAL):
+            for engine in self._engines.values():
+                with self._errors.catch("looking after an engine"):
+                    engine.end_stopped()
 
     def next_job(self, engine: str) -> tuple[Session, Job] | None:
         """Return whose turn it is at an engine, and the job; None if there is nothing to do."""
@@ -176,11 +189,7 @@ class Node:
             self._errors.report(f"{job.robot}: the {engine} engine", error)
             session.handle_failure(job, str(error))
         except DiedError as error:
-            if not self._stopping.is_set():
-                self._engine_died(engine, error)
-                session.handle_failure(job, str(error))
-                self._deaths[engine] += 1
-                self._stopping.wait(min(0.1 * 2.0 ** self._deaths[engine], _MAX_RESTART_PAUSE))
+            self._engine_died(engine, error, session, job)
         except Exception as error:  # not foreseen, but the other robots' work goes on
             self._errors.report(f"{job.robot}: unexpected, at the {engine} engine", error)
             session.handle_failure(job, repr(error))
@@ -191,12 +200,23 @@ class Node:
             self._reporter.report_change(session)
             self._wake_engines_for(session)  # a frame may have asked for a search
 
-    def _engine_died(self, engine: str, error: DiedError) -> None:
+    def _engine_died(
+        self, engine: str, error: DiedError, session: Session | None = None, job: Job | None = None
+    ) -> None:
+        """Report an engine that died, at a job or at none, and let time pass: one that always dies is no hurry."""
+        if self._stopping.is_set():
+            return
         why = last_line(str(error))
         self._errors.report(f"the {engine} engine is started again", error, kind=why)
-        for session in self.sessions:
-            session.engine_restarted(engine, why)
+        for each in self.sessions:
+            each.engine_restarted(engine, why)
+        if session is not None and job is not None:
+            session.handle_failure(job, str(error))
         self._reporter.changed.set()
+        now, before = time.monotonic(), self._died_at[engine]
+        self._died_at[engine] = now
+        self._deaths[engine] = self._deaths[engine] + 1 if now - before < _LIFE else 1
+        self._stopping.wait(min(0.1 * 2.0 ** self._deaths[engine], _MAX_RESTART_PAUSE))
 
     # ---- the pose clock
 
@@ -226,89 +246,3 @@ def _take_job(session: Session, engine: str) -> Job | None:
     if engine == "search":
         return session.take_search_request()
     return session.take_lidar_frame()
-
-
-class RobotEndpoints:
-    """One robot's subscriptions, queryables, publishers and liveliness tokens, around its session.
-
-    Args:
-        session: of the robot.
-        transport: where everything is declared.
-        reporter: publishes the robot's status.
-        wake_engines: called with the session when there may be a job.
-        pose_format: codec of the poses; None leaves it to the robot's keys.
-    """
-
-    def __init__(
-        self,
-        session: Session,
-        transport: Transport,
-        reporter: Reporter,
-        wake_engines: Callable[[Session], None],
-        pose_format: str | None = None,
-    ) -> None:
-        self.session = session
-        self._transport = transport
-        self._reporter = reporter
-        self._wake_engines = wake_engines
-        self._pose_format = pose_format or session.keys.pose_format
-        self._bare = session.keys.bare and pose_format is None
-        self._publisher: Publisher | None = None
-
-    def declare(self, node_id: str, number: int) -> None:
-        """Declare everything; ``node_id`` is of our ROS node, and ``number`` of this robot there, from 1."""
-        keys, transport = self.session.keys, self._transport
-        self._publisher = self._pose_publisher(node_id, number)
-        self._reporter.declare(self.session)
-        if self.session.odometry_source == "robot":
-            transport.subscribe(keys.odometry, self.on_odometry, "all")
-        transport.subscribe(keys.cloud, self.on_cloud, "newest")
-        transport.answer(keys.relocalize, self.relocalize)
-        transport.answer(keys.reset, self.reset)
-        transport.announce(keys.alive)
-
-    def _pose_publisher(self, node_id: str, number: int) -> Publisher:
-        keys = self.session.keys
-        publisher = self._transport.publisher(keys.pose, "realtime")
-        if not keys.rmw:
-            return publisher
-        token = rmw.publisher_token(keys.pose, node_id, _ROS_NODE, number)
-        if number == 1:
-            self._transport.announce(rmw.node_token(int(keys.pose.split("/")[0]), node_id, _ROS_NODE))
-        self._transport.announce(token)
-        return rmw.RmwPublisher(publisher, token, time.time_ns)
-
-    def on_cloud(self, sample: Sample) -> None:
-        """Take in a cloud."""
-        self.session.on_cloud(sample, time.monotonic())
-        self._wake_engines(self.session)
-
-    def on_odometry(self, sample: Sample) -> None:
-        """Take in an odometry sample."""
-        self.session.on_odometry(sample, time.monotonic())
-        self._wake_engines(self.session)
-
-    def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Answer ``rpc/relocalize``."""
-        self.session.relocalize()
-        return self._answer()
-
-    def reset(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Answer ``rpc/reset``."""
-        self.session.reset()
-        return self._answer()
-
-    def _answer(self) -> dict[str, Any]:
-        self._reporter.changed.set()
-        state, reason = self.session.state()
-        return {"ok": True, "robot": self.session.keys.robot, "state": state.reported, "reason": reason}
-
-    def publish_pose(self, now: float) -> None:
-        """Let time pass in the session, and publish the pose if it is known."""
-        self.session.tick(now)
-        pose = self.session.pose()
-        if pose is not None and self._publisher is not None:
-            encoded = encode_pose(pose, self._pose_format)
-            self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
-            self._reporter.rates[self.session.keys.robot].add(now)
-        self._reporter.report_change(self.session)

@@ -50,6 +50,12 @@ class InlineRunner:
     def run(self, job):
         return unwrap(*attempt(self.engine, job))
 
+    def watch(self):
+        pass
+
+    def end_stopped(self):
+        pass
+
     def close(self):
         pass
 

@@ -117,6 +117,66 @@ def test_killed_engine_process_is_restarted(world_file, world_drive):
 
 
 @pytest.mark.slow
+def test_idle_engine_that_is_killed_is_reaped_reported_and_started_again(world_file):
+    process = EngineProcess("search", str(world_file), BaseMap.load(world_file).sha256)
+    try:
+        process.start()
+        process.wait_prepared()
+        process.watch()
+        first = process.pid
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(DiedError, match=r"search engine died \(by signal 9\)"):
+            until(process.watch, 10.0)
+        assert not alive(first)  # nor a zombie
+        assert process.pid is None
+        process.watch()
+        assert process.pid not in (None, first)
+        until(lambda: process.watch() or not process._awaited, 60.0)  # ready before a job asks
+    finally:
+        process.close()
+    with pytest.raises(DiedError, match="closed"):
+        process.watch()
+
+
+@pytest.mark.slow
+def test_idle_engine_that_cannot_open_its_map_says_why(world_file):
+    process = EngineProcess("track", str(world_file), "0" * 64)
+    try:
+        process.start()
+        with pytest.raises(DiedError, match="replaced by another map"):
+            until(process.watch, 60.0)
+    finally:
+        process.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_stopped_engine_is_ended_during_a_job(world_file, world_drive):
+    process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256)
+    try:
+        process.start()
+        process.wait_prepared()
+        process.end_stopped()
+        process.end_stopped()
+        assert process.run(job(world_drive.clouds[0])).fix.state is State.SEARCHING
+        os.kill(process.pid, signal.SIGSTOP)
+        failed = []
+
+        def run():
+            with pytest.raises(DiedError) as caught:
+                process.run(job(world_drive.clouds[0]))
+            failed.append(str(caught.value))
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        until(lambda: process.end_stopped() or failed, 10.0)  # not thirty seconds
+        thread.join(10.0)
+        assert process.run(job(world_drive.clouds[0])).request is not None
+    finally:
+        process.close()
+
+
+@pytest.mark.slow
 def test_child_that_was_started_before_is_the_first(world_file, world_drive):
     child = EngineChild("track")
     process = EngineProcess("track", str(world_file), BaseMap.load(world_file).sha256, None, child=child)

@@ -73,6 +73,12 @@ class Runner:
             raise DiedError("the odometry engine died")
         return self.answer(job)
 
+    def watch(self):
+        pass
+
+    def end_stopped(self):
+        pass
+
     def close(self):
         pass
 

@@ -71,6 +71,23 @@ def test_dead_track_engine_loses_all_robots(pair):
         assert pair.status(name)["state"] == "TRACKING"
 
 
+def test_engine_that_died_while_idle_is_reported(pair, caplog):
+    pair.frame("r1", 0.0)
+
+    def dead():
+        raise DiedError("the search engine died (by signal 9)")
+
+    pair.search.watch = dead
+    pair.node.watch("search")
+    status = pair.status("r1")
+    assert (status["state"], status["counters"]["engine_restarts"]) == ("TRACKING", 1)
+    assert status["errors"] == ["the search engine is started again: the search engine died (by signal 9)"]
+    assert "by signal 9" in caplog.text
+    pair.track.watch = dead
+    pair.node.watch("track")
+    assert pair.status("r1")["state"] == "LOST"
+
+
 REPLACED = "site.coview: has been replaced by another map; start the node (serve) again"
 
 

@@ -6,7 +6,7 @@ import threading
 
 from sockets import until
 
-from coview_stream.stream.node.engine_process import Watchdog
+from coview_stream.stream.node.watchdog import Watchdog
 
 
 def names():

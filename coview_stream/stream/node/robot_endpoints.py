@@ -1,0 +1,102 @@
+"""Endpoints of one robot on the network."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from coview_stream.messages import encode_pose
+from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.node.session import Session
+from coview_stream.stream.node.status import Reporter
+from coview_stream.stream.transport import rmw
+from coview_stream.stream.transport.transport import Publisher, Transport
+
+_ROS_NODE = "coview_stream"
+
+
+class RobotEndpoints:
+    """One robot's subscriptions, queryables, publishers and liveliness tokens, around its session.
+
+    Args:
+        session: of the robot.
+        transport: where everything is declared.
+        reporter: publishes the robot's status.
+        wake_engines: called with the session when there may be a job.
+        pose_format: codec of the poses; None leaves it to the robot's keys.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        transport: Transport,
+        reporter: Reporter,
+        wake_engines: Callable[[Session], None],
+        pose_format: str | None = None,
+    ) -> None:
+        self.session = session
+        self._transport = transport
+        self._reporter = reporter
+        self._wake_engines = wake_engines
+        self._pose_format = pose_format or session.keys.pose_format
+        self._bare = session.keys.bare and pose_format is None
+        self._publisher: Publisher | None = None
+
+    def declare(self, node_id: str, number: int) -> None:
+        """Declare everything; ``node_id`` is of our ROS node, and ``number`` of this robot there, from 1."""
+        keys, transport = self.session.keys, self._transport
+        self._publisher = self._pose_publisher(node_id, number)
+        self._reporter.declare(self.session)
+        if self.session.odometry_source == "robot":
+            transport.subscribe(keys.odometry, self.on_odometry, "all")
+        transport.subscribe(keys.cloud, self.on_cloud, "newest")
+        transport.answer(keys.relocalize, self.relocalize)
+        transport.answer(keys.reset, self.reset)
+        transport.announce(keys.alive)
+
+    def _pose_publisher(self, node_id: str, number: int) -> Publisher:
+        keys = self.session.keys
+        publisher = self._transport.publisher(keys.pose, "realtime")
+        if not keys.rmw:
+            return publisher
+        token = rmw.publisher_token(keys.pose, node_id, _ROS_NODE, number)
+        if number == 1:
+            self._transport.announce(rmw.node_token(int(keys.pose.split("/")[0]), node_id, _ROS_NODE))
+        self._transport.announce(token)
+        return rmw.RmwPublisher(publisher, token, time.time_ns)
+
+    def on_cloud(self, sample: Sample) -> None:
+        """Take in a cloud."""
+        self.session.on_cloud(sample, time.monotonic())
+        self._wake_engines(self.session)
+
+    def on_odometry(self, sample: Sample) -> None:
+        """Take in an odometry sample."""
+        self.session.on_odometry(sample, time.monotonic())
+        self._wake_engines(self.session)
+
+    def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
+        """Answer ``rpc/relocalize``."""
+        self.session.relocalize()
+        return self._answer()
+
+    def reset(self, parameters: dict[str, str]) -> dict[str, Any]:
+        """Answer ``rpc/reset``."""
+        self.session.reset()
+        return self._answer()
+
+    def _answer(self) -> dict[str, Any]:
+        self._reporter.changed.set()
+        state, reason = self.session.state()
+        return {"ok": True, "robot": self.session.keys.robot, "state": state.reported, "reason": reason}
+
+    def publish_pose(self, now: float) -> None:
+        """Let time pass in the session, and publish the pose if it is known."""
+        self.session.tick(now)
+        pose = self.session.pose()
+        if pose is not None and self._publisher is not None:
+            encoded = encode_pose(pose, self._pose_format)
+            self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
+            self._reporter.rates[self.session.keys.robot].add(now)
+        self._reporter.report_change(self.session)
