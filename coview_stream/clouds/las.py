@@ -9,12 +9,14 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
+from coview_stream.clouds.laz_process import read_laz
 from coview_stream.errors import CloudError
 
 CHUNK = 1_000_000
@@ -27,6 +29,8 @@ _FOOT_UNITS = {9002, 9003, 9005}
 _PROJECTED_CRS_KEY, _LINEAR_UNIT_KEY = 3072, 3076
 _MIN_HEADER, _MAX_HEADER = 227, 375  # bytes
 _COMPRESSED = 0x80
+_VARIABLE = 0xFFFFFFFF  # points per chunk, where the chunk table has them
+_POINTS_PER_BYTE = 4  # set by hand: surveys take 2 to 6 bytes a point, a plane without noise half of one
 
 
 def read_las(path: Path) -> Cloud:
@@ -35,14 +39,25 @@ def read_las(path: Path) -> Cloud:
     Raises:
         CloudError: the file is damaged, truncated, empty or not in metres.
     """
-    import laspy
-
     problem = impossible_header(path)
     if problem:
         raise CloudError(_damaged(path, ValueError(problem)))
+    if _is_compressed(path):
+        return read_laz(path)
+    return decode(path, CloudBuilder).finish(os.fspath(path))
+
+
+def decode(path: Path, builder: Callable[[str | None], CloudBuilder]) -> CloudBuilder:
+    """Read a file whose header was checked, chunk by chunk, in this process, into ``builder`` of its reference system.
+
+    Raises:
+        CloudError: the file is damaged, truncated or not in metres.
+    """
+    import laspy
+
     try:
         with laspy.open(path) as reader:
-            return _read(reader, path)
+            return _read(reader, path, builder)
     except (CloudError, MemoryError):
         raise
     except Exception as error:
@@ -54,7 +69,12 @@ def read_las(path: Path) -> Cloud:
         raise CloudError(_damaged(path, error)) from error
 
 
-def _read(reader: Any, path: Path) -> Cloud:
+def _is_compressed(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return bool(stream.read(105)[104] & _COMPRESSED)
+
+
+def _read(reader: Any, path: Path, make: Callable[[str | None], CloudBuilder]) -> CloudBuilder:
     header = reader.header
     expected = int(header.point_count)
     size = path.stat().st_size
@@ -64,7 +84,7 @@ def _read(reader: Any, path: Path) -> Cloud:
             raise CloudError(_truncated(path, expected, stored))
     crs = _crs(header)
     _check_metres(header, crs, path)
-    builder = CloudBuilder(crs)
+    builder = make(crs)
     read = 0
     for chunk in reader.chunk_iterator(CHUNK):
         read += len(chunk)
@@ -77,7 +97,7 @@ def _read(reader: Any, path: Path) -> Cloud:
         builder.add(np.stack(columns, axis=1), classes[keep], dropped=int(len(keep) - keep.sum()))
     if read < expected:
         raise CloudError(_truncated(path, expected, read))
-    return builder.finish(os.fspath(path))
+    return builder
 
 
 def _damaged(path: Path, error: BaseException) -> str:
@@ -150,7 +170,25 @@ def impossible_header(path: Path) -> str | None:
         start = _unsigned(header[96:100])
         if start > size:
             return "the points begin behind the end"
-        return _impossible_chunks(stream, start, size) if header[104] & _COMPRESSED else None
+        if not header[104] & _COMPRESSED:
+            return None
+        points = _unsigned(header[247:255]) if header[25] >= 4 else _unsigned(header[107:111])
+        if points > _POINTS_PER_BYTE * size + CHUNK:
+            return f"{points} points cannot be in {size} bytes"
+        stream.seek(_unsigned(header[94:96]))
+        return _impossible_sizes(stream, records, max(points, CHUNK)) or _impossible_chunks(stream, start, size)
+
+
+def _impossible_sizes(stream: BinaryIO, records: int, points: int) -> str | None:
+    """Check the points per chunk that the compressor's record states: the decoder makes room for them at once."""
+    for _ in range(records):
+        record = stream.read(54)
+        length = _unsigned(record[20:22])
+        if record[2:18].rstrip(b"\0") == b"laszip encoded" and _unsigned(record[18:20]) == 22204:
+            per_chunk = _unsigned(stream.read(16)[12:16])
+            return f"{per_chunk} points per chunk" if points < per_chunk < _VARIABLE else None
+        stream.seek(length, os.SEEK_CUR)
+    return None
 
 
 def _impossible_chunks(stream: BinaryIO, start: int, size: int) -> str | None:

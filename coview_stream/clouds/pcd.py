@@ -19,6 +19,8 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _AXES = ("x", "y", "z")
 _MAX_HEADER = 64 * 1024  # bytes
+_MAX_ROW = 1 << 20  # bytes of a point, set by hand: a hundred times the longest descriptors
+_LZF_RATIO = 88  # LZF's most: a back reference of 3 bytes stands for up to 264
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ def _header_from(entries: dict[str, list[str]], data_start: int) -> _Header:
     for axis in _AXES:
         if axis not in fields or counts[fields.index(axis)] != 1:
             raise ValueError(f"no field {axis} of count 1 among {' '.join(fields)}")
+    if sum(size * count for size, count in zip(sizes, counts, strict=True)) > _MAX_ROW:
+        raise ValueError(f"COUNT and SIZE make points of more than {_MAX_ROW} bytes")
     points = int(entries["POINTS"][0]) if "POINTS" in entries else _width_times_height(entries)
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     if encoding not in ("ascii", "binary", "binary_compressed"):
@@ -159,6 +163,10 @@ def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
         )
     if unpacked < header.points * header.row.itemsize:
         raise _truncated(path, header, unpacked // max(1, header.row.itemsize))
+    if unpacked > packed * _LZF_RATIO:
+        raise CloudError(
+            f"{path}: damaged compressed PCD, {packed} bytes cannot unpack to {unpacked}; copy or export it again"
+        )
     try:
         body = lzf_decompress(content[start : start + packed], unpacked)
     except ValueError as error:
@@ -169,7 +177,7 @@ def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
     return _stack([np.frombuffer(body, header.types[i], header.points, int(starts[i])) for i in columns])
 
 
-def lzf_decompress(packed: bytes, size: int) -> bytes:
+def lzf_decompress(packed: bytes, size: int) -> bytearray:
     """Decompress one LZF block of ``size`` bytes.
 
     Control bytes below 32 start a literal run; others are back references with a 3-bit length (7: one more
@@ -198,11 +206,11 @@ def lzf_decompress(packed: bytes, size: int) -> bytes:
             begin = len(out) - distance
             if begin < 0:
                 raise ValueError("back reference before the start")
-            piece = bytes(out[begin : begin + length])
+            piece = out[begin : begin + length]
             # a reference may reach into what it is about to write: the pattern then repeats
-            out += piece if len(piece) == length else (piece * (length // len(piece) + 1))[:length]
+            out += piece if distance >= length else (piece * (length // distance + 1))[:length]
     except IndexError as error:
         raise ValueError("compressed block ends early") from error
     if len(out) != size:
         raise ValueError(f"block decodes to {len(out)} bytes instead of {size}")
-    return bytes(out)
+    return out

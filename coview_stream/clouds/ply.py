@@ -22,6 +22,8 @@ _TYPES = {
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _AXES = ("x", "y", "z")
 _MAX_HEADER = 64 * 1024  # bytes
+_MAX_LISTS = 8  # set by hand: lists in one element; files have one or two, and each costs a pass over its bytes
+_WINDOW = 1 << 18  # bytes looked at together, set by hand: 20 MB of temporaries
 
 
 @dataclass
@@ -36,6 +38,11 @@ class _Element:
     @property
     def has_list(self) -> bool:
         return any(len(prop) == 3 for prop in self.properties)
+
+    @property
+    def least_bytes(self) -> int:
+        """Bytes of a row whose lists are all empty, in a binary file."""
+        return sum(np.dtype(prop[1]).itemsize for prop in self.properties)
 
     def row(self, order: str) -> np.dtype[np.void]:
         return np.dtype([(prop[0], order + prop[1]) for prop in self.properties])
@@ -84,7 +91,7 @@ def _parse_header(content: bytes, path: Path) -> tuple[str, list[_Element], int]
                 case ["element", name, count]:
                     elements.append(_Element(name, _natural(count)))
                 case ["property", "list", length, item, name]:
-                    elements[-1].properties.append((name, _TYPES[length], _TYPES[item]))
+                    _add_list(elements[-1], name, _TYPES[length], _TYPES[item])
                 case ["property", kind, name]:
                     elements[-1].properties.append((name.lower(), _TYPES[kind]))
                 case [] | ["ply"] | ["comment" | "obj_info", *_]:
@@ -97,6 +104,14 @@ def _parse_header(content: bytes, path: Path) -> tuple[str, list[_Element], int]
     if order is None:
         raise CloudError(f"{path}: PLY header has no format line; export the file again")
     return order, elements, start
+
+
+def _add_list(element: _Element, name: str, length: str, item: str) -> None:
+    if length.startswith("f"):
+        raise ValueError("the length of a list is an integer")
+    element.properties.append((name, length, item))
+    if sum(len(prop) == 3 for prop in element.properties) > _MAX_LISTS:
+        raise ValueError(f"more than {_MAX_LISTS} lists")
 
 
 def _natural(text: str) -> int:
@@ -141,7 +156,7 @@ def _ascii(content: bytes, start: int, _: str, before: list[_Element], vertex: _
 
 def _binary(content: bytes, start: int, order: str, before: list[_Element], vertex: _Element, path: Path) -> Reals:
     for element in before:
-        start = _skip(content, start, order, element)
+        start = _skip(content, start, order, element, path)
     row = vertex.row(order)
     stored = (len(content) - start) // row.itemsize
     if stored < vertex.count:
@@ -151,17 +166,89 @@ def _binary(content: bytes, start: int, order: str, before: list[_Element], vert
     return np.stack([rows[axis].astype(np.float64 if double else np.float32) for axis in _AXES], axis=1)
 
 
-def _skip(content: bytes, start: int, order: str, element: _Element) -> int:
-    """Return the offset behind an element; rows with lists have no fixed size and are walked one by one."""
-    if not element.has_list:
-        return start + element.count * element.row(order).itemsize
-    for _row in range(element.count):
+def _skip(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
+    """Return the offset behind an element's rows, in time linear in their bytes whatever the header claims.
+
+    Raises:
+        CloudError: a list of negative length, or fewer bytes than the rows need.
+    """
+    end = start + element.count * element.least_bytes
+    if end > len(content):
+        raise CloudError(
+            f"{path}: truncated PLY, {element.count} rows of {element.name} do not fit into it; copy or export it again"
+        )
+    if not element.has_list or not element.count:
+        return end
+    stride = _after_row(content, start, order, element, path) - start
+    if _all_like_the_first(content, start, stride, order, element):
+        return start + element.count * stride
+    return _walk(content, start, order, element, path)
+
+
+def _after_row(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
+    for prop in element.properties:
+        kind = np.dtype(order + prop[1])
+        if len(prop) == 3:
+            if start + kind.itemsize > len(content):
+                raise _bad_list(path, element)
+            length = int(np.frombuffer(content, kind, 1, start)[0])
+            if length < 0:
+                raise _bad_list(path, element)
+            start += length * np.dtype(prop[2]).itemsize
+        start += kind.itemsize
+    if start > len(content):
+        raise _bad_list(path, element)
+    return start
+
+
+def _all_like_the_first(content: bytes, start: int, stride: int, order: str, element: _Element) -> bool:
+    """Tell whether the lists of all rows are as long as those of the first."""
+    if start + element.count * stride > len(content):
+        return False
+    for prop in element.properties:
+        kind = np.dtype(order + prop[1])
+        if len(prop) == 3:
+            lengths = np.ndarray(element.count, kind, content, start, stride)
+            if not (lengths == lengths[0]).all():
+                return False
+            start += int(lengths[0]) * np.dtype(prop[2]).itemsize
+        start += kind.itemsize
+    return True
+
+
+def _walk(content: bytes, start: int, order: str, element: _Element, path: Path) -> int:
+    """Follow rows of different lengths: where a row would end is computed for every byte of a window at once."""
+    left, size = element.count, len(content)
+    octets = np.frombuffer(content, np.uint8)
+    while left:
+        window = np.arange(start, min(start + _WINDOW, size))
+        if not len(window):
+            raise _bad_list(path, element)
+        position = window.copy()
+        wrong = np.zeros(len(window), bool)
         for prop in element.properties:
             kind = np.dtype(order + prop[1])
             if len(prop) == 3:
-                if start + kind.itemsize > len(content):
-                    return len(content)
-                length = int(np.frombuffer(content, kind, 1, start)[0])
-                start += length * np.dtype(prop[2]).itemsize
-            start += kind.itemsize
+                wrong |= position > size - kind.itemsize
+                position[wrong] = 0
+                raw = octets[position[:, None] + np.arange(kind.itemsize)]
+                lengths = raw.view(kind)[:, 0].astype(np.int64)
+                wrong |= lengths < 0
+                position += lengths * np.dtype(prop[2]).itemsize
+            position += kind.itemsize
+        position[wrong | (position > size)] = -1
+        following, at, begin = position.tolist(), 0, start
+        while left and 0 <= at < len(following):
+            at = following[at] - begin
+            left -= 1
+        start = begin + at
+        if start < 0:
+            raise _bad_list(path, element)
     return start
+
+
+def _bad_list(path: Path, element: _Element) -> CloudError:
+    return CloudError(
+        f"{path}: damaged PLY, a list of {element.name} has a negative length or reaches beyond the file; "
+        "copy or export it again"
+    )
