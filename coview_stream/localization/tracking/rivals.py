@@ -78,12 +78,19 @@ def find_rivals(
         if other is None:
             continue
         T = other.T_map_source
-        if all(matters(*off_by(T @ T_odom_body, each @ T_odom_body)) for each in found):
+        if all(_beside(T @ T_odom_body, each @ T_odom_body) for each in found):
             found.append(T)
     if len(found) == 1:
         return []
     ratio = place.ratios(scan, np.stack(found))
     return [Rival(found[k], float(ratio[k])) for k in np.argsort(-ratio, kind="stable") if k]
+
+
+def _beside(T_map_body: Pose, T_map_other: Pose) -> bool:
+    """Tell whether two poses are so far apart on the ground that it matters: wheels slip along it, not upwards."""
+    along = T_map_body.copy()
+    along[2, 3] = T_map_other[2, 3]
+    return matters(*off_by(along, T_map_other))
 
 
 def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:

@@ -249,13 +249,16 @@ class Tracker:
         Where the two places are so near that either is good enough, what the lidar sees is believed. Where odometry is
         known to drift so far, it contradicts nothing: the other place is what registration from there comes to. Where
         the headings alone differ, it is odometry's that is wrong: what has been moved does not turn about the robot.
+        Neither holds where the heights differ by more than odometry drifts: no wheel slips upwards.
         """
         plausible = match.innovation <= self.config.acceptance.max_innovation
         led = tries[0].T_map_body if plausible and not self._disputed else belief.T_map_body
         metres, degrees = off_by(match.T_map_body, led)
-        if not matters(metres, degrees):
+        rise = float(match.T_map_body[2, 3] - led[2, 3])
+        level = rise**2 <= self.config.acceptance.max_innovation * (belief.covariance[5, 5] + match.covariance[5, 5])
+        if not matters(metres, degrees) and (level or plausible):
             return replace(match, moves_place=not plausible)
-        moves = not matters(metres, 0.0)
+        moves = not matters(metres, 0.0) and level
         if not moves:
             places = [each.T_map_body for each in tries if each.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]

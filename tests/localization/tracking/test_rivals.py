@@ -12,7 +12,7 @@ from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import ScanInput, register
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
-from coview_stream.localization.tracking.rivals import find_rivals, rings
+from coview_stream.localization.tracking.rivals import _beside, find_rivals, rings
 from coview_stream.localization.tracking.slip import matters, off_by
 
 CONFIG = LocalizerConfig()
@@ -90,3 +90,11 @@ def test_rings_reach_as_far_as_odometry_slips():
     for slip in rng.uniform(-2.5, 2.5, (200, 2)):  # no slip is far from all
         if np.linalg.norm(slip) > 0.5:
             assert np.linalg.norm(straight[:, :2] - pose[:2] - slip, axis=1).min() < 0.75
+
+
+@pytest.mark.parametrize(
+    ("moved", "beside"), [((0.0, 0.0, 2.0), False), ((0.8, 0.0, 0.0), True), ((0.1, 0.1, -0.7), False)]
+)
+def test_pose_above_or_below_is_no_rival(moved, beside):
+    """Wheels slip along the ground."""
+    assert _beside(pose_from(np.eye(3), moved), np.eye(4)) == beside

@@ -77,6 +77,16 @@ def test_slip_so_small_that_either_place_is_good_enough_is_followed_at_once(worl
     assert degrees < 0.2
 
 
+def test_step_in_height_is_not_followed_at_once(world_map, slow_drive):
+    """No wheel slips upwards: as far as 0.3 m along the ground would be followed."""
+    causes = []
+    for step in ([0.0, 0.3, 0.0], [0.0, 0.0, 0.3]):
+        ride = on_the_way(world_map, slow_drive)
+        ride.slips(pose_from(np.eye(3), step), slow_drive.T_map_body[7])
+        causes.append(ride.update(slow_drive.clouds[8], slow_drive.T_map_body[8]).cause)
+    assert causes == [RejectionReason.VERIFIED, RejectionReason.ODOMETRY]
+
+
 def test_displaced_frame_is_detected_only_after_a_good_one(world_map, slow_drive):
     clouds, truth = slow_drive.clouds, slow_drive.T_map_body
     away = pose_from(np.eye(3), [6.0, 3.0, 0.0])
