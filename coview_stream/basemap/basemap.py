@@ -16,6 +16,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.basemap import file_format, tiles
 from coview_stream.basemap.likelihood_field import field_arrays
+from coview_stream.basemap.shapes import check_arrays
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
@@ -60,7 +61,9 @@ class BaseMap:
             self.config = MapConfig(descriptor=DescriptorConfig(**descriptor), **fields)
             self.crs: str | None = parameters["crs"]
             self.sources: dict[str, str] = dict(parameters["sources"])
-        except (KeyError, TypeError, ConfigError) as error:
+            if not isinstance(self.crs, str | None):
+                raise TypeError("crs is no text")
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise MapError(f"the map's parameters cannot be read ({error}); build it again") from error
         absent = [n for n in self.config.descriptor.channels if f"descriptor.{n}" not in arrays]
         if absent:
@@ -112,9 +115,11 @@ class BaseMap:
                 what the file says: for one that another process has just checked.
 
         Raises:
-            MapError: it is missing, damaged or of another version.
+            MapError: it is missing, damaged or of another version, or an array has another type or shape.
         """
-        return cls(*file_format.load(Path(path), check))
+        loaded = cls(*file_format.load(Path(path), check))
+        check_arrays(loaded._arrays, loaded.config)
+        return loaded
 
     def save(self, path: str | os.PathLike[str]) -> str:
         """Write the map atomically and return its sha256; raises :class:`MapError` if that fails."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import mmap
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,8 @@ VERSION = 1
 
 Arrays = dict[str, npt.NDArray[Any]]
 
+_DAMAGE = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, MemoryError, OSError)
+_MAX_ARRAYS = 256  # set by hand: ten times what a map has
 _CHUNK = 1 << 22  # bytes written or hashed at a time
 _CACHE_LINE = 64  # bytes
 _TYPES = {
@@ -109,13 +112,19 @@ def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
             f"{path}: map format {metadata.get('version')}, this program reads {VERSION}; build the map again"
         )
     try:
+        if len(header) > _MAX_ARRAYS:
+            raise ValueError(f"{len(header)} arrays, a map has {_MAX_ARRAYS} at most")
         arrays = {name: _mapped(path, start, entry) for name, entry in sorted(header.items())}
+        if start + sum(array.nbytes for array in arrays.values()) > path.stat().st_size:
+            raise ValueError("its arrays overlap")  # or reading them takes any time
         digest = str(metadata.get("sha256"))
         if check:
             with path.open("rb") as file:
                 digest = _digest(metadata["parameters"], arrays, lambda name: _read(file, start, header[name]))
         parameters = json.loads(metadata["parameters"])
-    except (KeyError, TypeError, ValueError, OSError) as error:
+        if not isinstance(parameters, dict):
+            raise TypeError("its parameters are no object")
+    except _DAMAGE as error:
         raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
     if digest != metadata.get("sha256"):
         raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
@@ -132,7 +141,7 @@ def _header(path: Path) -> tuple[dict[str, Any], int]:
             header = json.loads(text)
     except OSError as error:
         raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
     # only blanks may pad it: JSON would also accept a blank damaged into a line end
     padded = text.rstrip(b" ").endswith(b"}")
@@ -143,9 +152,11 @@ def _header(path: Path) -> tuple[dict[str, Any], int]:
 
 def _mapped(path: Path, start: int, entry: dict[str, Any]) -> npt.NDArray[Any]:
     dtype = np.dtype(_TYPES[entry["dtype"]])
-    shape = tuple(int(n) for n in entry["shape"])
+    shape = tuple(entry["shape"])
     begin, end = entry["data_offsets"]
-    if end - begin != dtype.itemsize * int(np.prod(shape)) or start + end > path.stat().st_size:
+    if not all(type(n) is int and n >= 0 for n in (*shape, begin, end)):
+        raise ValueError("a shape or an offset is no natural number")
+    if end - begin != dtype.itemsize * math.prod(shape) or start + end > path.stat().st_size:
         raise ValueError("an array reaches beyond the file")
     if end == begin:
         return np.empty(shape, dtype=dtype)

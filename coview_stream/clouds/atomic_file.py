@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,8 @@ from typing import BinaryIO
 def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """Yield a name that becomes ``path`` at the end of the block, or is deleted if the block raises.
 
+    What processes that were killed have left of the same file is deleted first.
+
     Args:
         path: the file's name; a file that is there stays whole until the new one is complete.
         temporary: the name to write under, in the same directory; by default one of this process's own.
@@ -21,11 +24,35 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
         OSError: the file cannot be renamed.
     """
     part = temporary or path.with_name(f".{path.name}.{os.getpid()}.part")
+    if temporary is None:
+        _remove_left(path)
     try:
         yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _remove_left(path: Path) -> None:
+    """Delete the parts of ``path`` whose processes are gone; any other file of such a name is left alone."""
+    begin, end = f".{path.name}.", ".part"
+    with contextlib.suppress(OSError):  # the writing that follows says what is wrong with the directory
+        for entry in os.scandir(path.parent):
+            process = entry.name[len(begin) : -len(end)]
+            if not (entry.name.startswith(begin) and entry.name.endswith(end) and process.isascii()):
+                continue
+            if process.isdigit() and 0 < int(process) < 1 << 31 and not _lives(int(process)):
+                Path(entry.path).unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is of another user
+        return True
+    return True
 
 
 @contextmanager

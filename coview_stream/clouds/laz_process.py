@@ -89,8 +89,8 @@ class LazProcess:
             answer = json.loads(line)
             if "end" in answer:
                 break
-            raw = np.empty((answer["points"], 3))
-            classes = np.empty(len(raw), np.uint8)
+            raw: Any = np.empty((answer["points"], 3))
+            classes: Any = np.empty(len(raw), np.uint8)
             for array in (raw, classes):
                 if array.nbytes and answers.readinto(memoryview(array).cast("B")) != array.nbytes:
                     raise self._died(path)

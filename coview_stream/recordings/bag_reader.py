@@ -56,10 +56,12 @@ class BagReader:
         weakref.finalize(self, self._reader.close)
 
     def counts(self) -> dict[tuple[str, str], int]:
-        """Count the messages of each (type, topic)."""
+        """Count the messages of each (type, topic); RunError if one of them has no name."""
         found: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             key = (connection.msgtype, connection.topic)
+            if not all(isinstance(name, str) for name in key):  # a database accepts anything
+                raise RunError(f"{self.path}: cannot be read (a topic without name or type); record or copy it again")
             found[key] = found.get(key, 0) + connection.msgcount
         return found
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from coview_stream.clouds.atomic_file import atomic_file, atomic_path
@@ -45,3 +49,18 @@ def test_atomic_path_uses_the_given_temporary_name(tmp_path):
 def test_missing_directory_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match="no"), atomic_file(tmp_path / "no" / "a.bin"):
         pass
+
+
+def test_parts_of_killed_processes_are_removed_and_no_others(tmp_path):
+    path = tmp_path / "a.bin"
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    left = tmp_path / f".a.bin.{gone.pid}.part"
+    kept = [f".a.bin.{os.getppid()}.part", f".b.bin.{gone.pid}.part", ".a.bin.x.part", ".a.bin..part", ".a.bin.-1.part",
+            f".a.bin.{'9' * 40}.part", "a.bin.7.part"]  # fmt: skip
+    for name in [left.name, *kept]:
+        (tmp_path / name).write_bytes(b"half")
+    with atomic_file(path) as stream:
+        stream.write(b"new")
+    assert not left.exists()
+    assert {entry.name for entry in tmp_path.iterdir()} == {"a.bin", *kept}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import threading
 from pathlib import Path
 
@@ -288,3 +290,17 @@ def test_topic_options_are_refused_for_files(tmp_path):
     (tmp_path / "frames").mkdir()
     with pytest.raises(RunError, match="has no topics"):
         open_run(tmp_path, cloud_topic="/points")
+
+
+def test_topic_without_a_name_in_a_database_is_refused(tmp_path):
+    bag = write_bag(tmp_path / "a", {"/points": [cloud(0, np.ones((5, 3), np.float32))]}, "sqlite3")
+    (database,) = bag.glob("*.db3")
+    single = database.rename(tmp_path / "b.db3")
+    with contextlib.closing(sqlite3.connect(single)) as connection:
+        kept = "CREATE TABLE other AS SELECT * FROM topics; DROP TABLE topics; ALTER TABLE other RENAME TO topics;"
+        connection.executescript(kept)
+        row = connection.execute("SELECT * FROM topics").fetchone()
+        connection.execute(f"INSERT INTO topics VALUES ({','.join('?' * len(row))})", (row[0] + 1, None, *row[2:]))
+        connection.commit()
+    with pytest.raises(RunError, match=r"b\.db3"):
+        open_run(single)

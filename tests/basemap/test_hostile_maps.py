@@ -1,0 +1,120 @@
+"""Map files made to fail later: one MapError when they are loaded, which names the field."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap import file_format
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.errors import MapError
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[file_format.Arrays, dict[str, Any]]:
+    """Arrays and parameters of a map of a plane with two boxes."""
+    rng = np.random.default_rng(3)
+    ground = np.c_[rng.uniform(-9, 9, (9000, 2)), rng.normal(0, 0.01, 9000)]
+    wall = np.c_[rng.uniform(-4, 4, 3000), np.full(3000, 5.0), rng.uniform(0, 4, 3000)]
+    path = tmp_path_factory.mktemp("map") / "a.npy"
+    np.save(path, np.concatenate([ground, wall]).astype(np.float32))
+    built = BaseMap.build(path)
+    return built._arrays, built.parameters
+
+
+def test_whole_map_is_loaded(small: Any, tmp_path: Path) -> None:
+    file_format.save(tmp_path / "a.coview", *small)
+    assert len(BaseMap.load(tmp_path / "a.coview")) == len(small[0]["stations"])
+
+
+NAMES = ["origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner", "descriptor.coview",
+         "field.tiles", "field.occupied", "field.ground", "field.edge", "station_codes", "station_codes.basis",
+         "station_codes.rest.step", "station_codes.norm"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("change", ["shorter", "flat", "type", "deeper", "wider"])
+def test_array_of_another_shape_or_type_is_refused_when_loading(
+    small: Any, tmp_path: Path, name: str, change: str
+) -> None:
+    array = small[0][name]
+    if change == "shorter" and name in ("surveyed", "tile_index"):
+        pytest.skip("any size will do")
+    changed = {
+        "shorter": lambda: array[:-1],
+        "flat": lambda: array.reshape(-1)[: array.size - 1],
+        "type": lambda: array.astype(np.int32 if array.dtype != np.int32 else np.int64),
+        "deeper": lambda: array[None],
+        "wider": lambda: np.repeat(array, 2, axis=-1) if name != "surveyed" else array.reshape(-1),
+    }[change]()
+    file_format.save(tmp_path / "a.coview", small[0] | {name: changed}, small[1])
+    # the one it does not fit to may be named in its place
+    with pytest.raises(MapError, match=r"the map's (\w|\.)+ (is|has)"):
+        BaseMap.load(tmp_path / "a.coview")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("origin", np.nan), ("stations", np.inf), ("surveyed_corner", np.nan), ("tile_index", 1 << 40),
+                        ("tile_index", -1)]
+)  # fmt: skip
+def test_values_that_would_be_used_as_places_are_checked(small: Any, tmp_path: Path, name: str, value: float) -> None:
+    changed = small[0][name].copy()
+    changed[..., -1] = value
+    file_format.save(tmp_path / "a.coview", small[0] | {name: changed}, small[1])
+    with pytest.raises(MapError, match=f"the map's {name}"):
+        BaseMap.load(tmp_path / "a.coview")
+
+
+@pytest.mark.parametrize(
+    "parameters", [None, [], "x", {"config": None}, {"config": []}, {"sources": [1, 2]}, {"sources": "ab"}, {"crs": 7}]
+)
+def test_parameters_of_another_kind_are_refused(small: Any, tmp_path: Path, parameters: Any) -> None:
+    whole = small[1] | parameters if isinstance(parameters, dict) and parameters else parameters
+    file_format.save(tmp_path / "a.coview", small[0], whole)
+    with pytest.raises(MapError):
+        BaseMap.load(tmp_path / "a.coview")
+
+
+def _with_header(path: Path, text: bytes, body: bytes = bytes(64)) -> Path:
+    path.write_bytes(len(text).to_bytes(8, "little") + text + body)
+    return path
+
+
+@pytest.mark.parametrize("opening", ["[", '{"a":'])
+def test_header_of_endless_brackets_is_refused(tmp_path: Path, opening: str) -> None:
+    path = _with_header(tmp_path / "a.coview", opening.encode() * 1_000_00)
+    for use in (file_format.load, file_format.check_target):
+        with pytest.raises(MapError):
+            use(path)
+
+
+@pytest.mark.parametrize(
+    ("shape", "offsets"),
+    [
+        ([float("inf")], [0, 8]), ([-1, -8], [0, 8]), ([-1], [8, 7]), ([10**30], [0, 8]), ([0, 10**30], [0, 0]),
+        ([True] * 3, [0, 1]), ([1], [-8, 0]), ([1.0], [0, 1]), ("1", [0, 1]), ([1] * 99, [0, 1]), (None, [0, 1]),
+        ([2**62, 4], [0, 0]),
+    ],
+)  # fmt: skip
+def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: Any, offsets: list[int]) -> None:
+    metadata = {"format": file_format.FORMAT, "version": "1", "parameters": "{}", "sha256": ""}
+    header = {"__metadata__": metadata, "a": {"dtype": "U8", "shape": shape, "data_offsets": offsets}}
+    with pytest.raises(MapError):
+        file_format.load(_with_header(tmp_path / "a.coview", json.dumps(header).encode()), False)
+
+
+def test_null_parameters_and_arrays_that_share_bytes_are_refused(tmp_path: Path) -> None:
+    metadata: dict[str, Any] = {"format": file_format.FORMAT, "version": "1", "parameters": None, "sha256": ""}
+    header = {"__metadata__": metadata}
+    with pytest.raises(MapError, match="damaged"):
+        file_format.load(_with_header(tmp_path / "a.coview", json.dumps(header).encode()))
+    metadata["parameters"] = "{}"
+    same = {"dtype": "U8", "shape": [60], "data_offsets": [0, 60]}
+    for count, reason in ((2, "overlap"), (1000, "arrays")):
+        many = header | {f"a{k}": same for k in range(count)}
+        with pytest.raises(MapError, match=reason):
+            file_format.load(_with_header(tmp_path / "a.coview", json.dumps(many).encode()))
