@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,7 +86,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_reloc(parser)
     add_risk(parser)
     add_state(parser)
-    parser.add_argument("--quiet", action="store_true", help="log errors only")
+    operation = parser.add_argument_group("operation (docs/operations.md)")
+    operation.add_argument("--node", metavar="NAME", help="the node's own name in its keys (the first robot's)")
+    operation.add_argument(
+        "--metrics",
+        nargs="?",
+        const="127.0.0.1:9464",
+        metavar="HOST:PORT",
+        help="answer GET /metrics and /health there (no port is opened; 127.0.0.1:9464 if none is named)",
+    )
+    operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
+    operation.add_argument("--quiet", action="store_true", help="log errors only")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -104,16 +115,15 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     import logging
 
+    from coview_stream.cli.logs import start_logging
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.config.node import NodeConfig
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import ServeOptions
-    from coview_stream.stream.transport.keys import robot_keys
+    from coview_stream.stream.transport.keys import node_keys, robot_keys
     from coview_stream.stream.transport.open_client import DEFAULT_ENDPOINT
 
-    logging.basicConfig(
-        level=logging.ERROR if args.quiet else logging.INFO, format="%(asctime)s %(levelname)s %(message)s"
-    )
+    start_logging(logging.ERROR if args.quiet else logging.INFO, args.log_json)
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
@@ -141,21 +151,26 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
+        node_keys(args.base, args.node or args.robot[0]), args.metrics,
     )  # fmt: skip
-    with stop_on_signals() as stop:
-        ended = _serve(options, stop, children)
+    hangups: list[int] = []
+    with stop_on_signals(lambda: hangups.append(1)) as stop:
+        ended = _serve(options, stop, children, hangups)
     if not ended:
         _exit_now()
     return 0
 
 
-def _serve(options: ServeOptions, stop: Stop, children: dict[str, EngineChild] | None = None) -> bool:
-    """Open the node and run it until asked to stop; False if a thread does not end in time.
+def _serve(
+    options: ServeOptions, stop: Stop, children: dict[str, EngineChild] | None = None, hangups: Sequence[int] = ()
+) -> bool:
+    """Open the node and run it until asked to stop; False if a thread hangs. Each hangup reloads the map.
 
     A thread of its own opens the node: a signal must end a wait for a host that does not answer, too.
     """
     from coview_stream.stream.node.engine_process import CancelledError
     from coview_stream.stream.node.serve import open_node
+    from coview_stream.stream.node.systemd import Notifier
 
     opened: list[Node] = []
     failed: list[BaseException] = []
@@ -172,8 +187,13 @@ def _serve(options: ServeOptions, stop: Stop, children: dict[str, EngineChild] |
     opening.start()
     while opening.is_alive() and not stop.wait(0.05):
         pass
+    answered = 0
     while not (failed or stop.wait(60.0)):
-        pass
+        if len(hangups) > answered:
+            answered = len(hangups)
+            for node in opened:
+                node.reload()
+    Notifier().stopping()
     if failed and not stop.requested:
         raise failed[0]
     end = stop.now() + _MAX_SHUTDOWN

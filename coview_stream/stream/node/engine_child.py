@@ -110,4 +110,5 @@ def _environment(kind: str) -> dict[str, str]:
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = {"COVIEW_THREADS": str(max(1, cores - 1))} if kind == "search" else {}
-    return threads | python_environment() | {"OPENBLAS_NUM_THREADS": "1"}
+    ours = {name: value for name, value in python_environment().items() if name != "NOTIFY_SOCKET"}  # the node notifies
+    return threads | ours | {"OPENBLAS_NUM_THREADS": "1"}

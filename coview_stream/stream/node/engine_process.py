@@ -51,6 +51,16 @@ class EngineRunner(Protocol):
         """Do one job and wait for it."""
         ...
 
+    @property
+    def pid(self) -> int | None:
+        """Process id, None while there is none."""
+        ...
+
+    @property
+    def ready(self) -> bool:
+        """Whether a job would be done at once."""
+        ...
+
     def watch(self) -> None:
         """Look after the engine while it has no job, never waiting; one that died is reported once, then started."""
         ...
@@ -118,6 +128,11 @@ class EngineProcess:
     def pid(self) -> int | None:
         """Process id of the child, None while there is none."""
         return self._child.pid if self._child else None
+
+    @property
+    def ready(self) -> bool:
+        """Whether the child has opened the map and prepared for jobs, as far as it has been asked."""
+        return self._pipe is not None and not self._awaited
 
     def start(self) -> None:
         """Start the child without waiting until it is ready."""

@@ -259,6 +259,11 @@ class PoseHint:
         """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
         return self._T_map_body if self._pending else None
 
+    @property
+    def known(self) -> Pose | None:
+        """``T_map_body`` (4, 4), whether the engine has it or not."""
+        return self._T_map_body
+
     def update(self, T_map_body: Pose, calibration: Calibration | None = None) -> None:
         """Take over a pose that the engine itself has verified."""
         self._T_map_body, self.calibration, self._pending = T_map_body, calibration, False

@@ -35,7 +35,7 @@ class LastPoseKeeper:
         self._sessions = sessions
         self._interval = interval
         self._errors = RateLimitedErrors(log)
-        self._kept: dict[str, Pose] = {}
+        self._kept: dict[tuple[str, str], Pose] = {}  # by robot and map
         self._forgotten: dict[str, int] = {}
         self._failing = False
 
@@ -73,11 +73,11 @@ class LastPoseKeeper:
             if now.forgotten != self._forgotten.get(robot, 0):
                 forget(self.folder, robot, sha256)
                 self._forgotten[robot] = now.forgotten
-                self._kept.pop(robot, None)
-            if now.T_map_body is None or now.stamp_ns is None or self._stands_still(robot, now.T_map_body):
+                self._kept.pop((robot, sha256), None)
+            if now.T_map_body is None or now.stamp_ns is None or self._stands_still((robot, sha256), now.T_map_body):
                 return
             save(self.folder, LastPose(robot, sha256, now.stamp_ns, now.T_map_body, now.calibration))
-            self._kept[robot] = now.T_map_body
+            self._kept[robot, sha256] = now.T_map_body
         except OSError as error:
             if not self._failing:
                 log.warning("%s: cannot keep the last poses (%s); going on without", self.folder, error)
@@ -85,9 +85,9 @@ class LastPoseKeeper:
         else:
             self._failing = False
 
-    def _stands_still(self, robot: str, T_map_body: Pose) -> bool:
+    def _stands_still(self, whose: tuple[str, str], T_map_body: Pose) -> bool:
         """Whether the robot is where it was when its pose was written."""
-        kept = self._kept.get(robot)
+        kept = self._kept.get(whose)
         if kept is None:
             return False
         moved = inverse(kept) @ T_map_body

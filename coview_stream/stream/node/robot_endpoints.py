@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -35,13 +36,30 @@ class RobotEndpoints:
         wake_engines: Callable[[Session], None],
         pose_format: str | None = None,
     ) -> None:
-        self.session = session
+        self._sessions: tuple[Session, ...] = (session,)  # that in force, and perhaps one on another map
+        self._switching = threading.Lock()  # no pose of the session before is published after the switch
         self._transport = transport
         self._reporter = reporter
         self._wake_engines = wake_engines
         self._pose_format = pose_format or session.keys.pose_format
         self._bare = session.keys.bare and pose_format is None
         self._publisher: Publisher | None = None
+
+    @property
+    def session(self) -> Session:
+        """The session in force."""
+        return self._sessions[0]
+
+    def add_session(self, session: Session) -> None:
+        """Hand all messages to another session as well, of another map."""
+        self._sessions = (self._sessions[0], session)
+
+    def switch_session(self) -> None:
+        """Go over to that session, which goes on from what the one in force has counted and published."""
+        with self._switching:
+            old, new = self._sessions
+            new.continue_from(old)
+            self._sessions = (new,)
 
     def declare(self, node_id: str, number: int) -> None:
         """Declare everything; ``node_id`` is of our ROS node, and ``number`` of this robot there, from 1."""
@@ -68,22 +86,26 @@ class RobotEndpoints:
 
     def on_cloud(self, sample: Sample) -> None:
         """Take in a cloud."""
-        self.session.on_cloud(sample, time.monotonic())
-        self._wake_engines(self.session)
+        for session in self._sessions:
+            session.on_cloud(sample, time.monotonic())
+            self._wake_engines(session)
 
     def on_odometry(self, sample: Sample) -> None:
         """Take in an odometry sample."""
-        self.session.on_odometry(sample, time.monotonic())
-        self._wake_engines(self.session)
+        for session in self._sessions:
+            session.on_odometry(sample, time.monotonic())
+            self._wake_engines(session)
 
     def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/relocalize``."""
-        self.session.relocalize()
+        for session in self._sessions:
+            session.relocalize()
         return self._answer()
 
     def reset(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/reset``."""
-        self.session.reset()
+        for session in self._sessions:
+            session.reset()
         return self._answer()
 
     def _answer(self) -> dict[str, Any]:
@@ -93,10 +115,15 @@ class RobotEndpoints:
 
     def publish_pose(self, now: float) -> None:
         """Let time pass in the session, and publish the pose if it is known."""
-        self.session.tick(now)
+        with self._switching:
+            self._publish_pose(now)
+        self._reporter.report_change(self.session)
+
+    def _publish_pose(self, now: float) -> None:
+        for session in self._sessions:
+            session.tick(now)
         pose = self.session.pose()
         if pose is not None and self._publisher is not None:
             encoded = encode_pose(pose, self._pose_format)
             self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
             self._reporter.rates[self.session.keys.robot].add(now)
-        self._reporter.report_change(self.session)

@@ -163,6 +163,10 @@ class RobotState:
         self._counters.poses += 1
         return pose
 
+    def publish_after(self, other: RobotState) -> None:
+        """Publish nothing older than another state has, nor another pose for the same stamp."""
+        self._published = other._published
+
     def age(self, odometry: OdometryBuffer) -> float | None:
         """Seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
         newest, correction = odometry.newest, self.correction

@@ -16,12 +16,14 @@ from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import MapError, TransportError
 from coview_stream.stream.node.engine_child import EngineChild, start_children
 from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineProcess
-from coview_stream.stream.transport.keys import RobotKeys, check_disjoint
+from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 from coview_stream.stream.transport.transport import Transport
 
 if TYPE_CHECKING:
     from coview_stream.stream.node.node import Node
+    from coview_stream.stream.node.reload import OpenedMap
     from coview_stream.stream.node.session import Session
+    from coview_stream.stream.node.systemd import Notifier
 
 log = logging.getLogger("coview_stream.node")
 
@@ -45,6 +47,8 @@ class ServeOptions:
         state: directory that keeps the last known poses; None for none.
         reloc: recognizers that propose the places to search at.
         risk: probability of a wrong place below which a search gives one.
+        node_keys: of the node's own; None for none.
+        metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
     """
 
     map_path: Path
@@ -61,6 +65,8 @@ class ServeOptions:
     state: Path | None = None
     reloc: Reloc = "auto"
     risk: float = AcceptanceConfig.risk
+    node_keys: NodeKeys | None = None
+    metrics: str | None = None
 
 
 def open_node(
@@ -88,28 +94,18 @@ def open_node(
     transport = None
     try:
         # for its errors and hash, while the engines start: they map it themselves
-        base_map = BaseMap.load(options.map_path)
-        missing = base_map.require_features(options.reloc)
-        if missing is not None:
-            log.warning("%s: %s", options.map_path, missing)
-        reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
-        for kind, child in children.items():
-            engines[kind] = EngineProcess(
-                kind, str(options.map_path), base_map.sha256, None,
-                registration=options.registration, reloc=reloc, risk=options.risk,
-                sensor_leans=options.lidar is None, child=child,
-            )  # fmt: skip
-        for engine in engines.values():
-            engine.start()
+        sha256, engines = start_engines(options, children)
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
         from coview_stream.stream.node.node import Node
+        from coview_stream.stream.node.reload import MapReloader
+        from coview_stream.stream.node.systemd import Notifier
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
         transport = open_transport(options.connect, options.listen, options.zenoh_config, options.node.max_payload)
         warn_if_served_already(transport, options.keys)
-        sessions = make_sessions(options, base_map.sha256)
+        sessions = make_sessions(options, sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
         for name, engine in engines.items():
             if name != "search":  # which has until the first keyframe
@@ -121,6 +117,14 @@ def open_node(
             sessions, transport, engines["track"], engines["search"], options.node, options.pose_codec,
             engines.get("odometry"), background,
         )  # fmt: skip
+        notifier = Notifier()
+        node.reloader = reloader = MapReloader(
+            node,
+            lambda cancelled: open_map(options, node.map_sha256, cancelled),
+            lambda busy: notifier.reloading(busy, "changing the map" if busy else ", ".join(names)),
+        )
+        node.run_beside("reload", reloader.run)
+        _add_health(node, options, notifier)
         node.start()
     except BaseException as error:
         for engine in engines.values():
@@ -133,7 +137,80 @@ def open_node(
             raise MapError(f"{options.map_path}: {error} while it opened the map") from error
         raise
     log.info("ready after %.1f s: map %s, robots %s", time.monotonic() - begin, options.map_path, ", ".join(names))
+    notifier.ready(f"serves {', '.join(names)}")
     return node
+
+
+def _add_health(node: Node, options: ServeOptions, notifier: Notifier) -> None:
+    """Have the node tell how it is: on zenoh, to systemd, and over HTTP where that is asked for."""
+    from coview_stream.stream.node.health import NodeHealth
+    from coview_stream.stream.node.metrics_server import MetricsServer
+
+    health, keys = NodeHealth(node, needs_connection=bool(options.connect)), options.node_keys
+    if keys is not None:
+        health.answer(keys)
+        node.run_beside("health", lambda stopping: health.run(stopping, keys))
+    if options.metrics is not None:
+        node.run_beside("metrics", MetricsServer(options.metrics, health.document).run)
+    if notifier.watchdog_period is not None:
+        node.run_beside("systemd", lambda stopping: notifier.run(stopping, lambda: not health.live_reasons()))
+
+
+def start_engines(options: ServeOptions, children: Mapping[str, EngineChild]) -> tuple[str, dict[str, EngineProcess]]:
+    """Check the map and have the engines begin to open it; return its hash and them.
+
+    Raises:
+        MapError: the map is unusable. CoViewError: it has not what the options ask for.
+    """
+    base_map = BaseMap.load(options.map_path)
+    missing = base_map.require_features(options.reloc)
+    if missing is not None:
+        log.warning("%s: %s", options.map_path, missing)
+    reloc: Reloc = options.reloc if missing is None else "coview"  # or the engines would say so again
+    engines = {
+        kind: EngineProcess(
+            kind, str(options.map_path), base_map.sha256, None,
+            registration=options.registration, reloc=reloc, risk=options.risk,
+            sensor_leans=options.lidar is None, child=child,
+        )
+        for kind, child in children.items()
+    }  # fmt: skip
+    for engine in engines.values():
+        engine.start()
+    return base_map.sha256, engines
+
+
+def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) -> OpenedMap | None:
+    """Open the map's file again, in new engines, until they would not keep a job waiting; None if it is the one served.
+
+    Args:
+        options: of the node.
+        served: hash of the map that is served.
+        cancelled: asked now and then; True gives up.
+
+    Raises:
+        MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: as asked.
+    """
+    from coview_stream.stream.node.reload import OpenedMap
+
+    if BaseMap.load(options.map_path).sha256 == served:
+        return None
+    children = start_children(options.lidar is not None)
+    engines: dict[str, EngineProcess] = {}
+    try:
+        sha256, engines = start_engines(options, children)
+        for engine in engines.values():
+            engine.wait_ready(cancelled)
+            engine.wait_prepared()
+        if cancelled():
+            raise CancelledError("the node is no longer wanted")
+        return OpenedMap(sha256, engines, make_sessions(options, sha256))
+    except BaseException:
+        for engine in engines.values():
+            engine.close()
+        for child in children.values():
+            child.close()
+        raise
 
 
 def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:

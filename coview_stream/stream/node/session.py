@@ -196,6 +196,29 @@ class Session:
             if self.robot_state.correction is None and not self._hint.forgotten:
                 self._hint.offer(T_map_body, calibration)
 
+    def begin_beside(self, old: Session) -> None:
+        """Begin with the place that the robot's session on another map knows: a hypothesis, to be verified on this one.
+
+        What is corrected of its sensor and odometry comes along, but for the ground, which is the survey's.
+        """
+        with old._lock:
+            known, before = old.robot_state.last_known_pose(old.odometry), old._hint.known
+            T_map_body = before if known.T_map_body is None else known.T_map_body
+            calibration, forgotten = old.calibration or old._hint.calibration, old._hint.forgotten
+        with self._lock:
+            self._hint.forgotten = forgotten
+            if T_map_body is not None:
+                self._hint.offer(T_map_body, None if calibration is None else replace(calibration, ground=0.0))
+
+    def continue_from(self, old: Session) -> None:
+        """Go on where the robot's session on another map stops: its counters, its transitions, its newest pose."""
+        with old._lock, self._lock:
+            for name, value in vars(old.counters).items():
+                setattr(self.counters, name, value)
+            self.history = old.history
+            self.robot_state.publish_after(old.robot_state)
+            self._record_state()
+
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
         """Note that an engine has forgotten all it knew; only that of ``track`` knew where the robot is."""
         with self._lock:

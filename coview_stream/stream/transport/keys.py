@@ -113,6 +113,27 @@ class RobotKeys(Preset):
     reset: str
 
 
+@dataclass(frozen=True)
+class NodeKeys:
+    """Keys of a node, whichever robots it serves; no wildcard matches them, for ``@node`` is a verbatim chunk.
+
+    Attributes:
+        health: key to publish its health and metrics on, once a second.
+        ask_health: key that answers queries with the same.
+        reload: key that answers queries to open the map's file again.
+    """
+
+    health: str
+    ask_health: str
+    reload: str
+
+
+def node_keys(base: str, name: str) -> NodeKeys:
+    """Return the keys of the node called ``name``; ConfigError if that is not one chunk of a key."""
+    own = f"{check_prefix(base, '--base')}/@node/{check_chunk(name, '--node')}"
+    return NodeKeys(f"{own}/out/health", f"{own}/rpc/health", f"{own}/rpc/reload")
+
+
 def robot_keys(
     preset: str,
     base: str,

@@ -50,6 +50,8 @@ class InlineRunner:
     def run(self, job):
         return unwrap(*attempt(self.engine, job))
 
+    pid, ready = None, True
+
     def watch(self):
         pass
 

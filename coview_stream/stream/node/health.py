@@ -1,0 +1,164 @@
+"""Health of a node for its operators: whether it lives and can serve, and its metrics, as JSON and for Prometheus."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from coview_stream.localization.state import State
+from coview_stream.messages.types import Encoded
+from coview_stream.stream.node.node import Node
+from coview_stream.stream.transport.keys import NodeKeys
+from coview_stream.version import __version__
+
+_MAX_BEAT = 2.0  # seconds without a tick of the pose clock, besides two of its periods; set by hand
+_INTERVAL = 1.0  # seconds between two documents; set by hand
+
+
+class NodeHealth:
+    """Health and metrics of a node.
+
+    It is *live* as long as its pose clock ticks and none of its threads has ended: one that is not has to be started
+    again. It is *ready* when a robot's messages would be used now: its engines have opened the map, and where it was
+    told to connect to something, it is connected.
+
+    Args:
+        node: the node.
+        needs_connection: whether it was told to connect to something.
+    """
+
+    def __init__(self, node: Node, needs_connection: bool = False) -> None:
+        self._node = node
+        self._needs_connection = needs_connection
+
+    def live_reasons(self) -> list[str]:
+        """Return why the node is not live; empty if it is."""
+        node = self._node
+        silent = time.monotonic() - node.beat
+        reasons = [f"thread {name} has ended" for name in node.ended_threads]
+        if silent > _MAX_BEAT + 2.0 / node.config.pose_rate:
+            reasons.append(f"the pose clock has stood still for {silent:.1f} s")
+        return reasons
+
+    def ready_reasons(self) -> list[str]:
+        """Return why the node is not ready; empty if it is."""
+        engines = self._node.feeds[0].engines.items()
+        reasons = [f"the {name} engine is starting" for name, engine in engines if not engine.ready]
+        if self._needs_connection:
+            connection = self._node.transport.connection()
+            if not (connection.routers or connection.peers):
+                reasons.append("not connected to any router or peer")
+        return reasons
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        node = self._node
+        live, ready = self.live_reasons(), self.ready_reasons()
+        feed = node.feeds[0]
+        now = time.monotonic()
+        return {
+            "stamp_ns": time.time_ns(),
+            "version": __version__,
+            "uptime_s": round(now - node.started, 1),
+            "live": {"ok": not live, "reasons": live},
+            "ready": {"ok": not (live or ready), "reasons": live + ready},
+            "map": {"sha256": node.map_sha256, "reload": dict(node.reloader.last) if node.reloader else None},
+            "memory_bytes": _memory(os.getpid()),
+            "engines": {
+                name: {
+                    "pid": (pid := engine.pid),
+                    "ready": engine.ready,
+                    "restarts": feed.restarts[name],
+                    "memory_bytes": None if pid is None else _memory(pid),
+                }
+                for name, engine in feed.engines.items()
+            },
+            "robots": {
+                session.keys.robot: {
+                    "state": session.state()[0].reported,
+                    "reason": session.state()[1],
+                    "pose_rate_hz": node.pose_rates[session.keys.robot].rate(now),
+                    "latency_ms": session.queue.latency.to_json(),
+                    "counters": session.counters.to_json(),
+                }
+                for session in list(node.sessions)
+            },
+        }
+
+    def answer(self, keys: NodeKeys) -> None:
+        """Answer queries for the document, and for a change of the map."""
+        self._node.transport.answer(keys.ask_health, lambda parameters: self.document())
+        self._node.transport.answer(keys.reload, lambda parameters: self._node.reload())
+
+    def run(self, stopping: threading.Event, keys: NodeKeys) -> None:
+        """Publish the document once a second until ``stopping`` is set."""
+        publisher = self._node.transport.publisher(keys.health, "report")
+        while not stopping.wait(_INTERVAL):
+            publisher.put(Encoded(json.dumps(self.document()).encode(), "application/json"))
+
+
+def prometheus_text(document: Mapping[str, Any]) -> str:
+    """Return a document of :class:`NodeHealth` in Prometheus' text format, version 0.0.4."""
+    return "".join(f"{line}\n" for line in _lines(document))
+
+
+def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    engines, robots = document["engines"], document["robots"]
+    memory = [({"process": "node"}, document["memory_bytes"])]
+    memory += [({"process": name}, engine["memory_bytes"]) for name, engine in engines.items()]
+    info = {"version": document["version"], "map_sha256": document["map"]["sha256"]}
+    yield from _metric("info", "gauge", "Version and map", [(info, 1)])
+    yield from _metric("live", "gauge", "Whether the node works", [({}, int(document["live"]["ok"]))])
+    yield from _metric("ready", "gauge", "Whether the node can serve now", [({}, int(document["ready"]["ok"]))])
+    yield from _metric("uptime_seconds", "gauge", "Since the node started", [({}, document["uptime_s"])])
+    yield from _metric("memory_bytes", "gauge", "Resident memory", memory)
+    of_engines = [({"engine": name}, engine) for name, engine in engines.items()]
+    ready = [(labels, int(engine["ready"])) for labels, engine in of_engines]
+    yield from _metric("engine_ready", "gauge", "Whether an engine can do a job now", ready)
+    restarts = [(labels, engine["restarts"]) for labels, engine in of_engines]
+    yield from _metric("engine_restarts_total", "counter", "Starts of an engine after the first", restarts)
+    of_robots = [({"robot": name}, robot) for name, robot in robots.items()]
+    names = sorted({state.reported for state in State})
+    states = [(labels | {"state": name}, int(robot["state"] == name)) for labels, robot in of_robots for name in names]
+    yield from _metric("robot_state", "gauge", "1 for the state that a robot is in", states)
+    rates = [(labels, robot["pose_rate_hz"]) for labels, robot in of_robots]
+    yield from _metric("pose_rate_hertz", "gauge", "Poses per second", rates)
+    latencies = [
+        (labels | {"quantile": f"0.{name[1:]}"}, None if value is None else value / 1e3)
+        for labels, robot in of_robots
+        for name, value in robot["latency_ms"].items()
+    ]
+    yield from _metric("latency_seconds", "gauge", "From a cloud's arrival to its fix, newest frames", latencies)
+    counted = [
+        (labels | {"event": name}, value) for labels, robot in of_robots for name, value in robot["counters"].items()
+    ]
+    yield from _metric("events_total", "counter", "What became of messages, and what else happened", counted)
+
+
+def _metric(
+    name: str, kind: str, text: str, samples: Iterable[tuple[Mapping[str, str], float | None]]
+) -> Iterator[str]:
+    """Yield one metric; a sample that is None is left out."""
+    yield f"# HELP coview_{name} {text}."
+    yield f"# TYPE coview_{name} {kind}"
+    for labels, value in samples:
+        if value is not None:
+            inner = ",".join(f'{key}="{_escaped(label)}"' for key, label in labels.items())
+            yield f"coview_{name}{{{inner}}} {value}" if inner else f"coview_{name} {value}"
+
+
+def _escaped(label: str) -> str:
+    return label.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+
+
+def _memory(pid: int) -> int | None:
+    """Return the resident memory of a process, bytes; None where there is no ``/proc``."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return None

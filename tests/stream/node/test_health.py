@@ -1,0 +1,156 @@
+"""Health of a node: live, ready and why not; metrics that Prometheus can read; slow readers hold up nobody."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import socket
+import threading
+import time
+
+import pytest
+from fake_node import STEP
+from sockets import until
+
+from coview_stream.errors import ConfigError
+from coview_stream.stream.node.health import NodeHealth, prometheus_text
+from coview_stream.stream.node.metrics_server import MetricsServer
+from coview_stream.stream.transport.key_expressions import matches
+from coview_stream.stream.transport.keys import node_keys
+from coview_stream.stream.transport.transport import Connection
+
+SAMPLE = re.compile(r'coview_[a-z_]+(\{[a-z_0-9]+="(\\.|[^"\\\n])*"(,[a-z_0-9]+="(\\.|[^"\\\n])*")*\})? -?[0-9.e+-]+')
+KEYS = node_keys("coview", "n1")
+
+
+def test_tracking_node_is_live_and_ready(site):
+    site.frame("r1", 0.0)
+    document = NodeHealth(site.node).document()
+    json.dumps(document)
+    assert document["live"] == document["ready"] == {"ok": True, "reasons": []}
+    assert document["robots"]["r1"]["state"] == "TRACKING"
+    assert document["robots"]["r1"]["counters"]["received"] == 1
+    assert set(document["engines"]) == {"track", "search"}
+
+
+def test_pose_clock_that_stands_still_is_not_live(site):
+    site.node.beat = time.monotonic() - 5.0
+    document = NodeHealth(site.node).document()
+    assert not document["live"]["ok"]
+    assert not document["ready"]["ok"]
+    assert "pose clock" in document["live"]["reasons"][0]
+
+
+def test_engine_that_starts_is_not_ready_but_live(site):
+    site.search.ready = False
+    document = NodeHealth(site.node).document()
+    assert document["live"]["ok"]
+    assert document["ready"] == {"ok": False, "reasons": ["the search engine is starting"]}
+
+
+def test_node_that_was_told_to_connect_is_not_ready_without(site, monkeypatch):
+    monkeypatch.setattr(site.net, "connection", Connection)
+    assert NodeHealth(site.node).ready_reasons() == []
+    assert NodeHealth(site.node, needs_connection=True).ready_reasons() == ["not connected to any router or peer"]
+
+
+def test_metrics_are_prometheus_text(site):
+    site.frame("r1", 0.0)
+    document = NodeHealth(site.node).document()
+    document["version"] = 'odd " \\ \n version'
+    lines = prometheus_text(document).splitlines()
+    samples = [line for line in lines if not line.startswith("#")]
+    assert [line for line in samples if not SAMPLE.fullmatch(line)] == []
+    assert 'coview_robot_state{robot="r1",state="TRACKING"} 1' in samples
+    assert 'coview_events_total{robot="r1",event="received"} 1' in samples
+    assert len(samples) == len({line.rpartition(" ")[0] for line in samples})
+
+
+def test_health_is_published_and_answered(site):
+    health = NodeHealth(site.node)
+    health.answer(KEYS)
+    assert site.net.query(KEYS.ask_health)["ready"]["ok"]
+    assert site.net.query(KEYS.reload)["ok"] is False  # this node cannot
+    stopping = threading.Event()
+    thread = threading.Thread(target=health.run, args=(stopping, KEYS))
+    thread.start()
+    until(lambda: site.net.samples(KEYS.health))
+    stopping.set()
+    thread.join(10.0)
+    assert json.loads(site.net.samples(KEYS.health)[0].payload)["live"]["ok"]
+
+
+def test_keys_of_a_node_match_no_wildcard():
+    for key in (KEYS.health, KEYS.ask_health, KEYS.reload):
+        assert not any(matches(wild, key) for wild in ("**", "coview/**", "coview/*/*/rpc/*"))
+    with pytest.raises(ConfigError, match="--node"):
+        node_keys("coview", "a/b")
+
+
+@pytest.fixture
+def server():
+    document = {"ok": True}
+    made = MetricsServer("127.0.0.1:0", lambda: {"ready": document})
+    stopping = threading.Event()
+    thread = threading.Thread(target=made.run, args=(stopping,))
+    thread.start()
+    yield made, document
+    stopping.set()
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def asked(server, method, page):
+    connection = http.client.HTTPConnection(server.address, timeout=10.0)
+    connection.request(method, page)
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, body
+
+
+def test_server_has_two_pages_to_read(server):
+    made, document = server
+    assert asked(made, "GET", "/health") == (200, b'{"ready": {"ok": true}}\n')
+    document["ok"] = False
+    assert asked(made, "GET", "/health?now")[0] == 503
+    assert asked(made, "GET", "/")[0] == 404
+    for method in ("POST", "PUT", "DELETE", "HEAD"):
+        assert asked(made, method, "/health")[0] == 501
+
+
+def test_slow_endless_and_vanishing_readers_are_cut_off(server):
+    made, _ = server
+    host, port = made.address.split(":")
+    silent = socket.create_connection((host, int(port)))
+    flood = socket.create_connection((host, int(port)))
+    flood.settimeout(1.0)
+    with contextlib.suppress(OSError):  # sent to nobody in the end
+        for _ in range(1000):
+            flood.sendall(b"GET /health HTTP/1.0\r\n" + b"X: y\r\n" * 10_000)
+    gone = socket.create_connection((host, int(port)))
+    gone.close()
+    assert asked(made, "GET", "/health")[0] == 200
+    silent.close()
+    flood.close()
+
+
+def test_metrics_of_a_real_node_are_served(site):
+    site.frame("r1", STEP)
+    made = MetricsServer("127.0.0.1:0", NodeHealth(site.node).document)
+    stopping = threading.Event()
+    thread = threading.Thread(target=made.run, args=(stopping,))
+    thread.start()
+    status, body = asked(made, "GET", "/metrics")
+    stopping.set()
+    thread.join(10.0)
+    assert status == 200
+    assert b'coview_robot_state{robot="r1",state="TRACKING"} 1\n' in body
+
+
+@pytest.mark.parametrize("address", ["", "nonsense", "127.0.0.1:", "127.0.0.1:99999999", "192.0.2.7:9464"])
+def test_bad_address_is_refused(address):
+    with pytest.raises(ConfigError, match="--metrics"):
+        MetricsServer(address, dict)

@@ -1,0 +1,162 @@
+"""Change of the map under a running node: no pose is lost, a map that cannot be used changes nothing."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from fake_node import STEP, Engine, Runner, Site
+from fake_robot import unknown
+from sockets import until
+
+from coview_stream.errors import MapError
+from coview_stream.stream.node.engine_process import CancelledError, DiedError
+from coview_stream.stream.node.reload import MapReloader, OpenedMap
+from coview_stream.stream.node.session import Session
+
+OTHER = "b" * 64
+
+
+class Change:
+    """A running node of robots, and another map that is opened for it."""
+
+    def __init__(self, *names, max_handover=60.0):
+        self.site = Site(*names)
+        self.engine = Engine()
+        self.runners = Runner(self.engine), Runner(self.engine)
+        self.error = None
+        self.notices = []
+        self.reloader = MapReloader(self.site.node, self.open, self.notices.append, max_handover)
+        self.site.node.reloader = self.reloader
+        self.site.node.run_beside("reload", self.reloader.run)
+        self.site.node.start()
+        self.step = 0
+
+    def open(self, cancelled):
+        if self.error is not None:
+            raise self.error
+        sessions = [Session(keys, OTHER, self.site.node.config) for keys in self.site.keys.values()]
+        return OpenedMap(OTHER, dict(zip(("track", "search"), self.runners, strict=True)), sessions)
+
+    def drive(self):
+        """A frame of each robot, and a moment for the engines."""
+        self.step += 1
+        for name in self.site.keys:
+            self.site.sees(name, STEP * self.step)
+        time.sleep(0.005)
+
+    def drive_until(self, condition, seconds=20.0):
+        until(lambda: self.drive() or condition(), seconds)
+
+    def states(self):
+        return [session.state()[0].reported for session in self.site.node.sessions]
+
+    def maps(self):
+        return [session.map_sha256 for session in self.site.node.sessions]
+
+
+@pytest.fixture
+def changes():
+    made = []
+
+    def make(*names, **more):
+        made.append(Change(*names, **more))
+        return made[-1]
+
+    yield make
+    for change in made:
+        change.site.node.close(5.0)
+
+
+def test_robots_keep_the_old_map_until_the_new_one_has_verified_their_place(changes):
+    change = changes("r1", "r2")
+    change.drive_until(lambda: change.states() == ["TRACKING"] * 2)
+    old = change.maps()[0]
+    before = change.site.node.sessions[0]
+    change.engine.answer = unknown  # the new map does not know them yet
+    assert change.site.node.reload()["ok"]
+    change.drive_until(lambda: len(change.engine.served) > 6)
+    assert change.maps() == [old, old]
+    assert change.states() == ["TRACKING"] * 2
+    counted = before.counters.received
+    change.engine.answer = Engine().answer
+    change.drive_until(lambda: change.maps() == [OTHER, OTHER])
+    assert change.states() == ["TRACKING"] * 2
+    change.drive_until(lambda: change.reloader.last["result"] == "changed")
+    assert change.notices == [True, False]
+    assert change.site.track.closed == 1
+    after = change.site.node.sessions[0]
+    assert after.counters.received > counted
+    assert [t["to"] for t in after.history.to_json()] == ["TRACKING"]  # nothing was lost meanwhile
+    poses = change.site.poses("r1")
+    stamps = [p.stamp_ns for p in poses]
+    assert stamps == sorted(stamps)
+    of = {}
+    for pose in poses:
+        of.setdefault(pose.stamp_ns, []).append(pose.map_sha256)
+    assert all(len(set(shas)) == 1 for shas in of.values())
+    assert [p.map_sha256 for p in poses] == sorted((p.map_sha256 for p in poses), reverse=old > OTHER)
+
+
+def test_place_on_the_old_map_is_a_hypothesis_on_the_new_one(changes):
+    change = changes("r1")
+    change.drive_until(lambda: change.states() == ["TRACKING"])
+    hints = []
+
+    def answer(job):
+        hints.append(job.hint)
+        return unknown(job)
+
+    change.engine.answer = answer
+    change.site.node.reload()
+    change.drive_until(lambda: len(hints) > 3)
+    assert hints[0] is not None
+    assert np.isfinite(hints[0]).all()
+    assert hints[1] is None  # told once
+
+
+def test_robot_that_the_new_map_does_not_know_is_searched_for_after_a_while(changes):
+    change = changes("r1", max_handover=0.3)
+    change.drive_until(lambda: change.states() == ["TRACKING"])
+    change.engine.answer = unknown
+    change.site.node.reload()
+    change.drive_until(lambda: change.reloader.last["result"] == "changed")
+    assert change.maps() == [OTHER]
+    assert change.states() != ["TRACKING"]
+
+
+@pytest.mark.parametrize("error", [MapError("it is damaged"), DiedError("it is damaged"), ValueError("it is damaged")])
+def test_map_that_cannot_be_used_changes_nothing(changes, error, caplog):
+    change = changes("r1")
+    change.drive_until(lambda: change.states() == ["TRACKING"])
+    old = change.maps()
+    change.error = error
+    change.site.node.reload()
+    change.drive_until(lambda: change.reloader.last["result"] == "refused")
+    assert "it is damaged" in change.reloader.last["error"]
+    assert "going on with the one before" in caplog.text
+    assert (change.maps(), change.states()) == (old, ["TRACKING"])
+    change.error = None
+    change.site.node.reload()  # and the next one is welcome
+    change.drive_until(lambda: change.maps() == [OTHER])
+
+
+def test_node_that_ends_during_a_change_ends(changes):
+    change = changes("r1")
+    change.drive_until(lambda: change.states() == ["TRACKING"])
+    change.engine.answer = unknown
+    change.site.node.reload()
+    change.drive_until(lambda: change.engine.served)
+    assert change.site.node.close(5.0)
+    assert [runner.closed for runner in change.runners] == [1, 1]
+    until(lambda: "coview-reload" not in [t.name for t in threading.enumerate()])
+
+
+def test_cancelled_opening_is_no_error(changes, caplog):
+    change = changes("r1")
+    change.error = CancelledError("the node ends")
+    change.site.node.reload()
+    until(lambda: change.notices == [True, False])
+    assert "refused" not in caplog.text
