@@ -88,6 +88,10 @@ BENCHMARKS = {
     "recognition": Benchmark("forest.recognition", "place recognition on public sets: AR@1, AR@5, AR@1 %, MRR"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
     "many": Benchmark("stream.many_robots", "sixteen robots on one node, of which eight search without end"),
+    "fuzz": Benchmark("fuzz.fuzz", "untrusted bytes into every decoder and reader, within limits"),
+    "soak": Benchmark(
+        "soak.soak", "hours with a fault every minute: false poses, stuck states, time to recover, leaks"
+    ),
 }
 """Name, and what it is; in the suite's order."""
 

@@ -1,0 +1,110 @@
+"""A TCP link that goes bad: a proxy on loopback in a process of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from multiprocessing.connection import Connection
+
+MODES = ("open", "cut", "flapping", "silent", "slow", "thin", "lossy", "corrupt")
+"""``silent``: half-open, nothing passes and nothing ends; ``slow``: 200 ms each way; ``thin``: 1 Mbit/s each way;
+``lossy``: a fifth of the pieces is held up as TCP does that sends them again; ``corrupt``: flipped bits."""
+
+_PIECE, _QUEUED = 16_384, 64  # bytes; pieces
+_SLOW, _THIN, _AGAIN, _EVERY, _FLIPS = 0.2, 125_000.0, 0.2, 2.0, 0.05  # s, bytes per s, s, s, share of pieces
+
+
+class Link:
+    """Forwards connections from ``port`` to ``target``, both on loopback, in its mode."""
+
+    def __init__(self, port: int, target: int, seed: int) -> None:
+        self._port, self._target = port, target
+        self._rng = random.Random(seed)
+        self._mode = "open"
+        self._open: set[asyncio.StreamWriter] = set()
+
+    async def run(self, conn: Connection) -> None:
+        """Forward until the other end of ``conn`` sends None; anything else that it sends is the mode from now on."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+        def told() -> None:
+            mode = conn.recv()
+            if mode is None:
+                ended.set()
+            else:
+                self._mode = mode
+                if mode == "cut":
+                    self._cut()
+
+        server = await asyncio.start_server(self._accept, "127.0.0.1", self._port)
+        loop.add_reader(conn.fileno(), told)
+        flapper = asyncio.create_task(self._flap())
+        conn.send("ready")
+        async with server:
+            await ended.wait()
+        flapper.cancel()
+        self._cut()
+
+    async def _flap(self) -> None:
+        while True:
+            await asyncio.sleep(_EVERY)
+            if self._mode == "flapping":
+                self._cut()
+
+    def _cut(self) -> None:
+        for writer in self._open:
+            writer.transport.abort()
+        self._open.clear()
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._mode == "cut":
+            writer.transport.abort()
+            return
+        try:
+            far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self._target)
+        except OSError:
+            writer.transport.abort()
+            return
+        ends = {writer, far_writer}
+        self._open |= ends
+        tasks = [asyncio.create_task(self._pass(*way)) for way in ((reader, far_writer), (far_reader, writer))]
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for end in ends:
+            end.transport.abort()
+        self._open -= ends
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        queue: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_QUEUED)
+        forward = asyncio.create_task(self._send(queue, writer))
+        try:
+            while piece := await reader.read(_PIECE):
+                await queue.put((time.monotonic(), piece))
+        except OSError:
+            pass
+        finally:
+            forward.cancel()
+
+    async def _send(self, queue: asyncio.Queue[tuple[float, bytes]], writer: asyncio.StreamWriter) -> None:
+        while True:
+            came, piece = await queue.get()
+            while self._mode == "silent":
+                await asyncio.sleep(0.05)
+            if self._mode == "slow":
+                await asyncio.sleep(max(0.0, came + _SLOW - time.monotonic()))
+            elif self._mode == "thin":
+                await asyncio.sleep(len(piece) / _THIN)
+            elif self._mode == "lossy" and self._rng.random() < 0.2:
+                await asyncio.sleep(_AGAIN)
+            elif self._mode == "corrupt" and self._rng.random() < _FLIPS:
+                broken = bytearray(piece)
+                broken[self._rng.randrange(len(broken))] ^= 1 << self._rng.randrange(8)
+                piece = bytes(broken)
+            writer.write(piece)
+            await writer.drain()
+
+
+def forward(conn: Connection, port: int, target: int, seed: int) -> None:
+    """Be a link until told to end."""
+    asyncio.run(Link(port, target, seed).run(conn))
