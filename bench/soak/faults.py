@@ -129,6 +129,15 @@ def map_file(stage: Stage) -> float:
     return time.monotonic()
 
 
+def hand_over(stage: Stage) -> float:
+    """Let every node take its map over anew while it serves."""
+    moment = time.monotonic()
+    for node in stage.nodes:
+        node.send(MAIN, signal.SIGHUP)
+    stage.wait(15.0)
+    return moment
+
+
 def disk_full(stage: Stage) -> float:
     """Fill the disk of the state folders."""
     if stage.disk is None:
@@ -191,6 +200,7 @@ FAULTS = {
         "link that loses 20 %, 10 s": _P(link, mode="lossy", seconds=10.0),
         "link that flips bits, 10 s": _P(link, mode="corrupt", seconds=10.0),
         "map file replaced, gone or half": map_file,
+        "map taken over anew by SIGHUP": hand_over,
         "disk of the state full": disk_full,
         "second node for the same robots": twin,
     }.items()
