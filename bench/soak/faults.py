@@ -30,6 +30,14 @@ class Fault(NamedTuple):
     name: str
     make: Callable[[Stage], float]
 
+    @property
+    def ends_processes(self) -> bool:
+        """Whether processes of the nodes end, whose memory cannot be watched any longer."""
+        return (isinstance(self.make, functools.partial) and self.make.func is kill) or self.make in (
+            restart,
+            hand_over,
+        )
+
 
 def router(stage: Stage) -> float:
     """Kill the router; it returns three seconds later."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ from bench.soak.watch import Robot, percentiles
 if TYPE_CHECKING:
     from bench.soak.soak import Event
 
-WARM = 180.0  # seconds of a process that its slopes leave out
+WARM = 600.0  # seconds of a process that its slopes leave out
 MAX_GROWTH = 1.0  # MB per hour
 MAX_LEAK = 1.0  # descriptors per hour
 MIN_HOURS = 0.25  # below which a slope says nothing
@@ -86,10 +87,17 @@ def processes(nodes: Sequence[Node], hours: float, ended: Sequence[float]) -> li
             total = sum(known) if known else math.nan
             text = "; ".join(f"{part} {'-' if each is None else f'{each:+.2f}'}" for part, each in slopes.items())
             long = hours >= MIN_HOURS and bool(known)
-            name = f"soak/{node.site.name}: {what} of its processes, slope after 3 min"
+            name = f"soak/{node.site.name}: {what} of its processes, slope after 10 min"
             target = f"< {most:g} {unit}" if long else ""
             shown = f"{total:+.2f} {unit} ({text})" if known else "-"
-            out.append(judged(name, shown, target, total < most if long else None, total))
+            details = {
+                f"{part} {pid}": [
+                    (round(each.at - rows[0].at), round(each.megabytes, 2), each.descriptors) for each in rows[::6]
+                ]
+                for (part, pid), rows in node.samples.items()
+            }
+            row = judged(name, shown, target, total < most if long else None, total)
+            out.append(replace(row, details=details) if what == "megabytes" else row)
     for node in nodes:
         last: dict[str, float] = {}
         for (part, _), rows in node.samples.items():

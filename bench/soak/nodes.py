@@ -20,11 +20,12 @@ from bench.soak.sites import Site
 
 MAIN, TRACK, SEARCH = "main", "track", "search"
 _KINDS = (TRACK, SEARCH, "odometry")
+_KEPT = 1000  # samples of a process that a slope is made of
 _GRACE = 10.0  # seconds from SIGTERM to SIGKILL
 
 
 class Sampled(NamedTuple):
-    """Memory of a process that is its own alone, and its open descriptors."""
+    """Memory that a process has made its own, no page of a file, and its open descriptors."""
 
     at: float
     megabytes: float
@@ -100,9 +101,9 @@ class Node:
         """Note memory and descriptors of all its processes."""
         at = time.monotonic()
         for part, process in self.family().items():
-            with contextlib.suppress(psutil.Error):
+            with contextlib.suppress(psutil.Error, OSError):
                 with process.oneshot():
-                    row = Sampled(at, process.memory_full_info().uss / 1e6, process.num_fds())
+                    row = Sampled(at, anonymous(process), process.num_fds())
                 self.samples.setdefault((part, process.pid), []).append(row)
 
     def end(self, number: int = signal.SIGTERM) -> float:
@@ -128,7 +129,19 @@ class Node:
         return self.log.read_text(errors="replace").count("Traceback (most recent call last)")
 
 
-def slope(rows: Sequence[Sequence[Sampled]], what: str, warm: float, apart: float = 120.0) -> float | None:
+def anonymous(process: psutil.Process) -> float:
+    """Return the megabytes of a process that are of no file, swapped out or not; a map is a file.
+
+    Where the system does not tell, what it shares with no other process.
+    """
+    page = Path(f"/proc/{process.pid}/status")
+    if not page.is_file():
+        return float(process.memory_full_info().uss / 1e6)
+    lines = dict(line.split(":", 1) for line in page.read_text().splitlines() if ":" in line)
+    return sum(int(lines[name].split()[0]) * 1024 / 1e6 for name in ("RssAnon", "VmSwap") if name in lines)
+
+
+def slope(rows: Sequence[Sequence[Sampled]], what: str, warm: float, apart: float = 300.0) -> float | None:
     """Change per hour of the processes of one part: weighted median over pairs of samples of the same process.
 
     Pairs are at least ``apart`` seconds apart and no sample is of the first ``warm`` seconds of its process; a pair
@@ -137,6 +150,7 @@ def slope(rows: Sequence[Sequence[Sampled]], what: str, warm: float, apart: floa
     slopes, weights = [], []
     for samples in rows:
         kept = [each for each in samples if each.at - samples[0].at >= warm]
+        kept = kept[:: 1 + len(kept) // _KEPT]
         at = np.array([each.at for each in kept])
         value = np.array([float(getattr(each, what)) for each in kept])
         i, j = np.triu_indices(len(kept), 1)

@@ -61,13 +61,18 @@ def options(parser: ArgumentParser) -> None:
 
 
 def chosen(words: Sequence[str], seed: int) -> Iterator[str]:
-    """Yield names of faults for ever, each once before any comes again, in an order drawn anew each time."""
+    """Yield names of faults for ever, each once before any comes again, in an order drawn anew each time.
+
+    In every other round, from the second on, no process of a node is ended: some have to grow old for leaks to be seen.
+    """
     names = [name for name in FAULTS if not words or any(word in name for word in words)]
     if not names:
         raise InputError(f"--faults {' '.join(words)}: no fault is called so; there are {', '.join(FAULTS)}")
     rng = Random(seed)
     while True:
         yield from rng.sample(names, len(names))
+        gentle = [name for name in names if not FAULTS[name].ends_processes]
+        yield from rng.sample(gentle, len(gentle))
 
 
 def rows(asked: Namespace) -> Iterator[Row]:

@@ -47,12 +47,25 @@ class Robot:
     state: str = ""
     states: Counter[str] = field(default_factory=Counter)
     status: dict[str, Any] = field(default_factory=dict)
-    frames: int = 0  # received by nodes, by their statuses
+    received: list[tuple[float, int]] = field(default_factory=list)  # by each node: its start, frames so far
     awaited: float = math.inf  # moment of the drive
     recovered: float | None = None  # arrival of the first pose from a frame of that moment or later
 
     def __post_init__(self) -> None:
         self.drive = Drive(self.site.world, RobotPlan(self.name, math.inf))
+
+    @property
+    def frames(self) -> int:
+        """How many frames nodes received of it, by their statuses."""
+        return sum(count for _, count in self.received)
+
+    def count(self, start: float, received: int) -> None:
+        """Note how many frames the node has received that was started then; a second before or after is the same."""
+        for k, (known, before) in enumerate(self.received):
+            if abs(known - start) < 1.5:
+                self.received[k] = known, max(before, received)
+                return
+        self.received.append((start, received))
 
     def set_manner(self, manner: Manner) -> None:
         """Note how it sends from now on: its stamps may be in that manner."""
@@ -108,11 +121,11 @@ class Watch:
             if rest[-1] == "odom":
                 robot.odometries, robot.fed_at = robot.odometries + 1, at
             elif rest[-1] == "status":
-                self._status(robot, payload)
+                self._status(robot, at, payload)
             else:
                 self._pose(robot, at, Sample(key, payload, encoding))
 
-    def _status(self, robot: Robot, payload: bytes) -> None:
+    def _status(self, robot: Robot, at: float, payload: bytes) -> None:
         try:
             told = json.loads(payload)
             counters = told.get("counters") or {}
@@ -120,9 +133,7 @@ class Watch:
         except (ValueError, KeyError, AttributeError):
             robot.unreadable += 1
             return
-        before = (robot.status.get("counters") or {}).get("received", 0)
-        now = counters.get("received", 0)
-        robot.frames += now - before if now >= before else now  # less than before: of another node
+        robot.count(at - float(told.get("uptime_s", 0.0)), int(counters.get("received", 0)))
         if state != robot.state:
             robot.states[state] += 1
         robot.state, robot.status = state, told

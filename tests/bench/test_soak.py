@@ -21,16 +21,21 @@ from bench.soak.nodes import Sampled, slope
 from bench.soak.robots import Manner, content_of, shifted, stamp
 from bench.soak.soak import chosen, tables
 from bench.soak.stage import Actor
+from bench.soak.watch import Robot
 from bench.stream.processes import free_port
 from coview_stream.errors import InputError
 
 
-def test_every_fault_comes_once_before_any_comes_again() -> None:
-    drawn = list(islice(chosen([], 5), 3 * len(FAULTS)))
-    for k in range(0, len(drawn), len(FAULTS)):
-        assert set(drawn[k : k + len(FAULTS)]) == set(FAULTS)
+def test_every_fault_comes_once_before_any_comes_again_and_processes_grow_old_every_other_round() -> None:
+    gentle = {name for name, fault in FAULTS.items() if not fault.ends_processes}
+    assert len(FAULTS) - len(gentle) == 5
+    assert "node SIGTERM, started again" not in gentle
+    drawn = list(islice(chosen([], 5), 2 * len(FAULTS) + len(gentle)))
+    first, second, third = drawn[: len(FAULTS)], drawn[len(FAULTS) : -len(FAULTS)], drawn[-len(FAULTS) :]
+    assert set(first) == set(third) == set(FAULTS)
+    assert set(second) == gentle
+    assert first != third
     assert drawn == list(islice(chosen([], 5), len(drawn)))
-    assert drawn[: len(FAULTS)] != drawn[len(FAULTS) : 2 * len(FAULTS)]
 
 
 def test_faults_are_chosen_by_words() -> None:
@@ -75,6 +80,14 @@ def test_warming_up_and_being_started_again_is_no_leak() -> None:
     rows = [samples(900.0 * k, 800.0, 100.0 + k, 0.0, warm_up=40.0) for k in range(4)]
     assert abs(slope(rows, "megabytes", warm=240.0) or 0.0) < 0.7
     assert (slope(rows, "megabytes", warm=0.0) or 0.0) > 0.5
+
+
+def test_frames_are_counted_across_nodes_whose_statuses_alternate() -> None:
+    robot = Robot.__new__(Robot)
+    robot.received = []
+    for start, received in ((10.0, 5), (60.2, 1), (10.4, 9), (59.8, 4), (10.1, 12)):
+        robot.count(start, received)
+    assert robot.frames == 16
 
 
 def test_nothing_known_has_no_slope() -> None:
