@@ -12,6 +12,7 @@ from typing import Any
 from coview_stream.errors import CoViewError, InputError, MessageError, RunError
 from coview_stream.messages import ros2
 from coview_stream.messages.validation import stamp_join
+from coview_stream.recordings.bounded_decompression import bound_rosbags
 
 _REMEDIES = (  # the first whose word occurs in the reason
     ("ompression", "write it again with zstd or without compression (ros2 bag convert)"),
@@ -80,6 +81,7 @@ class BagReader:
 
 
 def _reader_of(path: Path, ros1: bool) -> Any:
+    bound_rosbags()
     if ros1:
         from rosbags.rosbag1 import Reader as Ros1Reader
 

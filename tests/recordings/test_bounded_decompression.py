@@ -1,0 +1,65 @@
+"""What recordings unpack to is limited, whatever they claim."""
+
+from __future__ import annotations
+
+import bz2
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+from bag_files import cloud, odometry, write_bag
+
+from coview_stream.errors import CoViewError, RunError
+from coview_stream.recordings import bounded_decompression
+from coview_stream.recordings.bag_reader import BagReader
+from coview_stream.recordings.bounded_decompression import bounded
+from coview_stream.recordings.open_run import open_run
+
+WORDS = [b"", b"a", b"abc" * 1000]
+
+
+@pytest.mark.parametrize(
+    ("pack", "make"), [(bz2.compress, bz2.BZ2Decompressor), (lz4.frame.compress, lz4.frame.LZ4FrameDecompressor)]
+)
+def test_frames_come_back_whole_and_no_longer_than_allowed(
+    monkeypatch: pytest.MonkeyPatch, pack: object, make: object
+) -> None:
+    unpack = bounded(make)
+    for word in WORDS:
+        assert unpack(pack(word)) == word
+        assert unpack(pack(word) + pack(b"more")) == word + b"more"
+    bomb = pack(bytes(10**7))
+    with pytest.raises(ValueError, match="early"):
+        unpack(bomb[: len(bomb) // 2])
+    monkeypatch.setattr(bounded_decompression, "LIMIT", 10**7)
+    assert len(unpack(bomb)) == 10**7
+    monkeypatch.setattr(bounded_decompression, "LIMIT", 10**7 - 1)
+    with pytest.raises(ValueError, match="more than"):
+        unpack(bomb)
+
+
+@pytest.mark.parametrize(("storage", "compression"), [("mcap", "MESSAGE"), ("mcap", "STORAGE"), ("sqlite3", "MESSAGE")])
+def test_a_recording_that_unpacks_to_too_much_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: str, compression: str
+) -> None:
+    points = np.zeros((5000, 3), np.float32)
+    topics = {"/points": [cloud(k * 10**8, points) for k in range(3)],
+              "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(3)]}  # fmt: skip
+    bag = write_bag(tmp_path / "a", topics, storage, compression)
+    assert len(open_run(bag)) == 3
+    monkeypatch.setattr(bounded_decompression, "LIMIT", 1000)
+    with pytest.raises(CoViewError, match=r"unpacks to more than|not one"):
+        open_run(bag)
+
+
+def test_readers_are_bounded_once_opened(tmp_path: Path) -> None:
+    from rosbags.rosbag1 import reader
+    from rosbags.rosbag2 import storage_mcap
+
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    with pytest.raises(RunError):
+        BagReader(tmp_path / "a.mcap")
+    found = [storage_mcap.DECOMPRESSORS[name] for name in ("zstd", "lz4")]
+    found += [reader.decompressors[name] for name in ("bz2", "lz4")]
+    assert all(each.__module__ == bounded_decompression.__name__ for each in found)
