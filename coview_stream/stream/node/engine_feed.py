@@ -65,8 +65,8 @@ class EngineFeed:
         targets["stopped"] = (self._end_stopped_engines, ())
         for name, (target, args) in targets.items():
             thread = threading.Thread(target=target, name=f"coview-{name}", args=args, daemon=True)
-            self.threads.append(thread)
             thread.start()
+            self.threads.append(thread)  # now, for one that has not started counts as one that has ended
 
     def stop(self) -> None:
         """Have the threads end; without waiting."""

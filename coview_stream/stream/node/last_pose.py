@@ -83,7 +83,7 @@ def _write_whole(path: Path, data: bytes) -> None:
     """Write a file that only its owner may read: beside its place under a name that nobody can foresee, then renamed.
 
     A robot's day usually ends with a power cut: the bytes are on the disk before the name changes. What a cut leaves
-    behind is removed by the next :func:`load`.
+    behind is for :func:`remove_parts`, at the next start.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.stem}.", suffix=".part")  # 0600, no link followed
     part = Path(name)
@@ -107,8 +107,9 @@ def _open_regular(path: Path) -> BinaryIO:
     return file
 
 
-def _remove_parts(path: Path) -> None:
-    """Delete what writes of ``path`` that were cut short have left behind."""
+def remove_parts(folder: Path, robot: str, map_sha256: str) -> None:
+    """Delete what writes for a robot and a map that were cut short have left behind; not while one may be under way."""
+    path = file_of(folder, robot, map_sha256)
     with contextlib.suppress(OSError):
         for part in path.parent.glob(f"{glob.escape(path.stem)}*.part"):
             part.unlink(missing_ok=True)
@@ -133,7 +134,6 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPose | None:
         another version, or not of this robot and map.
     """
     path = file_of(folder, robot, map_sha256)
-    _remove_parts(path)
     try:
         with _open_regular(path) as file:
             last = _parsed(file.read(_MAX_BYTES + 1))

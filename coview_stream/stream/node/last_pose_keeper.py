@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coview_stream.geometry.transforms import Pose, inverse, rotation_angle
-from coview_stream.stream.node.last_pose import LastPose, forget, load, save
+from coview_stream.stream.node.last_pose import LastPose, forget, load, remove_parts, save
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
@@ -60,6 +60,7 @@ class LastPoseKeeper:
 
     def _hint(self, session: Session) -> None:
         robot = session.keys.robot
+        remove_parts(self.folder, robot, session.map_sha256)
         last = load(self.folder, robot, session.map_sha256)
         if last is not None:
             x, y = last.T_map_body[:2, 3]

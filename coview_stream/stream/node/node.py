@@ -109,8 +109,8 @@ class Node:
 
     def _start_thread(self, name: str, target: Callable[..., None], *args: object) -> None:
         thread = threading.Thread(target=target, name=f"coview-{name}", args=args, daemon=True)
-        self._threads.append(thread)
         thread.start()
+        self._threads.append(thread)  # now, for one that has not started counts as one that has ended
 
     def declare(self) -> None:
         """Declare publishers, subscriptions, queryables and liveliness tokens of all robots."""

@@ -16,7 +16,7 @@ from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.stream.node import last_pose
-from coview_stream.stream.node.last_pose import LastPose, default_folder, file_of, forget, load, save
+from coview_stream.stream.node.last_pose import LastPose, default_folder, file_of, forget, load, remove_parts, save
 
 SHA = "0123456789abcdef" * 4
 UTM = [512_345.678_901, 5_403_210.123_456, 287.4]
@@ -211,6 +211,7 @@ def test_what_a_power_cut_left_behind_is_removed(tmp_path):
     (tmp_path / f"{path.stem}.k2j3h4.part").write_text("half")
     other = tmp_path / f"r2-{SHA[:16]}.abc.part"
     other.write_text("of another robot")
+    remove_parts(tmp_path, "r1", SHA)
     same(load(tmp_path, "r1", SHA), LAST)
     assert {p.name for p in tmp_path.iterdir()} == {path.name, other.name}
 

@@ -1,117 +1,22 @@
-"""A node as an operator has it: a process that is signalled, whose map is replaced, and whose engines are killed."""
+"""A served map that is replaced, notices to systemd, and engines that are killed and stopped, with real processes."""
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
-import socket
-import subprocess
 import sys
-import threading
 import time
-import urllib.error
-import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
-from sockets import free_endpoint, until
+from serving import FALSE, Service
+from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.stream.client.client import RobotClient
-from coview_stream.stream.node.engine_child import python_command, python_environment
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")]
-
-FALSE = 1.0  # metres: the world is 68 m wide and its poses are good to a few centimetres
-
-
-class Service:
-    """A process that serves a copy of a map, and a robot that goes to and fro on it, twenty frames a second."""
-
-    def __init__(self, world_file, drive, folder):
-        self.folder, self.drive = folder, drive
-        self.map = folder / "site.coview"
-        self.map.write_bytes(Path(world_file).read_bytes())
-        self.endpoint, self.notices = free_endpoint(), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.notices.bind(str(folder / "notify"))
-        self.notices.settimeout(30.0)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
-        self.log = (folder / "log").open("wb")
-        self.process = subprocess.Popen(
-            python_command(
-                "coview_stream", "serve", str(self.map), "--robot", "r1", "--listen", self.endpoint,
-                "--state", str(folder / "state"), "--metrics", self.metrics, "--log-json",
-            ),
-            env=python_environment() | {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000"},
-            stderr=self.log,
-        )  # fmt: skip
-        self.client = RobotClient("r1", self.endpoint)
-        self.poses, self.truth = [], {}
-        self.pace = 0.1
-        self._ending = threading.Event()
-        self.client.wait_for_node(30)
-        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._send, self._read)]
-        for thread in self._threads:
-            thread.start()
-
-    def _send(self):
-        count = len(self.drive.clouds)
-        started = time.monotonic()
-        for k in range(1_000_000):
-            at = (count - 1) - abs((k % (2 * count - 2)) - (count - 1))
-            stamp = 1000.0 + self.pace * k
-            self.truth[round(stamp * 1e9)] = self.drive.T_map_body[at]
-            self.client.send_odometry(self.drive.T_odom_body[at], stamp)
-            self.client.send_cloud(self.drive.clouds[at], stamp)
-            if self._ending.wait(max(0.0, started + self.pace * (k + 1) - time.monotonic())):
-                return
-
-    def _read(self):
-        for pose in self.client.poses(timeout=None):
-            self.poses.append((time.monotonic(), pose))
-            if self._ending.is_set():
-                return
-
-    def health(self):
-        try:
-            with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
-                return json.load(answer)
-        except urllib.error.HTTPError as error:  # not ready
-            return json.load(error)
-
-    def engines(self):
-        return {name: engine["pid"] for name, engine in self.health()["engines"].items()}
-
-    def said(self):
-        return [json.loads(line) for line in (self.folder / "log").read_text().splitlines()]
-
-    def tracks(self, seconds=40.0):
-        """Wait for a pose that comes from now on."""
-        since = time.monotonic()
-        until(lambda: self.poses and self.poses[-1][0] > since, seconds)
-
-    def errors(self):
-        """Metres by which each pose is off; odometry is perfect, and every pose has a frame's stamp."""
-        return [
-            float(np.linalg.norm(pose.T_map_body[:3, 3] - self.truth[pose.stamp_ns][:3, 3]))
-            for _, pose in list(self.poses)
-        ]
-
-    def end(self):
-        self._ending.set()
-        self.process.terminate()
-        try:
-            return self.process.wait(10.0)
-        finally:
-            self.process.kill()
-            self.client.close()
-            self.notices.close()
-            self.log.close()
 
 
 @pytest.fixture
