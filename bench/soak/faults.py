@@ -33,10 +33,7 @@ class Fault(NamedTuple):
     @property
     def ends_processes(self) -> bool:
         """Whether processes of the nodes end, whose memory cannot be watched any longer."""
-        return (isinstance(self.make, functools.partial) and self.make.func is kill) or self.make in (
-            restart,
-            hand_over,
-        )
+        return self.make is restart or (isinstance(self.make, functools.partial) and self.make.func is kill)
 
 
 def router(stage: Stage) -> float:
@@ -138,12 +135,20 @@ def map_file(stage: Stage) -> float:
 
 
 def hand_over(stage: Stage) -> float:
-    """Let every node take its map over anew while it serves."""
-    moment = time.monotonic()
+    """Ask every node to take over half a map, which it has to refuse, and the whole one again."""
     for node in stage.nodes:
+        part = node.map.with_suffix(".new")
+        whole = node.site.map.read_bytes()
+        part.write_bytes(whole[: len(whole) // 2])
+        part.replace(node.map)
         node.send(MAIN, signal.SIGHUP)
-    stage.wait(15.0)
-    return moment
+    stage.wait(5.0)
+    for node in stage.nodes:
+        part = node.map.with_suffix(".new")
+        shutil.copy(node.site.map, part)
+        part.replace(node.map)
+        node.send(MAIN, signal.SIGHUP)
+    return time.monotonic()
 
 
 def disk_full(stage: Stage) -> float:
@@ -199,6 +204,7 @@ FAULTS = {
         "stranger: get of **": _P(strange, deed="ask", seconds=0.0),
         "stranger: puts on poses, statuses, rpc": _P(strange, deed="spoof", seconds=8.0),
         "stranger: deletes keys": _P(strange, deed="delete", seconds=5.0),
+        "stranger: holds tokens, answers queries": _P(strange, deed="claim", seconds=8.0),
         "stranger: flood of rubbish": _P(strange, deed="flood", seconds=10.0),
         "link cut for 5 s": _P(link, mode="cut", seconds=5.0),
         "link cut every 2 s, 10 s": _P(link, mode="flapping", seconds=10.0),
@@ -208,7 +214,7 @@ FAULTS = {
         "link that loses 20 %, 10 s": _P(link, mode="lossy", seconds=10.0),
         "link that flips bits, 10 s": _P(link, mode="corrupt", seconds=10.0),
         "map file replaced, gone or half": map_file,
-        "map taken over anew by SIGHUP": hand_over,
+        "SIGHUP for half a map, and for the whole": hand_over,
         "disk of the state full": disk_full,
         "second node for the same robots": twin,
     }.items()

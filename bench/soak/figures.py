@@ -41,7 +41,7 @@ def held(robots: Sequence[Robot], hours: float, faults: list[tuple[float, float]
         said = f"{wrong} of {robot.poses}"
         out.append(judged(f"soak/{name}: false or unreadable poses", said, "0", wrong == 0, wrong))
         out.append(Row(f"soak/{name}: worst pose, m / degrees", said=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}"))
-        for label, without in (("all", []), ("15 s after a fault and later", faults)):
+        for label, without in (("all", []), ("15 s after recovery and later", faults)):
             found = percentiles(robot.latencies, without)
             out.append(Row(f"soak/{name}: cloud to pose p50 / p95 / p99, ms, {label}", said=_three(found)))
     return out

@@ -50,6 +50,11 @@ class Event:
     zombies: int = 0
     skipped: str = ""
 
+    @property
+    def lasted(self) -> float:
+        """Seconds from its begin until all were found again, or were given up."""
+        return self.seconds + max((STUCK if each is None else each for each in self.recoveries.values()), default=0.0)
+
 
 def options(parser: ArgumentParser) -> None:
     """Add how long, how many and what."""
@@ -183,9 +188,7 @@ class Soak:
     def summary(self, ended: Sequence[float] = ()) -> Iterator[Row]:
         """Yield the rows of the targets."""
         hours = (time.monotonic() - self.start) / 3600
-        faults = [
-            (self.start + each.begin - 1, self.start + each.begin + each.seconds + STUCK / 4) for each in self.events
-        ]
+        faults = [(self.start + each.begin - 1.0, self.start + each.begin + each.lasted + 15.0) for each in self.events]
         yield from figures.held(self.stage.robots, hours, faults)
         yield from figures.survived(self.events)
         yield from figures.processes(self.stage.nodes, hours, ended)

@@ -71,7 +71,21 @@ def flood(session: Any, robots: Sequence[str], seconds: float) -> int:
     return count
 
 
-_DEEDS = {"ask": ask, "spoof": spoof, "delete": delete, "flood": flood}
+def claim(session: Any, robots: Sequence[str], seconds: float) -> int:
+    """Hold the robots' tokens, subscribe to everything, and answer every query with rubbish."""
+    held = [session.liveliness().declare_token(f"coview/{robot}/alive") for robot in robots]
+    held.append(session.declare_subscriber("**", lambda _: None))
+    held += [
+        session.declare_queryable(f"coview/{robot}/rpc/*", lambda query: query.reply(query.key_expr, b"\xff"))
+        for robot in robots
+    ]
+    time.sleep(seconds)
+    for each in held:
+        each.undeclare()
+    return len(held)
+
+
+_DEEDS = {"ask": ask, "spoof": spoof, "delete": delete, "flood": flood, "claim": claim}
 
 
 def roam(conn: Connection, endpoint: str, robots: Sequence[str]) -> None:

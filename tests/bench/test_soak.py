@@ -28,7 +28,7 @@ from coview_stream.errors import InputError
 
 def test_every_fault_comes_once_before_any_comes_again_and_processes_grow_old_every_other_round() -> None:
     gentle = {name for name, fault in FAULTS.items() if not fault.ends_processes}
-    assert len(FAULTS) - len(gentle) == 5
+    assert len(FAULTS) - len(gentle) == 4
     assert "node SIGTERM, started again" not in gentle
     drawn = list(islice(chosen([], 5), 2 * len(FAULTS) + len(gentle)))
     first, second, third = drawn[: len(FAULTS)], drawn[len(FAULTS) : -len(FAULTS)], drawn[-len(FAULTS) :]
