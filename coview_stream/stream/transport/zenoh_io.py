@@ -111,6 +111,10 @@ class Answers:
         self._queries.put(None)
 
     def _answer(self, key: str, query: Any, handler: Answer) -> None:
+        asked = str(query.key_expr)
+        if asked != key:  # an explorer's or a recorder's get("**") must not reset every robot
+            query.reply_err(json.dumps({"error": f"{key} answers to its own key only, not to {asked}"}), encoding=_JSON)
+            return
         try:
             reply = json.dumps(handler({str(name): str(value) for name, value in query.parameters}))
         except Exception as error:

@@ -35,6 +35,22 @@ def pair() -> Iterator[tuple[ZenohTransport, ZenohTransport]]:
     node.close()
 
 
+@pytest.mark.parametrize("selector", ["**", "coview/**", "coview/*/rpc/*", "coview/@node/**", "*/r1/rpc/reset"])
+def test_question_with_a_wildcard_calls_no_handler(pair: tuple[ZenohTransport, ZenohTransport], selector: str) -> None:
+    node, robot = pair
+    called = []
+    for key in ("coview/r1/rpc/reset", "coview/@node/r1/rpc/reload"):
+        node.answer(key, lambda _, key=key: called.append(key) or {"ok": True})
+    until(lambda: robot.query("coview/r1/rpc/reset")["ok"], 20.0)
+    assert robot.query("coview/@node/r1/rpc/reload")["ok"]
+    called.clear()
+    replies = ask(robot, selector)
+    assert called == []
+    assert replies
+    assert all(reply.ok is None for reply in replies)
+    assert robot.query("coview/r1/rpc/reset")["ok"]  # its own key still does
+
+
 def ask(transport: ZenohTransport, selector: str) -> list[Any]:
     return list(transport._session.get(selector, timeout=5.0))
 
