@@ -132,15 +132,17 @@ def _read_rows(path: Path, columns: int, meaning: str) -> tuple[Floats, list[int
         if len(words) != columns:
             raise RunError(f"{path}:{number}: {len(words)} columns instead of {columns}; each line is {meaning}")
         try:
-            row = [float(word) for word in words]
+            rows.append(list(map(float, words)))
         except ValueError as error:
             raise RunError(f"{path}:{number}: not a number ({error}); each line is {meaning}") from error
-        # false for NaN as well; stamps may be any finite number
-        if not all(abs(value) < np.inf for value in row) or max(map(abs, row[1:]), default=0.0) > MAX_COORDINATE:
-            raise RunError(f"{path}:{number}: NaN, infinite or absurd number; repair or drop the line")
-        rows.append(row)
         lines.append(number)
-    return np.array(rows, dtype=np.float64).reshape(-1, columns), lines
+    table = np.array(rows, dtype=np.float64).reshape(-1, columns)
+    # stamps may be any finite number
+    absurd = ~np.isfinite(table).all(axis=1) | (np.abs(table[:, 1:]) > MAX_COORDINATE).any(axis=1)
+    if absurd.any():
+        number = lines[int(np.argmax(absurd))]
+        raise RunError(f"{path}:{number}: NaN, infinite or absurd number; repair or drop the line")
+    return table, lines
 
 
 def _poses(translations: Floats, rotations: Floats | None) -> Poses:

@@ -17,7 +17,7 @@ def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
     Args:
         make: returns a decompressor like that of bz2: ``decompress(data, max_length)``, ``eof``, ``unused_data``.
 
-    The function raises :class:`ValueError` where that is more than :data:`LIMIT` bytes, or the data end early.
+    The function raises ValueError where that is more than :data:`LIMIT` bytes, or the data end early.
     """
 
     def decompress(data: bytes, _: int = 0) -> bytes:
