@@ -139,7 +139,7 @@ class Soak:
     def play(self, name: str) -> Row:
         """Make one fault, and wait until all is well again and the next is due."""
         stage, begin = self.stage, time.monotonic()
-        wanted = [each for each in stage.robots if not each.site.deceptive and each.tracked(begin, 5.0)]
+        wanted = [each for each in stage.robots if not each.site.deceptive]
         false, crashes = self.false(), self.crashes()
         event = Event(name, begin - self.start, 0.0, {}, [], [])
         try:

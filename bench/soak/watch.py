@@ -41,7 +41,6 @@ class Robot:
     worst: tuple[float, float] = (0.0, 0.0)
     odometries: int = 0
     fed_at: float = -math.inf
-    posed_at: float = -math.inf
     corrected: float = -math.inf  # moment of the drive of the newest frame that a pose came from
     latencies: list[tuple[float, float]] = field(default_factory=list)  # (arrival, seconds)
     state: str = ""
@@ -75,10 +74,6 @@ class Robot:
     def expect(self, moment: float) -> None:
         """Wait for a pose from a frame that was taken at a monotonic time or later."""
         self.awaited, self.recovered = moment - self.start, None
-
-    def tracked(self, now: float, within: float = 3.0) -> bool:
-        """Whether a pose came lately."""
-        return now - self.posed_at < within
 
     def fed(self, now: float) -> bool:
         """Whether its odometry arrives at the router."""
@@ -146,7 +141,7 @@ class Watch:
             return
         due = at - robot.start
         content = content_of(pose.stamp_ns, robot.manners, due)
-        robot.poses, robot.posed_at = robot.poses + 1, at
+        robot.poses += 1
         if abs(content - due) > _FAR:
             robot.false.append((round(due, 2), math.inf, math.inf))
             return
