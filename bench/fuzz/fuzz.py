@@ -74,7 +74,7 @@ def rows(asked: argparse.Namespace) -> Iterator[Row]:
             )  # fmt: skip
             for place, text in outcome.findings.items():
                 print(f"    {outcome.name}: {place}: {text}", file=sys.stderr, flush=True)
-    if not any((kept / name).glob("found-*") for name in names) and asked.found is None:
+    if asked.found is None and not any(kept.glob("*/found-*")):
         shutil.rmtree(kept, ignore_errors=True)
     else:
         print(f"... inputs are in {kept}", file=sys.stderr)
