@@ -107,11 +107,16 @@ def strange(stage: Stage, deed: str, seconds: float) -> float:
 
 def link(stage: Stage, mode: str, seconds: float) -> float:
     """Let the link of the robots or of the nodes go bad."""
-    bad = stage.links[stage.rng.choice(sorted(stage.links))]
+    name = stage.rng.choice(sorted(stage.links))
+    bad = stage.links[name]
+    stage.watch.flipping = mode == "corrupt" and name == "nodes"
     bad.send(mode)
     stage.wait(seconds)
     bad.send("open")
-    return time.monotonic()
+    moment = time.monotonic()
+    stage.wait(1.0 if stage.watch.flipping else 0.0)
+    stage.watch.flipping = False
+    return moment
 
 
 def map_file(stage: Stage) -> float:

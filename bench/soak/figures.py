@@ -40,6 +40,8 @@ def held(robots: Sequence[Robot], hours: float, faults: list[tuple[float, float]
         wrong = len(robot.false) + robot.unreadable
         said = f"{wrong} of {robot.poses}"
         out.append(judged(f"soak/{name}: false or unreadable poses", said, "0", wrong == 0, wrong))
+        if robot.garbled:
+            out.append(Row(f"soak/{name}: false or unreadable while the nodes' link flips bits", robot.garbled))
         out.append(Row(f"soak/{name}: worst pose, m / degrees", said=f"{robot.worst[0]:.2f} / {robot.worst[1]:.2f}"))
         for label, without in (("all", []), ("15 s after recovery and later", faults)):
             found = percentiles(robot.latencies, without)

@@ -17,6 +17,9 @@ from coview_stream.messages import encode_cloud, encode_odometry
 from coview_stream.messages.types import CloudMessage, OdometryMessage
 
 CLOUD_PERIOD, ODOMETRY_PERIOD = 0.1, 0.02
+REOPEN = "reopen"
+"""Tells a robot to open its session anew, as one does that is started again."""
+
 _LATE = 0.5  # seconds after which a message that the network held up is not sent any more
 
 
@@ -69,7 +72,7 @@ def shifted(T_odom_body: Floats, shift: tuple[float, float, float]) -> Floats:
 
 
 def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
-    """Send until told to stop; what is received is a :class:`Manner`, or None to end."""
+    """Send until told to stop; what is received is a :class:`Manner`, :data:`REOPEN`, or None to end."""
     import zenoh
 
     drive = Drive(world, RobotPlan(name, float("inf")))
@@ -80,32 +83,37 @@ def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
         "cloud": {"congestion_control": zenoh.CongestionControl.DROP},
         "odom": {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH},
     }
-    with open_session("client", connect=[endpoint]) as session:
-        conn.send("ready")
-        start = float(conn.recv())
-        due = {"odom": 0.0, "cloud": 0.0}
-        while True:
-            kind = "odom" if due["odom"] <= due["cloud"] else "cloud"
-            if conn.poll(max(0.0, start + due[kind] - time.monotonic())):
-                told = conn.recv()
-                if told is None:
-                    break
-                manner, since = told, round(time.monotonic() - start, 1)
-                due["cloud"] = max(due["cloud"], since)
+    session = open_session("client", connect=[endpoint])
+    conn.send("ready")
+    start = float(conn.recv())
+    due = {"odom": 0.0, "cloud": 0.0}
+    while True:
+        kind = "odom" if due["odom"] <= due["cloud"] else "cloud"
+        if conn.poll(max(0.0, start + due[kind] - time.monotonic())):
+            told = conn.recv()
+            if told is None:
+                break
+            if told == REOPEN:
+                session.close()
+                session = open_session("client", connect=[endpoint])
                 continue
-            content, late = due[kind], time.monotonic() - start - due[kind]
-            period = ODOMETRY_PERIOD if kind == "odom" else manner.cloud_period
-            due[kind] = round(content + period * max(1, int(late / period) if late > _LATE else 1), 6)
-            if late > _LATE or not (manner.odometry if kind == "odom" else manner.clouds):
-                continue
-            at = stamp(since if manner.stopped else content, manner)
-            if kind == "cloud":
-                message = encode_cloud(CloudMessage(at, drive.cloud(content)), "xyz")
-            else:
-                pose = shifted(drive.T_odom_body(since if manner.frozen else content), manner.shift)
-                message = encode_odometry(OdometryMessage(at, pose), "json")
-            session.put(
-                f"coview/{name}/in/{kind}", message.payload, encoding=message.encoding, attachment=message.attachment,
-                **how[kind],
-            )  # fmt: skip
+            manner, since = told, round(time.monotonic() - start, 1)
+            due["cloud"] = max(due["cloud"], since)
+            continue
+        content, late = due[kind], time.monotonic() - start - due[kind]
+        period = ODOMETRY_PERIOD if kind == "odom" else manner.cloud_period
+        due[kind] = round(content + period * max(1, int(late / period) if late > _LATE else 1), 6)
+        if late > _LATE or not (manner.odometry if kind == "odom" else manner.clouds):
+            continue
+        at = stamp(since if manner.stopped else content, manner)
+        if kind == "cloud":
+            message = encode_cloud(CloudMessage(at, drive.cloud(content)), "xyz")
+        else:
+            pose = shifted(drive.T_odom_body(since if manner.frozen else content), manner.shift)
+            message = encode_odometry(OdometryMessage(at, pose), "json")
+        session.put(
+            f"coview/{name}/in/{kind}", message.payload, encoding=message.encoding, attachment=message.attachment,
+            **how[kind],
+        )  # fmt: skip
+    session.close()
     conn.send("ended")

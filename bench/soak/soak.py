@@ -161,6 +161,11 @@ class Soak:
                     (event.stuck if robot.fed(now) else event.unfed).append(robot.name)
         for node in stage.nodes:
             node.revive()
+        if event.stuck or event.unfed:  # counted; the next fault is to find robots that work
+            stage.rescue()
+            for robot in wanted:
+                robot.expect(time.monotonic())
+            stage.wait(STUCK, lambda: all(robot.recovered for robot in wanted))
         stage.wait(max(5.0 if self.asked.every >= 30 else 1.0, begin + self.asked.every - time.monotonic()))
         event.false, event.crashes = self.false() - false, self.crashes() - crashes
         event.zombies = sum(node.zombies() for node in stage.nodes)
@@ -173,7 +178,11 @@ class Soak:
         if event.skipped:
             return f"skipped: {event.skipped}"
         back = [f"{name} {'STUCK' if each is None else f'{each:.1f} s'}" for name, each in event.recoveries.items()]
-        marks = [f"{event.false} FALSE"] * bool(event.false) + [f"{event.crashes} CRASHES"] * bool(event.crashes)
+        marks = (
+            ["nodes started again by hand"] * bool(event.stuck or event.unfed)
+            + [f"{event.false} FALSE"] * bool(event.false)
+            + [f"{event.crashes} CRASHES"] * bool(event.crashes)
+        )
         states = " ".join(f"{each.name}:{each.state}" for each in self.stage.robots)
         return "; ".join([*(back or ["nobody had to be found"]), *marks, states])
 

@@ -17,7 +17,7 @@ import psutil
 
 from bench.soak.link import forward
 from bench.soak.nodes import Node
-from bench.soak.robots import Manner, drive_on
+from bench.soak.robots import REOPEN, Manner, drive_on
 from bench.soak.sites import Site
 from bench.soak.stranger import roam
 from bench.soak.watch import Robot, Watch
@@ -106,6 +106,14 @@ class Stage:
         for robot in self.robots:
             robot.set_manner(manner)
             self.senders[robot.name].send(manner)
+
+    def rescue(self) -> None:
+        """Start all nodes again, and let all robots open their sessions anew, as an operator would."""
+        for node in self.nodes:
+            node.end()
+            node.start()
+        for sender in self.senders.values():
+            sender.send(REOPEN)
 
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Let time pass, in which all is watched; ended early by a condition, which is returned."""

@@ -23,7 +23,7 @@ from coview_stream.messages.types import Sample
 FALSE_METRES, FALSE_DEGREES = 3.0, 5.0
 """A pose further from the truth than either is false."""
 
-_FED = 2.0  # seconds since the last odometry, within which a robot's messages arrive
+_FED = 2.0  # seconds since the last of its messages, within which they arrive
 _FAR = 60.0  # seconds between a pose's stamp and its arrival, from which on it belongs to nothing that was sent
 
 
@@ -40,7 +40,8 @@ class Robot:
     unreadable: int = 0
     worst: tuple[float, float] = (0.0, 0.0)
     odometries: int = 0
-    fed_at: float = -math.inf
+    fed_at: dict[str, float] = field(default_factory=lambda: {"odom": -math.inf, "cloud": -math.inf})
+    garbled: int = 0  # poses and statuses that are false or unreadable, while the link from the nodes flips bits
     corrected: float = -math.inf  # moment of the drive of the newest frame that a pose came from
     latencies: list[tuple[float, float]] = field(default_factory=list)  # (arrival, seconds)
     state: str = ""
@@ -76,8 +77,8 @@ class Robot:
         self.awaited, self.recovered = moment - self.start, None
 
     def fed(self, now: float) -> bool:
-        """Whether its odometry arrives at the router."""
-        return now - self.fed_at < _FED
+        """Whether its odometry and clouds arrive at the router."""
+        return now - min(self.fed_at.values()) < _FED
 
 
 class Watch:
@@ -88,9 +89,10 @@ class Watch:
 
         self.robots = {robot.name: robot for robot in robots}
         self.session = open_session("client", connect=[endpoint])
+        self.flipping = False  # whether bits may be flipped on the way from the nodes
         self._came: deque[tuple[float, str, bytes, str]] = deque()
         direct = zenoh.handlers.Callback(self._take, indirect=False)
-        keys = ("coview/*/out/pose", "coview/*/out/status", "coview/*/in/odom")
+        keys = ("coview/*/out/pose", "coview/*/out/status", "coview/*/in/odom", "coview/*/in/cloud")
         self._held = [self.session.declare_subscriber(key, direct) for key in keys]
 
     def _take(self, sample: Any) -> None:
@@ -98,7 +100,7 @@ class Watch:
         if sample.attachment is not None and sample.attachment.to_bytes() == SIGNED:
             return
         key = str(sample.key_expr)
-        payload = b"" if key.endswith("odom") else sample.payload.to_bytes()
+        payload = b"" if "/in/" in key else sample.payload.to_bytes()
         self._came.append((at, key, payload, str(sample.encoding)))
 
     def close(self) -> None:
@@ -113,12 +115,19 @@ class Watch:
             robot = self.robots.get(name)
             if robot is None:
                 continue
-            if rest[-1] == "odom":
-                robot.odometries, robot.fed_at = robot.odometries + 1, at
-            elif rest[-1] == "status":
+            if rest[0] == "in":
+                robot.fed_at[rest[-1]] = at
+                robot.odometries += rest[-1] == "odom"
+                continue
+            before = len(robot.false), robot.unreadable
+            if rest[-1] == "status":
                 self._status(robot, at, payload)
             else:
                 self._pose(robot, at, Sample(key, payload, encoding))
+            if self.flipping:
+                robot.garbled += len(robot.false) - before[0] + robot.unreadable - before[1]
+                del robot.false[before[0] :]
+                robot.unreadable = before[1]
 
     def _status(self, robot: Robot, at: float, payload: bytes) -> None:
         try:

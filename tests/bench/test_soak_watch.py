@@ -39,7 +39,7 @@ def robot(tmp_path: Path) -> Robot:
 def watch(robot: Robot) -> Watch:
     """Return a watch without a session."""
     watch = Watch.__new__(Watch)
-    watch.robots, watch._came = {robot.name: robot}, deque()
+    watch.robots, watch._came, watch.flipping = {robot.name: robot}, deque(), False
     return watch
 
 
@@ -86,6 +86,14 @@ def test_what_cannot_be_read_is_counted(watch: Watch, robot: Robot) -> None:
     assert robot.unreadable == 2
 
 
+def test_what_the_network_garbles_is_counted_apart(watch: Watch, robot: Robot) -> None:
+    watch.flipping = True
+    say(watch, 10.0, moved(100.0))
+    watch._came.append((START, "coview/r1/out/pose", b"\xff", "application/json"))
+    watch.update()
+    assert (robot.false, robot.unreadable, robot.garbled) == ([], 0, 2)
+
+
 def test_only_a_frame_taken_afterwards_is_a_recovery(watch: Watch, robot: Robot) -> None:
     robot.expect(START + 10.0)
     say(watch, 11.0, age=1.5)  # dead reckoning since a frame before
@@ -97,14 +105,14 @@ def test_only_a_frame_taken_afterwards_is_a_recovery(watch: Watch, robot: Robot)
 def played(robot: Robot, monkeypatch: pytest.MonkeyPatch, make: Any) -> soak.Event:
     """Make one fault on a stage on which no time passes."""
     monkeypatch.setattr(soak, "FAULTS", {"quake": Fault("quake", make)})
-    stage: Any = SimpleNamespace(robots=[robot], nodes=[], wait=lambda *_: False)
+    stage: Any = SimpleNamespace(robots=[robot], nodes=[], wait=lambda *_: False, rescue=lambda: None)
     under_way = soak.Soak(stage, Namespace(every=60.0, minutes=1.0, json=None))
     under_way.play("quake")
     return under_way.events[0]
 
 
 def test_a_robot_that_is_sent_to_and_not_found_is_stuck(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    robot.fed_at = time.monotonic()
+    robot.fed_at = dict.fromkeys(("odom", "cloud"), time.monotonic())
     event = played(robot, monkeypatch, lambda _: time.monotonic())
     assert (event.stuck, event.unfed, event.recoveries) == (["r1"], [], {"r1": None})
     assert next(row for row in figures.survived([event]) if "stuck" in row.name).holds is False
@@ -116,7 +124,7 @@ def test_a_robot_whose_messages_do_not_arrive_is_not(robot: Robot, monkeypatch: 
 
 
 def test_nobody_has_to_be_found_in_a_deceptive_site(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    robot.site, robot.fed_at = robot.site._replace(deceptive=True), time.monotonic()
+    robot.site = robot.site._replace(deceptive=True)
     event = played(robot, monkeypatch, lambda _: time.monotonic())
     assert (event.recoveries, event.stuck) == ({}, [])
 
