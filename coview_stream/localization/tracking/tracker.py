@@ -246,19 +246,24 @@ class Tracker:
     def _against_odometry(self, match: MapMatch, belief: Estimate, scan: ScanInput, tries: list[MapMatch]) -> MapMatch:
         """Judge a match that fits, but perhaps not where odometry leads: the place moves if the scans say so.
 
-        Where the two places are so near that either is good enough, what the lidar sees is believed. Where odometry is
-        known to drift so far, it contradicts nothing: the other place is what registration from there comes to. Where
-        the headings alone differ, it is odometry's that is wrong: what has been moved does not turn about the robot.
-        Neither holds where the heights differ by more than odometry drifts: no wheel slips upwards.
+        Where the two places are so near that either is good enough, what the lidar sees is believed, without a pose
+        until the next frame agrees. Where odometry is known to drift so far, it contradicts nothing: the other place is
+        what registration from there comes to. Where the headings alone differ, it is odometry's that is wrong: what has
+        been moved does not turn about the robot. Where the heights differ by more than odometry drifts, it is not: no
+        wheel slips upwards.
         """
         plausible = match.innovation <= self.config.acceptance.max_innovation
         led = tries[0].T_map_body if plausible and not self._disputed else belief.T_map_body
         metres, degrees = off_by(match.T_map_body, led)
-        rise = float(match.T_map_body[2, 3] - led[2, 3])
-        level = rise**2 <= self.config.acceptance.max_innovation * (belief.covariance[5, 5] + match.covariance[5, 5])
-        if not matters(metres, degrees) and (level or plausible):
-            return replace(match, moves_place=not plausible)
-        moves = not matters(metres, 0.0) and level
+        if plausible and not matters(metres, degrees):
+            return match
+        gap, spread = match.T_map_body[:3, 3] - led[:3, 3], belief.covariance[3:, 3:] + match.covariance[3:, 3:]
+        limit = self.config.acceptance.max_innovation
+        turned = float(gap @ np.linalg.solve(spread, gap)) <= limit  # and no more than that
+        if turned and not matters(metres, degrees):
+            return replace(match, moves_place=True)
+        level = gap[2] ** 2 <= limit * spread[2, 2]
+        moves = turned or (level and not matters(metres, degrees))
         if not moves:
             places = [each.T_map_body for each in tries if each.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]
