@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def drive_on(conn: Connection, endpoint: str, world: Path, name: str) -> None:
     for k in range(2 * len(read_tum(world / "truth.tum")[0])):
         drive.cloud(k * CLOUD_PERIOD)
     manner, since = Manner(), 0.0
-    how = {
+    how: dict[str, dict[str, Any]] = {
         "cloud": {"congestion_control": zenoh.CongestionControl.DROP},
         "odom": {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH},
     }

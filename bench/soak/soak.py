@@ -18,6 +18,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from random import Random
+from typing import Any
 
 import numpy as np
 
@@ -201,7 +202,7 @@ class Soak:
         yield from figures.held(self.stage.robots, hours, faults)
         yield from figures.survived(self.events)
         yield from figures.processes(self.stage.nodes, hours, ended)
-        details = {"code": fingerprint(), "bench": fingerprint("bench/soak"), "line": code_line()}
+        details: dict[str, Any] = {"code": fingerprint(), "bench": fingerprint("bench/soak"), "line": code_line()}
         details |= {"minutes": 60 * hours, "robots": len(self.stage.robots), "seed": self.asked.seed}
         yield Row("soak/code", said=fingerprint(), details=details)
 
