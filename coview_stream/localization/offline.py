@@ -71,8 +71,8 @@ class RunResult:
 
     @property
     def calibration(self) -> Calibration | None:
-        """What was corrected of the sensor and of odometry in the end; None if that was never known."""
-        return self.posed[-1].calibration if self.posed else None
+        """What was corrected of the sensor and of odometry in the end, posed or not; None if that was never known."""
+        return self.fixes[-1].calibration if self.fixes else None
 
     @property
     def state(self) -> State:

@@ -150,3 +150,9 @@ def test_pictures_of_an_earlier_run_are_removed(located, world_map, tmp_path):
         (tmp_path / name).write_bytes(b"old")
     write(located, world_map, tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["result.json", "trajectory.tum"]
+
+
+def test_calibration_of_a_run_that_never_got_a_pose_is_told(world_map):
+    """It may be why."""
+    fix = Fix(1.0, State.SEARCHING, calibration=Calibration(pitch=0.05))
+    assert RunResult(1, [fix]).to_json(world_map)["calibration"]["pitch_deg"] == pytest.approx(2.86)
