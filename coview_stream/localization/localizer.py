@@ -94,6 +94,7 @@ class Localizer:
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search that found the place
         self._lean_is_told = True  # by a registration at the place
+        self._leader: Pose | None = None  # T_map_odom of the place that leads the search
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
@@ -265,6 +266,8 @@ class Localizer:
             if leant:
                 self._buffer.level(frame.R_body_cloud)
                 self._next_epoch()
+                if self._leader is not None and self._frames.anchor is not None:
+                    self._hints.place_led(self._leader, self._frames.anchor)
             keyframe = self._buffer.add(frame.voxels, frame.T_odom_body, stamp, frame.R_body_cloud, leant)
         self._tracker.add_scan(frame.voxels, frame.T_odom_body)
         self._newest = frame
@@ -353,8 +356,7 @@ class Localizer:
         """Learn the tilt from a place that leads, (4, 4) as registered, which a search that begins anew tries, too."""
         probability, R_body_cloud = result.evidence.confidence or 0.0, result.R_body_cloud
         levelled = self._frames.correction.learn_leader(T_map_body, result.T_odom_body, probability, R_body_cloud)
-        if self._frames.anchor is not None:
-            self._hints.place_led(levelled @ inverse(result.T_odom_body), self._frames.anchor)
+        self._leader = levelled @ inverse(result.T_odom_body)
 
     def _match_to_map(self, frame: Frame, defer: bool = False) -> MapMatch | None:
         """Register the newest scans if that is due: after a metre, a second, or whenever something looks wrong."""
@@ -412,6 +414,7 @@ class Localizer:
         if self._frames.anchor is not None:
             self._hints.odometry_continues(self._tracker.T_map_odom, self._frames.anchor)
         self._frames.forget_odometry()
+        self._leader = None
         self._buffer.clear()
         self._odometry_check.clear()
         self._tracker.forget_odometry()
@@ -420,6 +423,7 @@ class Localizer:
     def _restart_search(self, stamp: float) -> None:
         """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
+        self._leader = None
         self._frames.correction.forget_frame()
         self._tracker.forget_scans()
         self._next_epoch()
