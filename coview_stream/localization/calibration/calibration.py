@@ -53,18 +53,18 @@ class Calibration:
     def describe(self, mount: Mount | None = None) -> list[str]:
         """Say in plain words, a clause each, what is corrected; nothing where sensor and odometry are as they should.
 
-        A sensor that leans by a *positive* pitch looks down, as ``--mount`` counts it. ``mount`` is the one that clouds
-        have been read with already.
+        Signs are those of ``--mount``. ``mount`` is the one that clouds have been read with already.
         """
         said: list[str] = []
         leans = [
-            f"{abs(math.degrees(angle)):.1f} deg in {name}"
+            f"{math.degrees(angle):.1f} deg in {name}"
             for name, angle in (("roll", self.roll), ("pitch", self.pitch))
             if abs(angle) >= _WORTH_TELLING
         ]
         if leans:
             option = (mount or Mount()).turned(self.R_body_cloud).option
-            said.append(f"sensor leans {' and '.join(leans)}: corrected; set --mount={option} to silence this")
+            beyond = "" if mount is None or mount == Mount() else " beyond its mount"
+            said.append(f"sensor leans {' and '.join(leans)}{beyond}: corrected; set --mount={option} to silence this")
         if abs(self.scale) >= _SCALE:
             what = "short" if self.scale > 0 else "long"
             said.append(f"odometry measures {abs(self.scale):.1%} too {what}: corrected")
