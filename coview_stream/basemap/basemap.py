@@ -199,7 +199,7 @@ class BaseMap:
         """
         arrays = self._arrays
         if "field.tiles" not in arrays:
-            normals = arrays["normals"] * np.float32(1.0 / 127.0)
+            normals = tiles.unit_normals(arrays["normals"])
             surveyed, corner = arrays["surveyed"] > 0, arrays["surveyed_corner"]
             arrays = field_arrays(np.asarray(self.points), normals, surveyed, corner, self.config.block)
         try:

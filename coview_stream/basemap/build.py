@@ -18,7 +18,7 @@ from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.likelihood_field import field_arrays
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
-from coview_stream.basemap.tiles import sort_by_tile
+from coview_stream.basemap.tiles import scaled_normals, sort_by_tile
 from coview_stream.clouds.cloud import merge
 from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
@@ -69,7 +69,7 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
         if len(points) < _MIN_POINTS:
             raise MapError(f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more")
         step(2, 3)
-        normals = estimate_normals(points, config.normal_neighbours, config.normal_radius)
+        normals, planarity = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
     with _progress_bar(progress, "ground") as step:
         stations = find_stations(points, config.block, config.levels)
@@ -85,7 +85,7 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
 
         with _progress_bar(progress, "learned features") as step:
             learned = feature_arrays(points, step)
-    sorted_points, packed, index = sort_by_tile(points, normals, config.tile)
+    sorted_points, packed, index = sort_by_tile(points, scaled_normals(normals, planarity), config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
     with _progress_bar(progress, "likelihood field") as step:
         field = field_arrays(points, normals, surveyed > 0, surveyed_corner, config.block)

@@ -7,17 +7,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.geometry.arrays import Floats, Int8s, Ints
+from coview_stream.geometry.arrays import Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 _NORMAL_SCALE = 127.0
+_SHORTEST = 0.0625  # length of a kept normal: a shorter one would lose its direction, which would be off by 7 degrees
+
+
+def scaled_normals(normals: Points, planarity: Floats32) -> Points:
+    """Return unit normals (N, 3) as a map keeps them: as long as the planarity (N,) in [0, 1] of the points around."""
+    return normals * np.maximum(planarity, np.float32(_SHORTEST))[:, None]
 
 
 def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, Int8s, Ints]:
-    """Return points (N, 3), normals (N, 3) as int8, and the index (T, 4) of their tiles.
+    """Return points (N, 3), normals (N, 3) of a length of at most one as int8, and the index (T, 4) of their tiles.
 
     An index row is (column, row, begin, end): the tile covers ``[column, column + 1) * tile`` in x, likewise in y.
-    A normal in int8 is off by less than 0.5 degrees.
+    A normal of length 1 in int8 is off by less than 0.5 degrees.
     """
     cells = np.floor(points[:, :2].astype(np.float64) / tile).astype(np.int64)
     order = np.lexsort((cells[:, 1], cells[:, 0]))
@@ -48,6 +54,12 @@ def crop(
     inside = dx * dx + dy * dy < radius * radius
     # compress: a boolean index of rows takes five times as long
     packed = np.concatenate([normals[stretch] for stretch in stretches]).compress(inside, axis=0)
-    near_normals = packed.astype(np.float32)
-    near_normals /= _NORMAL_SCALE
-    return near_points.compress(inside, axis=0), near_normals
+    return near_points.compress(inside, axis=0), unit_normals(packed)
+
+
+def unit_normals(packed: npt.NDArray[Any]) -> Points:
+    """Return the unit normals (N, 3) of those (N, 3) that a map keeps; zero stays zero."""
+    normals = packed.astype(np.float32)
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    normals /= np.maximum(length, np.float32(1.0))[:, None]
+    return normals

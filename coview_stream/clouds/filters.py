@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_stream.clouds.open3d_loader import open3d
 from coview_stream.errors import ConfigError
-from coview_stream.geometry.arrays import Bools, Indices, Ints
+from coview_stream.geometry.arrays import Bools, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Points
 
 _MAX_CELLS = 2**62
@@ -86,10 +86,12 @@ def _voxel_groups(points: Points, voxel: float) -> tuple[Indices, Indices]:
     return order, starts
 
 
-def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> Points:
-    """Estimate unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0).
+def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> tuple[Points, Floats32]:
+    """Estimate unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0), and planarity (N,).
 
-    Costs about 1.7 s per million points on two cores. Fewer than three neighbours give (0, 0, 1).
+    Planarity is 1 where the points around lie on a plane and 0 where they scatter alike in all directions, as in a
+    crown: 1 - 3 s, with s the share of the covariance's smallest eigenvalue (the "surface variation" of Pauly et al.,
+    2002). Fewer than three neighbours give (0, 0, 1) and 0.
 
     Args:
         points: (N, 3) float32 metres, finite.
@@ -102,7 +104,7 @@ def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -
     if k < 3 or (radius is not None and not radius > 0):
         raise ConfigError(f"k={k}, radius={radius}: k must be at least 3 and the radius positive")
     if not len(points):
-        return points.reshape(0, 3)
+        return points.reshape(0, 3), np.empty(0, dtype=np.float32)
     geometry = open3d().geometry
     search = (
         geometry.KDTreeSearchParamKNN(k)
@@ -110,10 +112,15 @@ def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -
         else geometry.KDTreeSearchParamHybrid(radius=radius, max_nn=k)
     )
     cloud = _legacy(points)
-    cloud.estimate_normals(search)
+    cloud.estimate_covariances(search)
+    covariances = np.asarray(cloud.covariances)
+    cloud.estimate_normals(search)  # of those covariances
     normals = np.asarray(cloud.normals).astype(np.float32)
     normals[normals[:, 2] < 0] *= -1
-    return normals
+    smallest = np.einsum("ni,nij,nj->n", normals, covariances, normals)
+    total = np.einsum("nii->n", covariances)
+    share = np.divide(smallest, total, out=np.zeros_like(total), where=total > 0.0)
+    return normals, np.clip(1.0 - 3.0 * share, 0.0, 1.0).astype(np.float32)
 
 
 def _legacy(points: Points) -> Any:

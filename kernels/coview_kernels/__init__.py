@@ -25,7 +25,7 @@ from coview_kernels.evidence import (
     sort_beams,
 )
 from coview_kernels.field import FieldMap, FieldScan, FieldScores, field_scores, near_structure, unexplained
-from coview_kernels.icp import Alignment, Belief, Scale, align_planes
+from coview_kernels.icp import SCATTER, Alignment, Belief, Scale, align_planes
 from coview_kernels.nearest import PointGrid, nearest
 from coview_kernels.overhead import height_columns, lowest_heights, offsets_near
 from coview_kernels.polar import describe_points, polar_bin, station_bins
@@ -37,6 +37,7 @@ from coview_kernels.warm_up import warm_up
 from coview_kernels.windows import WindowImages, WindowRaster, window_products
 
 __all__ = [
+    "SCATTER",
     "Alignment",
     "Beams",
     "Belief",

@@ -118,10 +118,11 @@ def match(
                     _best, row, _beyond = walk(frame, starts, rows, at[0], at[1], at[2], search * search, 0.0)
                     if row >= 0:
                         normal = 3 * rows[4 * row + 3]
-                        off = ti.cast(0.0, f64)
+                        off, length = ti.cast(0.0, f64), ti.cast(0.0, f64)
                         for d in ti.static(range(3)):
                             off += (at[d] - ti.cast(ti.bit_cast(rows[4 * row + d], f32), f64)) * normals[normal + d]
-                        grounded += ti.cast(ti.abs(off) < settings[OFF], i32)
+                            length += ti.cast(normals[normal + d], f64) * normals[normal + d]
+                        grounded += ti.cast(ti.abs(off) < settings[OFF] * ti.sqrt(length), i32)
         counts[0], counts[1], counts[2] = surveyed, high, near
         counts[3], counts[4], counts[5] = covered, low, grounded
 

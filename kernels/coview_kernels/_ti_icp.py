@@ -20,6 +20,7 @@ WHOLES = ti.types.ndarray(ti.i32, 1)
 SERIAL = runtime.workers() == 1
 SLACK = 1e-9  # metres: more than rounding adds to a bound
 MAX_SHARE = 5.0  # weight of a point of the rarer kind
+SCATTER = 2.0  # times the width of the weights, how far points lie about one another where they form no surface
 MARGIN = 0.15  # metres that a search looks further than it must, so that it serves later poses; 0.05-0.3 are as fast
 BLOCK = 6  # 2^6 points go to one thread, the next to another: those that must search far come in clusters
 
@@ -106,23 +107,50 @@ def add_up(
     T, about, width, n, last, share, source: ti.template(), kinds: ti.template(),
     partners: ti.template(), bins: ti.template(), state: ti.template(),
 ):  # fmt: skip
-    """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs."""
+    """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs.
+
+    A pair whose partner lies on a surface tells of the direction of its normal, one in scatter of all three axes.
+    """
     acc = ti.Vector.zero(ti.f64, 30)
     for i in range(n):
         if bins[i] <= (last[1] if kinds[i] > 0 else last[0]):
             at = placed(T, floats(source, 3 * i))
+            gap = at - floats(partners, PARTNER * i)
             normal = floats(partners, PARTNER * i + 3)
-            r = normal.dot(at - floats(partners, PARTNER * i))
+            planarity = normal.norm()
+            normal /= ti.max(planarity, 1e-9)
+            planarity = ti.min(planarity, 1.0)
+            r = normal.dot(gap)
             ratio = r / width
-            w = (share[1] if kinds[i] > 0 else share[0]) / (1.0 + ratio * ratio)
-            turn = (at - about).cross(normal)
+            own = share[1] if kinds[i] > 0 else share[0]
+            w = own * planarity / (1.0 + ratio * ratio)
+            arm = at - about
+            turn = arm.cross(normal)
             J = ti.Vector([turn[0], turn[1], turn[2], normal[0], normal[1], normal[2], r])
             for a in ti.static(range(6)):
                 wa = w * J[a]
                 for b in ti.static(range(a, 7)):
                     acc[ti.static(7 * a - a * (a - 1) // 2 + b - a)] += wa * J[b]
-            acc[27] += w * r * r
-            acc[28] += w
+            length = gap.norm_sqr()
+            v = own * (1.0 - planarity) / (SCATTER * SCATTER + length / (width * width))
+            torque = arm.cross(gap)
+            square = arm.norm_sqr()
+            for a in ti.static(range(3)):
+                for b in ti.static(range(a, 3)):
+                    inertia = (square if ti.static(a == b) else ti.cast(0.0, ti.f64)) - arm[a] * arm[b]
+                    acc[ti.static(7 * a - a * (a - 1) // 2 + b - a)] += v * inertia
+                acc[ti.static(7 * (a + 3) - (a + 3) * (a + 2) // 2)] += v
+                acc[ti.static(7 * a - a * (a - 1) // 2 + 6 - a)] += v * torque[a]
+                acc[ti.static(7 * (a + 3) - (a + 3) * (a + 2) // 2 + 6 - (a + 3))] += v * gap[a]
+            # of a turn about one axis and a shift along another: the matrix of the cross product with the arm
+            acc[4] -= v * arm[2]
+            acc[5] += v * arm[1]
+            acc[9] += v * arm[2]
+            acc[11] -= v * arm[0]
+            acc[14] -= v * arm[1]
+            acc[15] += v * arm[0]
+            acc[27] += w * r * r + v * length
+            acc[28] += w + 3.0 * v
             acc[29] += 1.0
     for k in ti.static(range(30)):
         state[SUMS + k] = acc[k]

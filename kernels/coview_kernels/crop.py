@@ -27,7 +27,7 @@ def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Cro
 
     Args:
         points: (N, 3) float32, contiguous, metres; rows with NaN or inf are left out.
-        normals: (N, 3) int8, contiguous, unit normals times 127.
+        normals: (N, 3) int8, contiguous, normals, as long as the planarity around each point, times 127.
         spans: (S, 2) first row and row after the last of each stretch of the map to look at.
         cut: what to cut out and what to make of it.
 

@@ -54,7 +54,7 @@ def match_points(
 
     Args:
         grid: the map, (K, 3).
-        normals: (K, 3) float32, its unit normals.
+        normals: (K, 3) float32, its normals, of any length but zero.
         points: (N, 3) float32, scan frame, metres, finite.
         kinds: (N,) uint8 of :class:`PointKind`.
         T: (4, 4) ``T_map_scan``.

@@ -1,5 +1,8 @@
 """Trimmed point-to-plane ICP (eq. 13), coarse to fine, with weights against outliers and a prior.
 
+Where the map's points form no surface, in a crown or a hedge, a normal says nothing, and a pair tells of all three
+directions instead, each less exactly. How much of either is what the length of the map's normals says.
+
 An iteration is one prepared launch, of which the searches are spread over the threads. A point's partner is looked up,
 not searched for, where it cannot have changed: a search also tells how far all other map points are at least, and as
 long as the point has moved less than that leaves room for, the partner is the same (the triangle inequality; exact).
@@ -20,10 +23,10 @@ from coview_kernels import reference, runtime
 from coview_kernels.arrays import F32, F64, I64, Mask, as_finite64, as_float32, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.nearest import SAMPLE_GRID, PointGrid
-from coview_kernels.reference.icp import Alignment, Plan, Scale
+from coview_kernels.reference.icp import SCATTER, Alignment, Plan, Scale
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-__all__ = ["Alignment", "Belief", "Scale", "align_planes"]
+__all__ = ["SCATTER", "Alignment", "Belief", "Scale", "align_planes"]
 
 _TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS = 14, 15, 16, 17, 53
 _LOST = 2
@@ -58,13 +61,14 @@ def align_planes(
 
     Each iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it
     keeps the floor(keep * found) nearest pairs, at least one, and all that are as far as the last of them, to a
-    hundredth; and it takes a Gauss-Newton step on sum w r^2, where r = n . (T p - q) and w = share / (1 + (r /
-    width)^2). The share is such that both kinds weigh the same for any numbers of points, but 5 at most. A coarse scale
+    hundredth; and it takes a Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit
+    normal n, w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), with P the
+    planarity. The share is such that both kinds weigh the same for any numbers of points, but 5 at most. A coarse scale
     may make do with every so-many-th point of either kind, since the next one goes on from where it ends.
 
     Args:
         grid: the map, (K, 3).
-        normals: (K, 3) float32, its unit normals.
+        normals: (K, 3) float32, its normals, as long as the planarity around each point: 1 on a surface, 0 in scatter.
         source: (N, 3) float32, source frame, metres. Rows with NaN or inf find no partner.
         kind: (N,) bool.
         T: (4, 4) ``T_target_source`` to begin with.

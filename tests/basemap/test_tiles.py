@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coview_stream.basemap.tiles import crop, sort_by_tile
+from coview_stream.basemap.tiles import crop, scaled_normals, sort_by_tile, unit_normals
 
 TILE = 5.0
 
@@ -33,6 +33,17 @@ def test_sorting_keeps_every_point_with_its_normal(cloud, tiled):
     order, before = np.lexsort(points.T), np.lexsort(cloud[0].T)
     away = np.einsum("ij,ij->i", packed[order] / 127.0, cloud[1][before])
     assert np.degrees(np.arccos(np.clip(away / np.linalg.norm(packed[order] / 127.0, axis=1), -1, 1))).max() < 0.5
+
+
+def test_kept_normals_are_as_long_as_the_planarity_and_keep_their_direction(cloud):
+    rng = np.random.default_rng(1)
+    planarity = rng.choice([0.0, 0.2, 0.7, 1.0], len(cloud[1])).astype(np.float32)
+    positive = cloud[0] + np.float32(100.0)  # one tile: as they came
+    packed = sort_by_tile(positive, scaled_normals(cloud[1], planarity), 1e6)[1]
+    assert np.abs(np.linalg.norm(packed / 127.0, axis=1) - np.maximum(planarity, 0.0625)).max() < 0.01
+    along = np.einsum("ij,ij->i", unit_normals(packed), cloud[1])
+    assert np.degrees(np.arccos(np.clip(along, -1.0, 1.0))).max() < 7.0
+    np.testing.assert_array_equal(unit_normals(np.zeros((1, 3), np.int8)), [[0, 0, 0]])
 
 
 def test_tile_index_covers_cloud_without_gap_or_overlap(tiled):

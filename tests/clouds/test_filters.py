@@ -54,15 +54,27 @@ def test_normals_of_a_tilted_plane_point_up() -> None:
     points = np.column_stack([xy, 0.5 * xy[:, 0]]).astype(np.float32)
     expected = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
     for radius in (None, 1.5):
-        normals = estimate_normals(points, radius=radius)
-        assert normals.dtype == np.float32
+        normals, planarity = estimate_normals(points, radius=radius)
+        assert normals.dtype == planarity.dtype == np.float32
         np.testing.assert_allclose(normals, np.tile(expected, (2000, 1)), atol=1e-3)
+        assert planarity.min() > 0.999
+
+
+def test_planarity_tells_a_surface_from_a_crown() -> None:
+    crown = RNG.normal(0, 1, (4000, 3)).astype(np.float32)
+    rough = np.column_stack([RNG.uniform(0, 20, (8000, 2)), RNG.normal(0, 0.03, 8000)]).astype(np.float32)
+    inside = np.linalg.norm(crown, axis=1) < 1.0
+    scattered, flat = (estimate_normals(points, radius=1.0)[1] for points in (crown, rough))
+    assert np.median(scattered[inside]) < 0.5
+    assert np.median(flat) > 0.95
 
 
 def test_isolated_points_have_a_vertical_normal() -> None:
-    normals = estimate_normals(np.array([[0, 0, 0], [50, 0, 0]], np.float32), radius=1.0)
+    normals, planarity = estimate_normals(np.array([[0, 0, 0], [50, 0, 0]], np.float32), radius=1.0)
     np.testing.assert_array_equal(normals, [[0, 0, 1], [0, 0, 1]])
-    assert estimate_normals(np.zeros((0, 3), np.float32)).shape == (0, 3)
+    np.testing.assert_array_equal(planarity, [0, 0])
+    normals, planarity = estimate_normals(np.zeros((0, 3), np.float32))
+    assert (normals.shape, planarity.shape) == ((0, 3), (0,))
 
 
 def test_filters_refuse_bad_parameters() -> None:

@@ -77,11 +77,13 @@ def assert_same(ours, plain, pivot):
 @settings(max_examples=25)
 @given(
     st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3]), st.booleans(), st.sampled_from([1, 3]),
-    st.sampled_from([(1, 1, 1), (4, 2, 1), (3, 3, 3)]),
+    st.sampled_from([(1, 1, 1), (4, 2, 1), (3, 3, 3)]), st.booleans(),
 )  # fmt: skip
-def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every):
+def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every, scattered):
     rng = np.random.default_rng(seed)
     points, normals = room(rng, 0.01)
+    if scattered:  # what lengths say; on a lattice, whose nearest points are up to 0.2 m off
+        normals *= rng.choice([1.0, 0.6, 0.1, 0.0], (len(points), 1)).astype(np.float32)
     truth = pose([0, 0, rng.uniform(-3, 3)], rng.uniform(-9, 9, 3))
     local, above, pivot = scan_of(points, rng, truth, outliers, 0.02)
     start = truth @ pose(rng.normal(0, 0.02, 3), np.zeros(3))
@@ -93,7 +95,28 @@ def test_kernel_agrees_with_numpy(seed, outliers, believed, threads, every):
         scales = tuple(scale._replace(every=n) for scale, n in zip(SCALES, every, strict=True))
         ours, plain = both(PointGrid(points), normals, local, above, start, pivot, prior, scales)
     assert_same(ours, plain, pivot)
-    assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < 0.1
+    assert np.linalg.norm((ours.T - truth) @ np.append(pivot, 1.0)) < (0.2 if scattered else 0.1)
+
+
+def test_scatter_tells_of_all_directions_whatever_its_normals():
+    """Crowns over a floor, whose normals all look up: with planarity 1 nothing would hold the scan in the plane."""
+    rng = np.random.default_rng(5)
+    crowns = rng.uniform([0, 0, 3], [14, 14, 8], (30, 3))
+    blobs = (crowns[:, None] + rng.normal(0, 0.25, (30, 60, 3))).reshape(-1, 3)
+    floor = np.column_stack([rng.uniform(0, 14, (2500, 2)), np.zeros(2500)])
+    points = np.concatenate([blobs, floor]).astype(np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (len(points), 1))
+    seen = np.concatenate([(crowns[:, None] + rng.normal(0, 0.25, (30, 40, 3))).reshape(-1, 3), floor[::4]])
+    local, above, pivot = seen.astype(np.float32), np.arange(len(seen)) < 1200, np.array([7.0, 7.0, 1.0])
+    start = pose([0, 0, 0.03], [0.4, -0.3, 0.05])
+    off = {}
+    for planarity in (0.0, 1.0):
+        normals = up.copy()
+        normals[: len(blobs)] *= planarity
+        ours, plain = both(PointGrid(points), normals, local, above, start, pivot)
+        assert_same(ours, plain, pivot)
+        off[planarity] = np.linalg.norm((ours.T @ np.append(pivot, 1.0))[:2] - pivot[:2])
+    assert off[0.0] < 0.1 < 0.2 < off[1.0]
 
 
 def test_pairs_of_equal_distance_are_kept_together():

@@ -32,7 +32,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.errors import require_library
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, boxminus, boxplus, orthonormal, skew
+from coview_stream.geometry.transforms import Points, Pose, boxminus, boxplus, norms, orthonormal, skew
 from coview_stream.localization.registration.result import MIN_PAIRS, Registration
 
 # set by hand
@@ -103,7 +103,7 @@ def register_surfaces(
         kinds: either kind of point that the scan has enough of.
         target: the map.
         grid: the same points, to be searched.
-        normals: (K, 3) of these points.
+        normals: (K, 3) of these points, of any length.
         T_map_source: (4, 4) initial guess.
         pivot: (3,) source-frame point that rotations are about.
         scales: coarse to fine.
@@ -176,7 +176,8 @@ def _pairs(
         near = np.flatnonzero(distance <= farthest)
         moved = kind.points[near] @ T[:3, :3].T + T[:3, 3]
         gap = moved - grid.points[partner[near]]
-        residual = np.einsum("ij,ij->i", gap, normals[partner[near]])
+        normal = normals[partner[near]]
+        residual = np.einsum("ij,ij->i", gap, normal) / np.maximum(norms(normal), np.float32(1e-6))
         weight = min(0.5 * points / len(near), _MAX_SHARE)
         H_kind, b_kind = about_pivot(answer.H, answer.b, T, pivot)
         H_along, b_along = point_to_point_system(moved, gap, moved_pivot)

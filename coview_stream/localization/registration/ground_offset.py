@@ -141,9 +141,8 @@ def _fits(points: Points, T_map_source: Pose, target: LocalMap) -> Floats:
     distance, partner = kernels.nearest(target.grid, flat, _REACH)
     found = distance < _REACH
     off = np.zeros(len(flat))
-    off[found] = np.einsum(
-        "ij,ij->i", flat[found] - target.points[partner[found]], target.normals[partner[found]], dtype=np.float64
-    )
+    normals, _ = target.planes(partner[found])
+    off[found] = np.einsum("ij,ij->i", flat[found] - target.points[partner[found]], normals, dtype=np.float64)
     return np.where(found, 1.0 / (1.0 + (off / _WIDTH) ** 2), 0.0).reshape(len(points), -1)
 
 

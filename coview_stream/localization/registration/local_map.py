@@ -18,8 +18,8 @@ import numpy as np
 import coview_kernels as kernels
 from coview_stream.basemap import likelihood_field
 from coview_stream.config import RegistrationMethod
-from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.geometry.transforms import Points
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.transforms import Points, norms
 from coview_stream.localization.registration.result import MIN_PAIRS
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class LocalMap:
 
     Attributes:
         points: (K, 3) map frame, metres.
-        normals: (K, 3) unit normals.
+        normals: (K, 3) normals, as long as the planarity around each point: 1 on a surface, 0 in scatter.
         crop: the same points with what came of them when they were cut out of the map, if they were.
     """
 
@@ -56,6 +56,13 @@ class LocalMap:
             if self.crop is None
             else kernels.PointGrid.sorted(self.points, self.crop.cells)
         )
+
+    def planes(self, rows: Ints) -> tuple[Floats32, Floats32]:
+        """Return the unit normals (N, 3) of some points, and the planarity (N,) around each in [0, 1]."""
+        normals = self.normals[rows]
+        length = norms(normals)
+        unit = np.asarray(normals / np.maximum(length, np.float32(1e-6))[:, None], dtype=np.float32)
+        return unit, np.minimum(length, np.float32(1.0))
 
     @property
     def sample(self) -> Points:

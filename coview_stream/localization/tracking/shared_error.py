@@ -74,9 +74,9 @@ def clustered_covariance(
     # none are trimmed: those that fit best disagree least
     weights = _equal_weights(distance < reach, source.above)
     chosen = np.flatnonzero(weights)
-    q, n = target.points[partner[chosen]], target.normals[partner[chosen]]
-    residual = np.einsum("ij,ij->i", moved[chosen] - q, n).astype(np.float64)
-    weight = weights[chosen] / (1.0 + (residual / config.residual_scale) ** 2)
+    gap, (n, planarity) = moved[chosen] - target.points[partner[chosen]], target.planes(partner[chosen])
+    residual = np.einsum("ij,ij->i", gap, n).astype(np.float64)
+    weight = weights[chosen] * planarity / (1.0 + (residual / config.residual_scale) ** 2)
     arm = moved[chosen] - transform(T_map_source, pivot[None])[0].astype(np.float32)
     J = np.concatenate([np.cross(arm, n), n], axis=1).astype(np.float64)
     cluster = _clusters(moved[chosen], source.above[chosen])
@@ -84,8 +84,15 @@ def clustered_covariance(
     if count < _MIN_CLUSTERS:
         return None
     gradient = J * (weight * residual)[:, None]
+    A = (J * weight[:, None]).T @ J + 1e-6 * np.eye(6)
+    loose = weights[chosen] * (1.0 - planarity)
+    loose /= kernels.SCATTER**2 + np.einsum("ij,ij->i", gap, gap) / config.residual_scale**2
+    for axis in np.eye(3, dtype=np.float32):  # what forms no surface tells of all three directions
+        J = np.concatenate([np.cross(arm, axis), np.broadcast_to(axis, arm.shape)], axis=1).astype(np.float64)
+        gradient += J * (loose * (gap @ axis))[:, None]
+        A += (J * loose[:, None]).T @ J
     gradients = np.stack([np.bincount(cluster, column, count) for column in gradient.T], axis=1)
-    inverse_A = np.linalg.inv((J * weight[:, None]).T @ J + 1e-6 * np.eye(6))
+    inverse_A = np.linalg.inv(A)
     # of as many clusters six are used up by the fit
     return np.asarray(inverse_A @ (gradients.T @ gradients) @ inverse_A * count / (count - 6))
 

@@ -38,7 +38,7 @@ class Crop(NamedTuple):
     points: F32
     """(K, 3) metres, by cell; a view of ``cells.rows``, not contiguous."""
     normals: F32
-    """(K, 3)."""
+    """(K, 3), as long as the planarity around each point."""
     cells: Cells
     """Of these points, with the order that they have."""
     sample: F32
@@ -69,7 +69,7 @@ def crop_points(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
     starts = np.searchsorted(number[order], np.arange(int(frame[5:].prod()) + 1)).astype(np.int32)
     rows = np.empty((len(near), 4), dtype=np.int32)
     rows[:, :3], rows[:, 3] = near[order].view(np.int32), np.arange(len(near))
-    unit = normals[wanted[order]].astype(np.float32)
-    unit /= 127.0
+    planes = normals[wanted[order]].astype(np.float32)
+    planes /= 127.0
     cells = Cells(frame, starts, rows.reshape(-1))
-    return Crop(rows.view(np.float32)[:, :3], unit, cells, near[:: cut.every], top, corner)
+    return Crop(rows.view(np.float32)[:, :3], planes, cells, near[:: cut.every], top, corner)

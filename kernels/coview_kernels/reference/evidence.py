@@ -122,7 +122,9 @@ def match_points(
     distance, partner = nearest(tree, low, distances.search)
     found = np.isfinite(distance)
     gap = low[found] - tree.data[partner[found]]
-    grounded = np.abs(np.einsum("ij,ij->i", gap, normals[partner[found]])) < distances.off
+    normal = normals[partner[found]].astype(np.float64)
+    length = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+    grounded = np.abs(np.einsum("ij,ij->i", gap, normal)) < distances.off * length
     return PointCounts(*map(int, (surveyed.sum(), len(high), near.sum(), covered.sum(), len(low), grounded.sum())))
 
 

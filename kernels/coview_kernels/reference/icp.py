@@ -1,4 +1,4 @@
-"""Trimmed point-to-plane ICP in plain NumPy, on SciPy's k-d tree."""
+"""Trimmed point-to-plane ICP in plain NumPy, on SciPy's k-d tree; point-to-point where the map has no surface."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from coview_kernels.reference.nearest import nearest
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+SCATTER = 2.0
+"""Times the width of the weights, how far points lie about one another where they form no surface; set by hand."""
 
 _MAX_SHARE = 5.0  # a handful of points must not outweigh thousands
 _FIRST_BIN, _BINS = 107 << 6, 2048  # of squared distances: 64 to an octave, from 2^-20 square metres up
@@ -95,12 +98,8 @@ def _step(
     if len(chosen) < plan.min_pairs:
         return None
     share, gap, pairs = share[chosen], gap[chosen], pairs[chosen]
-    n = normals[pairs]
-    residual = np.einsum("ij,ij->i", gap, n)
-    weight = share / (1.0 + (residual / scale.width) ** 2)
     about = T[:3, :3] @ plan.pivot + T[:3, 3]
-    H, b = _normal_equations(gap + tree.data[pairs] - about, n, residual, weight)
-    mean_square = weight @ (residual * residual) / weight.sum()
+    H, b, mean_square = _normal_equations(gap + tree.data[pairs] - about, gap, normals[pairs], share, scale.width)
     information, gradient = H / (mean_square + 1e-6), b / (mean_square + 1e-6)
     if plan.prior is not None:
         mean, belief = plan.prior
@@ -109,17 +108,34 @@ def _step(
         shift = about - (mean[:3, :3] @ plan.pivot + mean[:3, 3])
         information = information + belief
         gradient = gradient + belief @ np.concatenate([turn, shift])
-    increment: F64 = -np.linalg.solve(information + 1e-6 * np.eye(6), gradient)
+    increment = np.asarray(-np.linalg.solve(information + 1e-6 * np.eye(6), gradient), dtype=np.float64)
     return increment, information, float(np.sqrt(mean_square)), len(chosen)
 
 
-def _normal_equations(arm: F64, normals: F32, residual: F64, weight: F64) -> tuple[F64, F64]:
-    """H (6, 6) = sum w J^T J and b (6,) = sum w J^T r, with J = (arm x n, n) for points at ``arm`` of the pivot."""
-    J = np.concatenate([np.cross(arm, normals), normals], axis=1)
-    weighted = weight[:, None] * J
-    H = J.T @ weighted
+def _normal_equations(arm: F64, gap: F64, normals: F32, share: F64, width: float) -> tuple[F64, F64, float]:
+    """H (6, 6) = sum w J^T J, b (6,) = sum w J^T r, and the mean square of r, for points at ``arm`` of the pivot.
+
+    Along its partner's normal a pair has J = (arm x n, n), r = n . gap and w = p share / (1 + (r / width)^2), where p
+    is the planarity, the length of the partner's normal as given. The rest, 1 - p, tells of all three directions:
+    J = (arm x e, e) and r = e . gap for each axis e, with w = (1 - p) share / (4 + (|gap| / width)^2).
+    """
+    planarity = np.minimum(np.linalg.norm(normals.astype(np.float64), axis=1), 1.0)
+    n = normals / np.maximum(planarity, 1e-9)[:, None]
+    residual = np.einsum("ij,ij->i", gap, n)
+    weight = share * planarity / (1.0 + (residual / width) ** 2)
+    J = np.concatenate([np.cross(arm, n), n], axis=1)
+    H: F64 = J.T @ (weight[:, None] * J)
+    b: F64 = J.T @ (weight * residual)
+    squares, total = weight @ (residual * residual), weight.sum()
+    length = np.einsum("ij,ij->i", gap, gap)
+    loose = share * (1.0 - planarity) / (SCATTER**2 + length / width**2)
+    for axis in np.eye(3):
+        J = np.concatenate([np.cross(arm, axis), np.broadcast_to(axis, arm.shape)], axis=1)
+        H += J.T @ (loose[:, None] * J)
+        b += J.T @ (loose * (gap @ axis))
+    squares, total = squares + loose @ length, total + 3.0 * loose.sum()
     # BLAS rounds the two halves differently
-    return 0.5 * (H + H.T), weighted.T @ residual
+    return 0.5 * (H + H.T), b, float(squares / total)
 
 
 def _shares(squares: F32, kind: Mask, keep: float, points: int) -> F64:
