@@ -102,6 +102,11 @@ def trim(keep, chunks, n, first, bins: ti.template()):
     return last, share
 
 
+def _place(row, column):
+    """Return where a number of the triangle, whose last column is b, stands among the sums."""
+    return 7 * row - row * (row - 1) // 2 + column - row
+
+
 @ti.func
 def add_up(
     T, about, width, n, last, share, source: ti.template(), kinds: ti.template(),
@@ -111,7 +116,7 @@ def add_up(
 
     A pair whose partner lies on a surface tells of the direction of its normal, one in scatter of all three axes.
     """
-    acc = ti.Vector.zero(ti.f64, 30)
+    acc, M = ti.Vector.zero(ti.f64, 30), ti.Matrix.zero(ti.f64, 3, 3)
     for i in range(n):
         if bins[i] <= (last[1] if kinds[i] > 0 else last[0]):
             at = placed(T, floats(source, 3 * i))
@@ -124,31 +129,26 @@ def add_up(
             ratio = r / width
             own = share[1] if kinds[i] > 0 else share[0]
             w = own * planarity / (1.0 + ratio * ratio)
-            arm = at - about
-            turn = arm.cross(normal)
-            J = ti.Vector([turn[0], turn[1], turn[2], normal[0], normal[1], normal[2], r])
-            for a in ti.static(range(6)):
-                wa = w * J[a]
-                for b in ti.static(range(a, 7)):
-                    acc[ti.static(7 * a - a * (a - 1) // 2 + b - a)] += wa * J[b]
             length = gap.norm_sqr()
             v = own * (1.0 - planarity) / (SCATTER * SCATTER + length / (width * width))
-            torque = arm.cross(gap)
-            square = arm.norm_sqr()
-            for a in ti.static(range(3)):
-                for b in ti.static(range(a, 3)):
-                    inertia = (square if ti.static(a == b) else ti.cast(0.0, ti.f64)) - arm[a] * arm[b]
-                    acc[ti.static(7 * a - a * (a - 1) // 2 + b - a)] += v * inertia
-                acc[ti.static(7 * (a + 3) - (a + 3) * (a + 2) // 2)] += v
-                acc[ti.static(7 * a - a * (a - 1) // 2 + 6 - a)] += v * torque[a]
-                acc[ti.static(7 * (a + 3) - (a + 3) * (a + 2) // 2 + 6 - (a + 3))] += v * gap[a]
-            # of a turn about one axis and a shift along another: the matrix of the cross product with the arm
-            acc[4] -= v * arm[2]
-            acc[5] += v * arm[1]
-            acc[9] += v * arm[2]
-            acc[11] -= v * arm[0]
-            acc[14] -= v * arm[1]
-            acc[15] += v * arm[0]
+            # W = w n n^T + v I weighs the gap; a turn moves the point by its cross product with the arm
+            arm, pull = at - about, w * r * normal + v * gap
+            torque = arm.cross(pull)
+            for column in ti.static(range(3)):
+                W = w * normal[column] * normal
+                W[column] += v
+                cross = arm.cross(W)
+                for row in ti.static(range(3)):
+                    acc[ti.static(_place(row, 3 + column))] += cross[row]
+                    M[row, column] = cross[row]
+                    if ti.static(row <= column):
+                        acc[ti.static(_place(3 + row, 3 + column))] += W[row]
+            for row in ti.static(range(3)):
+                lever = arm.cross(ti.Vector([M[row, 0], M[row, 1], M[row, 2]]))
+                for column in ti.static(range(row, 3)):
+                    acc[ti.static(_place(row, column))] += lever[column]
+                acc[ti.static(_place(row, 6))] += torque[row]
+                acc[ti.static(_place(3 + row, 6))] += pull[row]
             acc[27] += w * r * r + v * length
             acc[28] += w + 3.0 * v
             acc[29] += 1.0
