@@ -32,8 +32,31 @@ Progress = Callable[[int, int, Fix | None], None]
 """Called with (frames done, frames, newest fix)."""
 
 
+_TOLD = 3  # stretches without a pose that a summary names
+
 TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 """Pictures of a run; ``report.run_pictures`` draws them."""
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """Successive frames after the first fix that have no pose.
+
+    Attributes:
+        first: stamp of the first of them, seconds.
+        last: stamp of the last of them.
+        frames: their number.
+        reason: why the first of them has none.
+    """
+
+    first: float
+    last: float
+    frames: int
+    reason: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data of ``result.json``."""
+        return {"first_stamp": self.first, "last_stamp": self.last, "frames": self.frames, "reason": self.reason}
 
 
 @dataclass
@@ -84,6 +107,22 @@ class RunResult:
         """The first fix that has a pose."""
         return next(iter(self.posed), None)
 
+    @property
+    def interruptions(self) -> list[Interruption]:
+        """Where poses are missing after the first fix, in order; frames that were skipped are told apart."""
+        out: list[Interruption] = []
+        found, going_on = False, False
+        for fix in self.fixes:
+            has = fix.T_map_body is not None
+            if found and not has:
+                if going_on:
+                    out[-1] = replace(out[-1], last=fix.stamp, frames=out[-1].frames + 1)
+                else:
+                    reason = fix.state.reported if fix.evidence is None else fix.evidence.reason
+                    out.append(Interruption(fix.stamp, fix.stamp, 1, reason))
+            found, going_on = found or has, found and not has
+        return out
+
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres.
 
@@ -101,6 +140,7 @@ class RunResult:
             "first_fix_m": None if self.driven is None else round(self.driven, 3),
             "frames": self.frames,
             "posed": len(self.posed),
+            "interruptions": [each.to_json() for each in self.interruptions],
             "skipped": self.skipped,
             "sources": list(self.sources),
             "map_sha256": base_map.sha256,
@@ -230,6 +270,7 @@ def summary(located: RunResult) -> str:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m")
         lines.append(f"{'found':<18} {_found(located, posed[0])}")
+        lines.extend(f"{'without a pose':<18} {text}" for text in _interrupted(located))
         if located.calibration is not None:
             lines.extend(f"{'calibration':<18} {clause}" for clause in located.calibration.describe(located.mount))
     elif located.keyframes:
@@ -240,6 +281,21 @@ def summary(located: RunResult) -> str:
         p50, p99 = np.quantile(located.seconds, [0.5, 0.99]) * 1e3
         lines.append(f"{'step time':<18} p50 {p50:.1f} ms, p99 {p99:.0f} ms")
     return "\n".join(lines)
+
+
+def _interrupted(located: RunResult) -> list[str]:
+    """Say where poses are missing after the first one: the longest stretches, in the order of the run."""
+    every, begin = located.interruptions, located.fixes[0].stamp
+    longest = sorted(every, key=lambda each: -each.frames)[:_TOLD]
+    lines = [
+        f"{each.frames} frames from {each.first - begin:.1f} s to {each.last - begin:.1f} s: {each.reason}"
+        for each in every
+        if each in longest
+    ]
+    if len(every) > _TOLD:
+        rest = sum(each.frames for each in every) - sum(each.frames for each in longest)
+        lines.append(f"{rest} frames in {len(every) - _TOLD} more places: see result.json")
+    return lines
 
 
 def _found(located: RunResult, first: Fix) -> str:

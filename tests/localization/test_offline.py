@@ -17,7 +17,7 @@ from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.offline import RunResult, locate, summary, write
-from coview_stream.localization.result import Fix
+from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.state import State
 from coview_stream.recordings.open_run import open_run
 
@@ -156,3 +156,27 @@ def test_calibration_of_a_run_that_never_got_a_pose_is_told(world_map):
     """It may be why."""
     fix = Fix(1.0, State.SEARCHING, calibration=Calibration(pitch=0.05))
     assert RunResult(1, [fix]).to_json(world_map)["calibration"]["pitch_deg"] == pytest.approx(2.86)
+
+
+def test_interruptions_are_told_with_their_reason(world_map):
+    def fix(stamp, posed, reason):
+        state = State.TRACKING if posed else State.LOST
+        pose = (np.eye(4), np.eye(4), np.eye(6)) if posed else (None, None, None)
+        return Fix(stamp, state, *pose, evidence=KeyframeEvidence(stamp, state, reason))
+
+    spells = [(4, False, "no place stands out"), (3, True, ""), (2, False, "the scan fits less well"), (1, True, "")]
+    spells += [(1 + k % 3, k % 2 == 0, f"reason {k}") for k in range(1, 8)]
+    fixes, stamp = [], 10.0
+    for frames, posed, reason in spells:
+        for _ in range(frames):
+            fixes.append(fix(stamp, posed, reason))
+            stamp += 0.5
+    found = RunResult(len(fixes), fixes)
+    assert [each.frames for each in found.interruptions] == [2, 2, 1, 3, 2]
+    first = found.to_json(world_map)["interruptions"][0]
+    assert first == {"first_stamp": 13.5, "last_stamp": 14.0, "frames": 2, "reason": "the scan fits less well"}
+    told = summary(found)
+    assert "2 frames from 3.5 s to 4.0 s: the scan fits less well" in told
+    assert "3 frames in 2 more places: see result.json" in told
+    assert "without a pose" not in summary(RunResult(1, fixes[4:5]))
+    assert not RunResult(4, fixes[:4]).interruptions  # before the first fix it is being sought
