@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KINDS",
         help="what is imperfect, e.g. rain,snow:0.4 (a number says how strong); real is all of motion, traffic, rain, "
         "dust, beams, reflectors, glass, mounting, gravity, odometry, slip, strips, density, seasons, years, grass, "
-        "snow (none)",
+        "snow; what was made, with units, is printed at the end (none)",
     )
     parser.add_argument("--dirt-seed", type=int, default=0, help="of what is drawn for the dirt alone (0)")
     parser.add_argument("--utm", action="store_true", help="put the map at UTM-like coordinates")
@@ -75,4 +75,6 @@ def run(args: argparse.Namespace) -> int:
     world = simulate(args.out, config, progress=progress, overwrite=args.overwrite)
     facts = f"{world.base_points} map points, {world.frames} frames, {world.distance:.1f} m driven"
     print(f"{world.directory}: {facts}")
+    for line in config.dirt.describe():
+        print(f"dirt: {line}")
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from coview_stream.errors import ConfigError
 from coview_stream.sim.dirt.beams import Beams
@@ -85,33 +85,49 @@ class Dirt:
         """Whether the robot's frames differ from those of a clean world, besides what was changed in the scene."""
         return any(name in _ON_SENSOR for name in self.kinds)
 
+    def describe(self) -> list[str]:
+        """Say of each kind that is on how strong it is: "snow 0.4: m of snow off the roads"."""
+        chosen = [(name, STRENGTHS[name]) for name in self.kinds]
+        return [f"{name} {getattr(getattr(self, name), each.field):g}: {each.unit}" for name, each in chosen]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the seed and the settings of the kinds that are on as plain values, for JSON."""
         return {"seed": self.seed} | {name: asdict(getattr(self, name)) for name in self.kinds}
 
 
-_STRENGTH: dict[str, tuple[Any, str]] = {
-    "motion": (Motion, "rate"),
-    "traffic": (Traffic, "people"),
-    "rain": (Rain, "drops"),
-    "dust": (Dust, "reach"),
-    "beams": (Beams, "divergence"),
-    "reflectors": (Reflectors, "bloom"),
-    "glass": (Glass, "share"),
-    "mounting": (Mounting, "lean"),
-    "gravity": (Gravity, "error"),
-    "odometry": (Miscalibration, "scale"),
-    "slip": (Slip, "share"),
-    "strips": (Strips, "most"),
-    "density": (Density, "least"),
-    "seasons": (Seasons, "bare"),
-    "years": (Years, "years"),
-    "grass": (Grass, "height"),
-    "snow": (Snow, "depth"),
+class Strength(NamedTuple):
+    """The one setting of a kind of dirt that a number after its name on the command line sets."""
+
+    settings: Any
+    """The kind's dataclass."""
+    field: str
+    """Its field."""
+    unit: str
+    """What the number is, for people."""
+
+
+STRENGTHS: dict[str, Strength] = {
+    "motion": Strength(Motion, "rate", "samples of odometry a second, by which sweeps are deskewed"),
+    "traffic": Strength(Traffic, "people", "people on 100 m of street"),
+    "rain": Strength(Rain, "drops", "share of the beams that meet a drop"),
+    "dust": Strength(Dust, "reach", "m that a beam reaches into the cloud"),
+    "beams": Strength(Beams, "divergence", "mrad of a beam's width"),
+    "reflectors": Strength(Reflectors, "bloom", "degrees of the halo about a sign"),
+    "glass": Strength(Glass, "share", "share of the buildings that have windows"),
+    "mounting": Strength(Mounting, "lean", "degrees that the sensor leans"),
+    "gravity": Strength(Gravity, "error", "degrees of odometry's down"),
+    "odometry": Strength(Miscalibration, "scale", "share by which distances are wrong"),
+    "slip": Strength(Slip, "share", "share of the distance in a burst"),
+    "strips": Strength(Strips, "most", "m by which survey strips disagree at most"),
+    "density": Strength(Density, "least", "pulses per m2 where the survey is thinnest"),
+    "seasons": Strength(Seasons, "bare", "probability that a pulse passes one surface of a bare crown"),
+    "years": Strength(Years, "years", "years between survey and run"),
+    "grass": Strength(Grass, "height", "m of the tallest grass"),
+    "snow": Strength(Snow, "depth", "m of snow off the roads"),
 }
 """For each kind its settings, and the one that a number after its name on the command line sets."""
 
-KINDS_OF_DIRT = tuple(_STRENGTH)
+KINDS_OF_DIRT = tuple(STRENGTHS)
 """Names of all kinds of dirt."""
 
 _ON_SENSOR = frozenset(
@@ -121,7 +137,7 @@ _ON_SENSOR = frozenset(
 
 def real(seed: int = 0) -> Dirt:
     """Return all kinds of dirt at once, each with its default strength: the worst of all seasons in one run."""
-    return Dirt(seed, **{name: settings() for name, (settings, _) in _STRENGTH.items()})
+    return Dirt(seed, **{name: each.settings() for name, each in STRENGTHS.items()})
 
 
 def parse_dirt(text: str, seed: int = 0) -> Dirt:
@@ -138,11 +154,21 @@ def parse_dirt(text: str, seed: int = 0) -> Dirt:
         if word == REAL:
             dirt = real(seed)
             continue
-        if name not in _STRENGTH:
+        if name not in STRENGTHS:
             raise ConfigError(f"dirt: {name!r} is unknown; use {REAL}, or some of {', '.join(KINDS_OF_DIRT)}")
-        settings, strength = _STRENGTH[name]
-        dirt = replace(dirt, **{name: settings(**({strength: _number(word, value)} if value else {}))})
+        dirt = replace(dirt, **{name: _kind(STRENGTHS[name], word, value)})
     return dirt
+
+
+def _kind(strength: Strength, word: str, value: str) -> Any:
+    """Return the settings of a kind that a word such as ``snow:0.4`` names."""
+    if not value:
+        return strength.settings()
+    number = _number(word, value)
+    try:
+        return strength.settings(**{strength.field: number})
+    except ConfigError as error:
+        raise ConfigError(f"dirt: {word!r}, the number being {strength.unit}: {error}") from error
 
 
 def _number(word: str, value: str) -> float:

@@ -77,8 +77,14 @@ def test_the_command_line_takes_dirt(tmp_path, capsys):
     facts = json.loads((tmp_path / "w" / "world.json").read_text())["dirt"]
     assert set(facts) == {"seed", "rain", "mounting"}
     assert (facts["seed"], facts["mounting"]["lean"]) == (4, 3.0)
+    assert "dirt: mounting 3: degrees that the sensor leans" in capsys.readouterr().out
     assert main([*argv, "--dirt", "moon"]) == 2
     assert "moon" in capsys.readouterr().err
+
+
+def test_a_strength_out_of_range_is_told_with_its_unit():
+    with pytest.raises(ConfigError, match=r"'mounting:99', the number being degrees that the sensor leans.*0 and 30"):
+        parse_dirt("mounting:99")
 
 
 @pytest.mark.slow
