@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 
-if not sys.flags.safe_path and sys.path[0] == str(Path.cwd()):
+with suppress(OSError):  # the directory may be gone
+    _HERE = str(Path.cwd())
     # ``-m`` searches the current directory first, where a numpy.py may lie that nobody meant to run; a checkout that is
     # not installed is still found there
-    sys.path.append(sys.path.pop(0))
+    if not sys.flags.safe_path and sys.path[0] == _HERE:
+        sys.path.append(sys.path.pop(0))
 
 from coview_stream.cli import main
 

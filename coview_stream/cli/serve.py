@@ -188,11 +188,13 @@ def _serve(
     while opening.is_alive() and not stop.wait(0.05):
         pass
     answered = 0
-    while not (failed or stop.wait(60.0)):
-        if len(hangups) > answered:
+    while not failed:
+        if len(hangups) > answered:  # before the wait, too: one may have come while the node was opened
             answered = len(hangups)
             for node in opened:
                 node.reload()
+        if stop.wait(60.0):
+            break
     Notifier().stopping()
     if failed and not stop.requested:
         raise failed[0]

@@ -10,6 +10,7 @@ import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
@@ -95,6 +96,7 @@ class Localizer:
         self._confidence = 0.0  # of the search that found the place
         self._lean_is_told = True  # by a registration at the place
         self._leader: Pose | None = None  # T_map_odom of the place that leads the search
+        self._levelled_at: Floats | None = None  # position in the odometry frame where the search was levelled anew
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
@@ -238,10 +240,8 @@ class Localizer:
         """
         if self.state.has_place:
             return
-        doubted = known.doubted()
-        if doubted.sigma_tilt + doubted.sigma_scale < self.calibration.sigma_tilt + self.calibration.sigma_scale:
-            self._frames.correction.estimator.restore(doubted)
-        if abs(self._tracker.ground.metres) < abs(known.ground):
+        self._frames.correction.estimator.learn(known.doubted())
+        if not self._tracker.ground.learned:
             self._tracker.ground.restore(known.ground)
 
     def require_verification(self) -> None:
@@ -262,8 +262,9 @@ class Localizer:
         keyframe = None
         if searching:
             # what has been searched with leant: level it, and search again at once
-            leant = self._buffer.lean(frame.R_body_cloud) > _SMEARED
+            leant = self._buffer.lean(frame.R_body_cloud) > _SMEARED and self._has_driven_on(frame.T_odom_body)
             if leant:
+                self._levelled_at = frame.T_odom_body[:3, 3].copy()
                 self._buffer.level(frame.R_body_cloud)
                 self._next_epoch()
                 if self._leader is not None and self._frames.anchor is not None:
@@ -272,6 +273,11 @@ class Localizer:
         self._tracker.add_scan(frame.voxels, frame.T_odom_body)
         self._newest = frame
         return frame, keyframe
+
+    def _has_driven_on(self, T_odom_body: Pose) -> bool:
+        """Tell whether the robot has driven on since the search was levelled: places seen from here say nothing new."""
+        at = self._levelled_at
+        return at is None or float(np.linalg.norm(T_odom_body[:3, 3] - at)) >= self.config.keyframe.distance
 
     def _start_tracking(self, found: Registration, result: SearchResult, newest: Frame) -> Frame:
         """Begin at an accepted place, registered for a keyframe; return the newest frame, levelled by what that tells.
@@ -414,7 +420,8 @@ class Localizer:
         if self._frames.anchor is not None:
             self._hints.odometry_continues(self._tracker.T_map_odom, self._frames.anchor)
         self._frames.forget_odometry()
-        self._leader = None
+        self._leader = self._levelled_at = None
+        self._tracker.ground.restore(self._tracker.ground.metres)
         self._buffer.clear()
         self._odometry_check.clear()
         self._tracker.forget_odometry()
@@ -424,6 +431,8 @@ class Localizer:
         """Search again from nothing: the keyframes so far do not fit together with what is seen now."""
         self._buffer.clear()
         self._leader = None
+        self._hints.forget_led()
+        self._frames.correction.estimator.forget_leader()
         self._frames.correction.forget_frame()
         self._tracker.forget_scans()
         self._next_epoch()

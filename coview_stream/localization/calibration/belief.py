@@ -74,6 +74,19 @@ class Belief:
         self.P[:4, :4] = np.diag(np.square(sigmas))
         self._stand_straight()
 
+    def learn(self, known: Calibration) -> None:
+        """Take over what was known of this robot before, as far as it is known better than here."""
+        own = self.applied()
+        values = np.array([known.roll, known.pitch, known.scale, known.turn])
+        sigmas = (known.sigma_tilt, known.sigma_scale, known.sigma_turn)
+        for group, sigma, here in zip(_GROUPS, sigmas, (own.sigma_tilt, own.sigma_scale, own.sigma_turn), strict=True):
+            if sigma < here:
+                self.x[group.axes] = values[group.axes]
+                self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
+                axes = np.arange(SIZE)[group.axes]
+                self.P[axes, axes] = sigma**2
+        self._stand_straight()
+
     def begin_odometry(self) -> None:
         """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
         self.x[GRAVITY.axes] = 0.0
@@ -139,12 +152,13 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
     def sigma(a: float, b: float, apart: float) -> float:
         return math.sqrt(mean(a**2, b**2) + share * (1.0 - share) * apart**2)
 
+    apart = math.hypot(one.roll - other.roll, one.pitch - other.pitch) / math.sqrt(2.0)  # of each of the two
     return Calibration(
         mean(one.roll, other.roll),
         mean(one.pitch, other.pitch),
         mean(one.scale, other.scale),
         mean(one.turn, other.turn),
-        sigma(one.sigma_tilt, other.sigma_tilt, math.hypot(one.roll - other.roll, one.pitch - other.pitch)),
+        sigma(one.sigma_tilt, other.sigma_tilt, apart),
         sigma(one.sigma_scale, other.sigma_scale, one.scale - other.scale),
         sigma(one.sigma_turn, other.sigma_turn, one.turn - other.turn),
     )

@@ -55,6 +55,17 @@ class CalibrationEstimator:
         self._known.restore(known)
         self._apply()
 
+    def learn(self, known: Calibration) -> None:
+        """Take over what was known of this robot before, as far as it is known better than here."""
+        self._supposed = None
+        self._known.learn(known)
+        self._apply()
+
+    def forget_leader(self) -> None:
+        """Forget what was supposed of a place that led a search."""
+        self._supposed = None
+        self._apply()
+
     def begin_odometry(self) -> None:
         """Forget how odometry's frame leans, for another one begins; what is known of the robot stays."""
         self._supposed = None

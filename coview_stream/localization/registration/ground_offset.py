@@ -59,14 +59,19 @@ class GroundOffset:
     """
 
     def __init__(self) -> None:
-        self._none, self._some = _NONE * _ZERO, (1.0 - _NONE) * _ANY
-        self.clear()
+        self.restore(0.0)
+
+    @property
+    def learned(self) -> bool:
+        """Whether a registration has told anything since the place was found."""
+        return self._views > 0
 
     def restore(self, metres: float) -> None:
         """Begin, now and at each place that is found, with the offset that was known at this site before.
 
         It is a third hypothesis, the most probable one until registrations tell another; next to nothing restores none.
         """
+        self._none, self._some = _NONE * _ZERO, (1.0 - _NONE) * _ANY
         if abs(metres) > 2.0 * _NONE_SIGMA:
             known = _normal(_CHANGED, _OFFSETS - np.clip(metres, _OFFSETS[0], _OFFSETS[-1]))
             self._some = _STILL * known + (1.0 - _STILL) * (1.0 - _NONE) * _ANY

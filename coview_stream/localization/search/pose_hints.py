@@ -45,6 +45,10 @@ class PoseHints:
         """Hint that ``T_map_odom`` (4, 4) about ``anchor`` (3,) led a search that has begun anew; one at a time."""
         self._led = (T_map_odom @ pose_from(np.eye(3), -anchor),)
 
+    def forget_led(self) -> None:
+        """Forget the place that led: the odometry that it is tied to has been contradicted."""
+        self._led = ()
+
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return them as ``T_map_odom`` about ``anchor``, at a frame of pose ``T_odom_body`` about it as well."""
         if self._awaited is not None:

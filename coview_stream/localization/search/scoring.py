@@ -313,6 +313,7 @@ class PlaceScorer:
         """Return log-likelihood ratios (P,), and the shares (P,) of what is as the map has it."""
         mean = followed.observed.mean(axis=1)
         if not len(mean):
+            self._scatter.append(np.full(4, np.nan))
             return np.empty(0), np.empty(0)
         structure, free = np.mean([each.patches for each in (*self._scans, seen)], axis=0)
         patches = float(structure), float(free)

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import chdtrc, chdtri
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
@@ -258,12 +259,12 @@ class Tracker:
         if plausible and not matters(metres, degrees):
             return match
         gap, spread = match.T_map_body[:3, 3] - led[:3, 3], belief.covariance[3:, 3:] + match.covariance[3:, 3:]
-        limit = self.config.acceptance.max_innovation
-        turned = float(gap @ np.linalg.solve(spread, gap)) <= limit  # and no more than that
-        if turned and not matters(metres, degrees):
+        rare = chdtrc(6, self.config.acceptance.max_innovation)  # probability of what is not plausible any more
+        here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chdtri(3, rare)
+        if here and not matters(0.0, degrees):
             return replace(match, moves_place=True)
-        level = gap[2] ** 2 <= limit * spread[2, 2]
-        moves = turned or (level and not matters(metres, degrees))
+        level = gap[2] ** 2 <= chdtri(1, rare) * spread[2, 2]
+        moves = here or (level and not matters(metres, degrees))  # here, but turned; or so near that it does not matter
         if not moves:
             places = [each.T_map_body for each in tries if each.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for each in tries for rival in each.rivals]

@@ -173,7 +173,7 @@ class EngineFeed:
         now, before = time.monotonic(), self._died_at[engine]
         self._died_at[engine] = now
         self._deaths[engine] = self._deaths[engine] + 1 if now - before < _LIFE else 1
-        self._stopping.wait(min(0.1 * 2.0 ** self._deaths[engine], _MAX_RESTART_PAUSE))
+        self._stopping.wait(min(0.1 * 2.0 ** min(self._deaths[engine], 10), _MAX_RESTART_PAUSE))
 
 
 def _take_job(session: Session, engine: str) -> Job | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import threading
 import time
@@ -13,8 +14,11 @@ from typing import Any
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.node import Node
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.keys import NodeKeys
 from coview_stream.version import __version__
+
+log = logging.getLogger(__name__)
 
 _MAX_BEAT = 2.0  # seconds without a tick of the pose clock, besides two of its periods; set by hand
 _INTERVAL = 1.0  # seconds between two documents; set by hand
@@ -35,6 +39,7 @@ class NodeHealth:
     def __init__(self, node: Node, needs_connection: bool = False) -> None:
         self._node = node
         self._needs_connection = needs_connection
+        self._errors = RateLimitedErrors(log)
 
     def live_reasons(self) -> list[str]:
         """Return why the node is not live; empty if it is."""
@@ -99,7 +104,8 @@ class NodeHealth:
         """Publish the document once a second until ``stopping`` is set."""
         publisher = self._node.transport.publisher(keys.health, "report")
         while not stopping.wait(_INTERVAL):
-            publisher.put(Encoded(json.dumps(self.document()).encode(), "application/json"))
+            with self._errors.catch("health"):  # what cannot be told once must not end the telling
+                publisher.put(Encoded(json.dumps(self.document()).encode(), "application/json"))
 
 
 def prometheus_text(document: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ import json
 import logging
 import socket
 import socketserver
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from typing import Any
 
 from coview_stream.errors import ConfigError
 from coview_stream.stream.node.health import prometheus_text
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.node")
 
@@ -68,6 +70,7 @@ class _Server(HTTPServer):
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         self.document = document
+        self.errors = RateLimitedErrors(log)
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:
@@ -75,7 +78,10 @@ class _Server(HTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: a reader that goes away or is cut off is its own business."""
+        """Report what is not a reader's own business, as it is to go away or to be cut off."""
+        error = sys.exception()
+        if error is not None and not isinstance(error, OSError):
+            self.errors.report("metrics", error)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -82,6 +82,9 @@ class MapReloader:
             self._on_change(True)
             try:
                 self._change(stopping)
+            except Exception as error:  # the next one is to be answered all the same
+                self._note("failed", repr(error))
+                log.exception("the change of the map failed")
             finally:
                 self._busy = False
                 self._on_change(False)

@@ -202,3 +202,13 @@ def test_keyframes_far_apart_are_kept(world_map, world_drive):
     seen = np.array([each.body for each in scorer._scans])
     assert len(seen) == scorer._followed.observed.shape[1] == len(scorer._scatter) < len(scans)
     np.testing.assert_allclose(seen[[0, -1]], [scans[0].T_odom_body[:3, 3], scans[-1].T_odom_body[:3, 3]])
+
+
+def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_drive):
+    """An open field first: what is kept of each keyframe stays that keyframe's when the oldest are forgotten."""
+    for k in range(3):
+        assert not scored(scorer, [], scan_of(world_drive, k % 6)).places
+    for k in range(16):
+        own = scan_of(world_drive, k % 6)
+        assert scored(scorer, some_places(own), own).places
+    assert len(scorer._scans) == len(scorer._scatter)

@@ -154,3 +154,40 @@ def test_metrics_of_a_real_node_are_served(site):
 def test_bad_address_is_refused(address):
     with pytest.raises(ConfigError, match="--metrics"):
         MetricsServer(address, dict)
+
+
+def test_telling_goes_on_after_something_could_not_be_told(site, monkeypatch):
+    calls = []
+
+    def connection():
+        calls.append(1)
+        if len(calls) == 1:
+            raise RuntimeError("the session is being renewed")
+        return Connection(routers=("r",))
+
+    monkeypatch.setattr(site.net, "connection", connection)
+    monkeypatch.setattr("coview_stream.stream.node.health._INTERVAL", 0.01)
+    stopping = threading.Event()
+    health = NodeHealth(site.node, needs_connection=True)
+    thread = threading.Thread(target=health.run, args=(stopping, KEYS), daemon=True)
+    thread.start()
+    until(lambda: len(calls) > 3)
+    stopping.set()
+    thread.join(5.0)
+
+
+def test_a_page_that_cannot_be_made_is_reported(caplog):
+    def document():
+        raise KeyError("engines")
+
+    server = MetricsServer("127.0.0.1:0", document)
+    stopping = threading.Event()
+    thread = threading.Thread(target=server.run, args=(stopping,), daemon=True)
+    thread.start()
+    with contextlib.suppress(http.client.HTTPException, OSError):
+        connection = http.client.HTTPConnection(*server.address.split(":"), timeout=5)
+        connection.request("GET", "/health")
+        connection.getresponse()
+    until(lambda: "metrics" in caplog.text and "engines" in caplog.text)
+    stopping.set()
+    thread.join(5.0)
