@@ -17,8 +17,10 @@ import coview_kernels as kernels
 from coview_stream.basemap import file_format, tiles
 from coview_stream.basemap.likelihood_field import field_arrays
 from coview_stream.basemap.shapes import check_arrays
+from coview_stream.basemap.signature import SigningKey, VerifyKey, read_verify_key
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
+from coview_stream.basemap.trust import FileIdentity, Trust
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
 from coview_stream.errors import ConfigError, CoViewError, MapError
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
@@ -44,7 +46,10 @@ class BaseMap:
         crs: coordinate reference system text of the source, if it had one.
         sources: names and sha256 of the source files.
         sha256: hash of parameters and content; empty until saved or loaded.
+        identity: of the file it was loaded from, None if it was not.
     """
+
+    identity: FileIdentity | None = None
 
     def __init__(self, arrays: file_format.Arrays, parameters: dict[str, Any], sha256: str = "") -> None:
         missing = [name for name in _REQUIRED if name not in arrays]
@@ -106,24 +111,42 @@ class BaseMap:
         return cls(arrays, json.loads(json.dumps(parameters)))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], check: bool = True) -> BaseMap:
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        check: bool = True,
+        verify_key: str | os.PathLike[str] | VerifyKey | Trust | None = None,
+    ) -> BaseMap:
         """Memory-map a ``.coview`` file.
 
         Args:
             path: the file.
             check: compare its content with its checksum, for which the whole file is read; without, :attr:`sha256` is
                 what the file says: for one that another process has just checked.
+            verify_key: public key, or its PEM file, that the map has to be signed with; its content is compared with
+                the signed hashes then, whatever ``check`` says. By :class:`~coview_stream.basemap.trust.Trust` a file
+                that has been compared is not read again.
 
         Raises:
-            MapError: it is missing, damaged or of another version, or an array has another type or shape.
+            MapError: it is missing, damaged or of another version, an array has another type or shape, or it is not
+                signed with the key. InputError: the key cannot be read. DependencyError: no ``cryptography``.
         """
-        loaded = cls(*file_format.load(Path(path), check))
+        if isinstance(verify_key, str | os.PathLike):
+            verify_key = read_verify_key(verify_key)
+        trust = Trust(verify_key) if isinstance(verify_key, VerifyKey) else verify_key
+        file = file_format.open_file(Path(path), check, trust)
+        loaded = cls(file.arrays, file.parameters, file.sha256)
+        loaded.identity = file.identity
         check_arrays(loaded._arrays, loaded.config)
         return loaded
 
-    def save(self, path: str | os.PathLike[str]) -> str:
-        """Write the map atomically and return its sha256; raises :class:`MapError` if that fails."""
-        self.sha256 = file_format.save(Path(path), self._arrays, self.parameters)
+    def save(self, path: str | os.PathLike[str], sign_key: SigningKey | None = None) -> str:
+        """Write the map atomically, signed if there is a key, and return its sha256.
+
+        Raises:
+            MapError: that fails.
+        """
+        self.sha256 = file_format.save(Path(path), self._arrays, self.parameters, sign_key)
         return self.sha256
 
     def __len__(self) -> int:

@@ -1,7 +1,8 @@
 """The ``.coview`` file: safetensors, memory-mapped, versioned, checksummed, written atomically.
 
 safetensors is a length, a JSON header and raw little-endian arrays: nothing in it is executed on loading. The header's
-metadata hold the format version, all parameters, and the sha256 of parameters and arrays.
+metadata hold the format version, all parameters, and the sha256 of parameters and arrays. In a signed file they also
+hold the sha256 of each array and an ed25519 signature of all the rest of the header, so that every byte is covered.
 """
 
 from __future__ import annotations
@@ -10,13 +11,17 @@ import hashlib
 import json
 import math
 import mmap
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from coview_stream.basemap import trust as trusting
+from coview_stream.basemap.signature import SigningKey
+from coview_stream.basemap.trust import FileIdentity, Trust
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.errors import MapError
 
@@ -24,6 +29,23 @@ FORMAT = "coview-map"
 VERSION = 1
 
 Arrays = dict[str, npt.NDArray[Any]]
+
+
+class Loaded(NamedTuple):
+    """Content of a map file.
+
+    Attributes:
+        arrays: memory-mapped, read-only.
+        parameters: how it was built.
+        sha256: of both.
+        identity: of the file that the arrays are mapped from.
+    """
+
+    arrays: Arrays
+    parameters: dict[str, Any]
+    sha256: str
+    identity: FileIdentity
+
 
 _DAMAGE = (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError, MemoryError, OSError)
 _MAX_ARRAYS = 256  # set by hand: ten times what a map has
@@ -35,8 +57,14 @@ _TYPES = {
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
-def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
+def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey | None = None) -> str:
     """Write a map and return its sha256; an existing file stays whole until the new one is complete.
+
+    Args:
+        path: the file.
+        arrays: by name.
+        parameters: plain data.
+        key: signs the file; None leaves it unsigned.
 
     Raises:
         MapError: the directory does not exist or cannot be written, or the path holds something else than a map.
@@ -46,9 +74,12 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any]) -> str:
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     digest = _digest(text, contiguous, lambda name: _chunks(contiguous[name]))
     metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
+    names, header = _layout(contiguous, metadata)
+    if key is not None:
+        trusting.sign(header, {name: trusting.digest(_chunks(contiguous[name])) for name in sorted(names)}, key)
     try:
         with atomic_file(path, sync=True) as file:
-            _write(file, contiguous, metadata)
+            _write(file, contiguous, names, header)
     except OSError as error:
         raise MapError(f"{path}: cannot write the map ({error.strerror}); choose a writable place") from error
     return digest
@@ -68,15 +99,16 @@ def check_target(path: Path) -> None:
         raise MapError(f"{path}: not a regular file; give another name")
     if path.stat().st_size:
         try:
-            header, _ = _header(path)
-        except MapError:
+            with path.open("rb") as file:
+                header, _ = _header(path, file)
+        except (MapError, OSError):
             header = {}
         if header.get("__metadata__", {}).get("format") != FORMAT:
             raise MapError(f"{path}: exists and is no coview map; delete it or give another name")
 
 
-def _write(file: BinaryIO, arrays: Arrays, metadata: dict[str, str]) -> None:
-    """Write the safetensors layout array by array: the library's own writer holds a second copy of everything."""
+def _layout(arrays: Arrays, metadata: dict[str, str]) -> tuple[list[str], dict[str, Any]]:
+    """Return the order of the arrays, and the header."""
     header: dict[str, Any] = {"__metadata__": metadata}
     # those that fill cache lines first, so that each of them begins with one; then the wide types, so that every array
     # begins at a multiple of its item size
@@ -86,62 +118,123 @@ def _write(file: BinaryIO, arrays: Arrays, metadata: dict[str, str]) -> None:
         array = arrays[name]
         begin, end = end, end + array.nbytes
         header[name] = {"dtype": _NAMES[array.dtype.str], "shape": list(array.shape), "data_offsets": [begin, end]}
-    text = json.dumps(header, separators=(",", ":")).encode()
+    return names, header
+
+
+def _header_bytes(header: dict[str, Any]) -> bytes:
+    """Return a header with its length, padded to fill cache lines."""
+    text = trusting.serialized(header)
     text += b" " * (-(8 + len(text)) % _CACHE_LINE)
-    file.write(len(text).to_bytes(8, "little") + text)
+    return len(text).to_bytes(8, "little") + text
+
+
+def _is_exact(file: BinaryIO, header: dict[str, Any], start: int) -> bool:
+    """Return whether a file begins as we would write its header."""
+    try:
+        file.seek(0)
+        return file.read(start) == _header_bytes(header)
+    except (RecursionError, OSError):
+        return False
+
+
+def _write(file: BinaryIO, arrays: Arrays, names: list[str], header: dict[str, Any]) -> None:
+    """Write the safetensors layout array by array: the library's own writer holds a second copy of everything."""
+    file.write(_header_bytes(header))
     for name in names:
         for chunk in _chunks(arrays[name]):
             file.write(chunk)
 
 
 def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
-    """Memory-map a map: its arrays (read-only), parameters and sha256.
+    """Return arrays, parameters and sha256 of :func:`open_file`."""
+    return open_file(path, check)[:3]
+
+
+def open_file(path: Path, check: bool = True, trust: Trust | None = None) -> Loaded:
+    """Memory-map a map, signed or not.
 
     The whole file is read once, to compare it with its checksum, if ``check``; after that only the pages used are in
-    memory.
+    memory. All is of the one file that was opened, whatever takes its name meanwhile.
+
+    Args:
+        path: the file.
+        check: compare its content with its checksum. A file that has to be signed is compared with its signed hashes
+            in any case, unless ``trust`` says that this has been done.
+        trust: demands a signature.
 
     Raises:
-        MapError: missing, not a base map, of another version, truncated, or damaged.
+        MapError: missing, not a base map, of another version, truncated, damaged, changed meanwhile, or not signed
+            with the key. DependencyError: there is a key, and no ``cryptography``.
     """
-    header, start = _header(path)
-    metadata = header.pop("__metadata__", {})
-    if metadata.get("format") != FORMAT:
-        raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
-    if metadata.get("version") != str(VERSION):
-        raise MapError(
-            f"{path}: map format {metadata.get('version')}, this program reads {VERSION}; build the map again"
-        )
     try:
-        if len(header) > _MAX_ARRAYS:
-            raise ValueError(f"{len(header)} arrays, a map has {_MAX_ARRAYS} at most")
-        arrays = {name: _mapped(path, start, entry) for name, entry in sorted(header.items())}
-        if start + sum(array.nbytes for array in arrays.values()) > path.stat().st_size:
-            raise ValueError("its arrays overlap")  # or reading them takes any time
-        digest = str(metadata.get("sha256"))
-        if check:
-            with path.open("rb") as file:
+        file = path.open("rb")
+    except OSError as error:
+        raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
+    with file:
+        identity = trusting.identity(file)
+        header, start = _header(path, file)
+        metadata = header.get("__metadata__", {})
+        if metadata.get("format") != FORMAT:
+            raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
+        if metadata.get("version") != str(VERSION):
+            raise MapError(
+                f"{path}: map format {metadata.get('version')}, this program reads {VERSION}; build the map again"
+            )
+        if trust is not None:
+            trusting.check_signature(path, header, _is_exact(file, header, start), trust.key)
+        try:
+            names = sorted(header.keys() - {"__metadata__"})
+            if len(names) > _MAX_ARRAYS:
+                raise ValueError(f"{len(names)} arrays, a map has {_MAX_ARRAYS} at most")
+            arrays = {name: _mapped(file, identity.size, start, header[name]) for name in names}
+            used = start + sum(array.nbytes for array in arrays.values())
+            if used > identity.size:
+                raise ValueError("its arrays overlap")  # or reading them takes any time
+            if trust is not None and used < identity.size:
+                raise ValueError("it holds bytes of no array, which nobody signed")
+            digest = str(metadata.get("sha256"))
+            if trust is not None and trust.verified != identity:
+                trusting.check_sections(header, lambda name: _read(file, start, header[name]))
+            elif trust is None and check:
                 digest = _digest(metadata["parameters"], arrays, lambda name: _read(file, start, header[name]))
-        parameters = json.loads(metadata["parameters"])
-        if not isinstance(parameters, dict):
-            raise TypeError("its parameters are no object")
-    except _DAMAGE as error:
-        raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
-    if digest != metadata.get("sha256"):
-        raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
-    return arrays, parameters, digest
+            parameters = json.loads(metadata["parameters"])
+            if not isinstance(parameters, dict):
+                raise TypeError("its parameters are no object")
+        except _DAMAGE as error:
+            raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
+        if digest != metadata.get("sha256"):
+            raise MapError(f"{path}: the map is damaged (checksum differs); copy or build it again")
+        if trust is not None and trusting.identity(file) != identity:
+            raise MapError(f"{path}: the map was written to while it was verified; open it again when that is done")
+    return Loaded(arrays, parameters, digest, identity)
 
 
-def _header(path: Path) -> tuple[dict[str, Any], int]:
+def signer(path: Path) -> str | None:
+    """Return the fingerprint of the key that a map says it is signed with, unverified; None if it is not signed.
+
+    Raises:
+        MapError: it is not a map.
+    """
     try:
         with path.open("rb") as file:
-            size = int.from_bytes(file.read(8), "little")
-            if not 2 <= size <= min(path.stat().st_size, 1 << 24):
-                raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
-            text = file.read(size)
-            header = json.loads(text)
+            metadata = _header(path, file)[0].get("__metadata__", {})
+    except OSError as error:
+        raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
+    return str(metadata.get("signer")) if "signature" in metadata else None
+
+
+def _header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
+    try:
+        size = int.from_bytes(file.read(8), "little")
+        if not 2 <= size <= min(os.fstat(file.fileno()).st_size, 1 << 24):
+            raise MapError(f"{path}: not a coview map; build one with 'coview-stream build'")
+        text = file.read(size)
+        header = json.loads(text)
     except OSError as error:
         raise MapError(f"{path}: cannot read the map ({error.strerror}); check the path") from error
     except (ValueError, RecursionError) as error:
+        if isinstance(error, MapError):
+            raise
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
     # only blanks may pad it: JSON would also accept a blank damaged into a line end
     padded = text.rstrip(b" ").endswith(b"}")
@@ -150,17 +243,17 @@ def _header(path: Path) -> tuple[dict[str, Any], int]:
     return header, 8 + size
 
 
-def _mapped(path: Path, start: int, entry: dict[str, Any]) -> npt.NDArray[Any]:
+def _mapped(file: BinaryIO, size: int, start: int, entry: dict[str, Any]) -> npt.NDArray[Any]:
     dtype = np.dtype(_TYPES[entry["dtype"]])
     shape = tuple(entry["shape"])
     begin, end = entry["data_offsets"]
     if not all(type(n) is int and n >= 0 for n in (*shape, begin, end)):
         raise ValueError("a shape or an offset is no natural number")
-    if end - begin != dtype.itemsize * math.prod(shape) or start + end > path.stat().st_size:
+    if end - begin != dtype.itemsize * math.prod(shape) or start + end > size:
         raise ValueError("an array reaches beyond the file")
     if end == begin:
         return np.empty(shape, dtype=dtype)
-    return np.memmap(path, dtype=dtype, mode="r", offset=start + begin, shape=shape)
+    return np.memmap(file, dtype=dtype, mode="r", offset=start + begin, shape=shape)
 
 
 def _read(file: BinaryIO, start: int, entry: dict[str, Any]) -> Iterator[bytes]:

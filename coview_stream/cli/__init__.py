@@ -24,7 +24,7 @@ PROGRAM = "coview-stream"
 
 COMMANDS = (
     *("demo", "build", "info", "locate", "eval", "simulate", "airborne"),
-    *("serve", "replay", "watch", "doctor", "train"),
+    *("serve", "replay", "watch", "doctor", "train", "keygen"),
 )
 """Names in the order of ``--help``."""
 

@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="store features for learned re-localization, 35 MB per km2 (they are, where onnxruntime can be loaded)",
     )
+    parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
     parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
 
 
@@ -41,21 +42,24 @@ def run(args: argparse.Namespace) -> int:
 
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.signature import SigningKey
     from coview_stream.errors import MapError
 
     if args.output.resolve() in [path.resolve() for path in args.maps]:
         raise MapError(f"{args.output}: is one of the scans to read; give the map another name")
     file_format.check_target(args.output)
+    key = None if args.sign is None else SigningKey(args.sign)  # before anything slow
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     options["learned"] = _networks_available() if args.learned is None else args.learned
     begin = time.perf_counter()
     base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
-    base_map.save(args.output)
+    base_map.save(args.output, key)
     print(
         f"{args.output}: {base_map.parameters['source_points']} points read, {len(base_map.points)} kept, "
         f"{len(base_map)} stations, {time.perf_counter() - begin:.1f} s, {args.output.stat().st_size} bytes"
+        + ("" if key is None else f", signed with {key.fingerprint}")
     )
     return 0
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.options import acceptance_config, add_risk, check_picture
+from coview_stream.cli.options import acceptance_config, add_risk, add_verify_key, check_picture
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -28,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, metavar="A.png", help="draw the ambiguity")
     add_risk(parser)
+    add_verify_key(parser)
     parser.set_defaults(risk=None)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
@@ -49,8 +50,9 @@ def run(args: argparse.Namespace) -> int:
     acceptance = AcceptanceConfig() if args.risk is None else acceptance_config(args.risk)
     check_picture("-o", args.output)
     check_picture("--plot", args.plot)
-    base_map = BaseMap.load(args.map)
+    base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     facts = describe(base_map)
+    facts["signature"] = _signature(args.map, args.verify_key is not None)
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
     if args.json:
@@ -108,6 +110,16 @@ def describe(base_map: BaseMap) -> dict[str, object]:
         "sha256": base_map.sha256,
         "parameters": asdict(base_map.config),
     }
+
+
+def _signature(path: Path, verified: bool) -> str:
+    """Describe who signed a map, and whether that has been verified."""
+    from coview_stream.basemap.file_format import signer
+
+    by = signer(path)
+    if by is None:
+        return "none"
+    return f"by {by}, verified" if verified else f"by {by}, it says; --verify-key verifies it"
 
 
 def _learned(base_map: BaseMap) -> str:

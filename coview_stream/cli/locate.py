@@ -16,6 +16,7 @@ from coview_stream.cli.options import (
     add_risk,
     add_run_path,
     add_topics,
+    add_verify_key,
     lidar_config,
     mount_of,
 )
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_registration(parser)
     add_reloc(parser)
     add_risk(parser)
+    add_verify_key(parser)
     parser.add_argument("--no-pictures", action="store_true", help="write no png files")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
 
@@ -67,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         library()  # before anything is read: it may be missing
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
-    base_map = BaseMap.load(args.map)
+    base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     missing = base_map.require_features(args.reloc)
     if missing is not None:
         print(f"{args.map}: {missing}", file=sys.stderr)

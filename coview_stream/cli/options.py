@@ -135,6 +135,16 @@ def mount_of(args: argparse.Namespace) -> Mount:
     return Mount() if args.mount is None else parse_mount(args.mount)
 
 
+def add_verify_key(parser: argparse._ActionsContainer) -> None:
+    """Declare ``--verify-key``."""
+    parser.add_argument(
+        "--verify-key",
+        type=Path,
+        metavar="NAME.pub",
+        help="refuse a map that is not signed with this key (build --sign), or has been changed since",
+    )
+
+
 def add_gravity(parser: argparse._ActionsContainer) -> None:
     """Declare ``--gravity``."""
     parser.add_argument(

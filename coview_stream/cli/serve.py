@@ -18,6 +18,7 @@ from coview_stream.cli.options import (
     add_reloc,
     add_risk,
     add_state,
+    add_verify_key,
     check_codec,
     lidar_config,
     mount_of,
@@ -85,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_registration(parser)
     add_reloc(parser)
     add_risk(parser)
+    add_verify_key(parser)
     add_state(parser)
     operation = parser.add_argument_group("operation (docs/operations.md)")
     operation.add_argument("--node", metavar="NAME", help="the node's own name in its keys (the first robot's)")
@@ -115,6 +117,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     import logging
 
+    from coview_stream.basemap.signature import read_verify_key
     from coview_stream.cli.logs import start_logging
     from coview_stream.cli.signals import stop_on_signals
     from coview_stream.config.node import NodeConfig
@@ -128,6 +131,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
     check_codec("--pose-encoding", args.pose_encoding, POSE_CODECS)
     risk = acceptance_config(args.risk).risk
+    verify_key = None if args.verify_key is None else read_verify_key(args.verify_key)
     lidar = lidar_config(args.odometry, args.gravity, args.max_speed)
     if lidar is not None and (args.odometry_key or args.odometry_encoding):
         raise ConfigError(f"--odometry {KISS_ICP} reads no odometry: leave --odometry-key and -encoding out")
@@ -151,7 +155,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
-        node_keys(args.base, args.node or args.robot[0]), args.metrics,
+        node_keys(args.base, args.node or args.robot[0]), args.metrics, verify_key,
     )  # fmt: skip
     hangups: list[int] = []
     with stop_on_signals(lambda: hangups.append(1)) as stop:

@@ -14,7 +14,10 @@ import socket
 import subprocess
 import sys
 from multiprocessing.connection import Connection
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.trust import Trust
 
 NICE = {"odometry": 2, "track": 4, "search": 10}
 """Niceness of the engines, which stand back: the pose clock and the receiving threads are in the parent. Every pose
@@ -31,6 +34,7 @@ class Opening(NamedTuple):
         reloc: recognizers that propose the places to search at.
         risk: probability of a wrong place below which a search gives one.
         sensor_leans: whether sensors may lean against odometry's gravity.
+        trust: demands that the map is signed; None takes any.
     """
 
     map_path: str
@@ -39,6 +43,7 @@ class Opening(NamedTuple):
     reloc: str
     risk: float
     sensor_leans: bool = True
+    trust: Trust | None = None
 
 
 class EngineChild:

@@ -22,6 +22,7 @@ from coview_stream.stream.node.engine_child import EngineChild, Opening, end
 from coview_stream.stream.node.watchdog import Watchdog
 
 if TYPE_CHECKING:
+    from coview_stream.basemap.trust import Trust
     from coview_stream.stream.node.engines import Engine
     from coview_stream.stream.node.jobs import Job, Result
 
@@ -88,6 +89,7 @@ class EngineProcess:
         sensor_leans: whether sensors may lean against odometry's gravity.
         job_timeout: seconds after which a job counts as hung; set by hand.
         open_timeout: seconds after which opening the map, or preparing for the first job, does; set by hand.
+        trust: demands that the map is signed; None takes any.
         child: started before, to be the first one; None starts one.
     """
 
@@ -103,6 +105,7 @@ class EngineProcess:
         reloc: Reloc = "auto",
         risk: float = AcceptanceConfig.risk,
         sensor_leans: bool = True,
+        trust: Trust | None = None,
         child: EngineChild | None = None,
     ) -> None:
         self.kind = kind
@@ -115,6 +118,7 @@ class EngineProcess:
         self.reloc = reloc
         self.risk = risk
         self.sensor_leans = sensor_leans
+        self.trust = trust
         self._started = child
         self._closed = False
         self._lock = threading.Lock()
@@ -143,7 +147,7 @@ class EngineProcess:
             self._child, self._pipe = started.take()
             self._awaited = ["ready", "prepared"]
             with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
-                asked = (self.registration, self.reloc, self.risk, self.sensor_leans)
+                asked = (self.registration, self.reloc, self.risk, self.sensor_leans, self.trust)
                 self._pipe.send(Opening(self.map_path, self.sha256, *asked))
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:

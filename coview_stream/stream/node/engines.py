@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.trust import Trust
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import MapError, RunError
 from coview_stream.localization.localizer import Localizer
@@ -172,12 +173,18 @@ def kernels_of(kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return engine.kernels, engine.later_kernels
 
 
-def open_engine(kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None) -> Engine:
-    """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map.
+def open_engine(
+    kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None, trust: Trust | None = None
+) -> Engine:
+    """Make the engine ``track``, ``search`` or ``odometry``; the first two load the map, which the node has checked.
+
+    The file that the node has checked may have been changed meanwhile: its hash has to be ``sha256`` and, with
+    ``trust``, it is verified again, unless it is the very file, untouched.
 
     Raises:
-        MapError: an unusable map, or another one than ``sha256`` says. DependencyError: no kiss-icp, or no small_gicp
-            where ``config`` wants it. InputError, DependencyError: it wants learned features, which cannot be used.
+        MapError: an unusable map, not signed, or another one than ``sha256`` says. DependencyError: no kiss-icp, or no
+            small_gicp where ``config`` wants it, or no ``cryptography``. InputError, DependencyError: it wants learned
+            features, which cannot be used.
     """
     if kind == "odometry":
         from coview_stream.stream.node.odometry_engine import OdometryEngine
@@ -185,7 +192,7 @@ def open_engine(kind: str, map_path: str | Path, sha256: str, config: LocalizerC
         return OdometryEngine()
     if config is not None and config.registration.method == "gicp":
         gicp.library()
-    base_map = BaseMap.load(map_path, check=False)  # the node has
+    base_map = BaseMap.load(map_path, check=False, verify_key=trust)
     if base_map.sha256 != sha256:
         raise MapError(f"{map_path}: has been replaced by another map; start the node (serve) again")
     return TrackEngine(base_map, config) if kind == "track" else SearchEngine(base_map, config)

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.signature import VerifyKey
+from coview_stream.basemap.trust import Trust
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
@@ -49,6 +51,7 @@ class ServeOptions:
         risk: probability of a wrong place below which a search gives one.
         node_keys: of the node's own; None for none.
         metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
+        verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
     """
 
     map_path: Path
@@ -67,6 +70,7 @@ class ServeOptions:
     risk: float = AcceptanceConfig.risk
     node_keys: NodeKeys | None = None
     metrics: str | None = None
+    verify_key: VerifyKey | None = None
 
 
 def open_node(
@@ -162,7 +166,9 @@ def start_engines(options: ServeOptions, children: Mapping[str, EngineChild]) ->
     Raises:
         MapError: the map is unusable. CoViewError: it has not what the options ask for.
     """
-    base_map = BaseMap.load(options.map_path)
+    base_map = BaseMap.load(options.map_path, verify_key=options.verify_key)
+    # what has been verified here they need not read again, as long as the file is the same
+    trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
     missing = base_map.require_features(options.reloc)
     if missing is not None:
         log.warning("%s: %s", options.map_path, missing)
@@ -171,7 +177,7 @@ def start_engines(options: ServeOptions, children: Mapping[str, EngineChild]) ->
         kind: EngineProcess(
             kind, str(options.map_path), base_map.sha256, None,
             registration=options.registration, reloc=reloc, risk=options.risk,
-            sensor_leans=options.lidar is None, child=child,
+            sensor_leans=options.lidar is None, child=child, trust=trust,
         )
         for kind, child in children.items()
     }  # fmt: skip
@@ -193,7 +199,7 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     """
     from coview_stream.stream.node.reload import OpenedMap
 
-    if BaseMap.load(options.map_path).sha256 == served:
+    if BaseMap.load(options.map_path, verify_key=options.verify_key).sha256 == served:
         return None
     children = start_children(options.lidar is not None)
     engines: dict[str, EngineProcess] = {}

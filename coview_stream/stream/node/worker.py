@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
             config = LocalizerConfig(
                 registration=method, acceptance=rule, reloc=opening.reloc, sensor_leans=opening.sensor_leans
             )
-            engine = open_engine(kind, opening.map_path, opening.sha256, config)
+            engine = open_engine(kind, opening.map_path, opening.sha256, config, opening.trust)
             pipe.send(("ready", None))
             engine.prepare()
         except CoViewError as error:

@@ -1,0 +1,154 @@
+"""Signatures of map files: ed25519, with keys as PEM files, which ``openssl`` makes and reads as well.
+
+A signature says who made a file; a checksum only says that it arrived as it was sent. It stands inside the file: a map
+and its signature are copied, and replaced, as one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coview_stream.errors import InputError, require_library
+
+REQUIREMENT = "cryptography>=42"
+_DOMAIN = b"coview-map ed25519 1\n"  # so that no other use of a key signs what could be taken for a map
+_PURPOSE = "signed maps"
+_MAX_KEY = 1 << 14  # bytes of a key's file; a PEM file of this kind has some 120
+
+
+@dataclass(frozen=True)
+class VerifyKey:
+    """Public key that maps have to be signed with.
+
+    Attributes:
+        raw: its 32 bytes.
+        name: the file it was read from, for messages.
+    """
+
+    raw: bytes
+    name: str
+
+    @property
+    def fingerprint(self) -> str:
+        """First half of the sha256 of the key's bytes, in hexadecimal digits."""
+        return _fingerprint(self.raw)
+
+    def verifies(self, message: bytes, signature: bytes) -> bool:
+        """Tell whether the key's owner has signed the message."""
+        library = _library("asymmetric.ed25519")
+        invalid = require_library("cryptography.exceptions", REQUIREMENT, _PURPOSE).InvalidSignature
+        try:
+            library.Ed25519PublicKey.from_public_bytes(self.raw).verify(signature, _DOMAIN + message)
+        except (invalid, ValueError):
+            return False
+        return True
+
+
+class SigningKey:
+    """Private key that maps are signed with.
+
+    Args:
+        path: a PEM file, not encrypted.
+
+    Raises:
+        InputError: it cannot be read, or holds no private ed25519 key. DependencyError: no ``cryptography``.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        text = _read(path)
+        kind = _library("asymmetric.ed25519").Ed25519PrivateKey
+        try:
+            key = _library("serialization").load_pem_private_key(text, password=None)
+        except TypeError as error:
+            raise InputError(
+                f"{path}: the key is encrypted; decrypt it for the build (openssl pkey -in {path} -out plain.key)"
+            ) from error
+        except Exception as error:  # also of kinds of keys that the library does not know
+            raise InputError(f"{path}: holds no private key (PEM); make one with 'coview-stream keygen'") from error
+        if not isinstance(key, kind):
+            raise InputError(f"{path}: the key is not ed25519; make one with 'coview-stream keygen'")
+        self._key: Any = key
+        self._raw: bytes = key.public_key().public_bytes_raw()
+
+    @property
+    def fingerprint(self) -> str:
+        """That of its public key."""
+        return _fingerprint(self._raw)
+
+    def sign(self, message: bytes) -> bytes:
+        """Return the 64 bytes that only the owner of this key can make of the message."""
+        return bytes(self._key.sign(_DOMAIN + message))
+
+
+def read_verify_key(path: str | os.PathLike[str]) -> VerifyKey:
+    """Read a public key.
+
+    Raises:
+        InputError: the file cannot be read, or holds no public ed25519 key (PEM). DependencyError: no ``cryptography``.
+    """
+    text = _read(path)
+    kind = _library("asymmetric.ed25519").Ed25519PublicKey
+    if b"PRIVATE KEY-----" in text:
+        raise InputError(f"{path}: is a private key, which belongs where maps are built; give the public one (.pub)")
+    try:
+        key = _library("serialization").load_pem_public_key(text)
+    except Exception as error:  # also of kinds of keys that the library does not know
+        raise InputError(
+            f"{path}: holds no public key (PEM); give the .pub file of 'coview-stream keygen', or that of "
+            "'openssl pkey -pubout'"
+        ) from error
+    if not isinstance(key, kind):
+        raise InputError(f"{path}: the key is not ed25519; give the .pub file of 'coview-stream keygen'")
+    return VerifyKey(key.public_bytes_raw(), str(path))
+
+
+def make_keys(name: str | os.PathLike[str]) -> tuple[Path, Path, str]:
+    """Write a new pair of keys, ``NAME.key`` (readable by its owner only) and ``NAME.pub``.
+
+    Returns:
+        Both paths and the fingerprint.
+
+    Raises:
+        InputError: one of them exists, or cannot be written. DependencyError: no ``cryptography``.
+    """
+    private, public = Path(f"{os.fspath(name)}.key"), Path(f"{os.fspath(name)}.pub")
+    form = _library("serialization")
+    key = _library("asymmetric.ed25519").Ed25519PrivateKey.generate()
+    secret = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption())
+    known = key.public_key().public_bytes(form.Encoding.PEM, form.PublicFormat.SubjectPublicKeyInfo)
+    if public.exists():  # before the private one is there
+        raise InputError(f"{public}: exists; a key is never overwritten: give another name")
+    for path, content, mode in ((private, secret, 0o600), (public, known, 0o644)):
+        try:
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+                file.write(content)
+        except FileExistsError as error:
+            raise InputError(f"{path}: exists; a key is never overwritten: give another name") from error
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be written ({error.strerror}); give a name in a writable place"
+            ) from error
+    return private, public, _fingerprint(key.public_key().public_bytes_raw())
+
+
+def _fingerprint(raw: bytes) -> str:
+    return hashlib.sha256(raw).hexdigest()[:32]
+
+
+def _library(module: str) -> Any:
+    return require_library(f"cryptography.hazmat.primitives.{module}", REQUIREMENT, _PURPOSE)
+
+
+def _read(path: str | os.PathLike[str]) -> bytes:
+    try:
+        with Path(path).open("rb") as file:
+            text = file.read(_MAX_KEY + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the key ({error.strerror}); check the path") from error
+    if len(text) > _MAX_KEY:
+        raise InputError(f"{path}: too large for a key; give a PEM file, such as 'coview-stream keygen' makes")
+    return text

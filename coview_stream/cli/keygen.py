@@ -1,0 +1,23 @@
+"""``coview-stream keygen``: a pair of keys to sign maps with, and to verify them by."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+HELP = "make a pair of keys to sign maps with (build --sign) and to verify them by (--verify-key)"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("name", type=Path, metavar="NAME", help="writes NAME.key (keep it secret) and NAME.pub")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write both keys and print what they are for."""
+    from coview_stream.basemap.signature import make_keys
+
+    private, public, fingerprint = make_keys(args.name)
+    print(f"{private}: signs maps (build --sign); keep it where maps are built, readable by you only")
+    print(f"{public}: verifies them (--verify-key of serve, locate and info); fingerprint {fingerprint}")
+    return 0
