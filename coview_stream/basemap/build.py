@@ -18,7 +18,7 @@ from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.likelihood_field import field_arrays
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
-from coview_stream.basemap.tiles import scaled_normals, sort_by_tile
+from coview_stream.basemap.tiles import scaled_normals, sort_by_tile, unit_normals
 from coview_stream.clouds.cloud import merge
 from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
@@ -88,7 +88,7 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
     sorted_points, packed, index = sort_by_tile(points, scaled_normals(normals, planarity), config.tile)
     surveyed, surveyed_corner = surveyed_cells(points, config.block)
     with _progress_bar(progress, "likelihood field") as step:
-        field = field_arrays(points, normals, surveyed > 0, surveyed_corner, config.block)
+        field = field_arrays(sorted_points, unit_normals(packed), surveyed > 0, surveyed_corner, config.block)
         step(1, 1)
     arrays: Arrays = {
         "origin": origin + shift,

@@ -98,7 +98,6 @@ def _ground_heights(points: Points, normals: Points, flat: Ints, shape: tuple[in
     lowest = np.full(size, np.inf, dtype=np.float32)
     np.minimum.at(lowest, flat, points[:, 2])
     around = min_filter(lowest.reshape(shape), 3).ravel()
-    normals = np.rint(normals * np.float32(127.0)) * np.float32(1.0 / 127.0)  # as a file keeps them
     upward = np.abs(normals[:, 2])
     low = (points[:, 2] < around[flat] + np.float32(_GROUND_BAND)) & (upward > _STEEPEST)
     chosen = points[low].astype(np.float64)
