@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+import socket
 import time
 from multiprocessing.connection import Connection
 
@@ -12,6 +13,7 @@ MODES = ("open", "cut", "flapping", "silent", "slow", "thin", "lossy", "corrupt"
 ``lossy``: a fifth of the pieces is held up as TCP does that sends them again; ``corrupt``: flipped bits."""
 
 _PIECE, _QUEUED = 16_384, 64  # bytes; pieces
+_WINDOW = 65_536  # bytes that TCP takes in before they are forwarded: a thin link does not hold seconds of data
 _SLOW, _THIN, _AGAIN, _EVERY, _FLIPS = 0.2, 125_000.0, 0.2, 2.0, 0.05  # s, bytes per s, s, s, share of pieces
 
 
@@ -37,7 +39,11 @@ class Link:
                 if mode == "cut":
                     self._cut()
 
-        server = await asyncio.start_server(self._accept, "127.0.0.1", self._port)
+        with socket.socket() as listener:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _WINDOW)
+            listener.bind(("127.0.0.1", self._port))
+            server = await asyncio.start_server(self._accept, sock=listener.dup())
         loop.add_reader(conn.fileno(), told)
         flapper = asyncio.create_task(self._flap())
         conn.send("ready")
@@ -81,6 +87,8 @@ class Link:
         try:
             while piece := await reader.read(_PIECE):
                 await queue.put((time.monotonic(), piece))
+                while self._mode == "thin" and queue.qsize() > 1:
+                    await asyncio.sleep(0.01)
         except OSError:
             pass
         finally:

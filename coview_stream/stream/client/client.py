@@ -142,6 +142,8 @@ class RobotClient:
     def send_odometry(self, T_odom_body: Pose, stamp: float) -> None:
         """Publish one odometry sample: (4, 4) odometry <- body, metres, gravity aligned; ``stamp`` in seconds.
 
+        Never waits. The last 1024 samples wait for a link that is held up; then the oldest is dropped, and logged.
+
         Raises:
             InputError: the matrix is no rigid transform, or the stamp is not in seconds.
             TransportError: the client is closed.
@@ -187,7 +189,10 @@ class RobotClient:
         return self._transport.query(self.keys.reset, timeout=timeout)
 
     def close(self) -> None:
-        """Undeclare, end all iterators and close the session unless it is the caller's; idempotent."""
+        """Undeclare, end all iterators and close the session unless it is the caller's; idempotent.
+
+        Takes up to three seconds where the link is held up.
+        """
         self._poses.close()
         self._statuses.close()
         if self._owned and not self._closed:

@@ -101,7 +101,7 @@ class Sender:
         self._last_cloud = time.monotonic()
 
     def put_odometry(self, message: Encoded) -> None:
-        """Publish an odometry sample; waits for the link rather than drop it."""
+        """Publish an odometry sample. Never waits: the last 1024 wait for the link, then the oldest is dropped."""
         self._odometry.put(message)
 
     def settle(self) -> None:

@@ -32,6 +32,9 @@ _DEFAULTS: dict[str, Any] = {
     "transport/unicast/open_timeout": 3000,
     # poses are express, a batch each, and dropped after a millisecond without a free one: room for a fleet's at once
     "transport/link/tx/queue/size/real_time": 16,
+    # the system's buffer, in bytes, which knows no priorities: left alone it grows to 4 MB, and on a thin link odometry
+    # waits behind the clouds in it. With half of this the throughput on one machine fell to a third at times
+    "transport/link/tcp/so_sndbuf": 131072,
 }
 
 # zenoh switches shared memory on by itself. It saves 0.5 ms of 1.5 ms on a 1 MB cloud between processes of one machine,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+from collections import deque
 from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
@@ -15,28 +17,44 @@ from coview_stream.stream.transport.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
 _JSON = "application/json"
+_MAX_WAITING = 1024  # messages that wait for the link; set by hand
+FLUSH = 0.3  # seconds for them at closing; set by hand
 
 Answer = Callable[[dict[str, str]], dict[str, Any]]
 """Handler of a query: from its parameters to the fields of the reply."""
 
 
 class ZenohPublisher:
-    """A publisher that may exist before the session does."""
+    """A publisher that may exist before the session does, and outlive it.
 
-    def __init__(self, key: str, guard: RateLimitedErrors) -> None:
+    Args:
+        key: to publish on.
+        guard: logs what zenoh refuses.
+        writer: publishes in its own time; None publishes on the thread that calls.
+    """
+
+    def __init__(self, key: str, guard: RateLimitedErrors, writer: Writer | None = None) -> None:
         self._key = key
         self._guard = guard
+        self._writer = writer
         self._publisher: Any = None
         self._closed = False
 
     def attach(self, publisher: Any) -> None:
-        """Take zenoh's publisher, once there is a session to declare it on."""
+        """Take zenoh's publisher, once there is a session to declare it on; None when that session ends."""
         self._publisher = publisher
         if self._closed:
             self.close()
 
     def put(self, message: Encoded) -> None:
         """Publish; lost while there is no session yet or no peer."""
+        if self._writer is None:
+            self.write(message)
+        elif self._publisher is not None:
+            self._writer.put(self, message)
+
+    def write(self, message: Encoded) -> None:
+        """Publish now, for as long as the link holds that up."""
         publisher = self._publisher
         if publisher is not None and not self._closed:
             encoding = message.encoding or _UNSET
@@ -44,12 +62,65 @@ class ZenohPublisher:
                 publisher.put(message.payload, encoding=encoding, attachment=message.attachment)
 
     def close(self) -> None:
-        """Undeclare; later messages are ignored."""
+        """Undeclare; later messages are ignored. What waits for the link is given 0.3 s."""
+        if self._writer is not None and not self._closed:
+            self._writer.flush(FLUSH)
         self._closed = True
         publisher, self._publisher = self._publisher, None
         if publisher is not None:
             with self._guard.catch(self._key):
                 publisher.undeclare()
+
+
+class Writer:
+    """Queue of what waits for the link rather than being dropped, and the work of the one thread that empties it.
+
+    A link that is half-open holds up whoever writes to it, by seconds: the thread, not its callers. Of more than 1024
+    messages the oldest are dropped, five seconds of odometry at 200 Hz, and that is logged.
+    """
+
+    def __init__(self, guard: RateLimitedErrors) -> None:
+        self._guard = guard
+        self._waiting: deque[tuple[ZenohPublisher, Encoded]] = deque()
+        self._changed = threading.Condition()
+        self._busy = self._ended = False
+
+    def put(self, publisher: ZenohPublisher, message: Encoded) -> None:
+        """Add a message; never waits."""
+        with self._changed:
+            if self._ended:
+                return
+            if len(self._waiting) >= _MAX_WAITING:
+                self._waiting.popleft()
+                self._guard.report("writing", TransportError("the link is held up: the oldest odometry is dropped"))
+            self._waiting.append((publisher, message))
+            self._changed.notify_all()
+
+    def run(self) -> None:
+        """Write until :meth:`end`."""
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                while not (self._waiting or self._ended):
+                    self._changed.wait()
+                if self._ended:
+                    return
+                publisher, message = self._waiting.popleft()
+                self._busy = True
+            publisher.write(message)
+
+    def flush(self, seconds: float) -> bool:
+        """Wait until all is written, ``seconds`` at most; tell whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not (self._waiting or self._busy), seconds)
+
+    def end(self) -> None:
+        """Let :meth:`run` return; what still waits is lost."""
+        with self._changed:
+            self._ended = True
+            self._waiting.clear()
+            self._changed.notify_all()
 
 
 def plain(sample: Any, max_payload: int | None = None) -> Sample:
@@ -76,11 +147,12 @@ def quality(urgency: Urgency) -> dict[str, Any]:
         return {"express": True, "priority": priority.REAL_TIME, "congestion_control": congestion.DROP}
     if urgency == "report":
         return {"congestion_control": congestion.DROP}
-    if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link
-        return {"congestion_control": congestion.BLOCK}
+    if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link; before clouds on a thin one
+        return {"priority": priority.INTERACTIVE_HIGH, "congestion_control": congestion.BLOCK}
     # BLOCK_FIRST hands one frame to a background task and drops newer ones meanwhile: put never waits. DROP gives up a
     # big frame half sent after 50 ms, so on a slow link none arrives
-    return {"congestion_control": getattr(congestion, "BLOCK_FIRST", congestion.DROP)}
+    control = getattr(congestion, "BLOCK_FIRST", congestion.DROP)
+    return {"priority": priority.DATA_LOW, "congestion_control": control}
 
 
 class Answers:

@@ -17,7 +17,7 @@ from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
 from coview_stream.stream.transport.zenoh_config import zenoh_errors
-from coview_stream.stream.transport.zenoh_io import Answers, ZenohPublisher, first_reply, plain, quality
+from coview_stream.stream.transport.zenoh_io import FLUSH, Answers, Writer, ZenohPublisher, first_reply, plain, quality
 
 _log = logging.getLogger(__name__)
 
@@ -28,6 +28,7 @@ _NO_ROUTER = "Unable to connect"
 _POLL = 0.02  # a look at the matching status costs microseconds
 _RETRY = 0.5  # between two attempts to find the first router
 _OPEN_TIMEOUT = 2.0  # of opening, for the first attempt: a host that is off does not even refuse
+_CLOSE_TIMEOUT = 1.0  # of zenoh's own closing, which says goodbye on a link that may be held up
 _JOIN_TIMEOUT = 0.4  # for all our threads to end at close; they notice within 0.1
 _EXIT_TIMEOUT = 10.0  # for each thread to end with the process: longer than any attempt to open
 _TOKEN_TIMEOUT = 1.0  # for answers to a question for tokens
@@ -72,6 +73,7 @@ class ZenohTransport:
         self._declared: list[Any] = []  # zenoh undeclares what is not referenced
         self._pending: list[Callable[[Any], None]] = []
         self._answers = Answers(self._guard)
+        self._writer = Writer(self._guard)
         self._session: Any = None
         # a thread inside zenoh while the interpreter shuts down aborts the process: end them all before
         atexit.register(self._at_exit)
@@ -97,10 +99,12 @@ class ZenohTransport:
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
-        publisher = ZenohPublisher(key, self._guard)
+        publisher = ZenohPublisher(key, self._guard, self._writer if urgency == "data" else None)
 
         def declare(session: Any) -> None:
             publisher.attach(session.declare_publisher(key, **quality(urgency)))
+            if urgency == "data" and not any(thread.name == "coview writer" for thread in self._threads):
+                self._start("writer", self._writer.run)
 
         self._declare(key, declare)
         return publisher
@@ -191,7 +195,10 @@ class ZenohTransport:
         )
 
     def close(self) -> None:
-        """Undeclare everything and end the threads; takes well under a second. Idempotent."""
+        """Undeclare everything and end the threads; takes well under a second, on a link that is held up up to two.
+
+        What waits for the link is given 0.3 s. Idempotent.
+        """
         with self._lock:
             if self._closing.is_set():
                 return
@@ -199,8 +206,10 @@ class ZenohTransport:
             session, self._session = self._session, None
             self._pending.clear()
         if session is not None:
-            with self._guard.catch("closing"):
-                session.close()
+            self._writer.flush(FLUSH)
+            self._writer.end()
+            self._end_session(session)
+        self._writer.end()
         self._answers.end()
         end = time.monotonic() + _JOIN_TIMEOUT
         for thread in self._threads:
@@ -209,6 +218,18 @@ class ZenohTransport:
         self._declared.clear()
         if not any(thread.is_alive() for thread in self._threads):
             atexit.unregister(self._at_exit)
+
+    def _end_session(self, session: Any) -> None:
+        """Close a session, and go on without waiting where a link that is held up keeps it from closing."""
+
+        def end() -> None:
+            with self._guard.catch("closing"):
+                session.close()
+
+        closing = threading.Thread(target=end, name="coview closing", daemon=True)
+        self._threads.append(closing)
+        closing.start()
+        closing.join(_CLOSE_TIMEOUT)
 
     def _at_exit(self) -> None:
         self.close()
