@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import fft
 
+from bench.forest.published import Occupancy, StemTriangles, around
 from bench.forest.query import APART, BEST, Chain, distinct, errors, of_places, of_volume, query_of
 from bench.forest.worlds import Drive
 from bench.harness.clock import Clock
@@ -24,7 +25,18 @@ from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.votes import robust_zscore
 
-METHODS = ("scan context", "co-view", "both", "canopy", "global", "dense", "verified", "search")
+METHODS = (
+    "scan context",
+    "co-view",
+    "both",
+    "canopy",
+    "occupancy",
+    "triangles",
+    "global",
+    "dense",
+    "verified",
+    "search",
+)
 """In the tables' order."""
 
 BASELINES = ("scan context", "co-view", "both", "canopy")  # whose places are registered as well
@@ -44,6 +56,7 @@ class Methods:
         self._learned.prepare()
         self._retrieval.prepare()
         self._canopy = Canopy(base_map.points)
+        self._occupancy, self._triangles = Occupancy(base_map.points), StemTriangles(base_map.points)
         self._chain = Chain(base_map, self.config)
         maps = LocalMaps(base_map, self.config.registration.source_range)
         self._search = GlobalSearch(base_map, replace(self.config, reloc="learned"), maps)
@@ -79,7 +92,7 @@ class Methods:
         }
 
     def _by_hand(self, query: SearchRequest, clock: Clock) -> dict[str, list[Hypothesis]]:
-        """Name places by descriptors and by the heights of the canopy."""
+        """Name places by descriptors, by the heights of the canopy, and as published without learning."""
         stations = self.base_map.stations
         with clock("descriptors"):
             centre = on_ground(query.scan, query)
@@ -91,7 +104,13 @@ class Methods:
         named = {name: of_volume(volume, stations, centre) for name, volume in by_volume.items()}
         centre = on_ground(query.surroundings, query)
         canopy = of_places(self._canopy.places, score.ravel(), heading.ravel(), stations, centre)
-        return named | {"canopy": canopy}
+        view = around(query.surroundings, query.position)
+        with clock("occupancy"):
+            score, heading = self._occupancy.search(view)
+        occupancy = of_places(self._occupancy.places, score, heading, stations, centre)
+        with clock("triangles"):
+            found = self._triangles.search(view)
+        return named | {"canopy": canopy, "occupancy": occupancy, "triangles": of_places(*found, stations, centre)}
 
     def _by_features(
         self, query: SearchRequest, truth: Pose, clock: Clock, places: dict[str, Floats]
