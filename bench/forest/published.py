@@ -40,11 +40,11 @@ class Occupancy:
     """Occupancy as a probability (PROBE, arXiv 2603.05965), at places 2 m apart and all headings.
 
     A cell of the view from above is a Bernoulli variable. The robot's unknown shift from the grid's place is
-    marginalised by a Gaussian over the plane, which in polar cells is the paper's angular uncertainty ``shift / r``. The
-    heading is that of the best cosine of heights; the score a Jaccard index in which a cell counts by ``exp(-KL)`` of the
-    two probabilities, drawn toward one half by their uncertainty, and for less the less certain both are. Not the
-    paper's, whose maps were seen from the ground: what the query has not seen counts for nothing, in the score and in
-    the cosine.
+    marginalised by a Gaussian over the plane, which in polar cells is the paper's angular uncertainty ``shift /
+    r``. The heading is that of the best cosine of heights; the score a Jaccard index in which a cell counts by
+    ``exp(-KL)`` of the two probabilities, drawn toward one half by their uncertainty, and for less the less certain
+    both are. Not the paper's, whose maps were seen from the ground: what the query has not seen counts for nothing,
+    in the score and in the cosine.
     """
 
     RINGS, SECTORS, SHIFT = 20, 60, 1.0  # cells, and metres: the expected error of a place of the grid
