@@ -80,7 +80,9 @@ class RobotClient:
     ) -> None:
         self.keys: RobotKeys = robot_keys(preset, base, robot)
         self._owned = transport is None
-        self._transport = transport if transport is not None else open_client(endpoint, listen, config)
+        self._transport = (
+            transport if transport is not None else open_client(endpoint, listen, config, check_silence=True)
+        )
         self._poses: LatestQueue[PoseMessage] = LatestQueue(MAX_UNREAD_POSES)
         self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(_MAX_UNREAD_STATUSES)
         self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival

@@ -107,7 +107,9 @@ def open_node(
         from coview_stream.stream.node.systemd import Notifier
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
-        transport = open_transport(options.connect, options.listen, options.zenoh_config, options.node.max_payload)
+        transport = open_transport(
+            options.connect, options.listen, options.zenoh_config, options.node.max_payload, check_silence=True
+        )
         warn_if_served_already(transport, options.keys)
         sessions = make_sessions(options, sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)

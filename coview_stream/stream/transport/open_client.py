@@ -15,8 +15,11 @@ def open_client(
     endpoint: str | Sequence[str] | None = None,
     listen: str | Sequence[str] | None = None,
     config: str | Path | None = None,
+    check_silence: bool = False,
 ) -> Transport:
     """Open a zenoh session for a client: to :data:`DEFAULT_ENDPOINT` unless something else is given.
+
+    ``check_silence`` is as for :func:`coview_stream.stream.transport.zenoh_transport.open_transport`.
 
     Raises:
         TransportError: as :func:`coview_stream.stream.transport.zenoh_transport.open_transport`.
@@ -26,7 +29,9 @@ def open_client(
     connect = _listed(endpoint)
     if not connect and not _listed(listen) and config is None:
         connect = [DEFAULT_ENDPOINT]
-    return open_transport(connect, _listed(listen), None if config is None else Path(config))
+    return open_transport(
+        connect, _listed(listen), None if config is None else Path(config), check_silence=check_silence
+    )
 
 
 def _listed(endpoints: str | Sequence[str] | None) -> list[str]:

@@ -6,7 +6,7 @@ import atexit
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -15,6 +15,7 @@ from coview_stream.errors import TransportError
 from coview_stream.messages.types import Sample
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.subscription_check import Subscription, SubscriptionCheck
 from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
 from coview_stream.stream.transport.zenoh_config import zenoh_errors
 from coview_stream.stream.transport.zenoh_io import FLUSH, Answers, Writer, ZenohPublisher, first_reply, plain, quality
@@ -36,7 +37,11 @@ _QUEUE = 1024  # samples; 5 s of 200 Hz odometry. A full queue stops zenoh's rec
 
 
 def open_transport(
-    connect: Sequence[str] = (), listen: Sequence[str] = (), config: Path | None = None, max_payload: int | None = None
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    config: Path | None = None,
+    max_payload: int | None = None,
+    check_silence: bool = False,
 ) -> ZenohTransport:
     """Open a zenoh session.
 
@@ -48,6 +53,8 @@ def open_transport(
         listen: endpoints to listen on.
         config: zenoh configuration file; it wins over our defaults, ``connect`` and ``listen`` win over it.
         max_payload: of a larger message, in bytes, only the size is handed on; None takes in all.
+        check_silence: open the session anew once another one hears what this one does not, see
+            :mod:`coview_stream.stream.transport.subscription_check`; only of a client.
 
     Raises:
         TransportError: if the configuration is wrong or an endpoint cannot be listened on.
@@ -56,13 +63,13 @@ def open_transport(
 
     # RUST_LOG=zenoh=warn prints why a router refuses us; without it this is silent
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
-    return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload)
+    return ZenohTransport(zenoh_config.compose(connect, listen, config), max_payload, check_silence)
 
 
 class ZenohTransport:
     """A zenoh session; made by :func:`open_transport`. All methods may be called from any thread."""
 
-    def __init__(self, config: Any, max_payload: int | None = None) -> None:
+    def __init__(self, config: Any, max_payload: int | None = None, check_silence: bool = False) -> None:
         self._config = config
         self._max_payload = max_payload
         self._waits = zenoh_config.mode_of(config) == "client"
@@ -71,13 +78,17 @@ class ZenohTransport:
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
         self._declared: list[Any] = []  # zenoh undeclares what is not referenced
-        self._pending: list[Callable[[Any], None]] = []
+        self._declarations: list[Callable[[Any], None]] = []  # also those of before, for the session after this one
+        self._publishers: list[ZenohPublisher] = []
+        self._check = SubscriptionCheck(self._listen, self._reopen)
         self._answers = Answers(self._guard)
         self._writer = Writer(self._guard)
         self._session: Any = None
         # a thread inside zenoh while the interpreter shuts down aborts the process: end them all before
         atexit.register(self._at_exit)
         self._open()
+        if check_silence and self._waits and not zenoh_config.has_identity(config):
+            self._start("subscription check", self._check.run, self._closing)
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> None:
         """Call ``handler`` on a thread of its own; ``newest`` keeps one unread sample, ``all`` queues 1024.
@@ -90,16 +101,19 @@ class ZenohTransport:
         size = 1 if policy == "newest" else _QUEUE
         channel = zenoh.handlers.RingChannel if policy == "newest" else zenoh.handlers.FifoChannel
 
+        subscription = self._check.add(key)
+
         def declare(session: Any) -> None:
             subscriber = session.declare_subscriber(key, channel(size))
             self._declared.append(subscriber)
-            self._start(f"subscriber {key}", self._receive, key, subscriber, handler)
+            self._start(f"subscriber {key}", self._receive, subscription, subscriber, handler)
 
         self._declare(key, declare)
 
     def publisher(self, key: str, urgency: Urgency) -> Publisher:
         """Declare a publisher. Errors as in :meth:`subscribe`."""
         publisher = ZenohPublisher(key, self._guard, self._writer if urgency == "data" else None)
+        self._publishers.append(publisher)
 
         def declare(session: Any) -> None:
             publisher.attach(session.declare_publisher(key, **quality(urgency)))
@@ -204,7 +218,7 @@ class ZenohTransport:
                 return
             self._closing.set()
             session, self._session = self._session, None
-            self._pending.clear()
+            self._declarations.clear()
         if session is not None:
             self._writer.flush(FLUSH)
             self._writer.end()
@@ -281,12 +295,44 @@ class ZenohTransport:
         with self._lock:
             if not self._closing.is_set():
                 self._session = session
-                for declare in self._pending:
+                for declare in self._declarations:
                     with self._guard.catch("declaring"):
                         declare(session)
-                self._pending.clear()
                 return
         session.close()
+
+    def _listen(self, keys: Collection[str], seconds: float) -> set[str]:
+        """Listen to keys with another session for ``seconds`` at most; return those on which something came."""
+        import zenoh
+
+        heard: set[str] = set()
+        try:
+            with zenoh_errors("zenoh session"):
+                session: Any = zenoh.open(self._config)
+        except TransportError:
+            return heard
+        try:
+            readers = {key: session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in keys}
+            end = time.monotonic() + seconds
+            while len(heard) < len(keys) and time.monotonic() < end and not self._closing.wait(_POLL):
+                heard |= {key for key in readers.keys() - heard if readers[key].try_recv() is not None}
+        finally:
+            session.close()
+        return heard
+
+    def _reopen(self, keys: str) -> None:
+        """Open the session anew, with all that was declared on it, for it hears nothing on ``keys``."""
+        with self._lock:
+            if self._closing.is_set() or self._session is None:
+                return
+            session, self._session = self._session, None
+            declared, self._declared = self._declared, []
+        _log.warning("another session hears %s and this one does not: opening it anew", keys)
+        for publisher in self._publishers:
+            publisher.attach(None)
+        self._end_session(session)
+        declared.clear()
+        self._keep_trying(SimpleQueue())
 
     def _declare(self, key: str, declare: Callable[[Any], None]) -> None:
         import zenoh
@@ -296,11 +342,10 @@ class ZenohTransport:
         with self._lock:
             if self._closing.is_set():
                 raise TransportError(f"key {key!r}: the transport is closed")
-            if self._session is None:
-                self._pending.append(declare)
-                return
-            with zenoh_errors(f"key {key!r}"):
-                declare(self._session)
+            if self._session is not None:
+                with zenoh_errors(f"key {key!r}"):
+                    declare(self._session)
+            self._declarations.append(declare)
 
     # threads
 
@@ -309,13 +354,17 @@ class ZenohTransport:
         self._threads.append(thread)
         thread.start()
 
-    def _receive(self, key: str, subscriber: Any, handler: Callable[[Sample], None]) -> None:
+    def _receive(self, subscription: Subscription, subscriber: Any, handler: Callable[[Sample], None]) -> None:
         import zenoh
 
         for sample in subscriber:  # ends when the session closes
             if self._closing.is_set():
                 return
+            self._check.heard(subscription)
             if sample.kind == zenoh.SampleKind.PUT:
-                with self._guard.catch(key):
+                # one call at a time, also while the thread of a session before this one still ends
+                with subscription.serial, self._guard.catch(subscription.key):
+                    subscription.handling = True
                     handler(plain(sample, self._max_payload))
+                subscription.handling = False
             del sample  # it may be large, and must not live until the next one comes
