@@ -16,7 +16,6 @@ from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, r
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
 from coview_stream.localization.registration.register import ScanInput
-from coview_stream.localization.search.acceptance import decide
 from coview_stream.localization.search.consensus import Hypothesis, yaw_of_shift
 from coview_stream.localization.search.refinement import Candidate, register_place
 from coview_stream.localization.search.request import SearchRequest
@@ -128,10 +127,8 @@ class Chain:
     ) -> dict[str, Any]:
         """Errors of the best hypothesis and the best candidate, and what would have been believed; plain values."""
         scored, candidates = judged
-        leader = next((each for each in candidates if each.place is scored.places[0]), None)
         return {
             "before": errors(named[0].T_map_odom, truth, query)[:2] if named else None,
             "after": errors(candidates[0].T_map_odom, truth, query)[2:] if candidates else None,
             "passes": bool(candidates) and scored.error < 0.5,
-            "accepted": decide(scored, leader, query, self.config.acceptance).accepted is not None,
         }

@@ -46,9 +46,9 @@ def success(answers: Sequence[Answer], stage: str, metres: float, degrees: float
     return float(np.mean([_within(answer[stage], metres, degrees) for answer in answers]))
 
 
-def false(answer: Answer, believed: str) -> bool:
-    """Whether a wrong pose would have been ``believed``: more probable than not (``passes``), or ``accepted``."""
-    return bool(answer[believed]) and not _within(answer["after"], NEAR_METRES, NEAR_DEGREES)
+def false(answer: Answer) -> bool:
+    """Tell whether a wrong pose had the evidence for it: more probable than not of the places named."""
+    return bool(answer["passes"]) and not _within(answer["after"], NEAR_METRES, NEAR_DEGREES)
 
 
 def _within(errors: Sequence[float] | None, metres: float, degrees: float) -> bool:
@@ -85,8 +85,8 @@ def recall_table(answers: Sequence[Answer]) -> str:
 
 _POSES = (
     "m", "deg", "2 m, 5 deg, %", "registered: m", "deg", "0.3 m, 1 deg, %", "2 m, 5 deg, %", "passes, false",
-    "accepted", "accepted, false",
 )  # fmt: skip
+_GIVEN = ("search gives", "false")
 
 
 def _poses(answers: Sequence[Answer]) -> list[str]:
@@ -95,10 +95,14 @@ def _poses(answers: Sequence[Answer]) -> list[str]:
         *medians(answers, "before", (2, 1)), _percent(success(answers, "before", NEAR_METRES, NEAR_DEGREES)),
         *medians(answers, "after", (3, 2)), _percent(success(answers, "after", EXACT_METRES, EXACT_DEGREES)),
         _percent(success(answers, "after", NEAR_METRES, NEAR_DEGREES)),
-        str(sum(false(answer, "passes") for answer in answers)),
-        str(sum(answer["accepted"] for answer in answers)),
-        str(sum(false(answer, "accepted") for answer in answers)),
+        str(sum(false(answer) for answer in answers)),
     ]  # fmt: skip
+
+
+def _given(answers: Sequence[Answer]) -> list[str]:
+    """How many poses the product's search gave by this one keyframe, and how many of them were false."""
+    given = [answer["found"][0] for answer in answers if answer["found"] is not None]
+    return [str(len(given)), str(sum(metres > NEAR_METRES for metres in given))]
 
 
 def medians(answers: Sequence[Answer], stage: str, digits: tuple[int, int]) -> list[str]:
@@ -115,10 +119,10 @@ def _percent(share: float) -> str:
 def metric_table(answers: Sequence[Answer]) -> str:
     """Poses by learned features: of correlation, and after registration."""
     rows = [
-        [name, str(len(some)), *_poses(some)]
+        [name, str(len(some)), *_poses(some), *_given(some)]
         for name, some in groups(answers)
     ]  # fmt: skip
-    head = ("", "n", f"correlation: {_POSES[0]}", *_POSES[1:])
+    head = ("", "n", f"correlation: {_POSES[0]}", *_POSES[1:], *_GIVEN)
     return table(head, rows)
 
 
