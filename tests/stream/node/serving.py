@@ -23,11 +23,12 @@ FALSE = 1.0  # metres: the world is 68 m wide and its poses are good to a few ce
 class Service:
     """A process that serves a copy of a map, and a robot that goes to and fro on it, ten frames a second."""
 
-    def __init__(self, world_file, drive, folder, **environment):
+    def __init__(self, world_file, drive, folder, router="", robots_router="", **environment):
+        """Listen, and be connected to, unless the endpoints of a router are given: the node's, and the robot's."""
         self.folder, self.drive = folder, drive
         self.map = folder / "site.coview"
         self.map.write_bytes(Path(world_file).read_bytes())
-        self.endpoint, self.notices = free_endpoint(), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.endpoint, self.notices = robots_router or free_endpoint(), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.notices.bind(str(folder / "notify"))
         self.notices.settimeout(30.0)
         with socket.socket() as probe:
@@ -35,9 +36,10 @@ class Service:
             self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
         self._log = []
         notices = {"NOTIFY_SOCKET": str(folder / "notify"), "WATCHDOG_USEC": "1000000"}
+        where = ("--connect", router) if router else ("--listen", self.endpoint)
         self.process = subprocess.Popen(
             python_command(
-                "coview_stream", "serve", str(self.map), "--robot", "r1", "--listen", self.endpoint,
+                "coview_stream", "serve", str(self.map), "--robot", "r1", *where,
                 "--state", str(folder / "state"), "--metrics", self.metrics, "--log-json",
             ),
             env=python_environment() | notices | environment,
