@@ -17,7 +17,7 @@ Group = Literal["calibration", "reported"]
 Class = Literal["ordinary", "outside", "near copies"]
 
 LIDARS = ("vlp16", "mid360", "os64")
-FIRST_SEED = {"calibration": 31_000, "reported": 167_000}
+FIRST_SEED = {"calibration": 31_000, "reported": 215_000}
 STATED = (1e-1, 1e-2, 1e-3)
 """Of a run is noted when its search first states an error below each of these, whether or not it gives the place."""
 

@@ -31,6 +31,21 @@ _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structur
 
 
 @dataclass(frozen=True)
+class Most:
+    """Most independent observations that there can be, however little chance places scatter.
+
+    Attributes:
+        structure: patches of structure that a scan shows.
+        free: cubes of free space that it shows.
+        scans: of how many scans' surroundings the keyframes have seen something: of one, where all see the same.
+    """
+
+    structure: float = np.inf
+    free: float = np.inf
+    scans: float = 1.0
+
+
+@dataclass(frozen=True)
 class Background:
     """Shares at chance places, and how many independent observations a scan is.
 
@@ -98,17 +113,16 @@ def _compared(observed: Floats32) -> Floats:
     return np.column_stack([*shares, -observed[:, Share.PASSED]]).astype(np.float64)
 
 
-def estimate_background(
-    now: Floats32, variance: Floats, kept: Floats32, patches: tuple[float, float] = (np.inf, np.inf)
-) -> Background:
+def estimate_background(now: Floats32, variance: Floats, kept: Floats32, most: Most | None = None) -> Background:
     """Estimate the background from chance places.
 
     Args:
         now: (N, 7) the newest keyframe's observations at them.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
         kept: (K, 7) mean observations, over the keyframes, at those of them that are followed.
-        patches: how many patches of structure and of free space the scan shows: there are no more observations.
+        most: how many independent observations there can be.
     """
+    most = most or Most()
     counts = outcomes(now)
     total = counts.sum(axis=0) + _PSEUDO * np.array(_PSEUDO_SHARES)
     structure = np.maximum(total / total.sum(), _LEAST)
@@ -121,7 +135,7 @@ def estimate_background(
     presumed = chance / _PSEUDO_NUMBER
     number = _CALIBRATED * chance / ((count * seen + _PSEUDO * presumed) / (count + _PSEUDO))
     high = float(3.0 / (1.0 / number[:3]).sum())
-    both = min(high, _MOST, patches[0]), min(float(number[3]), patches[1])
+    both = min(high, most.scans * min(_MOST, most.structure)), min(float(number[3]), most.scans * most.free)
     return Background(structure, passed, _beta(now, kept), both)
 
 

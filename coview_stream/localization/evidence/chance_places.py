@@ -10,7 +10,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.localization.evidence.background import Background, estimate_background, scatter
+from coview_stream.localization.evidence.background import Background, Most, estimate_background, scatter
 from coview_stream.localization.evidence.observed_scan import ObservedScan
 
 # set by hand
@@ -30,7 +30,7 @@ def observe_with_background(
     poses = seen.poses(T_map_odom)
     observed = seen.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), "no")[1]
     places, chance = observed[: len(poses)], observed[len(poses) :]
-    return places, estimate_background(chance, scatter(chance), chance[:0], seen.patches)
+    return places, estimate_background(chance, scatter(chance), chance[:0], Most(*seen.patches))
 
 
 def chance_places(pose: Floats) -> Floats:

@@ -9,6 +9,7 @@ free in the map, or the map is contradicted there. Shares of these are compared,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
@@ -125,12 +126,14 @@ class ObservedScan:
         many: four times as many.
         patches: patches of four metres that its structure fills, and cubes that its free space does: no more
             observations than these are independent.
+        filled: (F,) numbers of those patches, the same for all scans of one odometry.
     """
 
     body: Floats
     few: ScanPart
     many: ScanPart
     patches: tuple[float, float]
+    filled: Ints
 
     @classmethod
     def of(cls, scan: ScanInput) -> ObservedScan:
@@ -141,8 +144,9 @@ class ObservedScan:
         points, height, above = points[order], cloud.height[order], cloud.above[order]
         free = (_seen_through(scan.range_image) @ T[:3, :3].T).astype(np.float32)
         kinds = points[height > STRUCTURE_HEIGHT], points[~above], free[_by_patch(free)]
-        patches = float(_filled(kinds[0][:, :2])), float(_filled(kinds[2]))
-        return cls(np.asarray(T[:3, 3]), ScanPart.of(kinds, _FEW), ScanPart.of(kinds, _MANY), patches)
+        filled = _filled(kinds[0][:, :2] + T[:2, 3])
+        patches = float(len(filled)), float(len(_filled(kinds[2])))
+        return cls(np.asarray(T[:3, 3]), ScanPart.of(kinds, _FEW), ScanPart.of(kinds, _MANY), patches, filled)
 
     def poses(self, T_map_odom: Floats) -> Floats:
         """Return the poses (H, 4) at which level transforms (H, 4, 4) put the scan, as :meth:`ScanPart.look_up`."""
@@ -163,10 +167,16 @@ def _evenly(points: Points, count: int) -> Points:
     return points[np.linspace(0, len(points) - 1, count).astype(np.int64)] if len(points) > count else points
 
 
-def _filled(points: Points) -> int:
-    """Return how many patches, or cubes, points (N, 2) or (N, 3) lie in."""
-    cell = np.floor(points / np.float32(_PATCH)).astype(np.int64) + _OFFSET
-    return len(np.unique(cell @ (1 << np.arange(0, 16 * points.shape[1], 16))))
+def surroundings(scans: Sequence[ObservedScan]) -> float:
+    """Return how many times the surroundings of one of some scans all of them together have seen; 1 if all the same."""
+    each = float(np.mean([len(scan.filled) for scan in scans]))
+    return max(1.0, len(np.unique(np.concatenate([scan.filled for scan in scans]))) / max(each, 1.0))
+
+
+def _filled(points: Points | Floats) -> Ints:
+    """Return the numbers of the patches, or cubes, that points (N, 2) or (N, 3) lie in, each once."""
+    cell = np.floor(points * (1.0 / _PATCH)).astype(np.int64) + _OFFSET
+    return np.unique(cell @ (1 << np.arange(0, 16 * points.shape[1], 16)))
 
 
 def _by_patch(points: Points) -> Ints:

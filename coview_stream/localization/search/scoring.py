@@ -17,10 +17,10 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
-from coview_stream.localization.evidence.background import estimate_background, left_in_mean, scatter
+from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, scatter
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
-from coview_stream.localization.evidence.observed_scan import ObservedScan, Share
+from coview_stream.localization.evidence.observed_scan import ObservedScan, Share, surroundings
 from coview_stream.localization.evidence.posterior import expected_by_chance, posterior
 from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.consensus import Hypothesis
@@ -315,8 +315,9 @@ class PlaceScorer:
         if not len(mean):
             self._scatter.append(np.full(4, np.nan))
             return np.empty(0), np.empty(0)
-        structure, free = np.mean([each.patches for each in (*self._scans, seen)], axis=0)
-        patches = float(structure), float(free)
+        scans = [*self._scans, seen]
+        structure, free = np.mean([each.patches for each in scans], axis=0)
+        most = Most(float(structure), float(free), surroundings(scans))
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, kept = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
         self._scatter.append(scatter(observed.shares[first]))
@@ -324,7 +325,7 @@ class PlaceScorer:
         for last in (False, True):
             known = [each for each in self._scatter if np.isfinite(each).all()] or [self._scatter[-1]]
             spread = np.mean(known, axis=0) * left_in_mean(over_time[chance[asked]])
-            background = estimate_background(observed.shares[first][chance], spread, mean[kept], patches)
+            background = estimate_background(observed.shares[first][chance], spread, mean[kept], most)
             ratios, q = log_likelihood_ratios(mean, background)
             if last:
                 break

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_up_scans import CHANCE, NUMBER, PASSED, chance_places, observation, places_of_their_own, what_was_seen_before
 
-from coview_stream.localization.evidence.background import estimate_background, left_in_mean, outcomes, scatter
+from coview_stream.localization.evidence.background import Most, estimate_background, left_in_mean, outcomes, scatter
 from coview_stream.localization.evidence.observed_scan import Share
 
 NOTHING = np.empty((0, len(Share)), dtype=np.float32)
@@ -37,12 +37,22 @@ def test_known_background_and_number_are_recovered(rng, number):
     assert all(0.5 * number < each < 2.0 * number for each in found.number)
 
 
-@pytest.mark.parametrize(("patches", "expected"), [((7.0, 0.0), (7.0, 0.0)), ((1e3, 1e3), None)])
-def test_a_scan_is_no_more_observations_than_the_patches_that_it_shows(rng, patches, expected):
+@pytest.mark.parametrize(
+    ("most", "expected"), [(Most(7.0, 0.0), (7.0, 0.0)), (Most(1e3, 1e3), None), (Most(7.0, 2.0, 1.5), (10.5, 3.0))]
+)
+def test_a_scan_is_no_more_observations_than_the_patches_that_it_shows(rng, most, expected):
     chance = chance_places(rng, 250, number=60)[:, 0]
     usual = estimate_background(chance, scatter(chance), chance).number
-    found = estimate_background(chance, scatter(chance), chance, patches).number
+    found = estimate_background(chance, scatter(chance), chance, most).number
     assert found == (expected or usual)
+
+
+def test_scans_of_other_surroundings_are_more_observations(rng):
+    """Where chance places are all alike: a hundred observations a scan, and more where more has been seen."""
+    chance = np.tile(chance_places(rng, 1)[:, 0], (250, 1))
+    one, three = (estimate_background(chance, scatter(chance), chance, Most(scans=n)).number[0] for n in (1.0, 3.0))
+    assert one == 100.0
+    assert 100.0 < three <= 300.0
 
 
 def test_correlated_points_are_counted_once(rng):

@@ -7,7 +7,7 @@ import pytest
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
-from coview_stream.localization.evidence.background import estimate_background, scatter
+from coview_stream.localization.evidence.background import Most, estimate_background, scatter
 from coview_stream.localization.evidence.chance_places import chance_places, observe_with_background
 from coview_stream.localization.evidence.observed_scan import ObservedScan, Share
 from coview_stream.localization.registration.prepare_scan import prepare_scan, voxelized
@@ -40,7 +40,7 @@ def test_background_is_what_the_places_around_the_first_pose_explain(world_map, 
     both = np.stack([T_MAP_ODOM, away])
     observed, background = observe_with_background(world_map.field, seen, both)
     chance = seen.few.look_up(world_map.field, chance_places(seen.poses(both)[0]), "no")[1]
-    expected = estimate_background(chance, scatter(chance), chance[:0], seen.patches)
+    expected = estimate_background(chance, scatter(chance), chance[:0], Most(*seen.patches))
     np.testing.assert_allclose(background.structure, expected.structure)
     assert background.passed == pytest.approx(expected.passed)
     assert background.ground == pytest.approx(expected.ground)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
-from coview_stream.localization.evidence.observed_scan import ObservedScan, ScanPart, Share
+from coview_stream.localization.evidence.observed_scan import ObservedScan, ScanPart, Share, surroundings
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
 
@@ -131,3 +133,14 @@ def test_empty_scan_observes_nothing(world_map, truth):
     _, shares, scores = ScanPart.of((nothing,) * 3, (9, 9, 9)).look_up(world_map.field, truth, "no")
     assert not shares.any()
     assert scores.tolist() == [0.0]
+
+
+def test_scans_from_one_place_see_the_surroundings_of_one_and_those_from_afar_of_several(scan):
+    seen = ObservedScan.of(scan)
+    away = scan.T_odom_body.copy()
+    away[0, 3] += 500.0
+    moved = replace(scan.cloud, points=scan.cloud.points + np.float32([500.0, 0.0, 0.0]))
+    other = ObservedScan.of(ScanInput(moved, scan.frame, away))
+    assert surroundings([seen, seen]) == 1.0
+    assert surroundings([seen, other]) == pytest.approx(2.0, abs=0.1)
+    assert surroundings([seen, other, other]) == pytest.approx(2.0, abs=0.1)
