@@ -20,7 +20,6 @@ from coview_stream.stream.node import serve
 from coview_stream.stream.node.engine_process import CancelledError
 from coview_stream.stream.transport import zenoh_transport
 from coview_stream.stream.transport.keys import robot_keys
-from coview_stream.stream.transport.memory_transport import MemoryTransport
 
 PROMISED = 2.0
 SLACK = 2.0  # for the processes of a busy machine
@@ -177,18 +176,8 @@ def test_serve_options_reach_node_config(monkeypatch, world_file):
     assert serve.make_sessions(asked[0], "")[0].lidar is lidar
 
 
-def test_second_node_of_same_robot_is_warned_about(caplog):
-    net = MemoryTransport()
-    net.announce("coview/r2/alive")
-    net.announce("coview/other/alive")
-    serve.warn_if_served_already(net, [robot_keys("native", "coview", name) for name in ("r1", "r2")])
-    (line,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
-    assert "r2" in line
-    assert "coview/r2/alive" in line
-
-
 def test_max_payload_reaches_the_transport(monkeypatch, world_file):
-    def open_transport(*args):
+    def open_transport(*args, **options):
         raise ConfigError(f"asked with {args}")
 
     monkeypatch.setattr(zenoh_transport, "open_transport", open_transport)

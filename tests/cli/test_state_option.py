@@ -88,8 +88,7 @@ def test_unusable_default_state_directory_is_a_warning(monkeypatch, tmp_path, ca
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_serve_runs_last_pose_keeper_unless_no_state(monkeypatch, world_file, tmp_path, kept):
-    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args: MemoryTransport())
-    monkeypatch.setattr(opening, "warn_if_served_already", lambda *args: None)
+    monkeypatch.setattr(zenoh_transport, "open_transport", lambda *args, **more: MemoryTransport())
     for name in ("start", "wait_ready", "close"):
         monkeypatch.setattr(EngineProcess, name, lambda self, *args: None)
     options = opening.ServeOptions(world_file, [robot_keys("native", "coview", "r1")], state=tmp_path if kept else None)

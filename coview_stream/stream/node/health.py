@@ -87,6 +87,8 @@ class NodeHealth:
                 session.keys.robot: {
                     "state": session.state()[0].reported,
                     "reason": session.state()[1],
+                    "served_by": None if (of := node.elections) is None else of.served_by(session.keys.robot),
+                    "serves": of is None or of.served_by(session.keys.robot) == of.node,
                     "pose_rate_hz": node.pose_rates[session.keys.robot].rate(now),
                     "latency_ms": session.queue.latency.to_json(),
                     "counters": session.counters.to_json(),
@@ -132,6 +134,8 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
     names = sorted({state.reported for state in State})
     states = [(labels | {"state": name}, int(robot["state"] == name)) for labels, robot in of_robots for name in names]
     yield from _metric("robot_state", "gauge", "1 for the state that a robot is in", states)
+    serving = [(labels, int(robot["serves"])) for labels, robot in of_robots]
+    yield from _metric("robot_served", "gauge", "Whether this node serves a robot, or stands by for another", serving)
     rates = [(labels, robot["pose_rate_hz"]) for labels, robot in of_robots]
     yield from _metric("pose_rate_hertz", "gauge", "Poses per second", rates)
     latencies = [

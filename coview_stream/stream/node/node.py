@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.stream.node.counters import PoseRate
+from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.engine_feed import EngineFeed
 from coview_stream.stream.node.engine_process import EngineRunner
 from coview_stream.stream.node.jobs import Job
@@ -57,10 +58,12 @@ class Node:
         pose_format: codec of the poses; None leaves it to each robot's keys.
         odometry: runs the jobs of the odometry engine, for robots that send none; None if there are none.
         background: what else has a thread of its own, by name; each runs until the event that it is given is set.
+        elections: whether this node or another one serves a robot; None: this one serves them all.
 
     Attributes:
         sessions: one per robot, those in force; the list given, whose items another map replaces.
         started: local time at which it was made.
+        elections: as given.
         beat: local time at which the pose clock has ticked last.
         reloader: changes the map; None if there is no way to open one.
         feeds: of the engines of the map that is served, and of another that is to take its place.
@@ -76,6 +79,7 @@ class Node:
         pose_format: str | None = None,
         odometry: EngineRunner | None = None,
         background: Mapping[str, Callable[[threading.Event], None]] | None = None,
+        elections: Elections | None = None,
     ) -> None:
         self.sessions = sessions if isinstance(sessions, list) else list(sessions)  # in place: others look at it
         self.transport = transport
@@ -84,11 +88,12 @@ class Node:
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._background = dict(background or {})
-        self._reporter = Reporter(self.sessions, transport, self._errors)
+        self.elections = elections
+        self._reporter = Reporter(self.sessions, transport, self._errors, elections)
         engines = {"track": track, "search": search} | ({"odometry": odometry} if odometry else {})
         self.feeds: tuple[EngineFeed, ...] = (self.make_feed(self.sessions, engines),)
         self._robots = [
-            RobotEndpoints(session, transport, self._reporter, self._wake_engines_for, pose_format)
+            RobotEndpoints(session, transport, self._reporter, self._wake_engines_for, pose_format, elections)
             for session in self.sessions
         ]
         self._ending: threading.Thread | None = None

@@ -9,6 +9,7 @@ from typing import Any
 
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import Encoded, Sample
+from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
 from coview_stream.stream.transport import rmw
@@ -26,6 +27,7 @@ class RobotEndpoints:
         reporter: publishes the robot's status.
         wake_engines: called with the session when there may be a job.
         pose_format: codec of the poses; None leaves it to the robot's keys.
+        elections: whether this node serves it; None: it does.
     """
 
     def __init__(
@@ -35,7 +37,9 @@ class RobotEndpoints:
         reporter: Reporter,
         wake_engines: Callable[[Session], None],
         pose_format: str | None = None,
+        elections: Elections | None = None,
     ) -> None:
+        self._elections = elections
         self._sessions: tuple[Session, ...] = (session,)  # that in force, and perhaps one on another map
         self._switching = threading.Lock()  # no pose of the session before is published after the switch
         self._transport = transport
@@ -122,8 +126,9 @@ class RobotEndpoints:
     def _publish_pose(self, now: float) -> None:
         for session in self._sessions:
             session.tick(now)
-        pose = self.session.pose()
-        if pose is not None and self._publisher is not None:
+        pose, robot = self.session.pose(), self.session.keys.robot
+        serves = self._elections is None or self._elections.claim(robot) is not None
+        if pose is not None and serves and self._publisher is not None:
             encoded = encode_pose(pose, self._pose_format)
             self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
-            self._reporter.rates[self.session.keys.robot].add(now)
+            self._reporter.rates[robot].add(now)

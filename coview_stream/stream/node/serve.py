@@ -15,11 +15,10 @@ from coview_stream.basemap.trust import Trust
 from coview_stream.config import AcceptanceConfig, RegistrationMethod, Reloc
 from coview_stream.config.node import NodeConfig
 from coview_stream.config.odometry import LidarOdometryConfig
-from coview_stream.errors import MapError, TransportError
+from coview_stream.errors import MapError
 from coview_stream.stream.node.engine_child import EngineChild, start_children
 from coview_stream.stream.node.engine_process import CancelledError, DiedError, EngineProcess
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
-from coview_stream.stream.transport.transport import Transport
 
 if TYPE_CHECKING:
     from coview_stream.stream.node.node import Node
@@ -101,6 +100,7 @@ def open_node(
         sha256, engines = start_engines(options, children)
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
+        from coview_stream.stream.node.election import Elections
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
         from coview_stream.stream.node.node import Node
         from coview_stream.stream.node.reload import MapReloader
@@ -110,7 +110,8 @@ def open_node(
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload, check_silence=True
         )
-        warn_if_served_already(transport, options.keys)
+        elections = Elections(options.keys, options.node.status_rate)
+        elections.declare(transport)
         sessions = make_sessions(options, sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
         for name, engine in engines.items():
@@ -121,7 +122,7 @@ def open_node(
         background = {} if options.state is None else {"last-pose": LastPoseKeeper(options.state, sessions).run}
         node = Node(
             sessions, transport, engines["track"], engines["search"], options.node, options.pose_codec,
-            engines.get("odometry"), background,
+            engines.get("odometry"), background, elections,
         )  # fmt: skip
         notifier = Notifier()
         node.reloader = reloader = MapReloader(
@@ -230,21 +231,3 @@ def make_sessions(options: ServeOptions, map_sha256: str) -> list[Session]:
     if options.lidar is None:
         return [Session(keys, map_sha256, options.node, codecs=codecs) for keys in options.keys]
     return [LidarSession(keys, map_sha256, options.node, codecs=codecs, lidar=options.lidar) for keys in options.keys]
-
-
-def warn_if_served_already(transport: Transport, keys: Sequence[RobotKeys]) -> None:
-    """Log which of the robots another node serves too, as far as can be seen from here."""
-    try:
-        # one question for all robots of a base: chunks of the key are base, name and "alive"
-        expressions = {k.alive.rsplit("/", 2)[0] + "/*/alive" for k in keys}
-        held = {token for expression in expressions for token in transport.tokens(expression)}
-    except TransportError as error:
-        log.warning("cannot see whether another node is there: %s", error)
-        return
-    for robot, token in ((k.robot, k.alive) for k in keys):
-        if token in held:
-            log.warning(
-                "another node serves %s already (it holds %s): poses of both go to one key; end one of them",
-                robot,
-                token,
-            )

@@ -7,11 +7,13 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from coview_stream.localization.state import State
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.counters import PoseRate
+from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.scheduling import Rate
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
@@ -32,13 +34,21 @@ class Reporter:
         sessions: one per robot.
         transport: where statuses go to.
         errors: logs what goes wrong.
+        elections: of robots that another node serves nothing is said; None: this one serves them all.
 
     Attributes:
         changed: set it when a state may have changed.
         rates: of each robot's poses; add to it when one goes out.
     """
 
-    def __init__(self, sessions: Sequence[Session], transport: Transport, errors: RateLimitedErrors) -> None:
+    def __init__(
+        self,
+        sessions: Sequence[Session],
+        transport: Transport,
+        errors: RateLimitedErrors,
+        elections: Elections | None = None,
+    ) -> None:
+        self._elections = elections
         self.changed = threading.Event()
         self.rates = {s.keys.robot: PoseRate() for s in sessions}
         self._sessions = sessions
@@ -102,8 +112,13 @@ class Reporter:
         self._reported[robot] = state.reported  # published or not: it is not tried again at once
         if state.reported != before and not closing:
             log.info("%s: %s (%s)", robot, state.reported, reason)
+        claim = None if self._elections is None else self._elections.claim(robot)
+        if self._elections is not None and claim is None:
+            return
         rate, uptime = self.rates[robot].rate(now), now - self._started
         document = status(session, self._connection.connection, self._connection.reconnects, rate, uptime)
+        if claim is not None:
+            document["node"] = replace(claim, ending=closing).to_json()
         if closing:
             document["reason"] = "the node is shutting down"
             if state is State.TRACKING:
