@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
+import re
+import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+_ABANDONED = 86_400.0  # seconds without a byte, after which a part is nobody's; set by hand
 
 
 @contextmanager
 def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """Yield a name that becomes ``path`` at the end of the block, or is deleted if the block raises.
 
-    What processes that were killed have left of the same file is deleted first.
+    What processes that were killed have left of the same file is deleted first: those of this host and its process
+    numbers at once, others, whose processes cannot be seen from here, after a day.
 
     Args:
         path: the file's name; a file that is there stays whole until the new one is complete.
@@ -23,7 +30,7 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be renamed.
     """
-    part = temporary or path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = temporary or path.with_name(f".{path.name}.{_host()}.{os.getpid()}.part")
     if temporary is None:
         _remove_left(path)
     try:
@@ -34,15 +41,25 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
 
 
 def _remove_left(path: Path) -> None:
-    """Delete the parts of ``path`` whose processes are gone; any other file of such a name is left alone."""
-    begin, end = f".{path.name}.", ".part"
+    """Delete the parts of ``path`` that nobody writes any more; any other file of such a name is left alone."""
+    form = re.compile(re.escape(f".{path.name}.") + r"(?:([0-9a-f]{8})\.)?([0-9]{1,10})\.part")
     with contextlib.suppress(OSError):  # the writing that follows says what is wrong with the directory
         for entry in os.scandir(path.parent):
-            process = entry.name[len(begin) : -len(end)]
-            if not (entry.name.startswith(begin) and entry.name.endswith(end) and process.isascii()):
+            found = form.fullmatch(entry.name)
+            if found is None or not 0 < (process := int(found[2])) < 1 << 31:
                 continue
-            if process.isdigit() and 0 < int(process) < 1 << 31 and not _lives(int(process)):
+            ours = found[1] == _host() and not _lives(process)
+            if ours or time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
                 Path(entry.path).unlink(missing_ok=True)
+
+
+def _host() -> str:
+    """Return a short name of this host and of its process numbers, of which each container has its own."""
+    try:
+        numbers = Path("/proc/self/ns/pid").stat().st_ino
+    except OSError:
+        numbers = 0
+    return f"{zlib.crc32(f'{platform.node()} {numbers}'.encode()):08x}"
 
 
 def _lives(process: int) -> bool:

@@ -51,16 +51,24 @@ def test_missing_directory_is_an_os_error(tmp_path):
         pass
 
 
-def test_parts_of_killed_processes_are_removed_and_no_others(tmp_path):
+def test_parts_that_nobody_writes_are_removed_and_no_others(tmp_path):
     path = tmp_path / "a.bin"
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    left = tmp_path / f".a.bin.{gone.pid}.part"
-    kept = [f".a.bin.{os.getppid()}.part", f".b.bin.{gone.pid}.part", ".a.bin.x.part", ".a.bin..part", ".a.bin.-1.part",
-            f".a.bin.{'9' * 40}.part", "a.bin.7.part"]  # fmt: skip
-    for name in [left.name, *kept]:
+    with atomic_path(path) as part:
+        here = part.name.split(".")[3]  # this host and its process numbers
+        part.touch()
+    path.unlink()
+    left = f".a.bin.{here}.{gone.pid}.part"
+    elsewhere = f".a.bin.0badc0de.{gone.pid}.part"  # a container of the same volume: its process may live
+    kept = [f".a.bin.{here}.{os.getppid()}.part", elsewhere, f".b.bin.{here}.{gone.pid}.part", ".a.bin.x.part",
+            ".a.bin..part", f".a.bin.{here}.-1.part", f".a.bin.{here}.{'9' * 40}.part", "a.bin.7.part",
+            f".a.bin.{gone.pid}.part"]  # fmt: skip
+    old = [".a.bin.0badc0de.7.part", ".a.bin.8.part"]  # of elsewhere, and of an earlier release
+    for name in [left, *kept, *old]:
         (tmp_path / name).write_bytes(b"half")
+    for name in [*old, "a.bin.7.part", ".a.bin.x.part"]:
+        os.utime(tmp_path / name, (0, 0))
     with atomic_file(path) as stream:
         stream.write(b"new")
-    assert not left.exists()
     assert {entry.name for entry in tmp_path.iterdir()} == {"a.bin", *kept}
