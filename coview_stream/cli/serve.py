@@ -24,6 +24,7 @@ from coview_stream.cli.options import (
     mount_of,
     writable_state_folder,
 )
+from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -93,12 +94,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     operation.add_argument(
         "--metrics",
         nargs="?",
-        const="127.0.0.1:9464",
+        const=METRICS_ADDRESS,
+        type=_host_port,
         metavar="HOST:PORT",
-        help="answer GET /metrics and /health there (no port is opened; 127.0.0.1:9464 if none is named)",
+        help=f"answer GET /metrics and /health there (no port is opened; {METRICS_ADDRESS} if none is named)",
     )
     operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
     operation.add_argument("--quiet", action="store_true", help="log errors only")
+
+
+def _host_port(text: str) -> str:
+    if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
+        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --metrics={METRICS_ADDRESS}")
+    return text
 
 
 def run(args: argparse.Namespace) -> int:
@@ -176,12 +184,13 @@ def _serve(
     from coview_stream.stream.node.serve import open_node
     from coview_stream.stream.node.systemd import Notifier
 
+    notifier = Notifier()
     opened: list[Node] = []
     failed: list[BaseException] = []
 
     def work() -> None:
         try:
-            opened.append(open_node(options, lambda: stop.requested, children))
+            opened.append(open_node(options, lambda: stop.requested, children, notifier))
         except CancelledError:
             pass
         except BaseException as error:
@@ -199,7 +208,7 @@ def _serve(
                 node.reload()
         if stop.wait(60.0):
             break
-    Notifier().stopping()
+    notifier.stopping()
     if failed and not stop.requested:
         raise failed[0]
     end = stop.now() + _MAX_SHUTDOWN

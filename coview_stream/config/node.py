@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from coview_stream.config.checks import all_positive, require
 from coview_stream.config.mount import Mount
 
+METRICS_ADDRESS = "127.0.0.1:9464"
+"""Where metrics can be read over HTTP unless another address is named; the port of OpenTelemetry's exporters."""
+
 
 @dataclass(frozen=True)
 class NodeConfig:

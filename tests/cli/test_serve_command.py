@@ -156,7 +156,7 @@ def test_serve_options_reach_node_config(monkeypatch, world_file):
         def close(self, patience):
             return True
 
-    def open_node(options, cancelled, children):
+    def open_node(options, cancelled, children, notifier):
         asked.append(options)
         os.kill(os.getpid(), signal.SIGTERM)
         return Node()
@@ -186,3 +186,9 @@ def test_max_payload_reaches_the_transport(monkeypatch, world_file):
     assert BaseMap.load(world_file).sha256
     with pytest.raises(ConfigError, match="1234"):
         serve.open_node(options)
+
+
+def test_metrics_without_an_address_does_not_swallow_the_map(world_file, capsys):
+    assert main(["serve", "--robot", "r1", "--metrics", str(world_file)]) == 2
+    said = capsys.readouterr().err
+    assert "is no HOST:PORT; write --metrics=127.0.0.1:9464" in said

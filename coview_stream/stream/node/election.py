@@ -4,14 +4,16 @@ The statuses of a robot are the signs of life of the node that serves it; each s
 *term*. A node begins by listening. Where it hears nobody for two and a half statuses it serves, in a term after all
 that it has heard of; where it hears somebody it stands by: it computes everything, to take over with a pose, and
 publishes nothing. Of two that serve (they started at once, or a network was in two parts) the one of the later term
-goes on, and of the same term the one whose name comes first. So a node that was stopped and goes on finds that it has
-been replaced.
+goes on, and of the same term the one whose name comes first; it says so at once to the one that does not. A node that
+has itself been stopped for longer than others wait for it listens again before it says anything. Nobody takes over by
+what is not heard while the network is away.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import socket
 import threading
 import time
 import uuid
@@ -30,6 +32,7 @@ _PATIENCE = 2.5  # of the periods of statuses, of a second at least, before a no
 _MAX_PERIOD = 60.0  # seconds between statuses that are believed
 _MAX_TERM = 1_000_000_000  # of those that are believed
 _MAX_STATUS = 65_536  # bytes: a longer one is none
+_MAX_NAME = 64  # characters of a node's name or host
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,17 @@ class Claim:
         node: name of the node; of the same term the one that comes first wins.
         period: seconds between its statuses.
         ending: it serves no longer.
+        host: name of the machine that it runs on, for people.
     """
 
     term: int
     node: str
     period: float = 1.0
     ending: bool = False
+    host: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.node} on {self.host}" if self.host else self.node
 
     def outranks(self, other: Claim) -> bool:
         """Tell whether this node goes on where both serve."""
@@ -54,7 +62,7 @@ class Claim:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as it stands in a status."""
-        return {"id": self.node, "term": self.term, "period_s": self.period, "ending": self.ending}
+        return {"id": self.node, "term": self.term, "period_s": self.period, "ending": self.ending, "host": self.host}
 
 
 def claim_in(payload: bytes) -> Claim | None:
@@ -64,14 +72,20 @@ def claim_in(payload: bytes) -> Claim | None:
     try:
         node = json.loads(payload)["node"]
         term, name, period, ending = node["term"], node["id"], node["period_s"], node["ending"]
-    except (ValueError, KeyError, TypeError, RecursionError):
+        host = node.get("host", "")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
     numbers = type(term) is int and isinstance(period, int | float) and type(period) is not bool
-    if not (numbers and isinstance(name, str) and isinstance(ending, bool)):
+    if not (numbers and isinstance(ending, bool) and _is_name(name) and name and _is_name(host)):
         return None
-    if not (0 <= term <= _MAX_TERM and 0.0 < period <= _MAX_PERIOD and 0 < len(name) <= 64):
+    if not (0 <= term <= _MAX_TERM and 0.0 < period <= _MAX_PERIOD):
         return None
-    return Claim(term, name, float(period), ending)
+    return Claim(term, name, float(period), ending, host)
+
+
+def _is_name(text: object) -> bool:
+    """Whether it can be logged."""
+    return isinstance(text, str) and len(text) <= _MAX_NAME and text.isprintable()
 
 
 class Election:
@@ -81,16 +95,20 @@ class Election:
         node: name of this node.
         period: seconds between its statuses.
         now: when it began to listen.
+        host: name of this machine.
 
     Attributes:
         claim: this node's; None while it stands by.
         other: the newest claim of another node that it stands by for.
+        challenges: how often a node has been heard that serves as well, and has to be told not to.
     """
 
-    def __init__(self, node: str, period: float, now: float) -> None:
-        self._node, self._period = node, period
+    def __init__(self, node: str, period: float, now: float, host: str = "") -> None:
+        self._node, self._period, self._host = node, period, host
         self._patient_until = now + _PATIENCE
+        self._ticked: float | None = None
         self._latest_term = 0
+        self.challenges = 0
         self.claim: Claim | None = None
         self.other: Claim | None = None
 
@@ -100,6 +118,7 @@ class Election:
             return
         self._latest_term = max(self._latest_term, claim.term)
         if self.claim is not None and not claim.outranks(self.claim):
+            self.challenges += not claim.ending
             return
         if not claim.ending:
             self.claim = None
@@ -108,10 +127,23 @@ class Election:
 
     def tick(self, now: float) -> Claim | None:
         """Let time pass; return the claim if this node serves."""
-        if self.claim is None and now >= self._patient_until:
-            self.claim = Claim(min(self._latest_term + 1, _MAX_TERM), self._node, self._period)
+        before, self._ticked = self._ticked, now
+        if before is not None and now - before >= _PATIENCE * max(1.0, self._period):
+            self.claim = None  # it was stopped, and another one may have taken over
+            self.wait(now)
+        if self.is_due(now):
+            self._latest_term = min(self._latest_term + 1, _MAX_TERM)
+            self.claim = Claim(self._latest_term, self._node, self._period, host=self._host)
             self.other = None
         return self.claim
+
+    def is_due(self, now: float) -> bool:
+        """Whether it takes over at the next tick."""
+        return self.claim is None and now >= self._patient_until
+
+    def wait(self, now: float) -> None:
+        """Listen anew, unless this node serves: that nobody has been heard so far says nothing."""
+        self._patient_until = max(self._patient_until, now + _PATIENCE)
 
 
 class Elections:
@@ -121,20 +153,28 @@ class Elections:
         keys: of each robot.
         status_rate: of this node's statuses, per second.
         clock: seconds, monotonic.
+        needs_connection: nobody is heard, and nobody listens, as long as the network is away.
     """
 
     def __init__(
-        self, keys: Sequence[RobotKeys], status_rate: float, clock: Callable[[], float] = time.monotonic
+        self,
+        keys: Sequence[RobotKeys],
+        status_rate: float,
+        clock: Callable[[], float] = time.monotonic,
+        needs_connection: bool = False,
     ) -> None:
         self.node = uuid.uuid4().hex[:12]
-        self._clock = clock
+        self._clock, self._needs_connection = clock, needs_connection
         self._keys = {k.robot: k for k in keys}
         self._lock = threading.Lock()
-        self._of = {robot: Election(self.node, round(1.0 / status_rate, 3), clock()) for robot in self._keys}
-        self._told: dict[str, str | None] = {}  # who serves it, as has been logged
+        host, period = socket.gethostname()[:_MAX_NAME], round(1.0 / status_rate, 3)
+        self._of = {robot: Election(self.node, period, clock(), host) for robot in self._keys}
+        self._told: dict[str, Claim | None] = {}  # who serves it, as has been logged
+        self._transport: Transport | None = None
 
     def declare(self, transport: Transport) -> None:
         """Listen from now on."""
+        self._transport = transport
         for robot, keys in self._keys.items():
             transport.subscribe(keys.status, self._listener(robot), "all")
 
@@ -147,19 +187,38 @@ class Elections:
 
         return heard
 
+    def check_connection(self) -> None:
+        """Do not take over by what is not heard while nothing is connected; call it at least once in a second."""
+        if not self._needs_connection or self._transport is None:
+            return
+        connection = self._transport.connection()
+        if not (connection.routers or connection.peers):
+            with self._lock:
+                for election in self._of.values():
+                    election.wait(self._clock())
+
     def claim(self, robot: str) -> Claim | None:
         """Return this node's claim to a robot; None while it stands by."""
+        election = self._of[robot]
+        if election.is_due(self._clock()):  # without the lock: as good as a moment ago
+            self.check_connection()
         with self._lock:
-            election = self._of[robot]
             claim, other = election.tick(self._clock()), election.other
-        serving = self.node if claim is not None else None if other is None else other.node
-        if serving is not None and self._told.get(robot) != serving:
-            before, self._told[robot] = self._told.get(robot), serving
-            if claim is None:
-                log.warning("%s: node %s serves it: standing by, to take over when that one is gone", robot, serving)
-            elif before is not None:
-                log.warning("%s: node %s is gone: serving it now", robot, before)
+            serving, before = claim or other, self._told.get(robot)
+            news = serving is not None and (before is None or before.node != serving.node)
+            if news:
+                self._told[robot] = serving
+        if news and claim is None:
+            log.warning("%s: node %s serves it: standing by, to take over when that one is gone", robot, serving)
+        elif news and before is not None:
+            log.warning("%s: node %s is gone: serving it now", robot, before)
         return claim
+
+    def told(self, robot: str) -> tuple[bool, int]:
+        """Return what others have to be told at once when it is another than before."""
+        claim = self.claim(robot)
+        with self._lock:
+            return claim is not None, self._of[robot].challenges
 
     def served_by(self, robot: str) -> str | None:
         """Return the name of the node that serves a robot, as far as this one knows."""

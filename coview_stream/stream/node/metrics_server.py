@@ -14,13 +14,12 @@ from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
+from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.errors import ConfigError
 from coview_stream.stream.node.health import prometheus_text
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.node")
-
-DEFAULT_ADDRESS = "127.0.0.1:9464"  # the port that exporters of OpenTelemetry use
 
 # set by hand
 _MAX_SECONDS = 2.0  # for a whole request, and for its answer
@@ -45,7 +44,7 @@ class MetricsServer:
         try:
             self._server = _Server((host.strip("[]") or "127.0.0.1", int(port)), document)
         except (OSError, ValueError, OverflowError) as error:
-            raise ConfigError(f"--metrics {address!r}: {error}; give HOST:PORT, such as {DEFAULT_ADDRESS}") from error
+            raise ConfigError(f"--metrics {address!r}: {error}; give HOST:PORT, such as {METRICS_ADDRESS}") from error
         self.address = f"{host or '127.0.0.1'}:{self._server.server_port}"
 
     def run(self, stopping: threading.Event) -> None:

@@ -76,6 +76,7 @@ def open_node(
     options: ServeOptions,
     cancelled: Callable[[], bool] = lambda: False,
     children: Mapping[str, EngineChild] | None = None,
+    notifier: Notifier | None = None,
 ) -> Node:
     """Load the map in the engines, open the network and start; what fails leaves nothing running.
 
@@ -83,6 +84,7 @@ def open_node(
         options: what to serve, and where.
         cancelled: asked now and then; True gives up.
         children: from :func:`start_children`, if the engines have been started already.
+        notifier: tells systemd; the caller tells by it that the service ends.
 
     Raises:
         MapError: the map is unusable. ConfigError: robots cannot be told apart. TransportError: no network.
@@ -110,7 +112,7 @@ def open_node(
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload, check_silence=True
         )
-        elections = Elections(options.keys, options.node.status_rate)
+        elections = Elections(options.keys, options.node.status_rate, needs_connection=bool(options.connect))
         elections.declare(transport)
         sessions = make_sessions(options, sha256)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
@@ -124,7 +126,7 @@ def open_node(
             sessions, transport, engines["track"], engines["search"], options.node, options.pose_codec,
             engines.get("odometry"), background, elections,
         )  # fmt: skip
-        notifier = Notifier()
+        notifier = notifier or Notifier()
         node.reloader = reloader = MapReloader(
             node,
             lambda cancelled: open_map(options, node.map_sha256, cancelled),
@@ -163,13 +165,20 @@ def _add_health(node: Node, options: ServeOptions, notifier: Notifier) -> None:
         node.run_beside("systemd", lambda stopping: notifier.run(stopping, lambda: not health.live_reasons()))
 
 
-def start_engines(options: ServeOptions, children: Mapping[str, EngineChild]) -> tuple[str, dict[str, EngineProcess]]:
+def start_engines(
+    options: ServeOptions, children: Mapping[str, EngineChild], base_map: BaseMap | None = None
+) -> tuple[str, dict[str, EngineProcess]]:
     """Check the map and have the engines begin to open it; return its hash and them.
+
+    Args:
+        options: of the node.
+        children: processes that become the engines.
+        base_map: the map, if it has been loaded and verified already.
 
     Raises:
         MapError: the map is unusable. CoViewError: it has not what the options ask for.
     """
-    base_map = BaseMap.load(options.map_path, verify_key=options.verify_key)
+    base_map = base_map or BaseMap.load(options.map_path, verify_key=options.verify_key)
     # what has been verified here they need not read again, as long as the file is the same
     trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
     missing = base_map.require_features(options.reloc)
@@ -184,8 +193,13 @@ def start_engines(options: ServeOptions, children: Mapping[str, EngineChild]) ->
         )
         for kind, child in children.items()
     }  # fmt: skip
-    for engine in engines.values():
-        engine.start()
+    try:
+        for engine in engines.values():
+            engine.start()
+    except BaseException:
+        for engine in engines.values():
+            engine.close()
+        raise
     return base_map.sha256, engines
 
 
@@ -202,14 +216,17 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     """
     from coview_stream.stream.node.reload import OpenedMap
 
-    if BaseMap.load(options.map_path, verify_key=options.verify_key).sha256 == served:
+    base_map = BaseMap.load(options.map_path, verify_key=options.verify_key)
+    if base_map.sha256 == served:
         return None
     children = start_children(options.lidar is not None)
     engines: dict[str, EngineProcess] = {}
     try:
-        sha256, engines = start_engines(options, children)
+        sha256, engines = start_engines(options, children, base_map)
         for engine in engines.values():
             engine.wait_ready(cancelled)
+            if cancelled():
+                break
             engine.wait_prepared()
         if cancelled():
             raise CancelledError("the node is no longer wanted")

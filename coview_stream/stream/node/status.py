@@ -56,7 +56,7 @@ class Reporter:
         self._errors = errors
         self._started = time.monotonic()
         self._connection = ConnectionMonitor()
-        self._reported: dict[str, str] = {}  # states, as in the statuses
+        self._reported: dict[str, tuple[str, object]] = {}  # states, as in the statuses, and what rivals were told
         self._publishers: dict[str, Publisher] = {}
 
     def declare(self, session: Session) -> None:
@@ -69,7 +69,11 @@ class Reporter:
             self.changed.set()
 
     def _has_changed(self, session: Session) -> bool:
-        return session.state()[0].reported != self._reported.get(session.keys.robot)
+        return self._news(session) != self._reported.get(session.keys.robot)
+
+    def _news(self, session: Session) -> tuple[str, object]:
+        told = None if self._elections is None else self._elections.told(session.keys.robot)
+        return session.state()[0].reported, told
 
     def run(self, rate: float, stopping: threading.Event) -> None:
         """Publish at ``rate``, and at once what has changed, until ``stopping``; set ``changed`` as well, to end."""
@@ -101,6 +105,8 @@ class Reporter:
 
     def _check_connection(self, now: float) -> None:
         self._connection.update(self._transport.connection())
+        if self._elections is not None:
+            self._elections.check_connection()
         if not (self._connection.connection.routers or self._connection.connection.peers):
             for session in self._sessions:
                 session.on_disconnected(now)
@@ -108,9 +114,9 @@ class Reporter:
     def _publish_status(self, session: Session, now: float, closing: bool = False) -> None:
         robot = session.keys.robot
         state, reason = session.state()
-        before = self._reported.get(robot)
-        self._reported[robot] = state.reported  # published or not: it is not tried again at once
-        if state.reported != before and not closing:
+        before, now_told = self._reported.get(robot, ("", None)), self._news(session)
+        self._reported[robot] = now_told  # published or not: it is not tried again at once
+        if state.reported != before[0] and not closing:
             log.info("%s: %s (%s)", robot, state.reported, reason)
         claim = None if self._elections is None else self._elections.claim(robot)
         if self._elections is not None and claim is None:

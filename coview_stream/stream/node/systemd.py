@@ -28,6 +28,7 @@ class Notifier:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self.watchdog_period = self._period(environment) if address else None
+        self._ends = False
 
     @staticmethod
     def _period(environment: Mapping[str, str]) -> float | None:
@@ -45,18 +46,20 @@ class Notifier:
             notify.sendto("\n".join(lines).encode(), self._address)
 
     def ready(self, status: str) -> None:
-        """Tell that the service is up, with one line for ``systemctl status``."""
-        self.send("READY=1", f"STATUS={status}")
+        """Tell that the service is up, with one line for ``systemctl status``; not any more once it ends."""
+        if not self._ends:
+            self.send("READY=1", f"STATUS={status}")
 
     def reloading(self, busy: bool, status: str) -> None:
         """Tell that a change of the map begins, or that it is over."""
-        if busy:
-            self.send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}", f"STATUS={status}")
-        else:
+        if not busy:
             self.ready(status)
+        elif not self._ends:
+            self.send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}", f"STATUS={status}")
 
     def stopping(self) -> None:
         """Tell that the service ends."""
+        self._ends = True
         self.send("STOPPING=1")
 
     def run(self, stopping: threading.Event, live: Callable[[], bool]) -> None:

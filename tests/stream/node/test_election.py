@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
+import random
 from dataclasses import replace
 
 import pytest
+from fake_node import Site
 
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.election import Claim, Election, Elections, claim_in
+from coview_stream.stream.node.status import Reporter
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 
@@ -98,9 +103,40 @@ def test_node_that_was_stopped_finds_that_it_has_been_replaced():
     net.stopped = {"a"}
     net.run(10.0)
     assert net.serving == {"b"}
-    net.stopped = set()
-    net.run(1.25)
-    assert net.serving == {"b"}
+    net.stopped, since = set(), len(net.history)
+    net.run(6.0)
+    assert all(served == {"b"} for served in net.history[since:])  # it listens before it says anything
+
+
+def test_stopped_node_without_another_goes_on_after_it_has_listened():
+    node = Election("a", 1.0, 0.0)
+    assert node.tick(3.0) == Claim(1, "a")
+    assert node.tick(5.4) == Claim(1, "a")
+    assert node.tick(8.0) is None
+    assert [node.tick(8.0 + k / 2) for k in (2, 4)] == [None, None]
+    assert node.tick(10.5) == Claim(2, "a")
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_after_any_faults_one_node_serves_within_four_seconds_and_stays_the_only_one(seed):
+    rng = random.Random(seed)
+    names = ["a", "b", "c", "d"][: rng.randint(2, 4)]
+    net = Network(*names)
+    for _ in range(8):
+        net.run(rng.choice([0.25, 1.0, 2.75, 6.0]))
+        split = set(rng.sample(names, rng.randint(0, len(names) - 1)))
+        net.parts = [split, set(names) - split]
+        net.stopped = {name for name in names if rng.random() < 0.3}
+        if rng.random() < 0.3:
+            net.start(name := rng.choice(names))  # it was killed
+            net.parts[0].discard(name)
+            net.parts[1].add(name)
+    net.parts, net.stopped = [set(names)], set()
+    net.run(4.0)
+    since = len(net.history)
+    net.run(20.0)
+    assert len(net.serving) == 1
+    assert all(served == net.serving for served in net.history[since:])
 
 
 def test_node_that_says_that_it_ends_is_followed_at_once():
@@ -134,7 +170,7 @@ def test_own_statuses_are_not_another_nodes():
             for wrong in (
                 {"term": -1}, {"term": 1.5}, {"term": True}, {"term": 10**30}, {"id": ""}, {"id": 4}, {"id": "x" * 65},
                 {"period_s": 0}, {"period_s": -1.0}, {"period_s": 1e9}, {"period_s": float("nan")}, {"period_s": None},
-                {"ending": 1},
+                {"ending": 1}, {"id": "a\nb"}, {"host": "\x1b[2J"}, {"host": 3}, {"host": "x" * 65},
             )
         ),
     ],
@@ -144,7 +180,7 @@ def test_what_is_no_status_of_a_node_is_no_claim(status):
 
 
 def test_claim_is_read_as_it_was_written():
-    claim = Claim(4, "abc", 0.5, True)
+    claim = Claim(4, "abc", 0.5, True, "machine-7")
     assert claim_in(json.dumps({"state": "LOST", "node": claim.to_json()}).encode()) == claim
 
 
@@ -153,15 +189,21 @@ def test_status_of_another_node_silences_this_one_for_its_robot_only(caplog):
     keys = [robot_keys("native", "coview", name) for name in ("r1", "r2")]
     elections = Elections(keys, 1.0, lambda: now[0])
     elections.declare(net)
+
+    def pass_time(until):
+        while now[0] < until:
+            now[0] += 0.5
+            elections.claim("r1"), elections.claim("r2")
+
     assert (elections.claim("r1"), elections.served_by("r1")) == (None, None)
-    now[0] = 3.0
+    pass_time(3.0)
     assert elections.claim("r1").term == elections.claim("r2").term == 1
     status = json.dumps({"node": Claim(2, "other").to_json()}).encode()
     net.publisher(keys[0].status, "report").put(Encoded(status, "application/json"))
     assert elections.claim("r1") is None
     assert elections.served_by("r1") == "other"
     assert elections.claim("r2") is not None
-    now[0] = 6.0
+    pass_time(6.0)
     assert elections.claim("r1").term == 3
     assert elections.served_by("r1") == elections.node
     said = [record.getMessage() for record in caplog.records]
@@ -169,3 +211,57 @@ def test_status_of_another_node_silences_this_one_for_its_robot_only(caplog):
         "r1: node other serves it: standing by, to take over when that one is gone",
         "r1: node other is gone: serving it now",
     ]
+
+
+def test_nobody_takes_over_by_what_is_not_heard_while_the_network_is_away():
+    net, now = MemoryTransport(), [0.0]
+    keys = [robot_keys("native", "coview", "r1")]
+    elections = Elections(keys, 1.0, lambda: now[0], needs_connection=True)
+    elections.declare(net)
+    net.go_away()
+
+    def pass_time(until):
+        while now[0] < until:
+            now[0] += 0.5
+            elections.claim("r1")
+
+    pass_time(20.0)
+    assert elections.claim("r1") is None
+    net.come_back()
+    pass_time(21.5)
+    assert elections.claim("r1") is None  # there was no time yet to hear anybody
+    pass_time(23.0)
+    assert elections.claim("r1").term == 1
+    net.go_away()
+    pass_time(30.0)
+    assert elections.claim("r1").term == 1  # who serves goes on to
+
+
+def test_status_goes_out_at_once_when_a_node_takes_over_and_when_a_lower_one_is_heard():
+    site, now = Site("r1"), [0.0]
+    keys = [session.keys for session in site.node.sessions]
+    elections = Elections(keys, 1.0, lambda: now[0])
+    elections.declare(site.net)
+    reporter = Reporter(site.node.sessions, site.net, RateLimitedErrors(logging.getLogger(__name__)), elections)
+    reporter.declare(site.node.sessions[0])
+
+    def statuses():
+        return [json.loads(sample.payload) for sample in site.net.samples(keys[0].status)]
+
+    reporter.publish(0.0)
+    reporter.report_change(site.node.sessions[0])
+    assert (statuses(), reporter.changed.is_set()) == ([], False)
+    for now[0] in (1.5, 2.5):
+        reporter.report_change(site.node.sessions[0])
+    assert reporter.changed.is_set()
+    reporter.changed.clear()
+    reporter.publish(0.0, all_robots=False)
+    assert [status["node"]["id"] for status in statuses()] == [elections.node]
+    reporter.report_change(site.node.sessions[0])
+    assert not reporter.changed.is_set()
+    lower = json.dumps({"node": Claim(0, "other").to_json()}).encode()
+    site.net.publisher(keys[0].status, "report").put(Encoded(lower, "application/json"))
+    reporter.report_change(site.node.sessions[0])
+    assert reporter.changed.is_set()
+    reporter.publish(0.0, all_robots=False)
+    assert [status["node"]["id"] for status in statuses()] == [elections.node, "other", elections.node]

@@ -36,6 +36,12 @@ def test_notices_reach_the_manager(manager):
     assert manager.recv(500).startswith(b"READY=1")
     notifier.stopping()
     assert manager.recv(500) == b"STOPPING=1"
+    notifier.ready("too late")
+    notifier.reloading(True, "too late")
+    notifier.reloading(False, "too late")
+    manager.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        manager.recv(500)
 
 
 def test_watchdog_is_fed_while_the_node_is_live(manager):
