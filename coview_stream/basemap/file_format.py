@@ -81,7 +81,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey
         with atomic_file(path, sync=True) as file:
             _write(file, contiguous, names, header)
     except OSError as error:
-        raise MapError(f"{path}: cannot write the map ({error.strerror}); choose a writable place") from error
+        raise MapError(f"{path}: cannot write the map ({error.strerror}); choose a writable place with room") from error
     return digest
 
 

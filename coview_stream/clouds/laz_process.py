@@ -20,6 +20,7 @@ from coview_stream.errors import CloudError
 
 _IDLE_S = 10.0  # set by hand: a child that nobody needs ends after that
 _THREADS = "4"  # set by hand: each thread's stack and heap count against the limit
+_MAX_END = 5.0  # seconds for a child to end by itself; set by hand
 _MAX_LINE = 1 << 20  # bytes of an answer's line: a reference system's text is the longest
 
 
@@ -139,7 +140,11 @@ class LazProcess:
             if stream is not None:
                 with contextlib.suppress(OSError):  # what was still to be sent to a dead one
                     stream.close()
-        child.wait()
+        try:
+            child.wait(_MAX_END)
+        except subprocess.TimeoutExpired:  # busy with a file that nobody waits for
+            child.kill()
+            child.wait()
 
 
 class _RefusedError(Exception):

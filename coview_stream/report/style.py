@@ -64,7 +64,9 @@ def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, 
         try:
             drawing.savefig(Path(path))
         except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be written ({error}); use .png and an existing directory") from error
+            raise InputError(
+                f"{path}: cannot be written ({error}); use .png, an existing directory and a disk with room"
+            ) from error
 
 
 def draw_base_map(axes: Any, points: Reals) -> Floats:
