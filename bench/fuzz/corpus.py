@@ -160,6 +160,7 @@ def seeds() -> dict[str, list[bytes]]:
                 "rpc": [
                     b"seconds=1;x",
                     b'{"state": "TRACKING", "robot": "r1", "reason": "", "counters": {"frames": 3}}',
+                    b'{"state": "LOST", "node": {"id": "a", "term": 1, "period_s": 1.0, "ending": false}}',
                 ],
             }
         )

@@ -122,6 +122,7 @@ def _rpc() -> Target:
     from coview_stream.errors import CoViewError
     from coview_stream.messages.json_messages import read_object
     from coview_stream.stream.client.fleet import FleetTable
+    from coview_stream.stream.node.election import claim_in
     from coview_stream.stream.transport import zenoh_io
     from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
@@ -137,6 +138,7 @@ def _rpc() -> Target:
         answers.end()
         answers.run()
         zenoh_io._error_of(data)
+        claim_in(data)
         with contextlib.suppress(CoViewError):
             table = FleetTable()
             table.add_status("r1", read_object(data), 1.0)
