@@ -53,6 +53,20 @@ def test_a_recording_that_unpacks_to_too_much_is_refused(
         open_run(bag)
 
 
+def test_a_recording_whose_files_unpack_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.zeros((50_000, 3), np.float32)
+    topics = {"/points": [cloud(k * 10**8, points) for k in range(5)],
+              "/odom": [odometry(k * 10**8, np.eye(4)) for k in range(5)]}  # fmt: skip
+    bag = write_bag(tmp_path / "a", topics, "sqlite3", "FILE")
+    packed = next(bag.glob("*.zstd")).stat().st_size
+    monkeypatch.setattr(bounded_decompression, "LIMIT", 10_000_000)
+    assert len(open_run(bag)) == 5
+    monkeypatch.setattr(bounded_decompression, "LIMIT", 0)
+    assert 5 * points.nbytes > bounded_decompression.RATIO * packed
+    with pytest.raises(CoViewError, match="a hundred times its size"):
+        open_run(bag)
+
+
 def test_readers_are_bounded_once_opened(tmp_path: Path) -> None:
     from rosbags.rosbag1 import reader
     from rosbags.rosbag2 import storage_mcap
