@@ -126,9 +126,9 @@ class RobotEndpoints:
     def _publish_pose(self, now: float) -> None:
         for session in self._sessions:
             session.tick(now)
-        pose, robot = self.session.pose(), self.session.keys.robot
+        robot = self.session.keys.robot
         serves = self._elections is None or self._elections.claim(robot) is not None
-        if pose is not None and serves and self._publisher is not None:
+        if serves and self._publisher is not None and (pose := self.session.pose()) is not None:
             encoded = encode_pose(pose, self._pose_format)
             self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
             self._reporter.rates[robot].add(now)

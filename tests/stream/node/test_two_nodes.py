@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 
 import pytest
+from bad_link import BadLink
 from serving import FALSE, Service
 from sockets import until
 from zenoh_routers import Router
@@ -37,10 +42,9 @@ def test_second_node_stands_by_takes_over_and_keeps_the_robot(world_file, slow_d
             second = subprocess.Popen(
                 python_command("coview_stream", *command), env=python_environment(), stderr=subprocess.PIPE, text=True
             )
-            for line in second.stderr:
-                if f"node {first} serves it: standing by" in line:
-                    break
-            threading.Thread(target=second.stderr.read, daemon=True).start()
+            lines: list[str] = []
+            threading.Thread(target=lines.extend, args=(second.stderr,), daemon=True).start()
+            until(lambda: any(f"node {first}" in line and "standing by" in line for line in list(lines)), 60.0)
             time.sleep(8.0)  # until it knows the place
             assert {node for _, node in said} == {first}
 
@@ -69,3 +73,104 @@ def test_second_node_stands_by_takes_over_and_keeps_the_robot(world_file, slow_d
                 second.kill()
                 second.wait()
             assert service.end() == 0
+
+
+class Other:
+    """Another process that serves the robot of a service."""
+
+    def __init__(self, service, router):
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.metrics = f"127.0.0.1:{probe.getsockname()[1]}"
+        command = ("serve", str(service.map), "--robot", "r1", "--connect", router, "--no-state")
+        self.process = subprocess.Popen(
+            python_command("coview_stream", *command, "--metrics", self.metrics),
+            env=python_environment(),
+            stderr=subprocess.DEVNULL,
+        )
+
+    def robot(self):
+        """What it says of the robot; None while it cannot be asked."""
+        try:
+            with urllib.request.urlopen(f"http://{self.metrics}/health", timeout=10) as answer:
+                return json.load(answer)["robots"]["r1"]
+        except urllib.error.HTTPError as error:  # not ready
+            return json.load(error)["robots"]["r1"]
+        except OSError:
+            return None
+
+    def wait(self, state="TRACKING"):
+        until(lambda: (told := self.robot()) is not None and told["state"] == state, 60.0)
+
+    def end(self):
+        self.process.kill()
+        self.process.wait()
+
+
+def serving(service, *nodes, settle=3.0, seconds=3.0):
+    """After some time to settle: which of the nodes publishes poses, by its number; it has to be one."""
+    time.sleep(settle)
+    begin, rates = [node.robot()["counters"]["poses"] for node in nodes], len(service.poses)
+    time.sleep(seconds)
+    told = [node.robot() for node in nodes]
+    made = [after["counters"]["poses"] - before for before, after in zip(begin, told, strict=True)]
+    assert sum(count > 0 for count in made) == 1, made
+    assert [each["serves"] for each in told] == [count > 0 for count in made]
+    assert len({each["served_by"] for each in told}) == 1
+    assert 5.0 * seconds < len(service.poses) - rates < 15.0 * seconds  # ten a second, not twice as many
+    return next(k for k, count in enumerate(made) if count)
+
+
+def test_first_node_is_killed_then_a_second_first_and_nobody_waits_for_the_dead(world_file, slow_drive, tmp_path):
+    with Router() as router:
+        service = Service(world_file, slow_drive, tmp_path, router=router.endpoint, robots_router=router.endpoint)
+        others = []
+        try:
+            service.tracks(60.0)
+            others.append(Other(service, router.endpoint))
+            others[0].wait()
+            assert serving(service, service, others[0], settle=0.0) == 0
+            service.process.kill()
+            killed = time.monotonic()
+            service.tracks(20.0)
+            gap = time.monotonic() - killed
+            assert gap < 8.0, "of a busy machine; on an idle one it is less than 3 s"
+            service.process.wait()
+            others.append(Other(service, router.endpoint))  # the first one, started again
+            others[1].wait()
+            assert serving(service, *others) == 0
+            for node in others:
+                node.end()
+            others = [Other(service, router.endpoint) for _ in range(2)]  # at once
+            for node in others:
+                node.wait()
+            first = serving(service, *others)
+            others[first].end()
+            service.tracks(20.0)
+            assert max(service.errors()) < FALSE
+        finally:
+            for node in others:
+                node.end()
+            service.end()
+
+
+@pytest.mark.parametrize("mode", ["cut", "silent"])
+def test_network_in_two_parts_has_one_node_again(world_file, slow_drive, tmp_path, mode):
+    with Router() as router, BadLink(router.endpoint) as link:
+        service = Service(world_file, slow_drive, tmp_path, router=link.endpoint, robots_router=router.endpoint)
+        other = None
+        try:
+            service.tracks(60.0)
+            other = Other(service, router.endpoint)
+            other.wait()
+            assert serving(service, service, other, settle=0.0) == 0
+            link.mode(mode)
+            time.sleep(6.0)
+            service.tracks(10.0)  # by the other one
+            link.mode("open")
+            serving(service, service, other, settle=4.0)
+            assert max(service.errors()) < FALSE
+        finally:
+            if other is not None:
+                other.end()
+            service.end()
