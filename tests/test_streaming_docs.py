@@ -77,6 +77,7 @@ def test_docs_list_every_counter():
     assert counters <= named
     assert named - counters == {
         "counters", "errors", "latency_ms", "engine_ms", "longest_wait_s", "longest_search_wait_s",
+        "node", "id", "host", "term", "period_s", "ending",
     }  # fmt: skip
 
 
@@ -152,7 +153,7 @@ def test_documented_fields_missing_in_smaller_pose_formats():
 
 def test_documented_client_example_runs(monkeypatch, capsys):
     net = MemoryTransport()
-    monkeypatch.setattr(client, "open_client", lambda *endpoints: net)
+    monkeypatch.setattr(client, "open_client", lambda *endpoints, **options: net)
 
     def answer(sample):
         pose = PoseMessage(decode_cloud(sample).stamp_ns, "rover1", "TRACKING", np.eye(4), np.eye(6), 0.5, "ab")

@@ -19,6 +19,7 @@ from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
 from coview_stream.stream.node.counters import counter_of
+from coview_stream.stream.node.election import claim_in
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import Transport
 
@@ -77,6 +78,7 @@ class RobotCapture:
         clouds: in order of arrival.
         odometry: likewise.
         status: newest of the node, None if there was none.
+        servers: nodes that published statuses, as they name themselves.
         alive: whether a node holds the liveliness token.
         began: local time at which the capture began, seconds.
         ended: local time at which it ended, seconds.
@@ -86,6 +88,7 @@ class RobotCapture:
     clouds: list[CapturedMessage] = field(default_factory=list)
     odometry: list[CapturedMessage] = field(default_factory=list)
     status: dict[str, Any] | None = None
+    servers: set[str] = field(default_factory=set)
     alive: bool = False
     began: float = 0.0
     ended: float = 0.0
@@ -126,6 +129,8 @@ def capture_robots(
         def handler(sample: Sample) -> None:
             with contextlib.suppress(MessageError):
                 capture.status = read_status(sample)
+                if (claim := claim_in(bytes(sample.payload))) is not None and not claim.ending:
+                    capture.servers.add(str(claim))
 
         return handler
 

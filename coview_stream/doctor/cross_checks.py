@@ -119,9 +119,14 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
         remedy = "is its out/status allowed through, and is --base the same?"
         return Finding("warn", "node", "alive, but says nothing", remedy, robot)
     found = f"{_text(status, 'state')}: {_text(status, 'reason') or 'no reason given'}"
+    servers = sorted(capture.servers)
+    found += f", node {servers[0]}" if len(servers) == 1 else ""
     found += f", version {_text(status, 'version')}, map {_text(status, 'map_sha256')[:12]}"
     if not capture.alive:
         return Finding("warn", "node", f"{found}; no liveliness token", "do access rules let it hold one?", robot)
+    if len(servers) > 1:
+        found = f"{', '.join(servers)} publish its status: one has just taken over, or they do not hear each other"
+        return Finding("warn", "node", found, "do access rules let nodes read out/status?", robot)
     if sha256 and status.get("map_sha256") != sha256:
         return Finding("FAIL", "node", f"{found}, not {sha256[:12]}", "it serves another map: restart it", robot)
     if status.get("version") != __version__:

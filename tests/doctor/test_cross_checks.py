@@ -100,3 +100,15 @@ def test_node_status_finding(status, alive, verdict, part):
     found = node_finding(capture(status=status, alive=alive), SHA, ns(0))
     assert found.verdict == verdict
     assert part in found.found
+
+
+def test_who_serves_the_robot_is_told():
+    robot = capture(status=STATUS, alive=True)
+    robot.servers = {"abc on machine-7"}
+    found = node_finding(robot, SHA, ns(0))
+    assert found.verdict == "ok"
+    assert "node abc on machine-7" in found.found
+    robot.servers |= {"def"}
+    found = node_finding(robot, SHA, ns(0))
+    assert found.verdict == "warn"
+    assert "abc on machine-7, def publish" in found.found

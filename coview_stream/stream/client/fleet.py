@@ -43,6 +43,7 @@ class RobotView:
         pose: the newest.
         status: the newest.
         status_heard: time of the newest status.
+        node: who serves it, in words, if another node did before; empty else.
         arrivals: times of the last poses.
     """
 
@@ -51,6 +52,7 @@ class RobotView:
     pose: PoseMessage | None = None
     status: dict[str, Any] = field(default_factory=dict)
     status_heard: float = -math.inf
+    node: str = ""
     arrivals: deque[float] = field(default_factory=deque)
 
     def pose_rate(self, now: float) -> float:
@@ -83,6 +85,9 @@ class FleetTable:
     def add_status(self, robot: str, status: dict[str, Any], now: float) -> None:
         """Take in a status that arrived at ``now``; no field of it is required."""
         view = self._view(robot, now)
+        before, after = _mapping(view.status, "node").get("id"), _mapping(status, "node")
+        if before is not None and after.get("id") != before:
+            view.node = f"served by node {after.get('id')} on {after.get('host')} now"
         view.status, view.status_heard = status, now
 
     def table(self, now: float, header: bool = True) -> list[str]:
@@ -115,7 +120,7 @@ def _row(view: RobotView, now: float) -> list[str]:
         *_pose_cells(view.fresh_pose(now), view.pose_rate(now)),
         f"{_number(latency.get('p50'), 0)}/{_number(latency.get('p99'), 0)}",
         _number(counters.get("dropped"), 0),
-        printable("; ".join([str(view.status.get("reason") or ""), *_says(view.status)])),
+        printable("; ".join([str(view.status.get("reason") or ""), *filter(None, [view.node]), *_says(view.status)])),
     ]
 
 

@@ -150,3 +150,15 @@ def test_unknown_json_fields_are_passed_on():
 def test_status_that_is_not_json_is_refused(payload):
     with pytest.raises(MessageError, match="the status is no JSON"):
         read_status(Sample("coview/r1/out/status", payload))
+
+
+def test_another_node_that_serves_the_robot_is_told():
+    fleet = FleetTable()
+    fleet.add_status("r1", STATUS, 8.0)
+    fleet.add_status("r1", STATUS | {"node": {"id": "abc", "host": "one"}}, 9.0)
+    assert "node" not in fleet.table(9.1)[1]
+    fleet.add_status("r1", STATUS | {"node": {"id": "def", "host": "two\n"}}, 10.0)
+    fleet.add_status("r1", STATUS | {"node": {"id": "def", "host": "two\n"}}, 11.0)
+    assert fleet.table(11.1)[1].endswith("all well; served by node def on two  now")
+    fleet.add_status("r1", STATUS | {"node": 7}, 12.0)
+    fleet.table(12.1)
