@@ -1,7 +1,7 @@
 """Election of the node that serves a robot: the one that does goes on, others stand by and take over from it.
 
 The statuses of a robot are the signs of life of the node that serves it; each says which node it is of, and of which
-*term*. A node begins by listening. Where it hears nobody for two and a half statuses it serves, in a term after all
+*term*. A node begins by listening. Where it hears nobody for four statuses it serves, in a term after all
 that it has heard of; where it hears somebody it stands by: it computes everything, to take over with a pose, and
 publishes nothing. Of two that serve (they started at once, or a network was in two parts) the one of the later term
 goes on, and of the same term the one whose name comes first; it says so at once to the one that does not. A node that
@@ -28,7 +28,7 @@ from coview_stream.stream.transport.transport import Transport
 log = logging.getLogger("coview_stream.node")
 
 # set by hand
-_PATIENCE = 2.5  # of the periods of statuses, of a second at least, before a node that is silent is one that is gone
+_PATIENCE = 4.0  # of the periods of statuses, of a second at least, before a node that is silent is one that is gone
 _MAX_PERIOD = 60.0  # seconds between statuses that are believed
 _MAX_TERM = 1_000_000_000  # of those that are believed
 _MAX_STATUS = 65_536  # bytes: a longer one is none

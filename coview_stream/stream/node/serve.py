@@ -104,6 +104,7 @@ def open_node(
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.election import Elections
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
+        from coview_stream.stream.node.memory import MemoryRelease
         from coview_stream.stream.node.node import Node
         from coview_stream.stream.node.reload import MapReloader
         from coview_stream.stream.node.systemd import Notifier
@@ -133,6 +134,7 @@ def open_node(
             lambda busy: notifier.reloading(busy, "changing the map" if busy else ", ".join(names)),
         )
         node.run_beside("reload", reloader.run)
+        node.run_beside("memory", MemoryRelease().run)
         _add_health(node, options, notifier)
         node.start()
     except BaseException as error:

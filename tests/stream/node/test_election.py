@@ -51,7 +51,7 @@ class Network:
 
 def test_one_node_serves_after_it_has_listened():
     net = Network("a")
-    net.run(2.25)
+    net.run(3.75)
     assert net.serving == set()
     net.run(0.5)
     assert net.serving == {"a"}
@@ -61,13 +61,13 @@ def test_one_node_serves_after_it_has_listened():
 
 def test_first_keeps_and_second_takes_over_and_first_does_not_take_back():
     net = Network("b")
-    net.run(4.0)
+    net.run(6.0)
     net.start("a")
     net.run(20.0)
     assert net.serving == {"b"}
-    assert all(served == {"b"} for served in net.history[12:])
+    assert all(served == {"b"} for served in net.history[20:])
     del net.nodes["b"]
-    net.run(3.5)
+    net.run(5.25)
     assert net.serving == {"a"}
     net.start("b")
     net.run(20.0)
@@ -76,7 +76,7 @@ def test_first_keeps_and_second_takes_over_and_first_does_not_take_back():
 
 def test_two_that_start_at_once_are_one_within_a_second():
     net = Network("b", "a", "c")
-    net.run(4.0)
+    net.run(6.0)
     assert net.serving == {"a"}
     assert sum(len(served) > 1 for served in net.history) <= 4
     net.run(30.0)
@@ -88,7 +88,7 @@ def test_network_that_was_in_two_parts_has_one_again():
     net.run(5.0)
     assert net.serving == {"a"}
     net.parts = [{"a"}, {"b"}]
-    net.run(5.0)
+    net.run(7.0)
     assert net.serving == {"a", "b"}
     net.parts = [{"a", "b"}]
     net.run(1.25)
@@ -110,15 +110,15 @@ def test_node_that_was_stopped_finds_that_it_has_been_replaced():
 
 def test_stopped_node_without_another_goes_on_after_it_has_listened():
     node = Election("a", 1.0, 0.0)
-    assert node.tick(3.0) == Claim(1, "a")
-    assert node.tick(5.4) == Claim(1, "a")
-    assert node.tick(8.0) is None
-    assert [node.tick(8.0 + k / 2) for k in (2, 4)] == [None, None]
-    assert node.tick(10.5) == Claim(2, "a")
+    assert node.tick(4.5) == Claim(1, "a")
+    assert node.tick(8.4) == Claim(1, "a")
+    assert node.tick(12.5) is None
+    assert [node.tick(12.5 + k / 2) for k in (2, 4, 6)] == [None, None, None]
+    assert node.tick(16.5) == Claim(2, "a")
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_after_any_faults_one_node_serves_within_four_seconds_and_stays_the_only_one(seed):
+def test_after_any_faults_one_node_serves_within_six_seconds_and_stays_the_only_one(seed):
     rng = random.Random(seed)
     names = ["a", "b", "c", "d"][: rng.randint(2, 4)]
     net = Network(*names)
@@ -132,7 +132,7 @@ def test_after_any_faults_one_node_serves_within_four_seconds_and_stays_the_only
             net.parts[0].discard(name)
             net.parts[1].add(name)
     net.parts, net.stopped = [set(names)], set()
-    net.run(4.0)
+    net.run(6.0)
     since = len(net.history)
     net.run(20.0)
     assert len(net.serving) == 1
@@ -150,15 +150,15 @@ def test_node_that_says_that_it_ends_is_followed_at_once():
 def test_slow_statuses_are_waited_for():
     standing = Election("b", 1.0, 0.0)
     standing.hear(Claim(1, "a", period=10.0), 1.0)
-    assert standing.tick(25.9) is None
-    assert standing.tick(26.1) == Claim(2, "b")
+    assert standing.tick(40.9) is None
+    assert standing.tick(41.1) == Claim(2, "b")
 
 
 def test_own_statuses_are_not_another_nodes():
     node = Election("a", 1.0, 0.0)
-    assert node.tick(3.0) == Claim(1, "a")
-    node.hear(Claim(7, "a"), 3.0)
-    assert node.tick(3.1) == Claim(1, "a")
+    assert node.tick(4.5) == Claim(1, "a")
+    node.hear(Claim(7, "a"), 4.5)
+    assert node.tick(4.6) == Claim(1, "a")
 
 
 @pytest.mark.parametrize(
@@ -196,14 +196,14 @@ def test_status_of_another_node_silences_this_one_for_its_robot_only(caplog):
             elections.claim("r1"), elections.claim("r2")
 
     assert (elections.claim("r1"), elections.served_by("r1")) == (None, None)
-    pass_time(3.0)
+    pass_time(4.5)
     assert elections.claim("r1").term == elections.claim("r2").term == 1
     status = json.dumps({"node": Claim(2, "other").to_json()}).encode()
     net.publisher(keys[0].status, "report").put(Encoded(status, "application/json"))
     assert elections.claim("r1") is None
     assert elections.served_by("r1") == "other"
     assert elections.claim("r2") is not None
-    pass_time(6.0)
+    pass_time(9.0)
     assert elections.claim("r1").term == 3
     assert elections.served_by("r1") == elections.node
     said = [record.getMessage() for record in caplog.records]
@@ -230,7 +230,7 @@ def test_nobody_takes_over_by_what_is_not_heard_while_the_network_is_away():
     net.come_back()
     pass_time(21.5)
     assert elections.claim("r1") is None  # there was no time yet to hear anybody
-    pass_time(23.0)
+    pass_time(25.0)
     assert elections.claim("r1").term == 1
     net.go_away()
     pass_time(30.0)
@@ -251,7 +251,7 @@ def test_status_goes_out_at_once_when_a_node_takes_over_and_when_a_lower_one_is_
     reporter.publish(0.0)
     reporter.report_change(site.node.sessions[0])
     assert (statuses(), reporter.changed.is_set()) == ([], False)
-    for now[0] in (1.5, 2.5):
+    for now[0] in (2.5, 4.0):
         reporter.report_change(site.node.sessions[0])
     assert reporter.changed.is_set()
     reporter.changed.clear()

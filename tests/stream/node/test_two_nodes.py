@@ -52,7 +52,7 @@ def test_second_node_stands_by_takes_over_and_keeps_the_robot(world_file, slow_d
             service.process.send_signal(signal.SIGSTOP)
             until(lambda: said[-1][1] != first, 20.0)
             service.tracks(5.0)  # it knew the place
-            assert time.monotonic() - begin < 15.0  # two and a half statuses, of a busy machine
+            assert time.monotonic() - begin < 15.0  # four statuses, of a busy machine
 
             service.process.send_signal(signal.SIGCONT)
             time.sleep(3.0)  # what it had still to say
