@@ -1,18 +1,21 @@
-"""Bill of materials of the wheel: what it brings in, as CycloneDX 1.5, from a lock.
+"""Bill of materials of a wheel: what it brings in, as CycloneDX 1.5, from a lock and what is installed of it.
 
-    python .ci/make_sbom.py .ci/lock/cp311-linux-x86_64.txt > coview-stream.cdx.json
+    ENVIRONMENT/bin/python .ci/make_sbom.py .ci/lock/wheel-cp311-linux-x86_64.txt dist/*.whl > coview-stream.cdx.json
 
-It lists what ``pip install`` takes in by requirement, and not the packages of extras, which a plain installation does
-not bring.
+Names, versions and hashes are those of the lock; licences and who needs whom are told by the metadata of packages in
+the environment that runs this, into which the lock has been installed. It has no time and no random number in it: the
+same wheel and the same lock have the same bill.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
 import tomllib
-from importlib.metadata import PackageNotFoundError, requires
+from collections.abc import Iterable, Iterator
+from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 from typing import Any
 
@@ -21,64 +24,103 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 _LOCKED = re.compile(r"^([A-Za-z0-9._-]+)==(\S+) --hash=sha256:([0-9a-f]{64})$", re.M)
+_LONGEST = 100  # characters of a licence's name; some packages put the whole text there
 
 
-def wanted(direct: list[str], locked: set[str]) -> set[str]:
-    """Return the names that requirements bring in, with theirs, of those that are locked."""
-    todo = [Requirement(each) for each in direct]
-    names: set[str] = set()
-    done: set[tuple[str, frozenset[str]]] = set()
+def needed(name: str, extras: Iterable[str] = ()) -> Iterator[Requirement]:
+    """Yield what an installed package requires here, nothing for one that is not installed."""
+    try:
+        texts = requires(name) or []
+    except PackageNotFoundError:
+        return
+    yield from applying(texts, extras)
+
+
+def applying(texts: Iterable[str], extras: Iterable[str] = ()) -> Iterator[Requirement]:
+    """Yield the requirements that apply to this Python and platform, with these extras."""
+    for need in map(Requirement, texts):
+        if need.marker is None or any(need.marker.evaluate({"extra": extra}) for extra in ("", *extras)):
+            yield need
+
+
+def edges(direct: Iterable[str], locked: set[str]) -> dict[str, set[str]]:
+    """Return who needs whom, of what is locked; the project itself is the empty name."""
+    found: dict[str, set[str]] = {"": set()}
+    todo = [("", need) for need in applying(direct)]
+    done: set[tuple[str, str, frozenset[str]]] = set()
     while todo:
-        need = todo.pop()
+        who, need = todo.pop()
         name, extras = canonicalize_name(need.name), frozenset(need.extras)
-        applies = need.marker is None or any(need.marker.evaluate({"extra": extra}) for extra in ("", *extras))
-        if not applies or name not in locked or (name, extras) in done:
+        if name not in locked or (who, name, extras) in done:
             continue
-        done.add((name, extras))
-        names.add(name)
-        try:
-            for text in requires(name) or []:
-                each = Requirement(text)
-                if each.marker is None or any(each.marker.evaluate({"extra": extra}) for extra in ("", *extras)):
-                    each.marker = None
-                    todo.append(each)
-        except PackageNotFoundError:
-            continue  # of another platform
-    return names
+        done.add((who, name, extras))
+        found.setdefault(who, set()).add(name)
+        found.setdefault(name, set())
+        todo += [(name, each) for each in needed(name, extras)]
+    return found
 
 
-def document(lock: str, project: dict[str, Any]) -> dict[str, Any]:
-    """Return the bill of materials of a project whose packages a lock has."""
+def licences(name: str) -> list[dict[str, Any]]:
+    """Return the licences that an installed package states, as CycloneDX has them; none where it states none."""
+    try:
+        told = metadata(name)
+    except PackageNotFoundError:
+        return []
+    if expression := told.get("License-Expression"):
+        return [{"expression": expression}]
+    if classified := [each for each in told.get_all("Classifier") or [] if each.startswith("License :: ")]:
+        return [{"license": {"name": each.rsplit(" :: ", 1)[1]}} for each in sorted(classified)]
+    line = (told.get("License") or "").strip()
+    return [{"license": {"name": line}}] if line and "\n" not in line and len(line) <= _LONGEST else []
+
+
+def document(lock: str, project: dict[str, Any], wheel: Path | None = None) -> dict[str, Any]:
+    """Return the bill of materials of a project whose packages a lock has.
+
+    Args:
+        lock: text of the lock.
+        project: table of that name in pyproject.toml.
+        wheel: the file, for its hash.
+    """
     packages = {canonicalize_name(name): (version, sha256) for name, version, sha256 in _LOCKED.findall(lock)}
-    names = sorted(wanted(project["dependencies"], set(packages)))
-    own = f"pkg:pypi/{project['name']}@{project['version']}"
+    graph = edges(project["dependencies"], set(packages))
+    refs = {name: f"pkg:pypi/{name}@{version}" for name, (version, _) in packages.items()}
+    refs[""] = f"pkg:pypi/{project['name']}@{project['version']}"
+    own: dict[str, Any] = {
+        "type": "library", "bom-ref": refs[""], "name": project["name"], "version": project["version"],
+        "purl": refs[""], "licenses": [{"expression": project["license"]}],
+    }  # fmt: skip
+    if wheel is not None:
+        own["hashes"] = [{"alg": "SHA-256", "content": hashlib.sha256(wheel.read_bytes()).hexdigest()}]
+    components = []
+    for name in sorted(set(graph) - {""}):
+        version, sha256 = packages[name]
+        component: dict[str, Any] = {
+            "type": "library", "bom-ref": refs[name], "name": name, "version": version, "purl": refs[name],
+            "hashes": [{"alg": "SHA-256", "content": sha256}],
+        }  # fmt: skip
+        if stated := licences(name):
+            component["licenses"] = stated
+        components.append(component)
     return {
         "bomFormat": "CycloneDX",
         "specVersion": "1.5",
         "version": 1,
-        "metadata": {
-            "component": {
-                "type": "library", "bom-ref": own, "name": project["name"], "version": project["version"], "purl": own,
-                "licenses": [{"license": {"id": project["license"]}}],
-            }
-        },
-        "components": [
-            {
-                "type": "library", "bom-ref": f"pkg:pypi/{name}@{packages[name][0]}", "name": name,
-                "version": packages[name][0], "purl": f"pkg:pypi/{name}@{packages[name][0]}",
-                "hashes": [{"alg": "SHA-256", "content": packages[name][1]}],
-            }
-            for name in names
+        "metadata": {"component": own},
+        "components": components,
+        "dependencies": [
+            {"ref": refs[name], "dependsOn": sorted(refs[other] for other in others)}
+            for name, others in sorted(graph.items())
         ],
-        "dependencies": [{"ref": own, "dependsOn": [f"pkg:pypi/{name}@{packages[name][0]}" for name in names]}],
-    }  # fmt: skip
+    }
 
 
-def main(path: str) -> None:
-    """Print the bill of materials for a lock."""
+def main(lock: str, wheel: str | None = None) -> None:
+    """Print the bill of materials for a lock and, for its hash, a wheel."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    sys.stdout.write(json.dumps(document(Path(path).read_text(), project), indent=1) + "\n")
+    bill = document(Path(lock).read_text(), project, None if wheel is None else Path(wheel))
+    sys.stdout.write(json.dumps(bill, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:3])
