@@ -58,6 +58,7 @@ class SubscriptionCheck:
         self._reopen = reopen
         self._clock = clock
         self._all: list[Subscription] = []
+        self._next = clock()  # no other session is opened before
 
     def add(self, key: str) -> Subscription:
         """Begin with a subscription; its owner says by :meth:`heard` when a sample comes."""
@@ -79,9 +80,12 @@ class SubscriptionCheck:
     def check(self, wait: Callable[[float], object]) -> None:
         """Check what is silent and due now; ``wait(seconds)`` passes time."""
         begin = self._clock()
-        silent = [each for each in self._all if begin >= each.due and not each.handling]
-        if not silent:
+        silent = [each for each in self._all if begin - each.heard >= _SILENT and not each.handling]
+        if begin < self._next or not any(begin >= each.due for each in silent):
             return
+        # those that are due soon as well: a hundred robots that are switched off are one session now and then
+        silent = [each for each in silent if begin >= each.due - 0.5 * each.wait]
+        self._next = begin + _SILENT
         for each in silent:
             each.wait = min(2.0 * each.wait, _LONGEST)
             each.due = begin + _LISTEN + _GRACE + each.wait

@@ -63,6 +63,18 @@ def test_silence_that_the_other_session_shares_is_asked_about_ever_less():
     assert len(world.asked) < 20
 
 
+def test_many_robots_that_are_switched_off_are_asked_about_together():
+    world = World()
+    for number in range(300):
+        world.check.add(f"r{number}/odometry")
+        world.now += 0.1
+        world.check.check(world.wait)
+    world.asked.clear()
+    world.run(3600.0)
+    assert len(world.asked) < 60
+    assert set.union(*(keys for _, keys in world.asked)) == {f"r{number}/odometry" for number in range(300)}
+
+
 def test_sample_that_comes_meanwhile_is_no_reason():
     world = World()
     late = world.check.add("robot/odometry")
