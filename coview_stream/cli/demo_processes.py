@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import TransportError
-from coview_stream.stream.node.engine_child import python_command, python_environment
 
 ROBOT = "demo"
 

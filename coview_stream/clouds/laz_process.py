@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
+from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CloudError
 
 _IDLE_S = 10.0  # set by hand: a child that nobody needs ends after that
@@ -105,16 +105,13 @@ class LazProcess:
         if self._child is not None and self._owner == os.getpid() and self._child.poll() is None:
             return self._child
         self._end(kill=True)
-        # an empty or relative entry would be looked up in the current directory
-        paths = [path for path in sys.path if Path(path).is_absolute()]
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "coview_stream.clouds.laz_child"],
+            python_command("coview_stream.clouds.laz_child"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=os.environ
+            env=python_environment()
             | {
-                "PYTHONPATH": os.pathsep.join(paths), "PYTHONSAFEPATH": "1",
                 "RAYON_NUM_THREADS": _THREADS, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
                 "MALLOC_ARENA_MAX": "2",
             },

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.stream.node.engine_child import python_command, python_environment
+from coview_stream.clouds.python_child import python_command, python_environment
 
 _TIMEOUT = 120.0  # seconds, set by hand; compiling all kernels takes 3 to 10 on two cores
 

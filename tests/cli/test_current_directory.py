@@ -53,7 +53,7 @@ def test_engines_do_not_import_from_the_current_directory(trap, world_file):
 @pytest.mark.slow
 def test_processes_of_the_demo_do_not_import_from_the_current_directory(trap):
     """As its first process does not, by the same command; its map is made before any of the others starts."""
-    from coview_stream.stream.node.engine_child import python_command, python_environment
+    from coview_stream.clouds.python_child import python_command, python_environment
 
     done = subprocess.run(
         python_command("coview_stream", "watch", "--json", "--seconds", "0.5"),

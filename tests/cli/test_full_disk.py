@@ -9,7 +9,7 @@ import pytest
 
 resource = pytest.importorskip("resource", reason="limits of processes are of POSIX")
 
-from coview_stream.stream.node.engine_child import python_command, python_environment  # noqa: E402
+from coview_stream.clouds.python_child import python_command, python_environment  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

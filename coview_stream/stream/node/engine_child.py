@@ -12,9 +12,10 @@ import contextlib
 import os
 import socket
 import subprocess
-import sys
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, NamedTuple
+
+from coview_stream.clouds.python_child import python_command, python_environment
 
 if TYPE_CHECKING:
     from coview_stream.basemap.trust import Trust
@@ -94,17 +95,6 @@ def end(process: subprocess.Popen[bytes] | None, pipe: Connection | None) -> Non
     if pipe is not None:
         with contextlib.suppress(OSError):
             pipe.close()
-
-
-def python_command(module: str, *args: str) -> list[str]:
-    """Return the command that runs one of our modules; nothing is imported from the current directory."""
-    return [sys.executable, "-P", "-m", module, *args]
-
-
-def python_environment() -> dict[str, str]:
-    """Return our environment for such a command: this package in reach, the current directory not searched."""
-    paths = os.pathsep.join(p for p in sys.path if p)
-    return os.environ | {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1"}
 
 
 def _environment(kind: str) -> dict[str, str]:

@@ -162,10 +162,10 @@ class EngineProcess:
         if "ready" in self._awaited:
             self._await("ready", cancelled)
 
-    def wait_prepared(self) -> None:
-        """Wait until a job would not wait any more; raises what :meth:`wait_ready` does."""
+    def wait_prepared(self, cancelled: Callable[[], bool] = lambda: False) -> None:
+        """Wait until a job would not wait any more; asks and raises what :meth:`wait_ready` does."""
         for message in list(self._awaited):
-            self._await(message)
+            self._await(message, cancelled)
 
     def run(self, job: Job) -> Result:
         """Do one job; a child that died before is started again first."""

@@ -226,10 +226,7 @@ def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) 
     try:
         sha256, engines = start_engines(options, children, base_map)
         for engine in engines.values():
-            engine.wait_ready(cancelled)
-            if cancelled():
-                break
-            engine.wait_prepared()
+            engine.wait_prepared(cancelled)
         if cancelled():
             raise CancelledError("the node is no longer wanted")
         return OpenedMap(sha256, engines, make_sessions(options, sha256))

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from sockets import free_endpoint, until
 
+from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.stream.client.client import RobotClient
-from coview_stream.stream.node.engine_child import python_command, python_environment
 
 FALSE = 1.0  # metres: the world is 68 m wide and its poses are good to a few centimetres
 

@@ -328,6 +328,16 @@ def test_opening_has_its_own_timeout_and_can_be_cancelled():
 
 
 @pytest.mark.slow
+def test_wait_until_prepared_can_be_cancelled():
+    process = EngineProcess("track", "unused", "0" * 64, open_timeout=5.0)
+    with_child(process, "time.sleep(60)")
+    process._awaited = ["prepared"]
+    with pytest.raises(CancelledError, match="track"):
+        process.wait_prepared(lambda: True)
+    process.close()
+
+
+@pytest.mark.slow
 def test_close_ends_a_running_job():
     process = EngineProcess("track", "unused", "0" * 64)
     with_child(process, "time.sleep(60)")

@@ -36,7 +36,7 @@ def serve(world_file, slow_drive, tmp_path):
 
 
 def test_steps_of_the_host_clock_change_nothing(serve, tmp_path):
-    from coview_stream.stream.node.engine_child import python_environment
+    from coview_stream.clouds.python_child import python_environment
 
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(JUMPING_CLOCK)
