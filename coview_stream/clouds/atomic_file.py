@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 _ABANDONED = 86_400.0  # seconds without a byte, after which a part is nobody's; set by hand
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 @contextmanager
@@ -21,7 +22,7 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
     """Yield a name that becomes ``path`` at the end of the block, or is deleted if the block raises.
 
     What processes that were killed have left of the same file is deleted first: those of this host and its process
-    numbers at once, others, whose processes cannot be seen from here, after a day.
+    numbers at once, others, whose processes cannot be seen from here or were before the host's last start, after a day.
 
     Args:
         path: the file's name; a file that is there stays whole until the new one is complete.
@@ -54,12 +55,15 @@ def _remove_left(path: Path) -> None:
 
 
 def _host() -> str:
-    """Return a short name of this host and of its process numbers, of which each container has its own."""
+    """Return a short name of this start of this host and of its process numbers, of which each container has its own.
+
+    Hosts that are copies of one image have the same name, and the same number for the processes outside of containers.
+    """
     try:
-        numbers = Path("/proc/self/ns/pid").stat().st_ino
+        numbers, start = Path("/proc/self/ns/pid").stat().st_ino, _BOOT.read_text()
     except OSError:
-        numbers = 0
-    return f"{zlib.crc32(f'{platform.node()} {numbers}'.encode()):08x}"
+        numbers, start = 0, ""
+    return f"{zlib.crc32(f'{platform.node()} {numbers} {start}'.encode()):08x}"
 
 
 def _lives(process: int) -> bool:

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from coview_stream.clouds import atomic_file as module
 from coview_stream.clouds.atomic_file import atomic_file, atomic_path
 
 
@@ -72,3 +73,23 @@ def test_parts_that_nobody_writes_are_removed_and_no_others(tmp_path):
     with atomic_file(path) as stream:
         stream.write(b"new")
     assert {entry.name for entry in tmp_path.iterdir()} == {"a.bin", *kept}
+
+
+def test_part_of_a_host_of_the_same_name_is_not_removed(tmp_path, monkeypatch):
+    path, boot = tmp_path / "a.bin", tmp_path / "boot_id"
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    monkeypatch.setattr(module, "_BOOT", boot)
+    boot.write_text("one")
+    with atomic_path(path) as part:
+        part.touch()
+    of_one = part.with_name(part.name.replace(str(os.getpid()), str(gone.pid)))
+    of_one.write_bytes(b"half")
+    boot.write_text("other")
+    with atomic_file(path):
+        pass
+    assert of_one.exists()
+    boot.write_text("one")
+    with atomic_file(path):
+        pass
+    assert not of_one.exists()
