@@ -6,7 +6,7 @@ that it has heard of; where it hears somebody it stands by: it computes everythi
 publishes nothing. Of two that serve (they started at once, or a network was in two parts) the one of the later term
 goes on, and of the same term the one whose name comes first; it says so at once to the one that does not. A node that
 has itself been stopped for longer than others wait for it listens again before it says anything. Nobody takes over by
-what is not heard while the network is away.
+what is not heard while the network is away, nor from a node that falls silent together with the robot.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ log = logging.getLogger("coview_stream.node")
 
 # set by hand
 _PATIENCE = 4.0  # of the periods of statuses, of a second at least, before a node that is silent is one that is gone
+_ROBOT_SILENT = 2.0  # seconds without a message of a robot, after which it is not heard
 _MAX_PERIOD = 60.0  # seconds between statuses that are believed
 _MAX_TERM = 1_000_000_000  # of those that are believed
 _MAX_STATUS = 65_536  # bytes: a longer one is none
@@ -107,6 +108,7 @@ class Election:
         self._node, self._period, self._host = node, period, host
         self._patient_until = now + _PATIENCE
         self._ticked: float | None = None
+        self._robot_heard = now
         self._latest_term = 0
         self.challenges = 0
         self.claim: Claim | None = None
@@ -125,12 +127,19 @@ class Election:
         self.other = claim
         self._patient_until = now if claim.ending else now + _PATIENCE * max(1.0, claim.period)
 
+    def hear_robot(self, now: float) -> None:
+        """Note that a message of the robot came."""
+        self._robot_heard = now
+
     def tick(self, now: float) -> Claim | None:
         """Let time pass; return the claim if this node serves."""
         before, self._ticked = self._ticked, now
         if before is not None and now - before >= _PATIENCE * max(1.0, self._period):
             self.claim = None  # it was stopped, and another one may have taken over
             self.wait(now)
+        replaces = self.other is not None and not self.other.ending
+        if replaces and now - self._robot_heard > _ROBOT_SILENT:
+            self.wait(now)  # it is this node that is cut off, or there is nothing to take over
         if self.is_due(now):
             self._latest_term = min(self._latest_term + 1, _MAX_TERM)
             self.claim = Claim(self._latest_term, self._node, self._period, host=self._host)
@@ -186,6 +195,10 @@ class Elections:
                     self._of[robot].hear(claim, self._clock())
 
         return heard
+
+    def hear_robot(self, robot: str) -> None:
+        """Note that a message of a robot came."""
+        self._of[robot].hear_robot(self._clock())
 
     def check_connection(self) -> None:
         """Do not take over by what is not heard while nothing is connected; call it at least once in a second."""

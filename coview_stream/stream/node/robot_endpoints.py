@@ -90,15 +90,21 @@ class RobotEndpoints:
 
     def on_cloud(self, sample: Sample) -> None:
         """Take in a cloud."""
+        self._note_heard()
         for session in self._sessions:
             session.on_cloud(sample, time.monotonic())
             self._wake_engines(session)
 
     def on_odometry(self, sample: Sample) -> None:
         """Take in an odometry sample."""
+        self._note_heard()
         for session in self._sessions:
             session.on_odometry(sample, time.monotonic())
             self._wake_engines(session)
+
+    def _note_heard(self) -> None:
+        if self._elections is not None:
+            self._elections.hear_robot(self.session.keys.robot)
 
     def relocalize(self, parameters: dict[str, str]) -> dict[str, Any]:
         """Answer ``rpc/relocalize``."""

@@ -26,6 +26,7 @@ class Network:
         self.nodes = {name: Election(name, 1.0, 0.0) for name in names}
         self.parts = [set(names)]
         self.stopped = set()
+        self.deaf = set()  # those that do not hear the robot
         self.history = []
 
     def start(self, name):
@@ -36,6 +37,8 @@ class Network:
         for _ in range(round(4 * seconds)):
             self.now += 0.25
             running = {name: node for name, node in self.nodes.items() if name not in self.stopped}
+            for name in running.keys() - self.deaf:
+                self.nodes[name].hear_robot(self.now)
             claims = {name: node.tick(self.now) for name, node in running.items()}
             self.history.append({name for name, claim in claims.items() if claim})
             if self.now % 1.0 == 0.0:
@@ -97,6 +100,29 @@ def test_network_that_was_in_two_parts_has_one_again():
     assert net.serving == {"b"}
 
 
+def test_node_that_is_cut_off_from_the_robot_too_does_not_take_over():
+    net = Network("a", "b")
+    net.run(7.0)
+    net.parts, net.deaf = [{"a"}, {"b"}], {"b"}
+    net.run(60.0)
+    assert net.serving == {"a"}
+    net.parts, net.deaf = [{"a", "b"}], set()
+    since = len(net.history)
+    net.run(20.0)
+    assert all(served == {"a"} for served in net.history[since:])
+
+
+def test_robot_that_comes_back_after_its_node_died_is_served():
+    net = Network("a", "b")
+    net.run(7.0)
+    net.stopped, net.deaf = {"a"}, {"b"}
+    net.run(20.0)
+    assert net.serving == set()
+    net.deaf = set()
+    net.run(4.5)
+    assert net.serving == {"b"}
+
+
 def test_node_that_was_stopped_finds_that_it_has_been_replaced():
     net = Network("a", "b")
     net.run(5.0)
@@ -127,11 +153,12 @@ def test_after_any_faults_one_node_serves_within_six_seconds_and_stays_the_only_
         split = set(rng.sample(names, rng.randint(0, len(names) - 1)))
         net.parts = [split, set(names) - split]
         net.stopped = {name for name in names if rng.random() < 0.3}
+        net.deaf = {name for name in names if rng.random() < 0.3}
         if rng.random() < 0.3:
             net.start(name := rng.choice(names))  # it was killed
             net.parts[0].discard(name)
             net.parts[1].add(name)
-    net.parts, net.stopped = [set(names)], set()
+    net.parts, net.stopped, net.deaf = [set(names)], set(), set()
     net.run(6.0)
     since = len(net.history)
     net.run(20.0)
@@ -150,6 +177,7 @@ def test_node_that_says_that_it_ends_is_followed_at_once():
 def test_slow_statuses_are_waited_for():
     standing = Election("b", 1.0, 0.0)
     standing.hear(Claim(1, "a", period=10.0), 1.0)
+    standing.hear_robot(40.0)
     assert standing.tick(40.9) is None
     assert standing.tick(41.1) == Claim(2, "b")
 
@@ -193,6 +221,7 @@ def test_status_of_another_node_silences_this_one_for_its_robot_only(caplog):
     def pass_time(until):
         while now[0] < until:
             now[0] += 0.5
+            elections.hear_robot("r1")
             elections.claim("r1"), elections.claim("r2")
 
     assert (elections.claim("r1"), elections.served_by("r1")) == (None, None)

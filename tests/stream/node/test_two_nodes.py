@@ -18,7 +18,7 @@ from serving import FALSE, Service
 from sockets import until
 from zenoh_routers import Router
 
-from coview_stream.stream.node.engine_child import python_command, python_environment
+from coview_stream.clouds.python_child import python_command, python_environment
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")]
 
@@ -134,7 +134,7 @@ def test_first_node_is_killed_then_a_second_first_and_nobody_waits_for_the_dead(
             killed = time.monotonic()
             service.tracks(20.0)
             gap = time.monotonic() - killed
-            assert gap < 8.0, "of a busy machine; on an idle one it is less than 3 s"
+            assert gap < 10.0, "of a busy machine; on an idle one it is 3 to 4 s"
             service.process.wait()
             others.append(Other(service, router.endpoint))  # the first one, started again
             others[1].wait()
