@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
+
 _SILENT = 5.0  # seconds without a sample, after which a key is listened to by another session; set by hand
 _LONGEST = 300.0  # seconds between two such checks of one key, which follow each other at twice the time each
 _LISTEN = 1.5  # seconds that the other session listens
@@ -48,12 +50,18 @@ class SubscriptionCheck:
     Args:
         listen: see :data:`Listen`.
         reopen: opens the session anew, with all that was declared on it.
+        guard: logs what goes wrong, which must not end the checks.
         clock: seconds, monotonic.
     """
 
     def __init__(
-        self, listen: Listen, reopen: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+        self,
+        listen: Listen,
+        reopen: Callable[[str], None],
+        guard: RateLimitedErrors,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._guard = guard
         self._listen = listen
         self._reopen = reopen
         self._clock = clock
@@ -75,7 +83,8 @@ class SubscriptionCheck:
     def run(self, stopping: threading.Event) -> None:
         """Check what is silent until ``stopping``."""
         while not stopping.wait(_LOOK):
-            self.check(stopping.wait)
+            with self._guard.catch("subscription check"):
+                self.check(stopping.wait)
 
     def check(self, wait: Callable[[float], object]) -> None:
         """Check what is silent and due now; ``wait(seconds)`` passes time."""

@@ -80,7 +80,7 @@ class ZenohTransport:
         self._declared: list[Any] = []  # zenoh undeclares what is not referenced
         self._declarations: list[Callable[[Any], None]] = []  # also those of before, for the session after this one
         self._publishers: list[ZenohPublisher] = []
-        self._check = SubscriptionCheck(self._listen, self._reopen)
+        self._check = SubscriptionCheck(self._listen, self._reopen, self._guard)
         self._answers = Answers(self._guard)
         self._writer = Writer(self._guard)
         self._session: Any = None
@@ -101,6 +101,7 @@ class ZenohTransport:
         size = 1 if policy == "newest" else _QUEUE
         channel = zenoh.handlers.RingChannel if policy == "newest" else zenoh.handlers.FifoChannel
 
+        self._require_key(key)
         subscription = self._check.add(key)
 
         def declare(session: Any) -> None:
@@ -334,11 +335,15 @@ class ZenohTransport:
         declared.clear()
         self._keep_trying(SimpleQueue())
 
-    def _declare(self, key: str, declare: Callable[[Any], None]) -> None:
+    @staticmethod
+    def _require_key(key: str) -> None:
         import zenoh
 
         with zenoh_errors(f"key {key!r}"):
             zenoh.KeyExpr(key)
+
+    def _declare(self, key: str, declare: Callable[[Any], None]) -> None:
+        self._require_key(key)
         with self._lock:
             if self._closing.is_set():
                 raise TransportError(f"key {key!r}: the transport is closed")

@@ -10,9 +10,14 @@ import pytest
 from sockets import until
 from zenoh_routers import Router
 
+from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded
+from coview_stream.stream.transport import subscription_check
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.subscription_check import SubscriptionCheck
 from coview_stream.stream.transport.zenoh_transport import open_transport
+
+GUARD = RateLimitedErrors(logging.getLogger(__name__))
 
 
 class World:
@@ -23,7 +28,7 @@ class World:
         self.sent: set[str] = set()
         self.asked: list[tuple[float, set[str]]] = []
         self.reopened: list[str] = []
-        self.check = SubscriptionCheck(self.listen, self.reopened.append, lambda: self.now)
+        self.check = SubscriptionCheck(self.listen, self.reopened.append, GUARD, lambda: self.now)
 
     def listen(self, keys, seconds):
         self.asked.append((self.now, set(keys)))
@@ -97,6 +102,33 @@ def test_handler_at_work_is_not_deaf():
     world.sent = {"robot/cloud"}
     world.run(30.0)
     assert not world.asked
+
+
+def test_error_does_not_end_the_checks(monkeypatch):
+    monkeypatch.setattr(subscription_check, "_LOOK", 0.001)
+    stopping, looks = threading.Event(), []
+
+    def listen(keys, seconds):
+        looks.append(keys)
+        if len(looks) == 3:
+            stopping.set()
+        raise ValueError("no such key")
+
+    ticks = iter(range(10_000))
+    check = SubscriptionCheck(listen, looks.append, GUARD, lambda: 100.0 * next(ticks))
+    check.add("a")
+    check.run(stopping)
+    assert looks == [{"a"}] * 3
+
+
+@pytest.mark.slow
+def test_key_that_is_none_is_refused_and_not_checked():
+    with Router() as router:
+        transport = open_transport([router.endpoint], check_silence=True)
+        with pytest.raises(TransportError, match="key"):
+            transport.subscribe("bad//key", print, "all")
+        assert not transport._check._all
+        transport.close()
 
 
 @pytest.mark.slow
