@@ -106,7 +106,7 @@ class Election:
 
     def __init__(self, node: str, period: float, now: float, host: str = "") -> None:
         self._node, self._period, self._host = node, period, host
-        self._patient_until = now + _PATIENCE
+        self._patient_until = now + _PATIENCE * max(1.0, period)
         self._ticked: float | None = None
         self._robot_heard = now
         self._latest_term = 0
@@ -122,6 +122,10 @@ class Election:
         if self.claim is not None and not claim.outranks(self.claim):
             self.challenges += not claim.ending
             return
+        leader = self.other
+        awaited = leader is not None and not leader.ending and now < self._patient_until
+        if awaited and leader is not None and leader.node != claim.node and leader.outranks(claim):
+            return  # of two others the one that goes on is waited for
         if not claim.ending:
             self.claim = None
         self.other = claim
@@ -151,8 +155,9 @@ class Election:
         return self.claim is None and now >= self._patient_until
 
     def wait(self, now: float) -> None:
-        """Listen anew, unless this node serves: that nobody has been heard so far says nothing."""
-        self._patient_until = max(self._patient_until, now + _PATIENCE)
+        """Listen anew: that nobody has been heard so far says nothing. Of no effect while this node serves."""
+        known = self._period if self.other is None else max(self._period, self.other.period)
+        self._patient_until = max(self._patient_until, now + _PATIENCE * max(1.0, known))
 
 
 class Elections:

@@ -174,6 +174,24 @@ def test_node_that_says_that_it_ends_is_followed_at_once():
     assert standing.tick(3.4) == Claim(4, "b")
 
 
+def test_lower_node_that_ends_is_not_the_one_that_is_waited_for():
+    standing = Election("c", 1.0, 0.0)
+    standing.hear(Claim(5, "a"), 1.0)
+    standing.hear(Claim(3, "b"), 1.5)
+    standing.hear(replace(Claim(3, "b"), ending=True), 2.0)
+    assert standing.tick(2.0) is None
+    assert standing.other == Claim(5, "a")
+    standing.hear_robot(4.9)
+    assert standing.tick(4.9) is None
+    assert standing.tick(5.1) == Claim(6, "c")
+
+
+def test_node_of_slow_statuses_listens_as_long_as_they_take():
+    node = Election("a", 10.0, 0.0)
+    assert node.tick(39.0) is None
+    assert node.tick(41.0) == Claim(1, "a", 10.0)
+
+
 def test_slow_statuses_are_waited_for():
     standing = Election("b", 1.0, 0.0)
     standing.hear(Claim(1, "a", period=10.0), 1.0)
