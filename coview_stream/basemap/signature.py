@@ -122,13 +122,18 @@ def make_keys(name: str | os.PathLike[str]) -> tuple[Path, Path, str]:
     known = key.public_key().public_bytes(form.Encoding.PEM, form.PublicFormat.SubjectPublicKeyInfo)
     if public.exists():  # before the private one is there
         raise InputError(f"{public}: exists; a key is never overwritten: give another name")
+    made: list[Path] = []
     for path, content, mode in ((private, secret, 0o600), (public, known, 0o644)):
         try:
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            made.append(path)
+            with os.fdopen(descriptor, "wb") as file:
                 file.write(content)
         except FileExistsError as error:
             raise InputError(f"{path}: exists; a key is never overwritten: give another name") from error
         except OSError as error:
+            for half in made:  # both or none
+                half.unlink(missing_ok=True)
             raise InputError(
                 f"{path}: cannot be written ({error.strerror}); give a name in a writable place"
             ) from error

@@ -265,3 +265,20 @@ def test_missing_library_is_one_line_with_the_remedy(path, key, monkeypatch):
     monkeypatch.setattr(signature, "require_library", missing)
     with pytest.raises(DependencyError, match=r"pip install 'cryptography>=42'"):
         opened(path, key)
+
+
+def test_keys_are_both_there_or_none(tmp_path, monkeypatch):
+    opened = os.fdopen
+
+    def full(descriptor, mode):
+        file = opened(descriptor, mode)
+        if len(list(tmp_path.iterdir())) == 2:
+            file.close()
+            raise OSError(28, "No space left on device")
+        return file
+
+    monkeypatch.setattr(os, "fdopen", full)
+    with pytest.raises(InputError, match="No space left"):
+        make_keys(tmp_path / "site")
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == []

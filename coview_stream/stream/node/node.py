@@ -207,6 +207,8 @@ class Node:
 
     def add_map(self, feed: EngineFeed) -> None:
         """Have the robots' messages go to the sessions and engines of another map as well, which publish nothing."""
+        for left in self.feeds[1:]:  # of a change that failed half way
+            left.close(_JOIN_TIMEOUT)
         self.feeds = (self.feeds[0], feed)
         for robot, session in zip(self._robots, feed.sessions, strict=True):
             robot.add_session(session)

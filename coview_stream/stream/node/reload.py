@@ -114,9 +114,14 @@ class MapReloader:
             return
         self._note("handing over")
         begin = time.monotonic()
-        for old, new in zip(self._node.sessions, opened.sessions, strict=True):
-            new.begin_beside(old)
-        self._node.add_map(self._node.make_feed(opened.sessions, opened.engines))
+        try:
+            for old, new in zip(self._node.sessions, opened.sessions, strict=True):
+                new.begin_beside(old)
+            self._node.add_map(self._node.make_feed(opened.sessions, opened.engines))
+        except BaseException:
+            for engine in opened.engines.values():
+                engine.close()
+            raise
         waiting = dict(enumerate(opened.sessions))
         while waiting and not stopping.wait(_STEP):
             for number, new in list(waiting.items()):

@@ -160,3 +160,16 @@ def test_cancelled_opening_is_no_error(changes, caplog):
     change.site.node.reload()
     until(lambda: change.notices == [True, False])
     assert "refused" not in caplog.text
+
+
+def test_change_that_fails_before_the_hand_over_leaves_no_engines(changes, monkeypatch):
+    change = changes("r1")
+
+    def refuse(self, old):
+        raise RuntimeError("made up")
+
+    monkeypatch.setattr(Session, "begin_beside", refuse)
+    change.reloader.request()
+    until(lambda: change.reloader.last["result"] == "failed", 10.0)
+    assert all(runner.closed == 1 for runner in change.runners)
+    assert len(change.site.node.feeds) == 1
