@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coview_stream.cli.options import check_codec
+from coview_stream.cli.options import add_mount, add_topics, check_codec, mount_of
 from coview_stream.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
+    from coview_stream.basemap.basemap import BaseMap
     from coview_stream.doctor.finding import Finding
     from coview_stream.stream.transport.keys import RobotKeys
 
@@ -26,6 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; keys and encodings are those of ``serve``."""
     parser.add_argument("map", type=Path, nargs="?", metavar="SITE.coview", help="a base map to look at")
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="robots to listen to")
+    recorded = parser.add_argument_group("a recorded run")
+    recorded.add_argument(
+        "--run", type=Path, dest="run_path", metavar="RUN", help="judge it, and search the map for it"
+    )
+    recorded.add_argument("--odometry", default="auto", metavar="auto|FILE", help="of the run, as for locate (auto)")
+    add_mount(recorded)
+    add_topics(recorded)
     network = parser.add_argument_group("network (looked at if one of these, or --robot, is given)")
     network.add_argument("--connect", action="append", default=[], metavar="EP", help="(tcp/127.0.0.1:7447)")
     network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for others here")
@@ -47,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.doctor.finding import failed
 
     keys = _robot_keys(args)
+    mount_of(args)  # before anything slow
     findings: list[Finding] = []
     for finding in _findings(args, keys):
         findings.append(finding)
@@ -54,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
             print(finding.line(), flush=True)  # the next one may take seconds
     if args.json:
         print(json.dumps([finding.to_json() for finding in findings], indent=1))
+    elif any(finding.verdict != "ok" for finding in findings):
+        print("by symptom, with what to do: docs/troubleshooting.md")
     return 1 if failed(findings) else 0
 
 
@@ -84,15 +95,32 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     connect = _endpoints(args)
     zenoh = connect is not None and _check_zenoh_config(args, connect)
     yield from machine_findings()
-    sha256 = None
+    sha256 = base_map = None
     if args.map is not None:
         base_map, finding = open_map(args.map)
         yield finding
         if base_map is not None:
             sha256 = base_map.sha256
             yield from map_findings(base_map, args.map.stat().st_size, memory()[1])
+    if args.run_path is not None:
+        yield from _recorded(args, base_map)
     if connect is not None and zenoh:
         yield from _network(args, connect, keys, sha256)
+
+
+def _recorded(args: argparse.Namespace, base_map: BaseMap | None) -> Iterator[Finding]:
+    """Judge a recorded run; what cannot be opened is a finding."""
+    from coview_stream.doctor.finding import from_error
+    from coview_stream.doctor.run_checks import run_findings
+    from coview_stream.errors import CoViewError
+    from coview_stream.recordings.open_run import open_run
+
+    try:
+        recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, mount=mount_of(args))
+    except CoViewError as error:
+        yield from_error("run", error)
+        return
+    yield from run_findings(recorded, base_map)
 
 
 def _check_zenoh_config(args: argparse.Namespace, connect: list[str]) -> bool:

@@ -22,7 +22,7 @@ def add_run_path(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_path", type=Path, metavar="RUN", help="run directory, cloud file, or rosbag2, mcap, bag")
 
 
-def add_topics(parser: argparse.ArgumentParser) -> None:
+def add_topics(parser: argparse._ActionsContainer) -> None:
     """Declare ``--cloud-topic`` and ``--odometry-topic`` of a ROS recording."""
     parser.add_argument("--cloud-topic", metavar="TOPIC", help="clouds of a recording with several such topics")
     parser.add_argument("--odometry-topic", metavar="TOPIC", help="its odometry, likewise")

@@ -13,7 +13,7 @@ import numpy as np
 
 from coview_stream.config.node import NodeConfig
 from coview_stream.errors import EncodingError, MessageError
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry, prepare
 from coview_stream.messages.choose import MessageKind, codec_for
 from coview_stream.messages.json_messages import read_status
@@ -31,6 +31,8 @@ Codecs = tuple[str | None, str | None]
 
 # set by hand
 _MAX_MESSAGES = 20_000  # kept of a channel: enough for 30 s of the fastest IMU odometry
+_MAX_KEPT = 30_000  # points of a cloud
+_MAX_CLOUDS = 300  # of which points are kept
 _MAX_COORDINATE = 1000.0  # metres: no lidar reaches farther; bytes read in a wrong format are any size
 
 
@@ -52,6 +54,7 @@ class CapturedMessage:
         distance: median distance of the points, metres, NaN without points.
         sweep: seconds after the stamp of the first and the last point, None without a time per point.
         T_odom_body: (4, 4) odometry, None for clouds.
+        cloud: (N, 3) float32 finite points, some of them, of some clouds; None of the others.
     """
 
     arrived: float
@@ -67,6 +70,7 @@ class CapturedMessage:
     distance: float = float("nan")
     sweep: tuple[float, float] | None = None
     T_odom_body: Pose | None = None
+    cloud: Points | None = None
 
 
 @dataclass
@@ -121,7 +125,8 @@ def capture_robots(
     ) -> Callable[[Sample], None]:
         def handler(sample: Sample) -> None:
             if not over and len(messages) < _MAX_MESSAGES:
-                messages.append(describe(sample, clock()))
+                message = describe(sample, clock())
+                messages.append(message if len(messages) < _MAX_CLOUDS else replace(message, cloud=None))
 
         return handler
 
@@ -168,7 +173,14 @@ def capture_cloud(
         points=len(distances),
         distance=float(np.median(distances)) if len(distances) else float("nan"),
         sweep=sweep,
+        cloud=_some(message.points),
     )
+
+
+def _some(points: Points) -> Points:
+    """Return every n-th finite point (N, 3), :data:`_MAX_KEPT` at most."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return np.array(points[:: -(-len(points) // _MAX_KEPT) or 1], dtype=np.float32)
 
 
 def capture_odometry(

@@ -60,10 +60,11 @@ def odometry_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding
 
 def _missing(what: str, capture: RobotCapture, key: str, elsewhere: str) -> Finding:
     remedy = "does the robot publish, on this key, and do access rules let it?"
+    remedy = elsewhere or remedy
     if what == "odometry":
-        remedy += " If it has none: `serve --odometry kiss-icp`"
+        remedy += f"{'.' * bool(elsewhere)} If it has none: `serve --odometry kiss-icp`"
     found = f"none in {capture.ended - capture.began:.1f} s on {key}"
-    return Finding("FAIL", what, found, elsewhere or remedy, capture.keys.robot)
+    return Finding("FAIL", what, found, remedy, capture.keys.robot)
 
 
 def _made_by_node(maker: str, ignored: int, robot: str) -> Finding:

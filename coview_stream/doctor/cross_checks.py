@@ -13,6 +13,7 @@ import numpy as np
 from coview_stream.config.node import NodeConfig
 from coview_stream.doctor.capture import CapturedMessage, RobotCapture
 from coview_stream.doctor.finding import Finding
+from coview_stream.doctor.frame_geometry import SeenFrame
 from coview_stream.messages.types import CloudMessage, OdometryMessage
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters
@@ -25,6 +26,9 @@ _MIN_PAIRED = 0.9  # share of the clouds that find odometry, set by hand
 _MAX_STATUS_AGE = 5.0  # seconds, set by hand; a node publishes one every second
 _LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
 _LEAP_TOLERANCE = 0.4  # seconds off a whole number of leap seconds, set by hand
+_MAX_FRAMES = 60  # compared with odometry, set by hand
+_NEAREST_NS = 100_000_000  # a cloud's stamp from the odometry that is taken for it, set by hand
+_LONG_SEARCH = 60.0  # seconds, set by hand: most robots are found within ten
 _DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 
 
@@ -104,6 +108,22 @@ def pairing_finding(
     return Finding("ok" if paired >= _MIN_PAIRED * len(clouds) else "warn", "pairing", found, robot=robot)
 
 
+def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
+    """Return the clouds that were kept, each with the odometry nearest to its stamp."""
+    odometry = [(m.stamp_ns or 0, m.T_odom_body) for m in capture.odometry if m.T_odom_body is not None]
+    odometry.sort(key=lambda item: item[0])
+    clouds = [m for m in capture.clouds if m.cloud is not None and m.stamp_ns is not None]
+    if not odometry or not clouds:
+        return []
+    stamps = np.array([stamp for stamp, _ in odometry])
+    frames = []
+    for message in clouds[:: -(-len(clouds) // _MAX_FRAMES)]:
+        nearest = int(np.argmin(np.abs(stamps - (message.stamp_ns or 0))))
+        if abs(int(stamps[nearest]) - (message.stamp_ns or 0)) < _NEAREST_NS and message.cloud is not None:
+            frames.append(SeenFrame((message.stamp_ns or 0) * 1e-9, message.cloud, odometry[nearest][1]))
+    return frames
+
+
 def _without_points(captured: CapturedMessage) -> CloudMessage:
     """Return a cloud of the same stamp without points: pairing reads stamps only."""
     times = None if captured.sweep is None else np.array(captured.sweep)
@@ -137,7 +157,18 @@ def node_finding(capture: RobotCapture, sha256: str | None, now_ns: int | None =
     errors = status.get("errors")
     if isinstance(errors, list) and errors:
         return Finding("warn", "node", f"{found}; reports: {str(errors[-1])[:200]}", robot=robot)
+    if status.get("state") != "TRACKING" and _number(status, "uptime_s") > _LONG_SEARCH:
+        return Finding("warn", "node", found, _not_found(_text(status, "reason")), robot)
     return Finding("ok", "node", found, robot=robot)
+
+
+def _not_found(reason: str) -> str:
+    """Say what to do about a robot that has no place."""
+    if "waiting for" in reason or reason.startswith("no clouds"):
+        return "its data does not come: see clouds and odometry above"
+    if "two places" in reason or "several places" in reason or "leads" in reason:
+        return "drive on, past what tells these places apart; `info --ambiguity` shows where that takes long"
+    return "drive ten metres; if all else here is ok: is it on this map? docs/troubleshooting.md"
 
 
 def _text(status: dict[str, Any], name: str) -> str:

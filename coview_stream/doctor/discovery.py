@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from difflib import SequenceMatcher
 
 from coview_stream.errors import ConfigError
 from coview_stream.stream.transport.keys import robot_keys
@@ -63,11 +64,27 @@ def discover(transport: Transport, wait: Callable[[float], object] = time.sleep)
     return sorted(found)
 
 
-def candidates_text(candidates: Iterable[Candidate], channel: str) -> str:
-    """Name the candidates of a channel, with the options that subscribe to them; empty if there are none."""
-    fitting = [candidate for candidate in candidates if candidate.channel == channel]
+def served_robots(transport: Transport) -> set[str]:
+    """Return the names of the robots for which a node holds a liveliness token, of any base."""
+    return {token.split("/")[-2] for token in transport.tokens("**/alive") if "/" in token}
+
+
+def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "", served: Iterable[str] = ()) -> str:
+    """Name the candidates of a channel, with the options that subscribe to them; empty if there are none.
+
+    Args:
+        candidates: found on the network.
+        channel: ``cloud`` or ``odometry``.
+        like: key that nothing came on: those that are spelt most like it come first.
+        served: robots that have a node; their data is named only if there is no other.
+    """
+    others = set(served)
+    fitting = [c for c in candidates if c.channel == channel]
+    fitting = [c for c in fitting if not others & set(c.where.strip("/").split("/"))] or fitting
     if not fitting:
         return ""
+    if like:
+        fitting.sort(key=lambda c: SequenceMatcher(None, c.where.strip("/"), like.strip("/")).ratio(), reverse=True)
     what = "clouds come" if channel == "cloud" else "odometry comes"
     listed = "; ".join(f"on {candidate.where}: try {candidate.options}" for candidate in fitting[:_MAX_LISTED])
     more = f"; and {len(fitting) - _MAX_LISTED} more" if len(fitting) > _MAX_LISTED else ""

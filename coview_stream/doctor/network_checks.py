@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 from coview_stream.doctor.capture import Codecs, RobotCapture, Wait, capture_robots
 from coview_stream.doctor.channel_checks import cloud_findings, odometry_findings
-from coview_stream.doctor.cross_checks import cross_findings, node_finding
-from coview_stream.doctor.discovery import Candidate, candidates_text, discover
+from coview_stream.doctor.cross_checks import captured_frames, cross_findings, node_finding
+from coview_stream.doctor.discovery import Candidate, candidates_text, discover, served_robots
 from coview_stream.doctor.finding import Finding
+from coview_stream.doctor.frame_checks import frame_findings
 from coview_stream.stream.transport.keys import RobotKeys
 from coview_stream.stream.transport.transport import Connection, Transport
 
@@ -73,11 +74,22 @@ def _counts(connection: Connection) -> str:
     return ", ".join(f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in counts.items() if n)
 
 
-def robot_findings(capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None) -> Iterator[Finding]:
-    """Judge all of one robot; ``candidates`` are what else is on the network, ``sha256`` the map's if one is known."""
-    yield from cloud_findings(capture, candidates_text(candidates, "cloud"))
-    yield from odometry_findings(capture, candidates_text(candidates, "odometry"))
+def robot_findings(
+    capture: RobotCapture, candidates: Sequence[Candidate], sha256: str | None, served: Collection[str] = ()
+) -> Iterator[Finding]:
+    """Judge all of one robot.
+
+    Args:
+        capture: what it sent.
+        candidates: what else is on the network.
+        sha256: the map's, if one is known.
+        served: robots that have a node.
+    """
+    others = set(served) - {capture.keys.robot}
+    yield from cloud_findings(capture, candidates_text(candidates, "cloud", capture.keys.cloud, others))
+    yield from odometry_findings(capture, candidates_text(candidates, "odometry", capture.keys.odometry, others))
     yield from cross_findings(capture)
+    yield from frame_findings(captured_frames(capture), capture.keys.robot)
     yield node_finding(capture, sha256)
 
 
@@ -94,8 +106,9 @@ def robots_findings(
     captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
     silent = not all(capture.clouds and capture.odometry for capture in captures)
     candidates = discover(transport, wait=wait) if silent or not keys else []
+    served = served_robots(transport) if candidates else set()
     for capture in captures:
-        yield from robot_findings(capture, candidates, sha256)
+        yield from robot_findings(capture, candidates, sha256, served)
     if not keys:
         yield candidates_finding(candidates)
 

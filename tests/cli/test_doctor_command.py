@@ -77,7 +77,7 @@ def test_healthy_robot_over_zenoh(capsys):
     assert code == 0, found
     paced = ("clouds", "odometry", "cloud stamps", "odometry stamps", "pairing")
     assert {what: verdicts.pop(what) in ("ok", "warn") for what in paced} == dict.fromkeys(paced, True)
-    assert verdicts == {"gravity": "ok", "one clock": "ok", "node": "warn"}
+    assert verdicts == {"gravity": "ok", "ground": "warn", "one clock": "ok", "node": "warn"}
     assert "says nothing" in found[-1]["found"]  # the token was seen, a status was not
     assert [f["found"] for f in found if f["what"] == "network"] == ["connected: 1 peer"]
 
@@ -100,7 +100,10 @@ def test_wrong_robot_name_suggests_the_right_one(capsys):
         code, found = findings_of(capsys, "--robot", "rover", "--connect", robot.endpoint, "--seconds", "0.2")
     assert code == 1
     assert found[-3]["remedy"] == "clouds come on coview/r1/in/cloud: try --robot r1"
-    assert found[-2]["remedy"] == "odometry comes on coview/r1/in/odom: try --robot r1"
+    assert (
+        found[-2]["remedy"]
+        == "odometry comes on coview/r1/in/odom: try --robot r1. If it has none: `serve --odometry kiss-icp`"
+    )
 
 
 def test_no_robot_on_the_network(capsys, monkeypatch):

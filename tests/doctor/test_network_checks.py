@@ -52,6 +52,7 @@ def test_findings_of_a_robot_and_its_node():
         "odometry": "ok",
         "odometry stamps": "ok",
         "gravity": "ok",
+        "ground": "warn",  # noise has none
         "one clock": "ok",
         "pairing": "ok",
         "node": "warn",  # it says no version

@@ -1,0 +1,125 @@
+"""Clouds against odometry: the usual faults of a set-up on a simulated drive and, where they are, on real runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_world
+
+from coview_stream.config.mount import parse_mount
+from coview_stream.doctor.frame_checks import frame_findings
+from coview_stream.doctor.frame_geometry import RIVALS, SeenFrame
+from coview_stream.doctor.run_checks import seen_frames
+from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
+from coview_stream.recordings.open_run import open_run
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("COVIEW_DATA", ROOT.parent / "shared" / "data"))
+R_camera_body = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def T(R):
+    return pose_from(R, np.zeros(3))
+
+
+def clouds(R):
+    return lambda f: SeenFrame(f.stamp, transform(T(R), f.points), f.T_odom_body)
+
+
+def scaled(s):
+    return lambda f: SeenFrame(f.stamp, f.points * np.float32(s), f.T_odom_body)
+
+
+def odometry(change):
+    return lambda f: SeenFrame(f.stamp, f.points, change(f.T_odom_body))
+
+
+def camera(f):
+    return SeenFrame(
+        f.stamp, transform(T(R_camera_body), f.points), T(R_camera_body) @ f.T_odom_body @ inverse(T(R_camera_body))
+    )
+
+
+PITCH = exp_so3([0.0, np.radians(10.0), 0.0])
+FAULTS = {
+    "lidar tilted": (clouds(PITCH), "lean"),
+    "odometry tilted": (odometry(lambda P: T(PITCH) @ P), "lean"),
+    "upside down": (clouds(exp_so3([np.pi, 0.0, 0.0])), "upside down"),
+    "yawed": (clouds(rot_z(np.pi / 2)), "against the motion of the body"),
+    "camera axes": (camera, "camera"),
+    "camera clouds": (clouds(R_camera_body), "axis points up"),
+    "static": (odometry(lambda P: np.eye(4)), "stands still, but the lidar moves"),
+    "inverse": (odometry(inverse), "inverse"),
+    "transposed": (odometry(RIVALS["transposed"]), "transposed"),
+    "millimetres": (scaled(1000.0), "millimetres"),
+    "feet": (scaled(3.2808), "feet"),
+}
+
+
+@pytest.fixture(scope="module")
+def frames(scene):
+    drive = small_world.record_along(scene, small_world.drive(14), 1.0)
+    pairs = zip(drive.clouds, drive.T_odom_body, strict=True)
+    return [SeenFrame(0.5 * k, cloud, pose) for k, (cloud, pose) in enumerate(pairs)]
+
+
+def test_unspoilt_drive_is_ok(frames):
+    assert [(f.what, f.verdict) for f in frame_findings(frames)] == [("ground", "ok"), ("motion", "ok")]
+
+
+# this drive is nearly straight: there an inverse is told as a lidar that is turned on the body
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "inverse"])
+def test_fault_is_found(frames, fault):
+    spoil, words = FAULTS[fault]
+    findings = list(frame_findings([spoil(f) for f in frames]))
+    assert any(words in f.found and f.verdict != "ok" and f.remedy for f in findings), findings
+
+
+def test_standing_robot_is_told_to_drive(frames):
+    (motion, ground) = frame_findings([frames[0]] * 8)
+    assert (motion.verdict, ground.verdict) == ("ok", "ok")
+    assert "drive" in motion.remedy
+
+
+def test_remedy_of_an_upside_down_lidar_is_its_mount(frames):
+    spoil, _ = FAULTS["upside down"]
+    (finding,) = frame_findings([spoil(f) for f in frames])
+    option = finding.remedy.removeprefix("set --mount=")
+    mount = parse_mount(option)
+    for f in frames[:3]:
+        back = mount.to_body(spoil(f).points)
+        assert np.linalg.norm(back - f.points, axis=1).max() < 0.1 * np.linalg.norm(f.points, axis=1).max()
+
+
+@pytest.fixture(scope="module")
+def real():
+    kept = {}
+
+    def frames(name):
+        path = DATA / name / "run"
+        if not path.exists():
+            pytest.skip(f"real scans {path} are not here; name their folder in COVIEW_DATA")
+        if name not in kept:
+            kept[name] = seen_frames(open_run(path))
+        return kept[name]
+
+    return frames
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["riverside_a", "kitti04", "handheld_livox"])
+def test_unspoilt_run_is_ok(real, name):
+    assert [f.verdict for f in frame_findings(real(name))] == ["ok", "ok"]
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_is_found_on_a_real_run(real, fault):
+    spoil, words = FAULTS[fault]
+    findings = list(frame_findings([spoil(f) for f in real("riverside_a")]))
+    assert any(words in f.found and f.verdict != "ok" and f.remedy for f in findings), findings
