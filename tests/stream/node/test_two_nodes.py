@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -19,6 +20,8 @@ from sockets import until
 from zenoh_routers import Router
 
 from coview_stream.clouds.python_child import python_command, python_environment
+
+NIGHTLY = bool(os.environ.get("COVIEW_NIGHTLY"))  # minutes more, see .ci/run
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")]
 
@@ -136,25 +139,32 @@ def test_first_node_is_killed_then_a_second_first_and_nobody_waits_for_the_dead(
             gap = time.monotonic() - killed
             assert gap < 10.0, "of a busy machine; on an idle one it is 3 to 4 s"
             service.process.wait()
-            others.append(Other(service, router.endpoint))  # the first one, started again
-            others[1].wait()
-            assert serving(service, *others) == 0
-            for node in others:
-                node.end()
-            others = [Other(service, router.endpoint) for _ in range(2)]  # at once
-            for node in others:
-                node.wait()
-            first = serving(service, *others)
-            others[first].end()
-            service.tracks(20.0)
             assert max(service.errors()) < FALSE
+            if NIGHTLY:
+                started_again_and_at_once(service, others, router.endpoint)
         finally:
             for node in others:
                 node.end()
             service.end()
 
 
-@pytest.mark.parametrize("mode", ["cut", "silent"])
+def started_again_and_at_once(service, others, router):
+    """The first node, started again, does not take the robot back; of two that start at once one serves it."""
+    others.append(Other(service, router))
+    others[1].wait()
+    assert serving(service, *others) == 0
+    while others:
+        others.pop().end()
+    others += [Other(service, router) for _ in range(2)]
+    for node in others:
+        node.wait()
+    first = serving(service, *others)
+    others[first].end()
+    service.tracks(20.0)
+    assert max(service.errors()) < FALSE
+
+
+@pytest.mark.parametrize("mode", ["cut", "silent"] if NIGHTLY else ["silent"])
 def test_network_in_two_parts_has_one_node_again(world_file, slow_drive, tmp_path, mode):
     with Router() as router, BadLink(router.endpoint) as link:
         service = Service(world_file, slow_drive, tmp_path, router=link.endpoint, robots_router=router.endpoint)
