@@ -69,7 +69,8 @@ def check_signature(path: Path, header: dict[str, Any], exact: bool, key: Verify
     metadata = header["__metadata__"]
     if "signature" not in metadata:
         raise MapError(
-            f"{path}: the map is not signed, and a signature by {key.name} is asked for; build it with --sign"
+            f"{path}: the map is not signed, and a signature by {key.name} is asked for; build it with --sign and "
+            f"the key that {key.name} belongs to"
         )
     signed = header | {"__metadata__": {name: value for name, value in metadata.items() if name != "signature"}}
     try:

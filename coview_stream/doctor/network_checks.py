@@ -40,7 +40,10 @@ def connection_finding(transport: Transport, connect: Sequence[str], wait: Wait 
     if any(reason == _OPEN for _, reason in reasons):
         remedy = "another program, or it wants TLS or a password: RUST_LOG=zenoh=warn says more"
     else:
-        remedy = "start the router or node there, and let the firewall pass its port"
+        remedy = (
+            "start the router or node there ('coview-stream serve SITE.coview --robot NAME'), let the firewall pass "
+            "its port, and give this the same --connect as the others"
+        )
     return Finding("FAIL", "network", found, remedy)
 
 

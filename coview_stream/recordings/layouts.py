@@ -16,8 +16,8 @@ from coview_stream.geometry.transforms import Pose, Poses, inverse
 _KITTI_COLUMNS = 12
 _BAGS = (".mcap", ".db3", ".bag")
 _LAYOUTS = (
-    "frames/NNNNNN.pcd with odometry.tum, KITTI's velodyne/*.bin with times.txt and poses.txt, "
-    "or a ROS recording (rosbag2 directory, .mcap, .bag)"
+    "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
+    "poses.txt, or a ROS recording (rosbag2 directory, .mcap, .db3, .bag)"
 )
 
 
