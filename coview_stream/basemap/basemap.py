@@ -124,8 +124,9 @@ class BaseMap:
             check: compare its content with its checksum, for which the whole file is read; without, :attr:`sha256` is
                 what the file says: for one that another process has just checked.
             verify_key: public key, or its PEM file, that the map has to be signed with; its content is compared with
-                the signed hashes then, whatever ``check`` says. By :class:`~coview_stream.basemap.trust.Trust` a file
-                that has been compared is not read again.
+                the signed hashes then, whatever ``check`` says. A
+                :class:`~coview_stream.basemap.trust.Trust` names a file that has been compared already, and is not
+                read again.
 
         Raises:
             MapError: it is missing, damaged or of another version, an array has another type or shape, or it is not

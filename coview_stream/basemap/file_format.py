@@ -154,7 +154,7 @@ def open_file(path: Path, check: bool = True, trust: Trust | None = None) -> Loa
     """Memory-map a map, signed or not.
 
     The whole file is read once, to compare it with its checksum, if ``check``; after that only the pages used are in
-    memory. All is of the one file that was opened, whatever takes its name meanwhile.
+    memory. Everything is read from the file as it was opened, even if another file takes its name.
 
     Args:
         path: the file.
@@ -191,7 +191,7 @@ def open_file(path: Path, check: bool = True, trust: Trust | None = None) -> Loa
             if used > identity.size:
                 raise ValueError("its arrays overlap")  # or reading them takes any time
             if trust is not None and used < identity.size:
-                raise ValueError("it holds bytes of no array, which nobody signed")
+                raise ValueError("it holds bytes that belong to no array and are not signed")
             digest = str(metadata.get("sha256"))
             if trust is not None and trust.verified != identity:
                 trusting.check_sections(header, lambda name: _read(file, start, header[name]))

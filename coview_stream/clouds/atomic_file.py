@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_ABANDONED = 86_400.0  # seconds without a byte, after which a part is nobody's; set by hand
+_ABANDONED = 86_400.0  # seconds since the last write, after which a partial file is deleted; set by hand
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -42,7 +42,7 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
 
 
 def _remove_left(path: Path) -> None:
-    """Delete the parts of ``path`` that nobody writes any more; any other file of such a name is left alone."""
+    """Delete partial files of ``path`` whose writer has ended; any other file of such a name stays."""
     form = re.compile(re.escape(f".{path.name}.") + r"(?:([0-9a-f]{8})\.)?([0-9]{1,10})\.part")
     with contextlib.suppress(OSError):  # the writing that follows says what is wrong with the directory
         for entry in os.scandir(path.parent):

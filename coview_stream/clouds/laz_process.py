@@ -139,7 +139,7 @@ class LazProcess:
                     stream.close()
         try:
             child.wait(_MAX_END)
-        except subprocess.TimeoutExpired:  # busy with a file that nobody waits for
+        except subprocess.TimeoutExpired:  # still decoding a file whose result is not wanted
             child.kill()
             child.wait()
 

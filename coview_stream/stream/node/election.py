@@ -1,12 +1,12 @@
 """Election of the node that serves a robot: the one that does goes on, others stand by and take over from it.
 
-The statuses of a robot are the signs of life of the node that serves it; each says which node it is of, and of which
-*term*. A node begins by listening. Where it hears nobody for four statuses it serves, in a term after all
-that it has heard of; where it hears somebody it stands by: it computes everything, to take over with a pose, and
-publishes nothing. Of two that serve (they started at once, or a network was in two parts) the one of the later term
-goes on, and of the same term the one whose name comes first; it says so at once to the one that does not. A node that
-has itself been stopped for longer than others wait for it listens again before it says anything. Nobody takes over by
-what is not heard while the network is away, nor from a node that falls silent together with the robot.
+The statuses of a robot show that the node that serves it is running; each says which node it is of, and of which
+*term*. A node begins by listening. If no status arrives for four periods it serves, in a term later than all that
+it has heard of; otherwise it stands by: it computes everything, to take over with a pose, and publishes nothing. Of
+two that serve (they started at once, or a network was in two parts) the one of the later term goes on, and of the
+same term the one whose name comes first; it says so at once to the one that does not. A node that has itself been
+stopped for longer than others wait for it listens again before it says anything. Nobody takes over by what is not
+heard while the network is away, nor from a node that falls silent together with the robot.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class Election:
         return self.claim is None and now >= self._patient_until
 
     def wait(self, now: float) -> None:
-        """Listen anew: that nobody has been heard so far says nothing. Of no effect while this node serves."""
+        """Begin to listen again, for example after a stop of this process. No effect while this node serves."""
         known = self._period if self.other is None else max(self._period, self.other.period)
         self._patient_until = max(self._patient_until, now + _PATIENCE * max(1.0, known))
 
