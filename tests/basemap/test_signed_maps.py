@@ -94,7 +94,7 @@ def test_truncated_map_is_refused(path, key, length):
 
 def test_appended_bytes_are_refused(path, key):
     path.write_bytes(path.read_bytes() + b"x")
-    with pytest.raises(MapError, match="nobody signed"):
+    with pytest.raises(MapError, match="are not signed"):
         opened(path, key)
 
 
