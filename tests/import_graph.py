@@ -29,6 +29,7 @@ FOLDERS = (
     "localization",
     "stream",
     "report",
+    "viewers",
     "sim",
     "training",
     "doctor",

@@ -11,6 +11,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.result import KeyframeEvidence
+from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.pose_hints import FROM_THERE
 from coview_stream.localization.search.refinement import Candidate
 from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest
@@ -35,6 +36,7 @@ class SearchResult:
         leader: (4, 4) T_map_odom of the most probable place, accepted or not: registered, if that succeeded; None
             without any place.
         R_body_cloud: (3, 3) rotation that the keyframe's clouds have been levelled by.
+        considered: the most probable places, for people to look at; None where none was scored.
     """
 
     accepted: Candidate | None
@@ -45,6 +47,7 @@ class SearchResult:
     leader: Pose | None = None
     T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
     R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
+    considered: Considered | None = None
 
 
 def decide(

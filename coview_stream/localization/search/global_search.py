@@ -14,6 +14,7 @@ from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.modes import find_modes
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
@@ -118,7 +119,7 @@ class GlobalSearch:
         result = decide(scored, leader, request, self.config.acceptance, undecided)
         if result.accepted is not None:
             self.clear()
-        return result
+        return replace(result, considered=Considered.of(scored, request, self.base_map.origin))
 
     def _vote(self, request: SearchRequest) -> None:
         """Let every recognizer compare the keyframe with the map."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.request import Epoch, SearchRequest
 from coview_stream.localization.state import State
 from coview_stream.stream.node.counters import Counters, ErrorLog, Latency, last_line
@@ -49,6 +50,7 @@ class EngineQueue:
         longest_search_wait: seconds that a keyframe of this robot has been waiting for its search and that has taken,
             at most; one that is replaced by a newer one waits on.
         processed_at: local time of the newest fix; None before the first.
+        considered: places that the newest search has considered; None once there is a place, or another epoch.
     """
 
     def __init__(self, robot: str, epoch: int, counters: Counters, errors: ErrorLog) -> None:
@@ -62,6 +64,7 @@ class EngineQueue:
         self.engine_latency = Latency()
         self.longest_wait = self.longest_search_wait = 0.0
         self.processed_at: float | None = None
+        self.considered: Considered | None = None
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
         self._search_result: SearchResult | None = None
@@ -79,7 +82,7 @@ class EngineQueue:
         """Drop what waits, and forget what is under way: there is another odometry frame."""
         self._counters.dropped += self._frame is not None
         self.epoch = epoch
-        self._frame = self._frame_under_way = self._search_result = None
+        self._frame = self._frame_under_way = self._search_result = self.considered = None
         self._forget_searches()
 
     # ---- frames for the tracking engine
@@ -131,7 +134,7 @@ class EngineQueue:
         self.latency.add(now - frame.received)
         self.longest_wait = max(self.longest_wait, now - frame.waiting_since)
         if result.fix.state.has_place:
-            self._request = self._requested_at = None
+            self._request = self._requested_at = self.considered = None
         if result.request is not None:
             self.put_search_request(result.request, now)
         return frame
@@ -191,6 +194,7 @@ class EngineQueue:
         if self._searching_since is not None:
             self.longest_search_wait = max(self.longest_search_wait, now - self._searching_since)
         self._searching_since = None
+        self.considered = result.considered
         if result.accepted is not None:
             self._request = self._requested_at = None  # what came meanwhile need not be searched for
         if job.request.epoch == self._search_epoch:

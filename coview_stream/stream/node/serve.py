@@ -104,6 +104,7 @@ def open_node(
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.election import Elections
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
+        from coview_stream.stream.node.map_view import MapViewAnswer
         from coview_stream.stream.node.memory import MemoryRelease
         from coview_stream.stream.node.node import Node
         from coview_stream.stream.node.reload import MapReloader
@@ -136,6 +137,9 @@ def open_node(
         node.run_beside("reload", reloader.run)
         node.run_beside("memory", MemoryRelease().run)
         _add_health(node, options, notifier)
+        map_view = MapViewAnswer(options.map_path, lambda: node.map_sha256)
+        for keys in options.keys:
+            transport.answer(keys.map_view, map_view)
         node.start()
     except BaseException as error:
         for engine in engines.values():

@@ -17,6 +17,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry
+from coview_stream.messages.hypotheses import HypothesesMessage
 from coview_stream.messages.types import CloudMessage, OdometryMessage, PoseMessage, Sample
 from coview_stream.odometry.buffer import OdometryBuffer, SampleKind
 from coview_stream.stream.node.counters import Counters, ErrorLog, MissingFrames, counter_of
@@ -297,6 +298,15 @@ class Session:
                 has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
                 reason = status_text(self.keys, self.counters, has_odometry)
             return self.robot_state.state, reason
+
+    def hypotheses(self) -> HypothesesMessage | None:
+        """Places that the search considers; None while there is a place, and before the first search."""
+        with self._lock:
+            seen = self.queue.considered
+            if seen is None or self.robot_state.state.has_place:
+                return None
+            stamp_ns = round(seen.stamp * 1e9)
+            return HypothesesMessage(stamp_ns, self.keys.robot, seen.places, seen.none, self.map_sha256)
 
     @property
     def calibration(self) -> Calibration | None:

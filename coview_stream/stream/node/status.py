@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from coview_stream.localization.state import State
+from coview_stream.messages.hypotheses import encode_hypotheses
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.election import Elections
@@ -58,10 +59,13 @@ class Reporter:
         self._connection = ConnectionMonitor()
         self._reported: dict[str, tuple[str, object]] = {}  # states, as in the statuses, and what rivals were told
         self._publishers: dict[str, Publisher] = {}
+        self._hypotheses: dict[str, Publisher] = {}
 
     def declare(self, session: Session) -> None:
-        """Declare a robot's status."""
-        self._publishers[session.keys.robot] = self._transport.publisher(session.keys.status, "report")
+        """Declare a robot's status, and the places that a search for it considers."""
+        keys = session.keys
+        self._publishers[keys.robot] = self._transport.publisher(keys.status, "report")
+        self._hypotheses[keys.robot] = self._transport.publisher(keys.hypotheses, "report")
 
     def report_change(self, session: Session) -> None:
         """Have the status published at once if the robot's state is another than its last status says."""
@@ -96,6 +100,17 @@ class Reporter:
             with self._errors.catch(f"{session.keys.robot}: status"):
                 if all_robots or self._has_changed(session):
                     self._publish_status(session, now)
+                if all_robots:
+                    self._publish_hypotheses(session)
+
+    def _publish_hypotheses(self, session: Session) -> None:
+        """Publish what a search considers, while there is one."""
+        robot = session.keys.robot
+        if self._elections is not None and self._elections.claim(robot) is None:
+            return
+        message = session.hypotheses()
+        if message is not None:
+            self._hypotheses[robot].put(encode_hypotheses(message))
 
     def publish_last(self, now: float) -> None:
         """Publish that the node ends, and no robot is tracked any more."""

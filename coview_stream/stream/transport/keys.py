@@ -101,16 +101,20 @@ class RobotKeys(Preset):
     Attributes:
         robot: its name.
         status: key to publish the status on.
+        hypotheses: key to publish on which places a search considers.
         alive: key of the liveliness token.
         relocalize: key that answers queries to forget the pose and search again.
         reset: key that answers queries to forget everything.
+        map_view: key that answers queries with the map, thinned, to look at.
     """
 
     robot: str
     status: str
+    hypotheses: str
     alive: str
     relocalize: str
     reset: str
+    map_view: str
 
 
 @dataclass(frozen=True)
@@ -183,9 +187,11 @@ def robot_keys(
         },
         robot=robot,
         status=f"{own}/out/status",
+        hypotheses=f"{own}/out/hypotheses",
         alive=f"{own}/alive",
         relocalize=f"{own}/rpc/relocalize",
         reset=f"{own}/rpc/reset",
+        map_view=f"{own}/rpc/map_view",
     )
 
 

@@ -15,7 +15,7 @@ from coview_stream.errors import TransportError
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.key_expressions import check_expression, matches
-from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
+from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
 
 _log = logging.getLogger(__name__)
 
@@ -82,7 +82,9 @@ class MemoryTransport:
         """Hold a token until :meth:`close`."""
         self._tokens.append(check_expression(key, "key", wildcards=False))
 
-    def query(self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0) -> dict[str, Any]:
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
+    ) -> dict[str, Any]:
         """Call the handler that :meth:`answer` declared; there is nothing to wait for.
 
         Raises:

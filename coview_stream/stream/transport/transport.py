@@ -9,6 +9,9 @@ from typing import Any, Literal, Protocol
 
 from coview_stream.messages.types import Encoded, Sample
 
+MAX_REPLY = 64 * 1024
+"""Bytes of a reply to a query, unless the caller allows more."""
+
 Policy = Literal["newest", "all"]
 """``newest``: a slow reader sees only the newest sample (a ring of one). ``all``: every sample, in order."""
 
@@ -64,8 +67,10 @@ class Transport(Protocol):
         """Hold a liveliness token on ``key`` until :meth:`close`."""
         ...
 
-    def query(self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0) -> dict[str, Any]:
-        """Query ``key`` and return the first JSON reply.
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
+    ) -> dict[str, Any]:
+        """Query ``key`` and return the first JSON reply, of at most ``max_bytes``.
 
         Raises:
             TransportError: no answer within ``timeout`` seconds, or one that is an error or no JSON object.

@@ -196,7 +196,9 @@ class Answers:
             query.reply(key, reply, encoding=_JSON)
 
 
-def first_reply(session: Any, key: str, parameters: dict[str, str], timeout: float) -> dict[str, Any] | None:
+def first_reply(
+    session: Any, key: str, parameters: dict[str, str], timeout: float, max_bytes: int
+) -> dict[str, Any] | None:
     """Query ``key`` and return the first JSON reply, None without one within ``timeout`` seconds.
 
     Raises:
@@ -207,13 +209,13 @@ def first_reply(session: Any, key: str, parameters: dict[str, str], timeout: flo
     for reply in session.get(zenoh.Selector(key, parameters), timeout=timeout):
         if reply.ok is None:
             raise TransportError(f"{key}: the node refused: {_error_of(reply.err.payload.to_bytes())}")
-        return _json_object(key, reply.ok.payload.to_bytes())
+        return _json_object(key, reply.ok.payload.to_bytes(), max_bytes)
     return None
 
 
-def _json_object(key: str, payload: bytes) -> dict[str, Any]:
+def _json_object(key: str, payload: bytes, max_bytes: int) -> dict[str, Any]:
     try:
-        return read_object(payload)
+        return read_object(payload, max_bytes)
     except MessageError as error:
         raise TransportError(f"{key}: the answer is no JSON object ({error}); is this a coview_stream node?") from error
 

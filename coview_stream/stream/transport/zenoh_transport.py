@@ -16,7 +16,7 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.subscription_check import Subscription, SubscriptionCheck
-from coview_stream.stream.transport.transport import Connection, Policy, Publisher, Urgency
+from coview_stream.stream.transport.transport import MAX_REPLY, Connection, Policy, Publisher, Urgency
 from coview_stream.stream.transport.zenoh_config import zenoh_errors
 from coview_stream.stream.transport.zenoh_io import FLUSH, Answers, Writer, ZenohPublisher, first_reply, plain, quality
 
@@ -144,18 +144,21 @@ class ZenohTransport:
 
         self._declare(key, declare)
 
-    def query(self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0) -> dict[str, Any]:
+    def query(
+        self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
+    ) -> dict[str, Any]:
         """Query ``key``, after waiting for the first router if need be, and return the first JSON reply.
 
         Raises:
-            TransportError: no answer within ``timeout`` seconds, or one that is an error or no JSON object.
+            TransportError: no answer within ``timeout`` seconds, or one that is an error, no JSON object or larger
+                than ``max_bytes``.
         """
         deadline = time.monotonic() + timeout
         while (session := self._session) is None and time.monotonic() < deadline:
             time.sleep(_POLL)
         if session is not None:
             left = max(_POLL, deadline - time.monotonic())
-            answer = first_reply(session, key, parameters or {}, left)
+            answer = first_reply(session, key, parameters or {}, left, max_bytes)
             if answer is not None:
                 return answer
         raise TransportError(f"{key}: no answer within {timeout:g} s; is the node running and connected?")

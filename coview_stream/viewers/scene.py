@@ -1,0 +1,99 @@
+"""Scene: what there is to see of a session, as plain data.
+
+Poses and hypotheses are the messages themselves (:class:`~coview_stream.messages.types.PoseMessage`,
+:class:`~coview_stream.messages.hypotheses.HypothesesMessage`), a status is the node's JSON, and the map is a
+:class:`~coview_stream.basemap.map_view.MapView`; what else there is stands here.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.map_view import MapView
+from coview_stream.geometry.transforms import Points, Pose, interpolate
+from coview_stream.messages.hypotheses import HypothesesMessage
+from coview_stream.messages.types import PoseMessage
+
+# set by hand
+_KEPT = 64  # poses of a robot, to look scans' poses up in
+_TOLERANCE_NS = 150_000_000  # beside the poses that are known: the next one is near enough to draw by
+_MAX_GAP_NS = 2_000_000_000  # between two poses: across a longer one nothing is interpolated
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One lidar frame of a robot, thinned.
+
+    Attributes:
+        robot: name.
+        stamp_ns: sensor time, nanoseconds.
+        points: (N, 3) float32 body frame, metres; no NaN.
+        T_map_body: (4, 4) float64 map <- body at the stamp; None where no pose is known there.
+    """
+
+    robot: str
+    stamp_ns: int
+    points: Points
+    T_map_body: Pose | None
+
+
+class Sink:
+    """Receiver of what there is to see; override what you show.
+
+    All methods are called on one thread, the feed's, and have to return soon: what comes meanwhile waits, and of what
+    waits too long the oldest is dropped. What they raise is logged.
+    """
+
+    def map(self, view: MapView) -> None:
+        """Take in the map: the first one that is known, and each other one that is served later."""
+
+    def pose(self, pose: PoseMessage) -> None:
+        """Take in a pose; ``pose.robot`` is always set."""
+
+    def status(self, robot: str, status: dict[str, Any]) -> None:
+        """Take in a node's status of a robot: JSON from the network, no field of which is certain."""
+
+    def hypotheses(self, hypotheses: HypothesesMessage) -> None:
+        """Take in the places that a search considers; outdated once a status or a pose says ``TRACKING``."""
+
+    def scan(self, scan: Scan) -> None:
+        """Take in a lidar frame, a few a second at most."""
+
+    def close(self) -> None:
+        """Finish: nothing more comes."""
+
+
+class PoseTrack:
+    """Newest poses of one robot, to tell where it was at a scan's stamp."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[int, Pose]] = deque(maxlen=_KEPT)
+
+    def add(self, stamp_ns: int, T_map_body: Pose) -> None:
+        """Take in a pose; stamps that go back begin anew."""
+        if self._poses and stamp_ns < self._poses[-1][0]:
+            self._poses.clear()
+        if not self._poses or stamp_ns > self._poses[-1][0]:
+            self._poses.append((stamp_ns, T_map_body))
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Tell whether a pose of this stamp or a later one has come."""
+        return bool(self._poses) and self._poses[-1][0] >= stamp_ns
+
+    def at(self, stamp_ns: int) -> Pose | None:
+        """Return (4, 4) map <- body at a stamp, interpolated; None where no pose is near."""
+        if not self._poses:
+            return None
+        stamps = np.array([stamp for stamp, _ in self._poses], dtype=np.int64)
+        after = int(np.searchsorted(stamps, stamp_ns))
+        if after == len(stamps) or after == 0:
+            stamp, T = self._poses[-1 if after else 0]
+            return T if abs(stamp - stamp_ns) <= _TOLERANCE_NS else None
+        (begin, T_begin), (end, T_end) = self._poses[after - 1], self._poses[after]
+        if end - begin > _MAX_GAP_NS:
+            return None
+        return interpolate(T_begin, T_end, (stamp_ns - begin) / (end - begin))

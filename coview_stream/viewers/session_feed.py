@@ -1,0 +1,254 @@
+"""Feed of a session: subscribes to what there is to see of robots, and hands it to any number of sinks.
+
+The network's threads only queue. One thread decodes and calls the sinks; another one asks for the map.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from operator import methodcaller
+
+import numpy as np
+
+from coview_stream.basemap.map_view import MAX_WIRE_BYTES, MapView
+from coview_stream.config.mount import Mount
+from coview_stream.errors import CoViewError, MessageError
+from coview_stream.messages.hypotheses import decode_hypotheses
+from coview_stream.messages.types import Sample
+from coview_stream.stream.client.client import LatestQueue
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.transport import Policy, Transport
+from coview_stream.viewers.scene import PoseTrack, Scan, Sink
+from coview_stream.viewers.topics import Topic
+
+_log = logging.getLogger(__name__)
+
+# set by hand
+MAX_ROBOTS = 256
+"""Robots that are looked at: names come from the network."""
+_MAX_QUEUED = 4_000  # messages waiting for slow sinks
+_POLL = 0.05  # seconds
+_SCAN_PERIOD = 0.2  # seconds between two scans of a robot that are decoded
+_SCAN_POINTS = 6_000
+_POSE_WAIT = 0.4  # seconds that a scan waits for a pose of its time
+_MAP_RETRY = 5.0  # seconds between two questions for a map
+_MAP_TIMEOUT = 10.0  # seconds of a question: the first makes the node thin its map
+
+MapSource = Callable[[str], MapView]
+"""Returns the map that a robot is served on; what goes wrong is a CoViewError."""
+
+
+class SessionFeed:
+    """Subscriptions to robots' poses, statuses, hypotheses and clouds, decoded for sinks; a context manager.
+
+    Args:
+        transport: stays the caller's.
+        topics: what to subscribe to.
+        map_view: the map, if it is known; else ``map_source`` is asked.
+        map_source: asked with a robot's name whenever its status names a map that is not known yet; None for no map.
+        clouds: whether to look at clouds too, which are most of the traffic.
+        mount: how lidars sit on their robots, as ``serve --mount`` has it.
+        policy: ``newest`` where a full queue must not hold up the publisher, as within the node's own process.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        topics: Sequence[Topic],
+        map_view: MapView | None = None,
+        map_source: MapSource | None = None,
+        clouds: bool = True,
+        mount: Mount | None = None,
+        policy: Policy = "all",
+    ) -> None:
+        self._transport = transport
+        self._topics = [topic for topic in topics if clouds or topic.kind != "cloud"]
+        self._policy: Policy = policy
+        self._mount = mount or Mount()
+        self._map_source = map_source
+        self._errors = RateLimitedErrors(_log)
+        self._inbox: LatestQueue[tuple[Topic, Sample] | MapView] = LatestQueue(_MAX_QUEUED)
+        self._clouds: dict[str, tuple[Topic, Sample]] = {}  # newest of each robot
+        self._lock = threading.Lock()  # of that and of the sinks
+        self._sinks: list[Sink] = []
+        self._maps: dict[str, MapView] = {}
+        self._wanted: LatestQueue[str] = LatestQueue(8)  # robots whose map is not known
+        self._asked: dict[str, float] = {}  # by hash, when that was last asked for
+        self._robots: set[str] = set()
+        self._tracks: dict[str, PoseTrack] = {}
+        self._pending: dict[str, tuple[float, Scan]] = {}  # scans that wait for a pose, and until when
+        self._next_scan: dict[str, float] = {}  # not before this time
+        self._stopping = threading.Event()
+        self._threads: list[threading.Thread] = []
+        if map_view is not None:
+            self._inbox.put(map_view)
+
+    def add(self, sink: Sink) -> None:
+        """Hand everything to a sink from now on, maps that have come before included."""
+        with self._lock:
+            self._sinks.append(sink)
+            maps = list(self._maps.values())
+        for view in maps:  # on the feed's thread, as all else; those who know it take it in again
+            self._inbox.put(view)
+
+    def start(self) -> None:
+        """Subscribe, and start the threads."""
+        for name, run in (("feed", self._run), ("map", self._run_map_source)):
+            thread = threading.Thread(target=run, name=f"coview-view-{name}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        for topic in self._topics:
+            policy: Policy = "newest" if topic.kind == "cloud" else self._policy
+            self._transport.subscribe(topic.key, self._receiver(topic), policy)
+
+    def close(self) -> None:
+        """End the threads and close the sinks; subscriptions end with the transport."""
+        if self._stopping.is_set():
+            return
+        self._stopping.set()
+        self._inbox.close()
+        self._wanted.close()
+        for thread in self._threads:
+            thread.join(1.0)
+        for sink in self._sinks:
+            with self._errors.catch("viewer"):
+                sink.close()
+
+    def __enter__(self) -> SessionFeed:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ---- the network's threads
+
+    def _receiver(self, topic: Topic) -> Callable[[Sample], None]:
+        def receive(sample: Sample) -> None:
+            if topic.kind != "cloud":
+                self._inbox.put((topic, sample))
+                return
+            robot = _robot(topic, sample)
+            with self._lock:
+                if robot in self._clouds or len(self._clouds) < MAX_ROBOTS:
+                    self._clouds[robot] = topic, sample
+
+        return receive
+
+    # ---- the feed's thread
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            item = self._inbox.get(timeout=_POLL)
+            with self._errors.catch("viewer"):
+                if item is not None:
+                    self._take(item)
+                self._take_clouds(time.monotonic())
+
+    def _take(self, item: tuple[Topic, Sample] | MapView) -> None:
+        if isinstance(item, MapView):
+            with self._lock:
+                self._maps[item.sha256] = item
+            self._hand_out("map", lambda sink: sink.map(item))
+            return
+        topic, sample = item
+        robot = _robot(topic, sample)
+        if robot not in self._robots and len(self._robots) >= MAX_ROBOTS:
+            return
+        self._robots.add(robot)
+        try:
+            if topic.kind == "pose":
+                self._take_pose(robot, topic, sample)
+            elif topic.kind == "status":
+                self._take_status(robot, sample)
+            else:
+                found = replace(decode_hypotheses(sample), robot=robot)
+                self._hand_out("hypotheses", lambda sink: sink.hypotheses(found))
+        except MessageError as error:
+            self._errors.report(sample.key, error)
+
+    def _take_pose(self, robot: str, topic: Topic, sample: Sample) -> None:
+        from coview_stream.messages import decode_pose
+
+        pose = replace(decode_pose(sample, hint=topic.hint), robot=robot)
+        self._tracks.setdefault(robot, PoseTrack()).add(pose.stamp_ns, pose.T_map_body)
+        self._hand_out("pose", lambda sink: sink.pose(pose))
+
+    def _take_status(self, robot: str, sample: Sample) -> None:
+        from coview_stream.messages.json_messages import read_status
+
+        status = read_status(sample)
+        sha256 = status.get("map_sha256")
+        if isinstance(sha256, str) and self._map_source is not None and sha256 not in self._maps:
+            now = time.monotonic()
+            if now - self._asked.get(sha256, -_MAP_RETRY) >= _MAP_RETRY and len(self._asked) < MAX_ROBOTS:
+                self._asked[sha256] = now
+                self._wanted.put(robot)
+        self._hand_out("status", lambda sink: sink.status(robot, status))
+
+    def _take_clouds(self, now: float) -> None:
+        """Decode the clouds whose turn it is, and hand out the scans that have waited for their pose."""
+        with self._lock:
+            due = [robot for robot in self._clouds if self._next_scan.get(robot, 0.0) <= now]
+            clouds = {robot: self._clouds.pop(robot) for robot in due if robot not in self._pending}
+        for robot, (topic, sample) in clouds.items():
+            self._next_scan[robot] = now + _SCAN_PERIOD
+            try:
+                scan = self._scan(robot, topic, sample)
+            except MessageError as error:
+                self._errors.report(sample.key, error)
+                continue
+            self._pending[robot] = now + _POSE_WAIT, scan
+        for robot, (until, scan) in list(self._pending.items()):
+            track = self._tracks.get(robot)
+            if now >= until or (track is not None and track.reaches(scan.stamp_ns)):
+                del self._pending[robot]
+                known = scan if track is None else replace(scan, T_map_body=track.at(scan.stamp_ns))
+                self._hand_out("scan", methodcaller("scan", known))
+
+    def _scan(self, robot: str, topic: Topic, sample: Sample) -> Scan:
+        from coview_stream.messages import decode_cloud
+
+        message = decode_cloud(sample, hint=topic.hint).limited(2 * _SCAN_POINTS)
+        points = message.points[np.isfinite(message.points).all(axis=1)]
+        points = points[:: max(1, -(-len(points) // _SCAN_POINTS))]
+        return Scan(robot, message.stamp_ns, np.array(self._mount.to_body(points), dtype=np.float32), None)
+
+    def _hand_out(self, what: str, call: Callable[[Sink], None]) -> None:
+        with self._lock:
+            sinks = list(self._sinks)
+        for sink in sinks:
+            with self._errors.catch(f"{type(sink).__name__}.{what}"):
+                call(sink)
+
+    # ---- the map's thread
+
+    def _run_map_source(self) -> None:
+        while not self._stopping.is_set():
+            robot = self._wanted.get(timeout=1.0)
+            if robot is None or self._map_source is None:
+                continue
+            try:
+                self._inbox.put(self._map_source(robot))
+            except CoViewError as error:
+                self._errors.report(f"map of {robot}", error)
+            except Exception as error:  # of any kind: the next map may be another one
+                self._errors.report(f"map of {robot}", error)
+
+
+def asked_of_node(transport: Transport, base: str) -> MapSource:
+    """Return a map source that asks the node of a robot."""
+
+    def ask(robot: str) -> MapView:
+        key = f"{base}/{robot}/rpc/map_view"
+        return MapView.from_json(transport.query(key, timeout=_MAP_TIMEOUT, max_bytes=MAX_WIRE_BYTES))
+
+    return ask
+
+
+def _robot(topic: Topic, sample: Sample) -> str:
+    return topic.robot or sample.key.split("/")[topic.depth]
