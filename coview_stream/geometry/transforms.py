@@ -180,11 +180,32 @@ def orthonormal(T: Pose) -> Pose:
 
 
 def is_pose(T: Reals) -> bool:
-    """Tell whether ``T`` is a finite 4x4 rigid transform (rotation orthonormal to 1e-3)."""
+    """Tell whether ``T`` is a finite 4x4 rigid transform: a rotation, orthonormal to 1e-3, and a last row 0 0 0 1."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[:3, :3]
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0)
+    rotates = np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
+    return bool(rotates and np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() < 1e-6)
+
+
+def why_no_pose(T: Reals) -> str:
+    """Return what is wrong with a matrix that is no pose (:func:`is_pose`), and what to do, as a clause."""
+    return f"is no rigid transform: {_flaw(T)}"
+
+
+def _flaw(T: Reals) -> str:
+    if T.shape != (4, 4):
+        return f"it has shape {T.shape}; give a 4x4 matrix"
+    if not np.isfinite(T).all():
+        return "it holds NaN or infinite numbers; leave such frames out"
+    if is_pose(T.T):
+        return "it is transposed, with its translation in the last row; give its transpose, whose T[:3, 3] it is"
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() >= 1e-3:
+        return "its rotation is not orthonormal; check the order of the quaternion (x, y, z, w)"
+    if np.linalg.det(R) < 0:
+        return "it mirrors (determinant -1); axes have to be right-handed"
+    return f"its last row is {T[3].tolist()}; give 0 0 0 1"
 
 
 def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:

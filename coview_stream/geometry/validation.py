@@ -5,6 +5,7 @@ Arrays are copied where the caller may write into them again.
 
 from __future__ import annotations
 
+import numbers
 from typing import TypeVar
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.arrays import Bools, Floats
-from coview_stream.geometry.transforms import Points, Pose, is_pose, orthonormal, pose_from
+from coview_stream.geometry.transforms import Points, Pose, is_pose, orthonormal, pose_from, why_no_pose
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -24,6 +25,7 @@ _MIN_POINTS = 10
 _SAMPLED_POINTS = 2000  # of a frame, to see how far they lie
 _MAX_DISTANCE = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
 _MAX_FROM_MAP = 1e7  # metres from the map's origin: no place on this planet
+_MAX_STAMP = 1e11  # seconds, more than 3,000 years; today in milliseconds is above it
 _MIN_EIGENVALUE = 1e-12  # of a correlation matrix
 
 
@@ -33,7 +35,10 @@ def to_array(
     """Return ``values`` as an array of ``dtype``, copied only if they are not; ``error`` if they are no numbers."""
     try:
         with np.errstate(over="ignore"):
-            return np.asarray(values).astype(dtype, copy=False)
+            array = np.asarray(values)
+            if array.dtype.kind in "bcmM":  # NumPy would turn them into numbers, a complex one by half
+                raise TypeError(f"they are {array.dtype}")
+            return array.astype(dtype, copy=False)
     except (TypeError, ValueError) as reason:
         raise error(f"{name} is not an array of numbers ({reason})") from reason
 
@@ -65,27 +70,36 @@ def validate_cloud(cloud: npt.ArrayLike) -> Points:
     return finite
 
 
-def check_stamp(stamp: float) -> None:
-    """Refuse a stamp that is no finite number of seconds (RunError)."""
-    try:
-        finite = bool(np.isfinite(stamp))
-    except TypeError as reason:
-        raise RunError(f"stamp is not numeric ({reason})") from reason
-    if not finite:
+def check_stamp(stamp: float, newest: float | None = None) -> None:
+    """Refuse a stamp that is no finite number of seconds, or not after ``newest``, that of the frame before (RunError)."""
+    if isinstance(stamp, bool | np.bool_) or not isinstance(stamp, numbers.Real):
+        raise RunError(f"stamp {stamp!r} is not numeric; give seconds, as a float")
+    if not np.isfinite(stamp):
         raise RunError(f"stamp is {stamp}; it must be finite, in seconds")
+    if abs(stamp) >= _MAX_STAMP:
+        raise RunError(f"stamp {stamp:.6g} cannot be seconds; give seconds, not milli- or nanoseconds")
+    if newest is not None and stamp <= newest:
+        what = "is that" if stamp == newest else "is before that"
+        raise RunError(
+            f"stamp {stamp:.3f} {what} of the frame before ({newest:.3f}); frames go forward in time: "
+            "sort them, or call reset() before another run"
+        )
 
 
 def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputError) -> Pose:
     """Return a rigid pose (4, 4) float64, orthonormal to the last digit; ``error`` for anything else."""
     pose = to_array(T, np.float64, name, error)
     if not is_pose(pose):
-        raise error(f"{name} is not a finite rigid 4x4 transform; check where it comes from")
+        raise error(f"{name} {why_no_pose(pose)}")
     return orthonormal(pose)
 
 
-def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float) -> Pose:
-    """Return a frame's pose (4, 4), exactly rigid; RunError where it is not, or its stamp (seconds) not finite."""
-    check_stamp(stamp)
+def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float, newest: float | None = None) -> Pose:
+    """Return a frame's pose (4, 4), exactly rigid.
+
+    RunError where it is not, or its stamp is not finite, not in seconds or not after ``newest``.
+    """
+    check_stamp(stamp, newest)
     return check_rigid(T_odom_body, "T_odom_body", RunError)
 
 

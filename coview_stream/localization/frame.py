@@ -50,12 +50,13 @@ class FramePreparation:
         """Begin with nothing known of the robot."""
         self.correction = FrameCorrection(config)
         self.anchor: Floats | None = None
+        self._newest: float | None = None  # stamp of the newest frame
         self._voxel_filter = kernels.VoxelFilter(config.keyframe.voxel, config.keyframe.range_min)
 
     def restart(self) -> None:
         """Go on in another frame of odometry, with what is known of the robot."""
         self.correction.restart()
-        self.anchor = None
+        self.anchor = self._newest = None
 
     def forget_odometry(self) -> None:
         """Connect the next frame with none before it: odometry may have jumped."""
@@ -75,7 +76,8 @@ class FramePreparation:
         Raises:
             CloudError, RunError: the frame is unusable; nothing has changed.
         """
-        raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp)
+        raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp, self._newest)
+        self._newest = stamp
         T = self.correction.odometry(T_raw)
         if self.anchor is None:
             self.anchor = T[:3, 3].copy()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from coview_stream.errors import CloudError, ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, is_pose
+from coview_stream.geometry.transforms import Pose, is_pose, why_no_pose
 from coview_stream.geometry.validation import cloud_rows, to_array
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage
 from coview_stream.stream.transport.key_expressions import check_expression
@@ -92,7 +92,7 @@ class Sender:
 
         T = to_array(T_odom_body, np.float64, "T_odom_body", InputError)
         if not is_pose(T):
-            raise InputError("T_odom_body is no rigid transform: give a finite 4x4 matrix, odometry <- body")
+            raise InputError(f"T_odom_body (odometry <- body) {why_no_pose(T)}")
         return self._with_convention(encode_odometry(OdometryMessage(stamp_ns, T), self.odometry_encoding))
 
     def put_cloud(self, message: Encoded) -> None:
