@@ -16,8 +16,13 @@ Every message names the file, field or key and the remedy. The command prints it
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from typing import Any
+
+
+class CoViewWarning(UserWarning):
+    """What goes on, and may not be what was meant; the message is one sentence. The command prints it as one line."""
 
 
 class CoViewError(Exception):
@@ -58,6 +63,12 @@ class TransportError(CoViewError):
 
 class DependencyError(CoViewError, ImportError):
     """A library that this operation needs is missing; the message says how to get it."""
+
+
+def warn(message: str | None) -> None:
+    """Issue a :class:`CoViewWarning`, unless there is no message."""
+    if message is not None:
+        warnings.warn(message, CoViewWarning, stacklevel=3)
 
 
 def require_library(module: str, requirement: str, purpose: str) -> Any:

@@ -190,6 +190,15 @@ class BaseMap:
         """Return at most ``count`` of :attr:`points`, evenly spread over them; a copy."""
         return np.array(self.points[:: max(1, -(-len(self.points) // count))])
 
+    def sampled_normals(self, count: int) -> Points:
+        """Return the unit normals of :meth:`sampled_points`."""
+        return tiles.unit_normals(np.array(self._arrays["normals"][:: max(1, -(-len(self.points) // count))]))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays: the size of its file, but for a few kB."""
+        return sum(array.nbytes for array in self._arrays.values())
+
     def release(self) -> None:
         """Let the memory go that the file's pages take; what is used again is read again."""
         for array in self._arrays.values():

@@ -20,10 +20,11 @@ from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.tiles import scaled_normals, sort_by_tile, unit_normals
 from coview_stream.clouds.cloud import merge
+from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of, read_head
 from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.config import MapConfig
-from coview_stream.errors import MapError
+from coview_stream.errors import MapError, warn
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points
 
@@ -50,9 +51,12 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
             raise MapError(f"{path}: given twice; name every source once")
+    warn(check_together([read_head(path) for path in paths]))  # all heads before the first points
     with _progress_bar(progress, "reading") as step:
         clouds = [_read(path, k, len(paths), step) for k, path in enumerate(paths)]
+    warn(check_together([head_of(path, cloud) for path, cloud in zip(paths, clouds, strict=True)]))
     whole = merge(clouds)
+    extent = extent_in_words(whole)
     source_points = len(whole)
     origin, crs, raw = whole.origin, whole.crs, whole.points
     del clouds, whole
@@ -67,14 +71,20 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
         if config.outlier_neighbours:
             points, _ = remove_outliers(points, config.outlier_neighbours, config.outlier_std_ratio)
         if len(points) < _MIN_POINTS:
-            raise MapError(f"{len(points)} points are left after cleaning; a base map needs {_MIN_POINTS} or more")
+            raise MapError(
+                f"{_names(paths)}: {len(points)} of {source_points} points are left after cleaning, over {extent}; "
+                f"a base map needs {_MIN_POINTS} or more: are the coordinates in metres?"
+            )
         step(2, 3)
         normals, planarity = estimate_normals(points, config.normal_neighbours, config.normal_radius)
         step(3, 3)
     with _progress_bar(progress, "ground") as step:
         stations = find_stations(points, config.block, config.levels)
         if not len(stations):
-            raise MapError("no ground found in the base map; it needs points on the ground to put stations on")
+            raise MapError(
+                f"{_names(paths)}: no ground found in {source_points} points over {extent}; a base map needs points on "
+                "the ground, and z up"
+            )
         step(1, 1)
     with _progress_bar(progress, "describing stations") as step:
         described = describe_storeys(points, stations, config.block, config.descriptor, step)
@@ -132,6 +142,10 @@ def surveyed_cells(points: Points, block: float) -> tuple[npt.NDArray[np.uint8],
     grid[rows, columns] = True
     square = np.ones((2 * _SURVEY_MARGIN + 1,) * 2, dtype=bool)
     return ndimage.binary_dilation(grid, square).astype(np.uint8), low * block
+
+
+def _names(paths: list[Path]) -> str:
+    return str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
 
 
 def _label(path: Path, paths: list[Path]) -> str:

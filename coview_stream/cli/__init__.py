@@ -14,10 +14,12 @@ import contextlib
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Sequence
-from typing import NoReturn
+from pathlib import Path
+from typing import NoReturn, TextIO
 
-from coview_stream.errors import ConfigError, CoViewError
+from coview_stream.errors import ConfigError, CoViewError, CoViewWarning
 from coview_stream.version import __version__
 
 PROGRAM = "coview-stream"
@@ -46,6 +48,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # our matrices are small: BLAS threads cost more than they bring, most of all beside other programs
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    sys.stdout = sys.stdout or _null()  # closed by who called: Python then has none
+    sys.stderr = sys.stderr or _null()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", CoViewWarning)
+        warnings.showwarning = _show_warning
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     try:
         code = _dispatch(sys.argv[1:] if argv is None else list(argv))
         sys.stdout.flush()  # a closed pipe must show up here, not while the interpreter shuts down
@@ -91,6 +102,25 @@ def _dispatch(argv: list[str]) -> int:
 def _fail(message: str) -> int:
     print(f"{PROGRAM}: error: {' '.join(message.split())}", file=sys.stderr)
     return 2
+
+
+def _null() -> TextIO:
+    return Path(os.devnull).open("w", encoding="utf-8")
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: object = None,
+) -> None:
+    """Print our own warnings as one line, others as Python does."""
+    if issubclass(category, CoViewWarning):
+        print(f"{PROGRAM}: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    else:
+        print(warnings.formatwarning(message, category, filename, lineno), file=sys.stderr, end="")
 
 
 def _describe(error: OSError) -> str:

@@ -43,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap import file_format
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.signature import SigningKey
-    from coview_stream.errors import MapError
+    from coview_stream.basemap.summary import summary
+    from coview_stream.errors import MapError, warn
 
     if args.output.resolve() in [path.resolve() for path in args.maps]:
         raise MapError(f"{args.output}: is one of the scans to read; give the map another name")
@@ -61,6 +62,10 @@ def run(args: argparse.Namespace) -> int:
         f"{len(base_map)} stations, {time.perf_counter() - begin:.1f} s, {args.output.stat().st_size} bytes"
         + ("" if key is None else f", signed with {key.fingerprint}")
     )
+    covered = summary(base_map)
+    for warning in covered.warnings:
+        warn(warning)
+    print(covered)
     return 0
 
 

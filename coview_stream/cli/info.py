@@ -94,9 +94,14 @@ def describe(base_map: BaseMap) -> dict[str, object]:
     """Return what ``info`` shows, by name; metres in the source's frame."""
     from dataclasses import asdict
 
+    from coview_stream.basemap.summary import summary
+
+    covered = summary(base_map)
     low = base_map.points.min(axis=0) + base_map.origin
     high = base_map.points.max(axis=0) + base_map.origin
     return {
+        "covers": str(covered),
+        "warnings": list(covered.warnings) or "none",
         "stations": len(base_map),
         "points": len(base_map.points),
         "source points": base_map.parameters.get("source_points"),

@@ -41,7 +41,9 @@ _MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/streaming.md pr
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; values are checked where they are used."""
     parser.add_argument("map", type=Path, metavar="SITE.coview")
-    parser.add_argument("--robot", nargs="+", action="extend", required=True, metavar="NAME", help="one or several robots")
+    parser.add_argument(
+        "--robot", nargs="+", action="extend", required=True, metavar="NAME", help="one or several robots"
+    )
     network = parser.add_argument_group("network (with none of these: --listen tcp/127.0.0.1:7447)")
     network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT of a router")
     network.add_argument("--listen", action="append", default=[], metavar="EP", help="wait for peers here")

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from coview_stream.errors import CloudError
+from coview_stream.clouds.reference_system import same_system, short_name
+from coview_stream.errors import CloudError, CoViewWarning
 from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
@@ -84,6 +85,7 @@ class CloudBuilder:
                 warnings.warn(
                     f"float32 coordinates near {self.origin.tolist()} are rounded to 6 cm or worse in the "
                     "file itself; export them as float64 or LAS",
+                    CoViewWarning,
                     stacklevel=2,
                 )
         if self.origin.any():
@@ -132,10 +134,11 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
     """
     if not clouds:
         raise CloudError("no cloud to merge: give at least one file")
-    systems = {cloud.crs for cloud in clouds if cloud.crs is not None}
-    if len(systems) > 1:
-        names = " and ".join(sorted(text.split("\n")[0][:60] for text in systems))
-        raise CloudError(f"clouds are in different reference systems ({names}); reproject them to one")
+    systems = [cloud.crs for cloud in clouds if cloud.crs is not None]
+    for system in systems[1:]:
+        if not same_system(systems[0], system):
+            names = " and ".join(sorted(map(short_name, (systems[0], system))))
+            raise CloudError(f"clouds are in different reference systems ({names}); reproject them to one")
     if len(clouds) == 1:
         return clouds[0]
     origin = clouds[0].origin
@@ -144,7 +147,7 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
     return Cloud(
         np.concatenate(shifted),
         origin,
-        next(iter(systems), None),
+        max(systems, key=lambda text: "+" in text or "VERT" in text, default=None),  # one that states heights as well
         np.concatenate(classes) if len(classes) == len(clouds) else None,
         sum(cloud.dropped for cloud in clouds),
     )

@@ -57,6 +57,25 @@ def is_cloud_name(path: str | os.PathLike[str]) -> bool:
     return Path(name).suffix.lower() in CLOUD_SUFFIXES and not name.startswith(".")
 
 
+def check_format(path: Path) -> str:
+    """Return the format that a file's suffix names; CloudError where it is not there, or its first bytes disagree."""
+    suffix = path.suffix.lower()
+    head = _head(path)
+    if suffix == ".e57" or head.startswith(b"ASTM-E57"):
+        raise CloudError(f"{path}: {E57_REMEDY}")
+    if suffix not in _READERS:
+        known = ", ".join(sorted(CLOUD_SUFFIXES))
+        raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")
+    name = _READERS[suffix][0]
+    found = sniff(head)
+    # raw float rows have no magic: anything that is not recognisably something else may be one
+    if found != name and not (suffix == ".bin" and found is None):
+        what = f"is {found}" if found else f"does not begin like {name}"
+        remedy = "unpack it" if found in ("zip", "gzip") else "rename it, or get the real file"
+        raise CloudError(f"{path}: named {suffix} but its content {what}; {remedy}")
+    return name
+
+
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """Read LAS, LAZ (COPC too), PCD, PLY, NPY or KITTI ``.bin``; metres, in the file's own frame.
 
@@ -68,20 +87,8 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
             holds no usable point. The message names the file and the remedy.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    head = _head(path)
-    if suffix == ".e57" or head.startswith(b"ASTM-E57"):
-        raise CloudError(f"{path}: {E57_REMEDY}")
-    if suffix not in _READERS:
-        known = ", ".join(sorted(CLOUD_SUFFIXES))
-        raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")
-    name, reader = _READERS[suffix]
-    found = sniff(head)
-    # raw float rows have no magic: anything that is not recognisably something else may be one
-    if found != name and not (suffix == ".bin" and found is None):
-        what = f"is {found}" if found else f"does not begin like {name}"
-        remedy = "unpack it" if found in ("zip", "gzip") else "rename it, or get the real file"
-        raise CloudError(f"{path}: named {suffix} but its content {what}; {remedy}")
+    check_format(path)
+    reader = _READERS[path.suffix.lower()][1]
     try:
         return reader(path)
     except OSError as error:
@@ -91,9 +98,9 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
 
 
 def _head(path: Path) -> bytes:
+    if path.is_dir():
+        raise CloudError(f"{path}: is a directory; name the cloud files themselves")
     try:
-        if path.is_dir():
-            raise CloudError(f"{path}: is a directory; name the cloud files themselves")
         with path.open("rb") as stream:
             head = stream.read(512)
     except FileNotFoundError as error:

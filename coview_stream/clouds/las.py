@@ -6,9 +6,7 @@ the number of chunks makes the LAZ decoder ask for more memory than there is, it
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,8 +14,11 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
+from coview_stream.clouds.las_header import read_las_header
+from coview_stream.clouds.laszip_pointwise import POINTWISE, is_pointwise, with_one_chunk
 from coview_stream.clouds.laz_process import read_laz
-from coview_stream.errors import CloudError
+from coview_stream.clouds.reference_system import flaw_of_system, stated_system, unchecked_system
+from coview_stream.errors import CloudError, warn
 
 CHUNK = 1_000_000
 """Points per chunk, set by hand: about 100 MB of float64 and record buffers at a time."""
@@ -25,8 +26,6 @@ CHUNK = 1_000_000
 NOISE_CLASSES = (7, 18)
 """ASPRS classes low and high noise."""
 
-_FOOT_UNITS = {9002, 9003, 9005}
-_PROJECTED_CRS_KEY, _LINEAR_UNIT_KEY = 3072, 3076
 _MIN_HEADER, _MAX_HEADER = 227, 375  # bytes
 _COMPRESSED = 0x80
 _VARIABLE = 0xFFFFFFFF  # points per chunk, where the chunk table has them
@@ -39,12 +38,22 @@ def read_las(path: Path) -> Cloud:
     Raises:
         CloudError: the file is damaged, truncated, empty or not in metres.
     """
-    problem = impossible_header(path)
-    if problem:
-        raise CloudError(_damaged(path, ValueError(problem)))
+    check_las(path)
     if _is_compressed(path):
         return read_laz(path)
     return decode(path, CloudBuilder).finish(os.fspath(path))
+
+
+def check_las(path: Path) -> None:
+    """Check a file's header against its size; CloudError where it is damaged or truncated."""
+    problem = impossible_header(path)
+    if problem:
+        raise CloudError(_damaged(path, ValueError(problem)))
+    header = read_las_header(path)
+    if header.compressor is None and header.record_length:
+        stored = max(0, path.stat().st_size - header.start) // header.record_length
+        if stored < header.points:
+            raise CloudError(_truncated(path, header.points, stored))
 
 
 def decode(path: Path, builder: Callable[[str | None], CloudBuilder]) -> CloudBuilder:
@@ -56,7 +65,7 @@ def decode(path: Path, builder: Callable[[str | None], CloudBuilder]) -> CloudBu
     import laspy
 
     try:
-        with laspy.open(path) as reader:
+        with laspy.open(with_one_chunk(path) if is_pointwise(path) else path) as reader:
             return _read(reader, path, builder)
     except (CloudError, MemoryError):
         raise
@@ -69,6 +78,22 @@ def decode(path: Path, builder: Callable[[str | None], CloudBuilder]) -> CloudBu
         raise CloudError(_damaged(path, error)) from error
 
 
+def las_system(path: Path) -> str | None:
+    """Return the reference system that a file states, WKT or ``EPSG:code``; None if it does not.
+
+    Raises:
+        CloudError: no map can be made in that system (feet, degrees, lengths that are not those on the ground).
+    """
+    header = read_las_header(path)
+    text = stated_system(header.wkt, header.geo_keys)
+    flaw = flaw_of_system(text, header.geo_keys, header.low, header.high)
+    if flaw is not None:
+        raise CloudError(f"{path}: {flaw}")
+    if unchecked_system(text):
+        warn(f"{path}: says {text}, whose units were not looked up; pip install 'pyproj>=3.6'")
+    return text
+
+
 def _is_compressed(path: Path) -> bool:
     with path.open("rb") as stream:
         return bool(stream.read(105)[104] & _COMPRESSED)
@@ -77,14 +102,7 @@ def _is_compressed(path: Path) -> bool:
 def _read(reader: Any, path: Path, make: Callable[[str | None], CloudBuilder]) -> CloudBuilder:
     header = reader.header
     expected = int(header.point_count)
-    size = path.stat().st_size
-    if not header.are_points_compressed:
-        stored = max(0, size - header.offset_to_point_data) // header.point_format.size
-        if stored < expected:
-            raise CloudError(_truncated(path, expected, stored))
-    crs = _crs(header)
-    _check_metres(header, crs, path)
-    builder = make(crs)
+    builder = make(las_system(path))
     read = 0
     for chunk in reader.chunk_iterator(CHUNK):
         read += len(chunk)
@@ -112,50 +130,6 @@ def _truncated(path: Path, expected: int, found: int) -> str:
     )
 
 
-def _crs(header: Any) -> str | None:
-    """Return the header's WKT if it has one (by pyproj if installed), else ``EPSG:code``, else None."""
-    if importlib.util.find_spec("pyproj") is not None:
-        try:
-            crs = header.parse_crs()
-        except Exception:
-            # a wrong reference system record is no reason to refuse the points
-            crs = None
-        if crs is not None:
-            return str(crs.to_wkt())
-    for vlr in _vlrs(header, "WktCoordinateSystemVlr"):
-        text = str(vlr.string).strip("\0 \n")
-        if text:
-            return text
-    code = _geo_key(header, _PROJECTED_CRS_KEY)
-    return f"EPSG:{code}" if code is not None and 1024 <= code < 32767 else None
-
-
-def _vlrs(header: Any, kind: str) -> list[Any]:
-    records = [*header.vlrs, *(getattr(header, "evlrs", None) or [])]
-    return [record for record in records if type(record).__name__ == kind]
-
-
-def _geo_key(header: Any, key: int) -> int | None:
-    for vlr in _vlrs(header, "GeoKeyDirectoryVlr"):
-        for entry in vlr.geo_keys:
-            if entry.id == key and entry.tiff_tag_location == 0:
-                return int(entry.value_offset)
-    return None
-
-
-def _check_metres(header: Any, crs: str | None, path: Path) -> None:
-    """Refuse feet and degrees where the file states them: a silent scale error looks like a lost robot."""
-    remedy = "reproject it to a metric system, for example with `pdal translate -f filters.reprojection`"
-    text = crs or ""
-    if re.search(r'UNIT\["[^"]*(foot|feet)', text, re.IGNORECASE) or (
-        _geo_key(header, _LINEAR_UNIT_KEY) in _FOOT_UNITS
-    ):
-        raise CloudError(f"{path}: coordinates are in feet according to its reference system; {remedy}")
-    geographic = re.search(r"GEOG(CS|CRS)\[", text) and not re.search(r"(PROJ(CS|CRS)|ENGCRS)\[", text)
-    if geographic and np.abs([header.mins[:2], header.maxs[:2]]).max() <= 360.0:
-        raise CloudError(f"{path}: coordinates are in degrees according to its reference system; {remedy}")
-
-
 def impossible_header(path: Path) -> str | None:
     """Return what is impossible in the header of a LAS or LAZ file; None if nothing is."""
     size = path.stat().st_size
@@ -176,7 +150,11 @@ def impossible_header(path: Path) -> str | None:
         if points > _POINTS_PER_BYTE * size + CHUNK:
             return f"{points} points cannot be in {size} bytes"
         stream.seek(_unsigned(header[94:96]))
-        return _impossible_sizes(stream, records, max(points, CHUNK)) or _impossible_chunks(stream, start, size)
+        wrong = _impossible_sizes(stream, records, max(points, CHUNK))
+    if wrong or read_las_header(path).compressor == POINTWISE:
+        return wrong
+    with path.open("rb") as stream:
+        return _impossible_chunks(stream, start, size)
 
 
 def _impossible_sizes(stream: BinaryIO, records: int, points: int) -> str | None:

@@ -71,7 +71,7 @@ def validate_cloud(cloud: npt.ArrayLike) -> Points:
 
 
 def check_stamp(stamp: float, newest: float | None = None) -> None:
-    """Refuse a stamp that is no finite number of seconds, or not after ``newest``, that of the frame before (RunError)."""
+    """Refuse a stamp that is no finite number of seconds, or not after that of the frame before (RunError)."""
     if isinstance(stamp, bool | np.bool_) or not isinstance(stamp, numbers.Real):
         raise RunError(f"stamp {stamp!r} is not numeric; give seconds, as a float")
     if not np.isfinite(stamp):

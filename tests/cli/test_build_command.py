@@ -36,6 +36,20 @@ def test_build_writes_and_describes_a_map(cloud, tmp_path, capsys):
         assert fact in out
 
 
+def test_last_line_tells_what_the_map_covers_and_warnings_are_one_line_each(map_points, tmp_path, capsys):
+    near = map_points[(np.abs(map_points[:, :2]) < 20.0).all(axis=1)]
+    write_cloud(tmp_path / "thin.ply", near[:: len(near) // 6000])
+    assert main(["build", str(tmp_path / "thin.ply"), "-o", str(tmp_path / "site.coview"), "--radius", "20"]) == 0
+    captured = capsys.readouterr()
+    last = captured.out.splitlines()[-1]
+    assert last.startswith("40 x 40 m with points on ")
+    for fact in ("points/m2", "heights -", "crs unknown", "per km2"):
+        assert fact in last
+    lines = captured.err.splitlines()
+    assert [line for line in lines if "points/m2 are few" in line]
+    assert all(line.startswith("coview-stream: warning: ") for line in lines if "warning" in line.lower())
+
+
 def test_preset_channels_and_descriptor_options(cloud, tmp_path):
     target = tmp_path / "site.coview"
     options = ["--preset", "tls", "--rings", "5", "--sectors", "8"]

@@ -108,3 +108,20 @@ def test_help_imports_no_heavy_library():
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=ENVIRONMENT, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "loaded:"
+
+
+@pytest.mark.parametrize("given", [["--robot", "a", "b"], ["--robot", "a", "--robot", "b"]])
+@pytest.mark.parametrize("name", ["serve", "watch", "doctor"])
+def test_robots_are_named_together_or_one_by_one(name, given):
+    site = ["site.coview"] if name == "serve" else []
+    assert cli.build_parser(name).parse_args([name, *site, *given]).robot == ["a", "b"]
+
+
+@pytest.mark.slow
+def test_closed_stdout_is_no_reason_to_fail(world_file):
+    command = [sys.executable, "-m", "coview_stream", "info", str(world_file)]
+    done = subprocess.run(
+        ["/bin/sh", "-c", '"$@" >&-', "sh", *command], capture_output=True, text=True, env=ENVIRONMENT
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr

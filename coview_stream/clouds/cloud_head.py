@@ -1,0 +1,154 @@
+"""Heads of cloud files, and whether several belong to one site: looked at before any of them is read whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coview_stream.clouds.cloud import Cloud
+from coview_stream.clouds.files import check_format
+from coview_stream.clouds.las import check_las, las_system
+from coview_stream.clouds.las_header import read_las_header
+from coview_stream.clouds.reference_system import same_system, short_name
+from coview_stream.errors import CloudError
+from coview_stream.geometry.arrays import Bools, Floats
+
+MAX_GAP = 1000.0
+"""Metres between tiles of one site, set by hand; a lake or a field may lie between them."""
+
+MAX_AREA = 50e6
+"""Square metres of the box around a site: the rasters of a build, cells of 0.5 m, have a limit there."""
+
+_SAMPLED_POINTS = 100_000  # of a cloud, to see how far it extends; set by hand
+_STRAY = 0.5  # per cent of the points at either end that may lie anywhere; set by hand
+
+
+@dataclass(frozen=True, eq=False)
+class CloudHead:
+    """What is known of a cloud file.
+
+    Attributes:
+        path: of the file.
+        crs: reference system, as :attr:`Cloud.crs`.
+        low, high: (3,) float64 corners of its extent, metres; None where the format tells them only with its points.
+    """
+
+    path: Path
+    crs: str | None = None
+    low: Floats | None = None
+    high: Floats | None = None
+
+
+def read_head(path: str | os.PathLike[str]) -> CloudHead:
+    """Check what can be checked of a file without reading its points.
+
+    Raises:
+        CloudError: as of :func:`~coview_stream.clouds.files.read_cloud`.
+    """
+    path = Path(path)
+    if check_format(path) != "LAS":
+        return CloudHead(path)
+    check_las(path)
+    header = read_las_header(path)
+    known = header.points > 0 and bool(np.isfinite([header.low, header.high]).all())
+    return CloudHead(path, las_system(path), header.low if known else None, header.high if known else None)
+
+
+def extent_in_words(cloud: Cloud) -> str:
+    """Return how far a cloud extends, but for stray points: ``902 x 750 x 24 m``."""
+    low, high = _extent(cloud)
+    return " x ".join(f"{metres:.3g}" if metres < 100 else f"{metres:.0f}" for metres in high - low) + " m"
+
+
+def _extent(cloud: Cloud) -> Floats:
+    sample = cloud.points[:: max(1, len(cloud) // _SAMPLED_POINTS)].astype(np.float64)
+    corners: Floats = np.percentile(sample, [_STRAY, 100.0 - _STRAY], axis=0) + cloud.origin
+    return corners
+
+
+def head_of(path: Path, cloud: Cloud) -> CloudHead:
+    """Return the head of a file that was read; a few stray points do not count for its extent.
+
+    Raises:
+        CloudError: it extends farther than a map can.
+    """
+    low, high = _extent(cloud)
+    wide = high - low
+    if wide[0] * wide[1] > MAX_AREA:
+        raise CloudError(
+            f"{path}: extends over {wide[0] / 1000:.0f} x {wide[1] / 1000:.0f} km, heights over {wide[2]:.0f} m; "
+            f"a map holds {MAX_AREA / 1e6:.0f} km2 at most: is it in millimetres or centimetres? Convert it to metres, "
+            "or cut it into sites"
+        )
+    return CloudHead(path, cloud.crs, low, high)
+
+
+def check_together(heads: Sequence[CloudHead]) -> str | None:
+    """Check that files can be one site, as far as their heads tell.
+
+    Returns:
+        What is unusual about them, as a sentence; None if nothing is.
+
+    Raises:
+        CloudError: two are in different reference systems, or so far apart that no map holds them; it names both.
+    """
+    stated = [head for head in heads if head.crs is not None]
+    for head in stated[1:]:
+        if not same_system(stated[0].crs, head.crs):
+            raise CloudError(
+                f"{stated[0].path} is in {short_name(stated[0].crs)}, {head.path} in {short_name(head.crs)}; "
+                "reproject one of them"
+            )
+    boxes = [
+        (head.path, head.low[:2], head.high[:2]) for head in heads if head.low is not None and head.high is not None
+    ]
+    if len(boxes) < 2:
+        return None
+    low, high = np.array([box[1] for box in boxes]), np.array([box[2] for box in boxes])
+    near = _connected(low, high)
+    if near.all():
+        return None
+    far = ~near if near.sum() >= (~near).sum() else near
+    one, other, gap = _nearest(low, high, far)
+    wide = high.max(axis=0) - low.min(axis=0)
+    what = f"{boxes[one][0]} lies {gap / 1000:.1f} km from {boxes[other][0]}, the nearest of the other files"
+    if wide[0] * wide[1] > MAX_AREA:
+        raise CloudError(
+            f"{what}; they cannot be one map: leave out what does not belong, bring all into one reference system and "
+            "unit, or build a map for each site"
+        )
+    return f"{what}; the map holds both, and nothing between"
+
+
+def _connected(low: Floats, high: Floats) -> Bools:
+    """Find the boxes (N, 2) that hang together with the first, with gaps below :data:`MAX_GAP`."""
+    reached = np.zeros(len(low), dtype=bool)
+    reached[0] = True
+    fresh = [0]
+    while fresh:
+        at = fresh.pop()
+        found = np.flatnonzero(~reached & (_gaps(low, high, at) < MAX_GAP))
+        reached[found] = True
+        fresh += found.tolist()
+    return reached
+
+
+def _nearest(low: Floats, high: Floats, far: Bools) -> tuple[int, int, float]:
+    """Find the two boxes, one of ``far`` and one of the others, with the smallest gap between them, metres."""
+    pairs = []
+    for at in np.flatnonzero(far):
+        gaps = np.where(far, np.inf, _gaps(low, high, int(at)))
+        nearest = int(np.argmin(gaps))
+        pairs.append((float(gaps[nearest]), int(at), nearest))
+    gap, one, other = min(pairs)
+    return one, other, gap
+
+
+def _gaps(low: Floats, high: Floats, at: int) -> Floats:
+    apart = np.maximum(np.maximum(low - high[at], low[at] - high), 0.0)
+    gaps: Floats = np.hypot(apart[:, 0], apart[:, 1])
+    return gaps

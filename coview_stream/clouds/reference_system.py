@@ -1,0 +1,186 @@
+"""Coordinate reference systems that cloud files state: which one, and whether a map can be made in it.
+
+A map has to be in metres, east, north and up, with lengths as on the ground. A silent error of scale looks like a robot
+that is never found.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from coview_stream.geometry.arrays import Floats
+
+_PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of reference systems
+_LINEAR_UNIT, _VERTICAL_UNIT = 3076, 4099  # GeoTIFF keys of units
+_CODES = range(1024, 32767)  # of EPSG; 32767 is a system that other keys describe
+_METRE = 9001
+_UNITS = {9002: "feet", 9003: "US survey feet", 9005: "Clarke's feet", 9014: "fathoms", 9093: "miles"}
+
+MAX_SCALE_ERROR = 0.01
+"""Share by which lengths of a projection may differ from those on the ground, set by hand: half a metre in 50 m."""
+
+
+def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
+    """Return what a file states: its WKT, ``EPSG:code`` or ``EPSG:code+vertical code``; None if it does not say."""
+    if wkt:
+        return wkt
+    horizontal = next((keys[key] for key in (_PROJECTED, _GEOGRAPHIC) if keys.get(key, 0) in _CODES), None)
+    if horizontal is None:
+        return None
+    vertical = keys.get(_VERTICAL, 0)
+    return f"EPSG:{horizontal}+{vertical}" if vertical in _CODES and _knows(vertical) else f"EPSG:{horizontal}"
+
+
+def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high: Floats) -> str | None:
+    """Return why no map can be made of coordinates in this system, and what to do; None if one can.
+
+    Args:
+        text: the system, as :func:`stated_system` gives it.
+        keys: GeoTIFF keys that state units apart from the system.
+        low: (3,) lower corner of the coordinates.
+        high: (3,) upper corner.
+    """
+    what = _stated_unit(keys) or _unit_in_text(text or "", low, high)
+    system = _parse(text)
+    if what is None and system is not None:
+        what = _flaw(system, 0.5 * (low + high))
+    if what is None:
+        return None
+    return f"{what} according to its reference system; reproject it to {_metric_system(system, low, high)}"
+
+
+def unchecked_system(text: str | None) -> bool:
+    """Tell whether a file's system is known by a code alone that cannot be looked up, for want of pyproj."""
+    return text is not None and text.startswith("EPSG:") and importlib.util.find_spec("pyproj") is None
+
+
+def same_system(one: str | None, other: str | None) -> bool:
+    """Tell whether two systems are the same, or may be: one is not stated, or states no heights."""
+    if one is None or other is None or one == other:
+        return True
+    first, second = _parse(one), _parse(other)
+    if first is None or second is None:
+        return False
+    parts = [_parts(system) for system in (first, second)]
+    return all(_equal(a, b) for a, b in zip(*parts, strict=False))
+
+
+def short_name(text: str | None) -> str:
+    """Return a system's name, in a few words."""
+    if text is None:
+        return "unknown"
+    system = _parse(text)
+    if system is not None:
+        code = system.to_epsg()
+        return f"EPSG:{code} {system.name}" if code else str(system.name)
+    named = re.match(r'\s*\w+\["([^"]+)"', text)
+    return named.group(1) if named else " ".join(text.split())[:60]
+
+
+def _stated_unit(keys: Mapping[int, int]) -> str | None:
+    for key, what in ((_LINEAR_UNIT, "coordinates are"), (_VERTICAL_UNIT, "heights are")):
+        unit = keys.get(key, _METRE)
+        if unit in _UNITS:
+            return f"{what} in {_UNITS[unit]}"
+    return None
+
+
+def _unit_in_text(text: str, low: Floats, high: Floats) -> str | None:
+    if re.search(r'UNIT\["[^"]*(foot|feet)', text, re.IGNORECASE):
+        return "coordinates are in feet"
+    geographic = re.search(r"GEOG(CS|CRS)\[", text) and not re.search(r"(PROJ(CS|CRS)|ENGCRS)\[", text)
+    return "coordinates are in degrees" if geographic and _like_degrees(low, high) else None
+
+
+def _like_degrees(low: Floats, high: Floats) -> bool:
+    return bool(np.abs([low[:2], high[:2]]).max() <= 360.0)
+
+
+@lru_cache(maxsize=64)
+def _parse(text: str | None) -> Any:
+    """Return a pyproj.CRS; None without pyproj, or where the text is none: no reason to refuse the points."""
+    if not text or importlib.util.find_spec("pyproj") is None:
+        return None
+    import pyproj
+
+    try:
+        return pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError:
+        return None
+
+
+def _knows(code: int) -> bool:
+    return _parse(f"EPSG:{code}") is not None
+
+
+def _parts(system: Any) -> list[Any]:
+    """Return the horizontal part of a system and, if it has one, the vertical."""
+    whole = system.source_crs if system.is_bound and system.source_crs is not None else system
+    return [part.source_crs if part.is_bound else part for part in (whole.sub_crs_list or [whole])]
+
+
+def _equal(one: Any, other: Any) -> bool:
+    codes = one.to_epsg(), other.to_epsg()
+    return bool(one.equals(other, ignore_axis_order=True)) or (None not in codes and codes[0] == codes[1])
+
+
+def _flaw(system: Any, centre: Floats) -> str | None:
+    parts = _parts(system)
+    if parts[0].is_geocentric:
+        return "coordinates are geocentric (z does not point up)"
+    if parts[0].is_geographic:
+        return "coordinates are in degrees" if _like_degrees(centre, centre) else None
+    axes = [("coordinates", axis) for axis in parts[0].axis_info[:2]]
+    axes += [("heights", axis) for part in (parts[0].axis_info[2:], *(p.axis_info for p in parts[1:])) for axis in part]
+    for what, axis in axes:
+        if abs(axis.unit_conversion_factor - 1.0) > 1e-9:
+            unit = {"foot": "feet", "US survey foot": "US survey feet"}.get(axis.unit_name, axis.unit_name)
+            return f"{what} are in {unit} ({system.name})"
+    scale = _scale(parts[0], centre)
+    if scale is not None and abs(scale - 1.0) > MAX_SCALE_ERROR:
+        return f"lengths are {scale:.2f} times those on the ground ({system.name} is a map of the world, not of a site)"
+    return None
+
+
+def _scale(projected: Any, centre: Floats) -> float | None:
+    """Return lengths on the map by lengths on the ground; None where the place is not in the system's area."""
+    place = _longitude_latitude(projected, centre)
+    if place is None:
+        return None
+    import pyproj
+
+    factors = pyproj.Proj(projected).get_factors(*place)
+    scale = float(np.sqrt(abs(factors.meridional_scale * factors.parallel_scale)))
+    return scale if np.isfinite(scale) and scale > 0 else None
+
+
+def _longitude_latitude(projected: Any, centre: Floats) -> tuple[float, float] | None:
+    import pyproj
+
+    try:
+        to_degrees = pyproj.Transformer.from_crs(projected, projected.geodetic_crs, always_xy=True)
+        longitude, latitude = to_degrees.transform(float(centre[0]), float(centre[1]))
+    except pyproj.exceptions.ProjError:
+        return None
+    inside = np.isfinite([longitude, latitude]).all() and abs(latitude) < 89.0
+    return (float(longitude), float(latitude)) if inside else None
+
+
+def _metric_system(system: Any, low: Floats, high: Floats) -> str:
+    """Name a metric system of the place, if that can be told."""
+    how = "a metric system, for example with `pdal translate -f filters.reprojection`"
+    centre = 0.5 * (low + high)
+    if system is None or _parts(system)[0].is_geocentric:
+        return how
+    geographic = _parts(system)[0].is_geographic
+    place = (float(centre[0]), float(centre[1])) if geographic else _longitude_latitude(_parts(system)[0], centre)
+    if place is None or not -80 <= place[1] <= 84:
+        return how
+    zone = int((place[0] + 180.0) // 6.0) % 60 + 1
+    return f"EPSG:{(32600 if place[1] >= 0 else 32700) + zone} or another {how[2:]}"

@@ -1,0 +1,85 @@
+"""Reference systems that files state: units, heights, scales, and which are the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coview_stream.clouds import reference_system
+from coview_stream.clouds.reference_system import flaw_of_system, same_system, short_name, stated_system
+
+pytest.importorskip("pyproj", reason="pyproj is not there; pip install pyproj")
+
+
+def flaw(text, place, keys=None):
+    centre = np.array(place, dtype=float)
+    return flaw_of_system(text, keys or {}, centre - 50.0, centre + 50.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "keys", "says"),
+    [
+        ("EPSG:2277", (3.1e6, 1.0e7, 500), {}, "coordinates are in US survey feet .*EPSG:32614"),
+        ("EPSG:2994", (6.4e5, 8.5e5, 400), {}, "coordinates are in feet"),
+        (None, (1000, 1000, 0), {3076: 9002}, "coordinates are in feet"),
+        ("EPSG:25832", (5e5, 5.4e6, 100), {4099: 9003}, "heights are in US survey feet"),
+        ("EPSG:26910+6360", (5e5, 5.4e6, 100), {}, "heights are in US survey feet"),
+        ("EPSG:4326", (8.1, 50.2, 100), {}, "in degrees .*EPSG:32632"),
+        ("EPSG:4978", (4e6, 6e5, 4.8e6), {}, "geocentric"),
+        ("EPSG:3857", (6e5, 6.8e6, 0), {}, "lengths are 1.62 times"),
+        ("EPSG:3395", (6e5, 6.8e6, 0), {}, "lengths are 1.6"),
+    ],
+)
+def test_system_that_is_not_metric_is_refused_with_the_reason(text, place, keys, says):
+    import re
+
+    found = flaw(text, place, keys)
+    assert found is not None
+    assert re.search(says, found), found
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("EPSG:25832", (5e5, 5.4e6, 100)),
+        ("EPSG:25832+7837", (5e5, 5.4e6, 100)),
+        ("EPSG:28992", (8.5e4, 4.47e5, 0)),
+        ("EPSG:27700", (5.3e5, 1.8e5, 0)),
+        ("EPSG:2193", (1.6e6, 5.4e6, 0)),
+        ("EPSG:25832", (12.0, 34.0, 0)),  # local coordinates that only say so
+        ("EPSG:4326", (5e5, 5.4e6, 100)),  # likewise
+        ("EPSG:99999", (1, 1, 1)),
+        ("no system at all", (1, 1, 1)),
+        (None, (1, 1, 1)),
+    ],
+)
+def test_metric_system_and_unknown_one_pass(text, place):
+    assert flaw(text, place) is None
+
+
+def test_system_comes_from_text_or_from_keys():
+    assert stated_system("PROJCS[...]", {3072: 25832}) == "PROJCS[...]"
+    assert stated_system("", {3072: 25832}) == "EPSG:25832"
+    assert stated_system("", {3072: 25832, 4096: 5783}) == "EPSG:25832+5783"
+    assert stated_system("", {2048: 4326}) == "EPSG:4326"
+    assert stated_system("", {3072: 32767, 3076: 9001}) is None
+
+
+def test_systems_are_compared_by_meaning():
+    import pyproj
+
+    text = pyproj.CRS(25832).to_wkt("WKT1_GDAL")
+    assert same_system("EPSG:25832", text)
+    assert same_system("EPSG:25832", "EPSG:25832+7837")  # the first says nothing of heights
+    assert same_system(None, text)
+    assert not same_system(text, "EPSG:25833")
+    assert not same_system("EPSG:25832+7837", "EPSG:25832+5783")
+    assert short_name("EPSG:25832").startswith("EPSG:25832 ETRS89")
+
+
+def test_without_pyproj_units_in_the_file_still_count(monkeypatch):
+    monkeypatch.setattr(reference_system, "_parse", lambda text: None)
+    assert flaw('PROJCS["x",UNIT["US survey foot",0.3048006]]', (1e6, 1e6, 0)) is not None
+    assert flaw(None, (1, 1, 0), {3076: 9003}) is not None
+    assert flaw("EPSG:2277", (3.1e6, 1.0e7, 500)) is None
+    assert not same_system("EPSG:2277", "EPSG:2278")
