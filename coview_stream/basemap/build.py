@@ -51,10 +51,13 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
     for path, place in zip(paths, places, strict=True):
         if places.count(place) > 1:
             raise MapError(f"{path}: given twice; name every source once")
-    warn(check_together([read_head(path) for path in paths]))  # all heads before the first points
+    told = check_together([read_head(path) for path in paths])  # all heads before the first points
+    warn(told)
     with _progress_bar(progress, "reading") as step:
         clouds = [_read(path, k, len(paths), step) for k, path in enumerate(paths)]
-    warn(check_together([head_of(path, cloud) for path, cloud in zip(paths, clouds, strict=True)]))
+    heads = [head_of(path, cloud) for path, cloud in zip(paths, clouds, strict=True)]
+    if told is None:  # some formats tell their extent with their points only
+        warn(check_together(heads))
     whole = merge(clouds)
     extent = extent_in_words(whole)
     source_points = len(whole)

@@ -103,8 +103,8 @@ class CloudBuilder:
         if self.origin is None:
             if self.dropped:
                 raise CloudError(
-                    f"{name}: none of the {self.dropped} points is usable (NaN, infinite, withheld or "
-                    "noise); export the cloud again"
+                    f"{name}: none of the {self.dropped} points is usable (NaN, infinite, farther than "
+                    f"{MAX_COORDINATE / 1000:.0f} km from zero, withheld or noise); export the cloud again, in metres"
                 )
             raise CloudError(f"{name}: holds zero points; export the cloud again")
         points = self._points[0] if len(self._points) == 1 else np.concatenate(self._points)

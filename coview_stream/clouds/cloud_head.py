@@ -20,6 +20,9 @@ from coview_stream.geometry.arrays import Bools, Floats
 MAX_GAP = 1000.0
 """Metres between tiles of one site, set by hand; a lake or a field may lie between them."""
 
+FAR_GAP = 10_000.0
+"""Metres between files that are never one site, set by hand; two maps cost less than what lies between."""
+
 MAX_AREA = 50e6
 """Square metres of the box around a site: the rasters of a build, cells of 0.5 m, have a limit there."""
 
@@ -116,7 +119,7 @@ def check_together(heads: Sequence[CloudHead]) -> str | None:
     one, other, gap = _nearest(low, high, far)
     wide = high.max(axis=0) - low.min(axis=0)
     what = f"{boxes[one][0]} lies {gap / 1000:.1f} km from {boxes[other][0]}, the nearest of the other files"
-    if wide[0] * wide[1] > MAX_AREA:
+    if gap > FAR_GAP or wide[0] * wide[1] > MAX_AREA:
         raise CloudError(
             f"{what}; they cannot be one map: leave out what does not belong, bring all into one reference system and "
             "unit, or build a map for each site"
