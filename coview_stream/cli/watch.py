@@ -115,7 +115,7 @@ class _Watch:
         self._show_pose, self._transport = show_pose, transport
         self._queue: LatestQueue[tuple[float, _Topic, Sample]] = LatestQueue(_MAX_QUEUED)
         self._terminal = sys.stdout.isatty() and not args.json
-        self._lines_drawn = 0  # of the table on the terminal
+        self._lines_drawn = 0  # of the table
         self._unreadable_keys: set[str] = set()
         self._depth = len(args.base.split("/"))
         for topic in topics:
@@ -177,11 +177,14 @@ class _Watch:
 
     def _draw(self, now: float) -> None:
         if not self._terminal:
-            for line in self._fleet.table(now, header=False):
+            if not self._fleet.views:
+                return
+            for line in self._fleet.table(now, header=not self._lines_drawn):  # the titles once
                 print(line, flush=True)
+            self._lines_drawn = 1
             return
-        width = shutil.get_terminal_size().columns
-        lines = [line[: width - 1] for line in self._fleet.table(now)]
+        size = shutil.get_terminal_size()
+        lines = self._fleet.table(now, width=size.columns - 1)[: max(2, size.lines - 1)]
         back = f"\x1b[{self._lines_drawn}F" if self._lines_drawn else ""
         print(f"{back}\x1b[J" + "\n".join(lines), flush=True)
         self._lines_drawn = len(lines)

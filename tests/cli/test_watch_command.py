@@ -109,7 +109,8 @@ def test_watch_prints_json_lines_of_all_robots(node, watch, capsys):
 @pytest.mark.slow
 def test_watch_prints_lines_without_terminal(node, watch, capsys):
     assert watch(node.endpoint, "--robot", "r1", after="_draw") == 0
-    (line,) = capsys.readouterr().out.splitlines()
+    header, line = capsys.readouterr().out.splitlines()
+    assert header.split()[:3] == ["robot", "state", "x"]
     cells = line.split()
     assert cells[:6] == ["r1", "TRACKING", "12.34", "-5.00", "1.70", "28.6"]
     assert float(cells[7]) > 1.0
@@ -124,10 +125,10 @@ def test_watch_redraws_terminal_in_place(node, watch, capsys, monkeypatch):
     out = capsys.readouterr().out
     frames = out.split("\x1b[J")[1:]
     assert len(frames) == 2
-    assert frames[0].endswith("\x1b[3F")  # back over the header and two robots
+    assert frames[0].endswith("\x1b[5F")  # back over the header and two robots with their reasons
     for frame in frames:
-        lines = frame.removesuffix("\x1b[3F").splitlines()
-        assert [line.split()[0] for line in lines] == ["robot", "r1", "r2"]
+        lines = frame.removesuffix("\x1b[5F").splitlines()
+        assert [line.split()[0] for line in lines] == ["robot", "r1", "fine", "r2", "fine"]
         assert max(map(len, lines)) < 60
 
 

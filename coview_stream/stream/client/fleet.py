@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,8 @@ WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last one is no longer shown
 SILENT = 5.0  # seconds without any message: a node sends one every second
 _LEAST = 1e-6  # smaller probabilities of a wrong place are not told apart: columns are narrow
+
+_INDENT = " " * 4  # of a reason below its robot
 
 _COLUMNS = (
     ("robot", -12),
@@ -90,17 +93,34 @@ class FleetTable:
             view.node = f"served by node {after.get('id')} on {after.get('host')} now"
         view.status, view.status_heard = status, now
 
-    def table(self, now: float, header: bool = True) -> list[str]:
-        """Return lines of text, one per robot, sorted by name."""
-        rows = [_row(self.views[name], now) for name in sorted(self.views)]
-        if header:
-            rows.insert(0, [title for title, _ in _COLUMNS])
-        return ["  ".join(map(_cell, row, (width for _, width in _COLUMNS))).rstrip() for row in rows]
+    def table(self, now: float, header: bool = True, width: int | None = None) -> list[str]:
+        """Return lines of text, sorted by robot's name: one for each, or its reason below where it is long.
+
+        Args:
+            now: time of the clock that messages were added by, seconds.
+            header: begin with the titles of the columns.
+            width: of the terminal, characters, which no line exceeds; None: a line for each robot, however long.
+        """
+        lines = header_lines(width) if header else []
+        for name in sorted(self.views):
+            row = _row(self.views[name], now)
+            if width is None or len(_line(row)) <= width:
+                lines.append(_line(row))
+                continue
+            lines.append(_line(row[:-1])[:width])
+            lines += textwrap.wrap(row[-1], width, initial_indent=_INDENT, subsequent_indent=_INDENT) if row[-1] else []
+        return lines
 
     def _view(self, robot: str, now: float) -> RobotView:
         view = self.views.setdefault(robot, RobotView(robot, now))
         view.heard = now
         return view
+
+
+def header_lines(width: int | None = None) -> list[str]:
+    """Return the titles of :meth:`FleetTable.table`, in one line."""
+    titles = [title for title, _ in _COLUMNS]
+    return [_line(titles)[:width]]
 
 
 def printable(text: object) -> str:
@@ -138,6 +158,10 @@ def _pose_cells(pose: PoseMessage | None, rate: float) -> list[str]:
         f"{rate:.1f}",
         _odds(1.0 - pose.confidence),
     ]
+
+
+def _line(row: list[str]) -> str:
+    return "  ".join(_cell(text, width) for text, (_, width) in zip(row, _COLUMNS, strict=False)).rstrip()
 
 
 def _cell(text: str, width: int) -> str:

@@ -45,11 +45,9 @@ class LidarSession(Session):
         self._odometry_epoch += 1
         self._first_odometry_epoch = self._odometry_epoch  # jobs from before a reset are ignored
         self._lidar_frames = LidarFrameQueue(self.keys.robot, self.config, self.lidar, self.counters)
-        self._cloud_at = float("-inf")  # local time of the newest readable cloud
 
     def _add_cloud(self, message: CloudMessage, now: float) -> None:
         """Queue a cloud for the odometry engine."""
-        self._cloud_at = now
         if self._lidar_frames.put(message, now) is SampleKind.RESTART:
             self.counters.clock_restarts += 1
             self._restart_odometry("the sender's clock started anew")

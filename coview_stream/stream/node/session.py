@@ -30,6 +30,9 @@ from coview_stream.stream.node.scheduling import SearchDemand
 from coview_stream.stream.node.session_reasons import COUNTED_AS, RESTART_REASONS, status_text
 from coview_stream.stream.transport.keys import RobotKeys
 
+_EVER = 1e9  # seconds: what never came is not missing since then
+_SEARCHING = (State.SEARCHING, State.AMBIGUOUS)  # the reason of a loss says itself what has stayed away
+
 
 class Session:
     """A robot's odometry, its queue to the engines and its state, behind one lock.
@@ -76,6 +79,8 @@ class Session:
         self._frame_sync = FrameSync(self.config, self.odometry, self.counters)
         self._missing = MissingFrames()
         self._disconnected_at = float("-inf")  # local time
+        self._cloud_at = float("-inf")  # local time of the newest readable cloud
+        self._now = float("-inf")  # local time of the newest tick
 
     # ---- messages
 
@@ -89,6 +94,7 @@ class Session:
         message = message.limited(self.config.max_points)
         message = replace(message, points=self.config.mount.to_body(message.points))
         with self._lock:
+            self._cloud_at = now
             self.counters.received += 1
             self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
             self._add_cloud(message, now)
@@ -145,6 +151,7 @@ class Session:
     def tick(self, now: float) -> None:
         """Let time pass: frames and odometry that stay away lose the place."""
         with self._lock:
+            self._now = now
             self._queue_paired(now)
             if not self.robot_state.state.has_place:
                 return
@@ -297,7 +304,17 @@ class Session:
             if reason is None:
                 has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
                 reason = status_text(self.keys, self.counters, has_odometry)
+            elif self.robot_state.state in _SEARCHING and (missing := self._missing_input()):
+                reason = f"{missing}; before: {reason}"
             return self.robot_state.state, reason
+
+    def _missing_input(self) -> str:
+        """Return what has not come for a while, and for how long, at the newest tick; empty if nothing is missing."""
+        arrived = {"clouds": self._cloud_at}
+        if self.odometry_source == "robot":
+            arrived["odometry"] = self.odometry.arrived
+        silent = {name: self._now - at for name, at in arrived.items() if self._now - at > self.config.max_outage}
+        return " and ".join(f"no {name} for {seconds:.0f} s" for name, seconds in silent.items() if seconds < _EVER)
 
     def hypotheses(self) -> HypothesesMessage | None:
         """Places that the search considers; None while there is a place, and before the first search."""

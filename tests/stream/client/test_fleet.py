@@ -39,6 +39,22 @@ def test_tracking_robot_shows_its_pose():
     ]
 
 
+def test_reason_stands_whole_below_its_robot_on_a_terminal():
+    fleet = FleetTable()
+    reason = (
+        "the right place would be told by more of what stands around, and so far " + 8 * "there is too little of it "
+    )
+    for robot in ("r1", "r2"):
+        fleet.add_status(robot, {**STATUS, "state": "SEARCHING", "reason": reason}, 9.0)
+    for width in (60, 80, 130):
+        lines = fleet.table(9.1, width=width)
+        assert all(len(line) <= width for line in lines)
+        first, second = (k for k, line in enumerate(lines) if line.startswith(("r1", "r2")))
+        below = lines[first + 1 : second]
+        assert " ".join(line.strip() for line in below) == reason.strip()
+        assert all(line.startswith("    ") for line in below)
+
+
 def test_what_the_node_says_of_the_sensor_stands_behind_the_reason():
     fleet = FleetTable()
     says = "sensor leans 2.9 deg in pitch: corrected; set --mount=0,2.9,0 to silence this"

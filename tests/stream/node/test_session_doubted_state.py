@@ -155,3 +155,33 @@ def test_network_outage_keeps_the_place_for_max_outage(seconds, state):
     assert job.require_verification or state is State.LOST
     robot.session.handle_result(job, tracking(job), robot.now + 0.01)
     assert robot.session.pose() is not None
+
+
+@pytest.mark.parametrize(("ended", "said"), [("clouds", "no clouds for 6 s"), ("odometry", "no odometry for 6 s")])
+def test_searching_robot_whose_data_end_says_so_and_for_how_long(ended, said):
+    robot = Robot()
+    robot.frame(0.0, unknown)
+    before = robot.session.state()[1]
+    for k in range(1, 61):  # 6 s
+        if ended != "odometry":
+            robot.moved(0.1 * k)
+        if ended != "clouds":
+            robot.saw(0.1 * k)
+        robot.session.tick(1000.0 + 0.1 * k)
+    assert robot.session.state()[1] == f"{said}; before: {before}"
+
+
+def test_searching_robot_whose_data_come_has_its_own_reason():
+    robot = Robot()
+    robot.frame(0.0, unknown)
+    for k in range(1, 61):
+        robot.moved(0.1 * k)
+        robot.saw(0.1 * k)
+        robot.session.tick(1000.0 + 0.1 * k)
+    assert robot.session.state()[1] == "no place fits"
+
+
+def test_robot_that_never_sent_anything_waits_for_it():
+    robot = Robot()
+    robot.session.tick(2000.0)
+    assert robot.session.state()[1].startswith("waiting for clouds")
