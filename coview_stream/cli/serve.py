@@ -24,6 +24,7 @@ from coview_stream.cli.options import (
     mount_of,
     writable_state_folder,
 )
+from coview_stream.cli.view import add_view
 from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.errors import ConfigError
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from coview_stream.stream.node.engine_child import EngineChild
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.serve import ServeOptions
+    from coview_stream.viewers.scene import Sink
+    from coview_stream.viewers.session_feed import SessionFeed
 
 HELP = "localize live robots: frames in, poses out at 10 Hz, over zenoh"
 
@@ -101,6 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="HOST:PORT",
         help=f"answer GET /metrics and /health there (no port is opened; {METRICS_ADDRESS} if none is named)",
     )
+    add_view(operation)
     operation.add_argument("--log-json", action="store_true", help="log one JSON object a line")
     operation.add_argument("--quiet", action="store_true", help="log errors only")
 
@@ -130,6 +134,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     from coview_stream.basemap.signature import read_verify_key
     from coview_stream.cli.logs import start_logging
     from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.view import open_sinks
     from coview_stream.config.node import NodeConfig
     from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS
     from coview_stream.stream.node.serve import ServeOptions
@@ -167,21 +172,27 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.registration, writable_state_folder(args), args.reloc, risk,
         node_keys(args.base, args.node or args.robot[0]), args.metrics, verify_key,
     )  # fmt: skip
+    sinks = open_sinks(args)
     hangups: list[int] = []
     with stop_on_signals(lambda: hangups.append(1)) as stop:
-        ended = _serve(options, stop, children, hangups)
+        ended = _serve(options, stop, children, hangups, sinks)
     if not ended:
         _exit_now()
     return 0
 
 
 def _serve(
-    options: ServeOptions, stop: Stop, children: dict[str, EngineChild] | None = None, hangups: Sequence[int] = ()
+    options: ServeOptions,
+    stop: Stop,
+    children: dict[str, EngineChild] | None = None,
+    hangups: Sequence[int] = (),
+    sinks: Sequence[Sink] = (),
 ) -> bool:
     """Open the node and run it until asked to stop; False if a thread hangs. Each hangup reloads the map.
 
     A thread of its own opens the node: a signal must end a wait for a host that does not answer, too.
     """
+    from coview_stream.cli.view import feed_of_node
     from coview_stream.stream.node.engine_process import CancelledError
     from coview_stream.stream.node.serve import open_node
     from coview_stream.stream.node.systemd import Notifier
@@ -189,10 +200,12 @@ def _serve(
     notifier = Notifier()
     opened: list[Node] = []
     failed: list[BaseException] = []
+    feeds: list[SessionFeed | None] = []
 
     def work() -> None:
         try:
-            opened.append(open_node(options, lambda: stop.requested, children, notifier))
+            opened.append(node := open_node(options, lambda: stop.requested, children, notifier))
+            feeds.append(feed_of_node(node, options.keys, options.map_path, options.node.mount, sinks))
         except CancelledError:
             pass
         except BaseException as error:
@@ -214,6 +227,8 @@ def _serve(
     if failed and not stop.requested:
         raise failed[0]
     end = stop.now() + _MAX_SHUTDOWN
+    for feed in filter(None, feeds):
+        feed.close()
     opening.join(_MAX_SHUTDOWN)
     return not opening.is_alive() and all(node.close(end - stop.now()) for node in opened)
 

@@ -9,9 +9,11 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coview_stream.cli.options import add_client_network
+from coview_stream.cli.view import add_view
 from coview_stream.errors import ConfigError, MessageError
 
 if TYPE_CHECKING:
@@ -39,12 +41,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print every pose and status as one line of JSON")
     parser.add_argument("--rerun", action="store_true", help="show poses in the rerun viewer (extra: viz)")
+    add_view(parser)
+    parser.add_argument("--map", type=Path, metavar="SITE.coview", help="the map to show (the node is asked for one)")
+    parser.add_argument(
+        "--no-clouds", action="store_true", help="show no scans: clouds are most of what a slow link has to carry"
+    )
     parser.add_argument("--seconds", type=float, metavar="S", help="end after this long (at a signal)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Subscribe and show, until a signal or the time is over."""
     from coview_stream.cli.signals import stop_on_signals
+    from coview_stream.cli.view import feed_of_watch, map_of_watch, open_sinks
     from coview_stream.stream.client.fleet import FleetTable
     from coview_stream.stream.transport.open_client import open_client
 
@@ -52,12 +60,16 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
     topics = _topics(args)
     show_pose = _viewer() if args.rerun else lambda pose: None
+    view, sinks, feed = map_of_watch(args.map), open_sinks(args), None
     transport = open_client(args.connect, args.listen, args.config)
     try:
         with stop_on_signals() as stop:
+            feed = feed_of_watch(args, transport, sinks, view)
             watch = _Watch(args, FleetTable(), topics, show_pose, transport)
             watch.run(stop, None if args.seconds is None else time.monotonic() + args.seconds)
     finally:
+        if feed is not None:
+            feed.close()
         transport.close()
     return 0
 

@@ -35,6 +35,7 @@ _POLL = 0.05  # seconds
 _SCAN_PERIOD = 0.2  # seconds between two scans of a robot that are decoded
 _SCAN_POINTS = 6_000
 _POSE_WAIT = 0.4  # seconds that a scan waits for a pose of its time
+_JOIN_TIMEOUT = 0.2  # seconds for a thread to end; a map that is being thinned is not waited for
 _MAP_RETRY = 5.0  # seconds between two questions for a map
 _MAP_TIMEOUT = 10.0  # seconds of a question: the first makes the node thin its map
 
@@ -113,7 +114,7 @@ class SessionFeed:
         self._inbox.close()
         self._wanted.close()
         for thread in self._threads:
-            thread.join(1.0)
+            thread.join(_JOIN_TIMEOUT)
         for sink in self._sinks:
             with self._errors.catch("viewer"):
                 sink.close()

@@ -91,7 +91,7 @@ class _Handler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         super().setup()
         self.rfile.close()
-        self.rfile = io.BufferedReader(_Limited(self.connection))
+        self.rfile = io.BufferedReader(LimitedRequest(self.connection))
 
     def do_GET(self) -> None:
         page = self.path.partition("?")[0]
@@ -118,7 +118,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Log no requests."""
 
 
-class _Limited(io.RawIOBase):
+class LimitedRequest(io.RawIOBase):
     """What a socket sends, up to a number of bytes and seconds together, then its end."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -128,9 +128,11 @@ class _Limited(io.RawIOBase):
         self._left = _MAX_BYTES
 
     def readable(self) -> bool:
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
+        """Read what there is; 0 after the last byte or second that is allowed."""
         seconds = self._deadline - time.monotonic()
         if seconds <= 0 or self._left <= 0:
             return 0

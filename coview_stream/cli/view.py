@@ -1,0 +1,123 @@
+"""Views of a session that ``serve`` and ``watch`` open: their options, their sinks, and the feed of these."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.map_view import MapView
+    from coview_stream.config.mount import Mount
+    from coview_stream.stream.node.node import Node
+    from coview_stream.stream.transport.keys import RobotKeys
+    from coview_stream.stream.transport.transport import Transport
+    from coview_stream.viewers.scene import Sink
+    from coview_stream.viewers.session_feed import MapSource, SessionFeed
+
+_WEB = "127.0.0.1:8642"
+
+
+def add_view(parser: argparse._ActionsContainer) -> None:
+    """Declare the options of what to show, which ``serve`` and ``watch`` share."""
+    parser.add_argument(
+        "--web",
+        nargs="?",
+        const=_WEB,
+        type=_host_port,
+        metavar="HOST:PORT",
+        help=f"show map and robots as a web page there (no page; {_WEB} if no address is named)",
+    )
+
+
+def _host_port(text: str) -> str:
+    if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
+        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --web={_WEB}")
+    return text
+
+
+def open_sinks(args: argparse.Namespace) -> list[Sink]:
+    """Open what the options ask for, and print where it is to be seen.
+
+    Raises:
+        ConfigError: an address cannot be listened on.
+    """
+    sinks: list[Sink] = []
+    if args.web is not None:
+        from coview_stream.viewers.web_page import WebPage
+
+        page = WebPage(args.web)
+        print(f"page at {page.url}", file=sys.stderr, flush=True)
+        sinks.append(page.sink)
+    return sinks
+
+
+def feed_of_watch(
+    args: argparse.Namespace, transport: Transport, sinks: Sequence[Sink], view: MapView | None
+) -> SessionFeed | None:
+    """Return a running feed of the robots that ``watch`` was asked for; None where nothing takes it in."""
+    if not sinks:
+        return None
+    from coview_stream.stream.transport.keys import robot_keys
+    from coview_stream.viewers.session_feed import SessionFeed, asked_of_node
+    from coview_stream.viewers.topics import topics_of_base, topics_of_robots
+
+    topics = topics_of_base(args.base)
+    if args.robot:
+        topics = topics_of_robots([robot_keys(args.preset, args.base, name) for name in dict.fromkeys(args.robot)])
+    source = None if view is not None else asked_of_node(transport, args.base)
+    return _running(SessionFeed(transport, topics, view, source, clouds=not args.no_clouds), sinks)
+
+
+def feed_of_node(
+    node: Node, keys: Sequence[RobotKeys], path: Path, mount: Mount, sinks: Sequence[Sink]
+) -> SessionFeed | None:
+    """Return a running feed of a node in this process; None where nothing takes it in.
+
+    It reads what the node reads and publishes on the node's own session, of which nothing waits for it.
+    """
+    if not sinks:
+        return None
+    from coview_stream.viewers.session_feed import SessionFeed
+    from coview_stream.viewers.topics import topics_of_robots
+
+    source = _file_of(node, path)
+    feed = SessionFeed(node.transport, topics_of_robots(keys), None, source, mount=mount, policy="newest")
+    return _running(feed, sinks)
+
+
+def _running(feed: SessionFeed, sinks: Sequence[Sink]) -> SessionFeed:
+    for sink in sinks:
+        feed.add(sink)
+    feed.start()
+    return feed
+
+
+def _file_of(node: Node, path: Path) -> MapSource:
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.map_view import MapView
+    from coview_stream.errors import MapError
+
+    def load(robot: str) -> MapView:
+        base_map = BaseMap.load(path, check=False)  # the node has compared it when it opened the map
+        if base_map.sha256 != node.map_sha256:
+            raise MapError(f"{path}: the file is of another map than the one that is served")
+        return MapView.of(base_map)
+
+    return load
+
+
+def map_of_watch(path: Path | None) -> MapView | None:
+    """Return the view of a map file; None for none.
+
+    Raises:
+        MapError: it cannot be read.
+    """
+    if path is None:
+        return None
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.map_view import MapView
+
+    return MapView.of(BaseMap.load(path, check=False))

@@ -1,0 +1,205 @@
+"""Sink of the web page: turns what there is to see into events for the hub, and keeps each robot's trail."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import struct
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.map_view import MapView
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Points, transform, yaw_of
+from coview_stream.messages.hypotheses import HypothesesMessage
+from coview_stream.messages.types import PoseMessage
+from coview_stream.viewers.scene import Scan, Sink
+from coview_stream.viewers.web_hub import WebHub, encode_event
+
+# set by hand
+_TRAIL = 4_000  # points of a robot's trail
+_TRAIL_STEP = 0.25  # metres between them
+_TRAIL_GAP = 2.0  # seconds without a pose: the trail is interrupted
+_MAX_TEXT = 500  # letters of a text from the network
+_MAX_TEXTS = 8
+_SCAN_POINTS = 3_000
+_SCAN_STEP = 0.01  # metres
+_MAPS = 4  # that are kept
+
+_STATUS = ("state", "reason", "version", "map_sha256", "odometry", "uptime_s", "stamp_ns")
+_PARTS = {
+    "pose": ("rate_hz", "age_s", "confidence"),
+    "latency_ms": ("p50", "p95", "p99"),
+    "engine_ms": ("p50", "p95", "p99"),
+    "counters": ("received", "processed", "dropped", "missing", "fixes", "losses", "searches"),
+}
+
+
+class WebSink(Sink):
+    """Events of a session for the pages of a hub.
+
+    Attributes:
+        maps: what the pages read, by hash: see :func:`packed_map`.
+    """
+
+    def __init__(self, hub: WebHub) -> None:
+        self.maps: dict[str, bytes] = {}
+        self._hub = hub
+        self._trails: dict[str, deque[list[float] | None]] = {}
+        self._last: dict[str, float] = {}  # local time of each robot's newest pose
+        hub.tell_first(self._trail_events)
+
+    def map(self, view: MapView) -> None:
+        """Keep the map for the pages to read, and tell them."""
+        if view.sha256 in self.maps:
+            return
+        while len(self.maps) >= _MAPS:
+            self.maps.pop(next(iter(self.maps)))
+        self.maps[view.sha256] = packed_map(view)
+        self._hub.publish("map", view.sha256, {"sha256": view.sha256, "count": len(view.points)})
+
+    def pose(self, pose: PoseMessage) -> None:
+        """Tell a pose, and continue the trail."""
+        x, y, z = (float(c) for c in pose.T_map_body[:3, 3])
+        covariance = pose.covariance
+        known = bool(np.isfinite(covariance).all())
+        self._extend_trail(pose.robot, x, y)
+        self._hub.publish(
+            "pose",
+            pose.robot,
+            {
+                "robot": pose.robot,
+                "stamp_ms": pose.stamp_ns / 1e6,
+                "state": pose.state[:_MAX_TEXT],
+                "x": round(x, 3),
+                "y": round(y, 3),
+                "z": round(z, 3),
+                "yaw": round(yaw_of(pose.T_map_body), 5),
+                "cov": [float(covariance[r, c]) for r, c in ((0, 0), (0, 1), (1, 1))] if known else None,
+                "sigma": np.sqrt(np.abs(np.diag(covariance))).round(5).tolist() if known else None,
+                "confidence": _finite(pose.confidence),
+                "age_s": _finite(pose.age),
+                "protection": None if pose.protection is None else pose.protection.to_json(),
+                "map_sha256": pose.map_sha256[:_MAX_TEXT],
+            },
+        )
+
+    def status(self, robot: str, status: dict[str, Any]) -> None:
+        """Tell what a person wants to know of a status; its fields come from the network, and any may be missing."""
+        data: dict[str, Any] = {"robot": robot} | {name: _plain(status.get(name)) for name in _STATUS}
+        for part, names in _PARTS.items():
+            fields = status.get(part)
+            data[part] = {name: _plain(fields.get(name)) for name in names} if isinstance(fields, dict) else {}
+        calibration = status.get("calibration")
+        says = calibration.get("says") if isinstance(calibration, dict) else None
+        data["says"] = _texts(says)
+        data["errors"] = _texts(status.get("errors"))
+        self._hub.publish("status", robot, data)
+
+    def hypotheses(self, hypotheses: HypothesesMessage) -> None:
+        """Tell the places that a search considers."""
+        names = ("x", "y", "z", "yaw", "probability")
+        places = [dict(zip(names, np.round(row[:5], 5).tolist(), strict=True)) for row in hypotheses.places]
+        self._hub.publish(
+            "hypotheses",
+            hypotheses.robot,
+            {
+                "robot": hypotheses.robot,
+                "stamp_ms": hypotheses.stamp_ns / 1e6,
+                "none": _finite(hypotheses.none),
+                "places": places,
+            },
+        )
+
+    def scan(self, scan: Scan) -> None:
+        """Tell a scan, in the map frame where the pose is known; nobody watches: not."""
+        if not self._hub.pages:
+            return
+        points = scan.points[:: max(1, -(-len(scan.points) // _SCAN_POINTS))]
+        centre = np.zeros(3)
+        if scan.T_map_body is not None:
+            centre = scan.T_map_body[:3, 3]
+            turned = np.eye(4)
+            turned[:3, :3] = scan.T_map_body[:3, :3]
+            points = transform(turned, points)
+        self._hub.publish(
+            "scan",
+            scan.robot,
+            {
+                "robot": scan.robot,
+                "stamp_ms": scan.stamp_ns / 1e6,
+                "in_map": scan.T_map_body is not None,
+                "centre": np.round(centre, 3).tolist(),
+                "step": _SCAN_STEP,
+                "points": base64.b64encode(_steps(points, np.zeros(3), _SCAN_STEP)).decode("ascii"),
+            },
+            keep=False,
+        )
+
+    def close(self) -> None:
+        """Close all pages."""
+        self._hub.close()
+
+    def _extend_trail(self, robot: str, x: float, y: float) -> None:
+        trail = self._trails.setdefault(robot, deque(maxlen=_TRAIL))
+        now = time.monotonic()
+        gap = now - self._last.get(robot, now) > _TRAIL_GAP
+        self._last[robot] = now
+        last = trail[-1] if trail else None
+        if gap and last is not None:
+            trail.append(None)
+            last = None
+        if last is None or math.hypot(x - last[0], y - last[1]) >= _TRAIL_STEP:
+            trail.append([round(x, 2), round(y, 2)])
+
+    def _trail_events(self) -> list[bytes]:
+        return [
+            encode_event("trail", {"robot": robot, "points": list(trail.copy())})
+            for robot, trail in list(self._trails.items())
+        ]
+
+
+def packed_map(view: MapView) -> bytes:
+    """Return a map as the page reads it.
+
+    Four bytes of the header's length, the header (JSON, padded to a multiple of four bytes), and little-endian int16
+    x, y, z of the points in ``step`` metres from ``origin``, the ``ground`` points of the ground first.
+    """
+    data = view.to_json()
+    header = {name: data[name] for name in ("map_sha256", "crs", "origin", "step_m", "count", "ground")}
+    text = json.dumps(header, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<I", len(text)) + text + base64.b64decode(data["points"])
+
+
+def _steps(points: Points, centre: Floats, step: float) -> bytes:
+    steps = np.rint((points.astype(np.float64) - centre) / step)
+    return np.clip(steps, -32_767, 32_767).astype("<i2").tobytes()
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(value: object) -> str | float | bool | None:
+    """Return a text, cut, or a finite number; None for all else."""
+    if isinstance(value, str):
+        return value[:_MAX_TEXT]
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, int | float):
+        try:
+            return _finite(float(value))
+        except OverflowError:  # integers of JSON have no limit
+            return None
+    return None
+
+
+def _texts(values: object) -> list[str]:
+    return (
+        [text[:_MAX_TEXT] for text in values[:_MAX_TEXTS] if isinstance(text, str)] if isinstance(values, list) else []
+    )

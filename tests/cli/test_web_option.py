@@ -1,0 +1,95 @@
+"""``--web`` of ``serve`` and ``watch``: the page of a live session, and addresses that are none."""
+
+from __future__ import annotations
+
+import json
+import queue
+import re
+import socket
+import subprocess
+import threading
+import urllib.request
+
+import pytest
+from sockets import free_endpoint
+
+from coview_stream.cli import main
+from coview_stream.clouds.python_child import python_command, python_environment
+
+
+@pytest.mark.parametrize("command", [["serve", "--robot", "r1", "--web", "site.coview"], ["watch", "--web", "here"]])
+def test_what_is_no_address_is_refused(command, capsys):
+    assert main(command) == 2
+    assert "no HOST:PORT; write --web=127.0.0.1:8642" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_ends_watch_with_one_line(capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        assert main(["watch", "--web", address]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "in use" in line
+
+
+def test_a_map_that_is_none_ends_watch(tmp_path, capsys):
+    assert main(["watch", "--web", "127.0.0.1:0", "--map", str(tmp_path / "none.coview")]) == 2
+    assert "none.coview" in capsys.readouterr().err
+
+
+class Command:
+    """A command with a page, and the events of that page."""
+
+    def __init__(self, *words):
+        command = python_command("coview_stream", *words, "--web", "127.0.0.1:0")
+        self.process = subprocess.Popen(
+            command, env=python_environment(), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        )
+        self.events = queue.Queue()
+        for line in self.process.stderr:
+            found = re.fullmatch(r"page at (http://\S+)\n", line)
+            if found:
+                self.url = found.group(1)
+                break
+        threading.Thread(target=self.process.stderr.read, daemon=True).start()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self):
+        with urllib.request.urlopen(f"{self.url}events", timeout=60) as stream:
+            kind = ""
+            for line in stream:
+                if line.startswith(b"event: "):
+                    kind = line[7:].decode().strip()
+                elif line.startswith(b"data: "):
+                    self.events.put((kind, json.loads(line[6:])))
+
+    def wait(self, *kinds):
+        """The first event of each kind."""
+        found = {}
+        while set(kinds) - set(found):
+            kind, data = self.events.get(timeout=30)
+            found.setdefault(kind, data)
+        return found
+
+    def end(self):
+        self.process.terminate()
+        code = self.process.wait(10.0)
+        self.process.stderr.close()
+        return code
+
+
+@pytest.mark.slow
+def test_serve_and_watch_show_robot_and_map(world_file, tmp_path):
+    endpoint = free_endpoint()
+    serve = Command("serve", str(world_file), "--robot", "r1", "--listen", endpoint, "--state", str(tmp_path))
+    watch = Command("watch", "--connect", endpoint)
+    try:
+        for command in (serve, watch):
+            seen = command.wait("status", "map")
+            assert (seen["status"]["robot"], seen["status"]["state"]) == ("r1", "SEARCHING")
+            assert seen["status"]["map_sha256"] == seen["map"]["sha256"]
+            with urllib.request.urlopen(f"{command.url}map/{seen['map']['sha256']}", timeout=30) as answer:
+                assert len(answer.read()) > 6 * seen["map"]["count"]
+    finally:
+        assert [watch.end(), serve.end()] == [0, 0]

@@ -1,0 +1,121 @@
+"""What the web page is told: poses, statuses from anyone, scans in the map frame, the map."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+
+import numpy as np
+import pytest
+from test_web_hub import events
+
+from coview_stream.basemap.map_view import MapView
+from coview_stream.geometry.protection import ProtectionLevel
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.messages.hypotheses import HypothesesMessage
+from coview_stream.messages.types import PoseMessage
+from coview_stream.viewers.scene import Scan
+from coview_stream.viewers.web_hub import WebHub
+from coview_stream.viewers.web_sink import WebSink, packed_map
+
+EAST = 593_000.0
+
+
+@pytest.fixture
+def hub():
+    return WebHub()
+
+
+@pytest.fixture
+def sink(hub):
+    return WebSink(hub)
+
+
+@pytest.fixture
+def page(hub, sink):
+    return hub.open_page()
+
+
+def pose(x, covariance=None, **fields):
+    T = pose_from(rot_z(0.5), [EAST + x, -20.0, 3.0])
+    return PoseMessage(
+        10**18, "r1", "TRACKING", T, np.eye(6) if covariance is None else covariance, 0.999, "ab", **fields
+    )
+
+
+def test_a_pose_is_told_with_its_uncertainty(sink, page):
+    covariance = np.diag([0.04, 0.01, 0.09, 1e-6, 1e-6, 1e-6])
+    covariance[0, 1] = covariance[1, 0] = 0.01
+    sink.pose(pose(0.25, covariance, protection=ProtectionLevel(0.5, 1.0)))
+    ((kind, told),) = events(page.take(0.0))
+    assert (kind, told["robot"], told["x"], told["yaw"]) == ("pose", "r1", EAST + 0.25, 0.5)
+    assert told["cov"] == [0.04, 0.01, 0.01]
+    assert told["sigma"][:3] == [0.2, 0.1, 0.3]
+    assert told["protection"]["m"] == 0.5
+
+
+def test_a_pose_without_uncertainty_is_told_too(sink, page):
+    sink.pose(pose(0.0, np.full((6, 6), np.nan)))
+    ((_, told),) = events(page.take(0.0))
+    assert (told["cov"], told["sigma"], told["protection"]) == (None, None, None)
+
+
+def test_a_page_that_opens_later_gets_the_trail(sink, hub):
+    for x in (0.0, 0.1, 1.0, 1.1):
+        sink.pose(pose(x))
+    told = dict(events(hub.open_page().take(0.0)))
+    assert told["trail"]["points"] == [[EAST, -20.0], [EAST + 1.0, -20.0]]
+
+
+def test_a_status_from_anyone_is_cut_to_what_is_shown(sink, page):
+    sink.status("r1", {
+        "state": "LOST", "reason": "x" * 9999, "uptime_s": 10**400, "latency_ms": {"p50": 7.5, "p99": "fast"},
+        "pose": [1], "counters": None, "calibration": {"says": ["leans", 3] + ["y"] * 99}, "errors": {"a": 1},
+        "secret": "not told",
+    })  # fmt: skip
+    ((_, told),) = events(page.take(0.0))
+    assert (told["state"], len(told["reason"]), told["uptime_s"]) == ("LOST", 500, None)
+    assert (told["latency_ms"]["p50"], told["latency_ms"]["p99"]) == (7.5, "fast")
+    assert (told["pose"], told["errors"], told["says"][0], len(told["says"])) == ({}, [], "leans", 7)
+    assert "secret" not in told
+
+
+def test_hypotheses_are_told(sink, page):
+    sink.hypotheses(HypothesesMessage(10**18, "r1", np.array([[1.0, 2.0, 3.0, 0.5, 0.75, 9.0]]), 0.25, "ab"))
+    ((_, told),) = events(page.take(0.0))
+    assert told["places"] == [{"x": 1.0, "y": 2.0, "z": 3.0, "yaw": 0.5, "probability": 0.75}]
+    assert told["none"] == 0.25
+
+
+def test_a_scan_is_told_in_the_map_frame_where_its_pose_is_known(sink, page):
+    points = np.array([[1.0, 0.0, 2.0]], dtype=np.float32)
+    sink.scan(Scan("r1", 10**18, points, pose_from(rot_z(np.pi / 2), [EAST, 7.0, 1.0])))
+    ((_, told),) = events(page.take(0.0))
+    found = np.frombuffer(base64.b64decode(told["points"]), dtype="<i2") * told["step"]
+    assert np.allclose(found, [0.0, 1.0, 2.0], atol=0.01)
+    assert (told["in_map"], told["centre"]) == (True, [EAST, 7.0, 1.0])
+    sink.scan(Scan("r1", 10**18, points, None))
+    ((_, told),) = events(page.take(0.0))
+    assert told["in_map"] is False
+
+
+def test_the_map_is_packed_for_the_page(sink, page):
+    points = np.array([[0.0, 0.0, 5.0], [10.0, 4.0, 0.0]], dtype=np.float32)
+    view = MapView(np.array([EAST, 0.0, 0.0]), points, np.array([False, True]), "EPSG:25832", "ab")
+    sink.map(view)
+    sink.map(view)
+    assert events(page.take(0.0)) == [("map", {"sha256": "ab", "count": 2})]
+    packed = sink.maps["ab"]
+    assert packed == packed_map(view)
+    (length,) = struct.unpack("<I", packed[:4])
+    header = json.loads(packed[4 : 4 + length])
+    rows = np.frombuffer(packed[4 + length :], dtype="<i2").reshape(-1, 3) * header["step_m"] + header["origin"]
+    assert np.allclose(rows, [[EAST + 10.0, 4.0, 0.0], [EAST, 0.0, 5.0]], atol=0.01)
+    assert (length % 4, header["ground"]) == (0, 1)
+
+
+def test_few_maps_are_kept(sink):
+    for name in "abcdef":
+        sink.map(MapView(np.zeros(3), np.zeros((1, 3), dtype=np.float32), np.array([True]), None, name))
+    assert list(sink.maps) == list("cdef")
