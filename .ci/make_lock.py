@@ -2,7 +2,7 @@
 
     python .ci/make_lock.py                  # asks pip what it would install now, and writes .ci/lock/*-PLATFORM.txt
 
-There are three: ``test`` of ``pip install '.[test]'``, ``wheel`` of what a plain installation takes in (the same
+There are three: ``test`` of ``pip install '.[test]'``, ``wheel`` of ``pip install '.[all]'`` (the same
 versions), ``build`` of what makes the wheel. A lock is of one Python and one platform, for a hash is of one file. It is
 made again when something is to be newer.
 """
@@ -60,7 +60,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         test = lock_of(resolve(folder, [f"{ROOT}[test]"]), "pip install '.[test]'")
-        wheel = lock_of(resolve(folder, [str(ROOT)], test), "pip install .")
+        wheel = lock_of(resolve(folder, [f"{ROOT}[all]"], test), "pip install '.[all]'")
         build = lock_of(resolve(folder, ["build", *backend], test), "python -m build --no-isolation")
     for what, text in (("test", test), ("wheel", wheel), ("build", build)):
         path = ROOT / ".ci" / "lock" / f"{what}-{platform_name()}.txt"

@@ -1,4 +1,4 @@
-"""Bill of materials of a wheel: what it brings in, as CycloneDX 1.5, from a lock and what is installed of it.
+"""Bill of materials of a wheel: what ``all`` brings in, as CycloneDX 1.5, from a lock and what is installed of it.
 
     ENVIRONMENT/bin/python .ci/make_sbom.py .ci/lock/wheel-cp311-linux-x86_64.txt dist/*.whl > coview-stream.cdx.json
 
@@ -43,6 +43,19 @@ def applying(texts: Iterable[str], extras: Iterable[str] = ()) -> Iterator[Requi
             yield need
 
 
+def direct_needs(project: dict[str, Any], extra: str = "all") -> list[str]:
+    """Return what a project requires with one of its extras, and with the extras of its own that this one names."""
+    own = f"{project['name']}["
+    needs = list(project["dependencies"])
+    for text in project["optional-dependencies"][extra]:
+        if not text.startswith(own):
+            needs.append(text)
+            continue
+        for other in text[len(own) :].partition("]")[0].split(","):
+            needs += direct_needs(project, other)
+    return sorted(set(needs))
+
+
 def edges(direct: Iterable[str], locked: set[str]) -> dict[str, set[str]]:
     """Return who needs whom, of what is locked; the project itself is the empty name."""
     found: dict[str, set[str]] = {"": set()}
@@ -83,7 +96,7 @@ def document(lock: str, project: dict[str, Any], wheel: Path | None = None) -> d
         wheel: the file, for its hash.
     """
     packages = {canonicalize_name(name): (version, sha256) for name, version, sha256 in _LOCKED.findall(lock)}
-    graph = edges(project["dependencies"], set(packages))
+    graph = edges(direct_needs(project), set(packages))
     refs = {name: f"pkg:pypi/{name}@{version}" for name, (version, _) in packages.items()}
     refs[""] = f"pkg:pypi/{project['name']}@{project['version']}"
     own: dict[str, Any] = {

@@ -17,6 +17,8 @@ Every message names the file, field or key and the remedy. The command prints it
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -71,6 +73,33 @@ def warn(message: str | None) -> None:
         warnings.warn(message, CoViewWarning, stacklevel=3)
 
 
+EXTRA_OF = {
+    "scipy": "node",
+    "tqdm": "node",
+    "taichi": "node",
+    "quadrants": "node",
+    "gtsam": "node",
+    "onnxruntime": "node",
+    "laspy": "node",
+    "lazrs": "node",
+    "rosbags": "messages",
+    "foxglove_schemas_protobuf": "messages",
+    "google": "messages",
+    "pyproj": "build",
+    "open3d": "build",
+    "CSF": "build",
+    "matplotlib": "plot",
+    "small_gicp": "gicp",
+    "kiss_icp": "kiss-icp",
+    "cryptography": "sign",
+    "rerun": "viz",
+    "torch": "learn-train",
+    "onnx": "learn-train",
+    "psutil": "bench",
+}
+"""Extra of the package that brings a module of others, by its first name."""
+
+
 def require_library(module: str, requirement: str, purpose: str) -> Any:
     """Import a module that comes with one of the package's extras.
 
@@ -87,7 +116,33 @@ def require_library(module: str, requirement: str, purpose: str) -> Any:
     except Exception as error:  # an incompatible version may raise anything
         library = module.partition(".")[0]
         absent = isinstance(error, ImportError) and error.name == library
+        if absent and library in EXTRA_OF:
+            raise DependencyError(_not_installed(library, purpose)) from error
         missing = "is not installed" if absent else f"cannot be loaded ({error})"
-        # not by our extra: pip would look for this package in a registry, and it may come from elsewhere
-        remedy = f"pip install '{requirement}'"
-        raise DependencyError(f"{purpose}: {library.replace('_', '-')} {missing}; {remedy}") from error
+        raise DependencyError(f"{purpose}: {_spelt(library)} {missing}; pip install '{requirement}'") from error
+
+
+@contextmanager
+def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator[None]:
+    """Turn the ImportError of a module that an extra brings into a :class:`DependencyError` that names the extra.
+
+    Args:
+        purpose: what needs it, for the message.
+        extra: the one that brings all that this needs; None: the one that brings the module.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library not in EXTRA_OF:
+            raise
+        raise DependencyError(_not_installed(library, purpose, extra)) from error
+
+
+def _not_installed(library: str, purpose: str, extra: str | None = None) -> str:
+    # pip takes the version that is installed, and looks for no other: it does not matter where this package came from
+    return f"{purpose}: {_spelt(library)} is not installed; pip install 'coview-stream[{extra or EXTRA_OF[library]}]'"
+
+
+def _spelt(library: str) -> str:
+    return {"google": "protobuf", "CSF": "cloth-simulation-filter"}.get(library, library.replace("_", "-"))

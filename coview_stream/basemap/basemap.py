@@ -22,7 +22,7 @@ from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.trust import FileIdentity, Trust
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
-from coview_stream.errors import ConfigError, CoViewError, MapError
+from coview_stream.errors import ConfigError, CoViewError, MapError, naming_missing_libraries
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 
@@ -101,7 +101,8 @@ class BaseMap:
             MapError: there is no ground to stand on.
             DependencyError, InputError: ``learned=True`` without onnxruntime or weights.
         """
-        from coview_stream.basemap.build import build_arrays
+        with naming_missing_libraries("building a map", "build"):
+            from coview_stream.basemap.build import build_arrays
 
         paths = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
         settings = config or map_preset(preset, **options)

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, TextIO
 
-from coview_stream.errors import ConfigError, CoViewError, CoViewWarning
+from coview_stream.errors import ConfigError, CoViewError, CoViewWarning, naming_missing_libraries
 from coview_stream.version import __version__
 
 PROGRAM = "coview-stream"
@@ -31,6 +31,9 @@ COMMANDS = (
 """Names in the order of ``--help``."""
 
 _MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin where it is imported
+
+_EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}
+"""Extras that bring all that a command needs; what the others lack says it by itself."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -96,7 +99,8 @@ def _dispatch(argv: list[str]) -> int:
         args = build_parser(argv[0] if argv and argv[0] in COMMANDS else None).parse_args(argv)
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
-    return int(args.run(args))
+    with naming_missing_libraries(f"{PROGRAM} {args.command}", _EXTRAS.get(args.command)):
+        return int(args.run(args))
 
 
 def _fail(message: str) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coview_stream.cli.options import acceptance_config, add_risk, add_verify_key, check_picture
+from coview_stream.errors import naming_missing_libraries
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
@@ -60,7 +61,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n".join(f"{name:<14} {_text(value)}" for name, value in facts.items()))
     if args.plot:
-        from coview_stream.report.plots import plot_map
+        with naming_missing_libraries("coview-stream info --plot", "plot"):
+            from coview_stream.report.plots import plot_map
 
         points = base_map.points.astype(np.float64) + base_map.origin
         plot_map(points, base_map.stations + base_map.origin, args.plot, args.map.name)

@@ -69,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
         library()  # before anything is read: it may be missing
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
+    draws = not args.no_pictures and _can_draw()
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     missing = base_map.require_features(args.reloc)
     if missing is not None:
@@ -99,12 +100,24 @@ def run(args: argparse.Namespace) -> int:
 
         located = locate(base_map, recorded, config, step)
     write(located, base_map, args.output)
-    if not args.no_pictures:
+    if draws:
         from coview_stream.report.run_pictures import draw_run
 
         draw_run(located, base_map, args.output)
     print(summary(located))
     return 0 if located.posed else 1
+
+
+def _can_draw() -> bool:
+    """Return whether pictures can be drawn; if not, print why: poses are what matters."""
+    from coview_stream.errors import DependencyError, require_library
+
+    try:
+        require_library("matplotlib", "matplotlib>=3.8", "no pictures")
+    except DependencyError as error:
+        print(error, file=sys.stderr)
+        return False
+    return True
 
 
 def _lidar_odometry(odometry: str, gravity: str | None) -> LidarOdometry | None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.cloud import LOCAL_LIMIT, Cloud
-from coview_stream.clouds.las import read_las
+from coview_stream.clouds.las import read_las, require_laspy
 from coview_stream.clouds.npy_bin import read_bin, read_npy
 from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
@@ -189,8 +189,7 @@ def _bin(stream: BinaryIO, rows: Reals, path: Path) -> None:
 
 
 def _las(stream: BinaryIO, rows: Reals, path: Path) -> None:
-    import laspy
-
+    laspy = require_laspy()
     if not np.isfinite(rows).all():
         raise CloudError(f"{path}: LAS cannot hold NaN or infinite coordinates; drop those rows first")
     header = laspy.LasHeader(point_format=6, version="1.4")

@@ -18,7 +18,7 @@ from coview_stream.clouds.las_header import read_las_header
 from coview_stream.clouds.laszip_pointwise import POINTWISE, is_pointwise, with_one_chunk
 from coview_stream.clouds.laz_process import read_laz
 from coview_stream.clouds.reference_system import flaw_of_system, stated_system, unchecked_system
-from coview_stream.errors import CloudError, warn
+from coview_stream.errors import CloudError, require_library, warn
 
 CHUNK = 1_000_000
 """Points per chunk, set by hand: about 100 MB of float64 and record buffers at a time."""
@@ -40,6 +40,7 @@ def read_las(path: Path) -> Cloud:
     """
     check_las(path)
     if _is_compressed(path):
+        require_laspy()  # here: its process could not say so
         return read_laz(path)
     return decode(path, CloudBuilder).finish(os.fspath(path))
 
@@ -62,8 +63,7 @@ def decode(path: Path, builder: Callable[[str | None], CloudBuilder]) -> CloudBu
     Raises:
         CloudError: the file is damaged, truncated or not in metres.
     """
-    import laspy
-
+    laspy = require_laspy()
     try:
         with laspy.open(with_one_chunk(path) if is_pointwise(path) else path) as reader:
             return _read(reader, path, builder)
@@ -76,6 +76,12 @@ def decode(path: Path, builder: Callable[[str | None], CloudBuilder]) -> CloudBu
         if type(error).__name__ != "PanicException":
             raise
         raise CloudError(_damaged(path, error)) from error
+
+
+def require_laspy() -> Any:
+    """Return laspy; DependencyError where it or its decoder is not installed."""
+    require_library("lazrs", "lazrs>=0.6", "LAS and LAZ files")
+    return require_library("laspy", "laspy[lazrs]>=2.5", "LAS and LAZ files")
 
 
 def las_system(path: Path) -> str | None:

@@ -76,5 +76,5 @@ def _remedy(error: ImportError) -> str:
                 f"Ubuntu with `apt-get install {package}`{extra}"
             )
     if isinstance(error, ModuleNotFoundError) and error.name == "open3d":
-        return "Open3D is not installed; `pip install open3d-cpu` (Linux x86-64) or `pip install open3d`"
+        return "Open3D is not installed; pip install 'coview-stream[build]'"
     return f"Open3D cannot be loaded ({reason}); reinstall it with `pip install --force-reinstall open3d-cpu`"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import platform
 import sys
@@ -27,11 +28,45 @@ def machine_findings(probed: Callable[[str], dict[str, Any]] = probe) -> Iterato
     total, available = memory()
     yield memory_finding(total, available)
     yield blas_finding(os.environ.get("OPENBLAS_NUM_THREADS", ""))
-    yield kernels_finding(probed("kernels"), bool(os.environ.get("COVIEW_KERNELS")))
+    lacking = lacking_modules()
+    yield parts_finding(lacking)
+    if lacking["node"] is not None:
+        yield kernels_finding(probed("kernels"), bool(os.environ.get("COVIEW_KERNELS")))
     yield zenoh_finding(probed("zenoh"))
     yield codecs_finding(probed("codecs"))
-    yield open3d_finding(probed("open3d"))
-    yield matplotlib_finding(probed("matplotlib"))
+    if lacking["build"] is not None:
+        yield open3d_finding(probed("open3d"))
+    if lacking["plot"] is not None:
+        yield matplotlib_finding(probed("matplotlib"))
+
+
+_PARTS = {
+    "node": (("scipy", "gtsam", "onnxruntime"), "serve, locate, replay"),
+    "build": (("open3d", "laspy", "pyproj"), "build, simulate, demo"),
+    "plot": (("matplotlib",), "pictures"),
+}
+"""Modules of each part, of which the first tells whether it is installed, and what the part does."""
+
+
+def lacking_modules(found: Callable[[str], object] = importlib.util.find_spec) -> dict[str, list[str] | None]:
+    """Return, for each part, which of its modules are not there; None where the part is not installed."""
+    return {
+        part: [name for name in names if found(name) is None] if found(names[0]) is not None else None
+        for part, (names, _) in _PARTS.items()
+    }
+
+
+def parts_finding(lacking: dict[str, list[str] | None]) -> Finding:
+    """Judge which parts of the package are installed: a robot's side needs none of them."""
+    installed = {part: names for part, names in lacking.items() if names is not None}
+    text = "; ".join(["client, watch, info, doctor", *(_PARTS[part][1] for part in installed)])
+    broken = [f"{part} lacks {', '.join(names)}" for part, names in installed.items() if names]
+    if broken:
+        remedy = f"pip install 'coview-stream[{','.join(part for part, names in installed.items() if names)}]'"
+        return Finding("warn", "parts", f"{text}; {'; '.join(broken)}", remedy)
+    absent = [part for part in lacking if part not in installed]
+    more = "" if not absent else f" (more: pip install 'coview-stream[{','.join(absent)}]')"
+    return Finding("ok", "parts", text + more)
 
 
 def python_finding(version: tuple[int, ...]) -> Finding:
@@ -104,8 +139,8 @@ def codecs_finding(found: dict[str, Any]) -> Finding:
     """Judge what reading ROS 2, Foxglove and keelson messages needs."""
     missing = [found["error"]] if "error" in found else found["missing"]
     if missing:
-        text = f"cannot be read: {', '.join(missing)}"
-        return Finding("FAIL", "message formats", text, "`pip install --force-reinstall coview-stream`")
+        text = f"raw and JSON; ROS 2 CDR or Foxglove cannot be read: {', '.join(missing)}"
+        return Finding("warn", "message formats", text, "pip install 'coview-stream[messages]'")
     return Finding("ok", "message formats", "raw, JSON, ROS 2 CDR, Foxglove, keelson")
 
 
@@ -121,7 +156,7 @@ def matplotlib_finding(found: dict[str, Any]) -> Finding:
     """Judge Matplotlib: pictures only."""
     if "error" in found:
         text = f"{found['error']}: no pictures from locate, demo, info and eval"
-        return Finding("warn", "matplotlib", text, "`pip install matplotlib`")
+        return Finding("warn", "matplotlib", text, "pip install 'coview-stream[plot]'")
     return Finding("ok", "matplotlib", str(found["version"]))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.errors import MessageError
+from coview_stream.errors import MessageError, require_library
 from coview_stream.geometry.transforms import Pose, pose_to_tum, transform
 from coview_stream.messages import protobuf_wire
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
@@ -26,13 +26,12 @@ _ROTATION = 5  # FrameTransform.rotation; PoseInFrame ends before
 @lru_cache(maxsize=1)
 def schemas() -> Any:
     """Import the schema classes, on first use: it takes 50 ms."""
-    from foxglove_schemas_protobuf import FrameTransform_pb2, PointCloud_pb2, PoseInFrame_pb2
-
-    return SimpleNamespace(
-        FrameTransform=FrameTransform_pb2.FrameTransform,
-        PointCloud=PointCloud_pb2.PointCloud,
-        PoseInFrame=PoseInFrame_pb2.PoseInFrame,
-    )
+    require_library("google.protobuf.message", "protobuf>=5", "Foxglove messages")
+    names = ("FrameTransform", "PointCloud", "PoseInFrame")
+    package = "foxglove_schemas_protobuf"
+    wanted = "foxglove-schemas-protobuf>=0.3"
+    found = (require_library(f"{package}.{name}_pb2", wanted, "Foxglove messages") for name in names)
+    return SimpleNamespace(**{name: getattr(module, name) for name, module in zip(names, found, strict=True)})
 
 
 def _parse(schema: Any, payload: bytes) -> Any:

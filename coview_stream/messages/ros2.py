@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.errors import MessageError
+from coview_stream.errors import MessageError, require_library
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 from coview_stream.messages.point_fields import MAX_FIELDS, Table, read_table, write_table
 from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage, PoseMessage, Sample
@@ -28,9 +28,8 @@ _NUMBERS = {f"<{kind}": number for number, kind in _KINDS.items()}
 @lru_cache(maxsize=1)
 def store() -> Any:
     """Import the message types and generate their code, on first use: it takes 0.25 s."""
-    from rosbags.typesys import Stores, get_typestore
-
-    found = get_typestore(Stores.ROS2_HUMBLE)
+    typesys = require_library("rosbags.typesys", "rosbags>=0.11", "ROS 2 messages")
+    found = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for name in (CLOUD, ODOMETRY, POSE):
         found.get_msgdef(name)
     return found

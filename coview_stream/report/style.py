@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from coview_stream.errors import InputError
+from coview_stream.errors import InputError, naming_missing_libraries
 from coview_stream.geometry.arrays import Floats, Reals
 
 STATE_COLOURS = {"SEARCHING": "#999999", "AMBIGUOUS": "#E69F00", "TRACKING": "#0072B2", "LOST": "#D55E00"}
@@ -51,9 +51,10 @@ def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, 
     Raises:
         InputError: the picture cannot be written.
     """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    with naming_missing_libraries("pictures"):
+        import matplotlib as mpl
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
     rows, columns = options.pop("nrows", 1), options.pop("ncols", 1)
     axes_options = options.pop("axes", {})

@@ -46,8 +46,8 @@ def test_lock_has_every_direct_dependency_at_a_version_that_it_allows(lock):
         "platform_machine": machine, "platform_system": "Linux", "extra": "",
     }  # fmt: skip
     direct = {
-        "wheel": PROJECT["dependencies"],
-        "test": [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["test"]],
+        "wheel": script("make_sbom").direct_needs(PROJECT, "all"),
+        "test": script("make_sbom").direct_needs(PROJECT, "test"),
         "build": ["build", *tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]],
     }[what]
     for text in direct:

@@ -30,7 +30,8 @@ def test_healthy_machine_has_no_failures(monkeypatch):
     found = list(machine.machine_findings(lambda name: GOOD[name]))
     assert not failed(found)
     assert [f.what for f in found] == [
-        "python", "processor", "memory", "BLAS threads", "kernels", "zenoh", "message formats", "open3d", "matplotlib",
+        "python", "processor", "memory", "BLAS threads", "parts", "kernels", "zenoh", "message formats", "open3d",
+        "matplotlib",
     ]  # fmt: skip
     assert {f.verdict for f in found if f.what not in ("python", "processor", "memory")} == {"ok"}
 
@@ -55,9 +56,9 @@ def test_healthy_machine_has_no_failures(monkeypatch):
         (machine.kernels_finding(GOOD["kernels"] | {"backend": "numpy"}, True), "warn", "unset"),
         (machine.zenoh_finding({"error": "ModuleNotFoundError"}), "FAIL", "eclipse-zenoh"),
         (machine.zenoh_finding({"version": "1.9.0"}), "warn", "upgrade"),
-        (machine.codecs_finding({"missing": ["rosbags"]}), "FAIL", "reinstall"),
+        (machine.codecs_finding({"missing": ["rosbags"]}), "warn", "coview-stream[messages]"),
         (machine.open3d_finding({"error": "DependencyError: no libX11; install it"}), "warn", "install it"),
-        (machine.matplotlib_finding({"error": "ImportError"}), "warn", "install matplotlib"),
+        (machine.matplotlib_finding({"error": "ImportError"}), "warn", "coview-stream[plot]"),
     ],
 )
 def test_machine_faults_have_a_remedy(finding, verdict, part):
@@ -134,3 +135,17 @@ def test_map_findings(world_file, world_map, tmp_path):
         ["ok", "ok", "ok"],
     ]
     assert open_map(tmp_path / "none.coview")[1].verdict == "FAIL"
+
+
+def test_robot_side_alone_is_all_right_and_says_what_more_there_is():
+    found = machine.parts_finding(machine.lacking_modules(lambda name: None))
+    assert found.verdict == "ok"
+    assert "client, watch, info, doctor" in found.found
+    assert "coview-stream[node,build,plot]" in found.found
+
+
+def test_part_without_one_of_its_modules_is_a_warning_with_its_remedy():
+    found = machine.parts_finding(machine.lacking_modules(lambda name: None if name == "gtsam" else object()))
+    assert found.verdict == "warn"
+    assert "node lacks gtsam" in found.found
+    assert "coview-stream[node]" in found.remedy

@@ -10,6 +10,7 @@ import hashlib
 import struct
 from collections.abc import Callable
 
+from coview_stream.errors import require_library
 from coview_stream.messages.types import Encoded
 from coview_stream.stream.transport.transport import Publisher
 
@@ -33,9 +34,8 @@ def type_hash(name: str, humble: bool = False) -> str:
     """Return the RIHS01 hash of a ROS 2 message type, or what Humble writes instead."""
     if humble:
         return NO_HASH
-    from rosbags.typesys import Stores, get_typestore
-
-    return str(get_typestore(Stores.ROS2_JAZZY).hash_rihs01(name))
+    typesys = require_library("rosbags.typesys", "rosbags>=0.11", "the preset rmw_zenoh")
+    return str(typesys.get_typestore(typesys.Stores.ROS2_JAZZY).hash_rihs01(name))
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:

@@ -1,0 +1,27 @@
+"""An installation without extras: the robot's side works, the rest names the extra that it needs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import light_installation
+import pytest
+
+
+@pytest.mark.slow
+def test_client_needs_no_extra():
+    script = f"BLOCKED = {set(light_installation.EXTRA_OF)!r}{light_installation.BLOCK}\n"
+    script += "import light_installation\nlight_installation.check_client()"
+    paths = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths}
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_commands_work_or_name_the_extra_that_they_need(world_file, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+    light_installation.check_commands(tmp_path, world_file, block=True)
