@@ -38,7 +38,8 @@ _SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "core.envelope": ("keelson", ("cloud", "odometry", "pose")),
 }
 _KEELSON: dict[str, tuple[MessageKind, ...]] = {"point_cloud": ("cloud",), "frame_transform": ("odometry", "pose")}
-_MAGIC = ((b"\0\0\0\0", "cdr"), (b"\0\1\0\0", "cdr"), (b"{", "json"))
+# of CDR two bytes name the encoding, and two are options: the padding that ends the message. Its codec names XCDR2
+_MAGIC = re.compile(rb"(?P<cdr>\0[\0\1\6-\x0b]\0[\0-\3])|(?P<json>\{)")
 _RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
 _KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
 _MAX_ENCODING = 256  # characters
@@ -104,9 +105,8 @@ def _by_key(kind: MessageKind, key: str) -> str:
 
 
 def _by_magic(sample: Sample) -> str:
-    for start, codec in _MAGIC:
-        if sample.payload.startswith(start):
-            return codec
+    if found := _MAGIC.match(sample.payload):
+        return str(found.lastgroup)
     raise EncodingError(
         f"{sample.key}: no encoding is set, and the payload is neither CDR nor JSON; set one, or name it by option"
     )

@@ -22,6 +22,9 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_XCDR2 = {
+    6: "CDR2_BE", 7: "CDR2_LE", 8: "D_CDR2_BE", 9: "D_CDR2_LE", 10: "PL_CDR2_BE", 11: "PL_CDR2_LE",
+}  # fmt: skip
 _NUMBERS = {f"<{kind}": number for number, kind in _KINDS.items()}
 
 
@@ -35,7 +38,23 @@ def store() -> Any:
     return found
 
 
+def _check_encapsulation(payload: bytes, name: str) -> None:
+    """Check the first two bytes, which name the encoding; the two after them are options, which a reader ignores."""
+    kind = int.from_bytes(payload[:2], "big")
+    if len(payload) < 4:
+        raise MessageError(f"not a {name} in CDR: truncated")
+    if kind in _XCDR2:
+        raise MessageError(
+            f"a {name} in {_XCDR2[kind]} (XCDR2), which is not read: publish with XCDR1, as ROS 2 does "
+            "(data representation XCDR1 in the writer's QoS)"
+        )
+    if kind not in (0, 1):
+        what = "a parameter list (PL_CDR)" if kind in (2, 3) else f"encapsulation 0x{kind:04x}"
+        raise MessageError(f"not a {name} in CDR: {what}; publish plain CDR")
+
+
 def _read(payload: bytes, name: str) -> Any:
+    _check_encapsulation(payload, name)
     try:
         return store().deserialize_cdr(memoryview(payload), name)
     except Exception as error:  # generated code on hostile bytes; what it raises differs between versions
@@ -53,6 +72,7 @@ def _pose(message: Any) -> Pose:
 
 def _refuse_many_fields(payload: bytes) -> None:
     """Check the number of PointFields before parsing: rosbags would build millions of objects for a hostile one."""
+    _check_encapsulation(payload, CLOUD)
     order = "<" if payload[1:2] == b"\1" else ">"
     try:
         (name,) = struct.unpack_from(order + "I", payload, 12)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
@@ -17,6 +16,7 @@ from coview_stream.stream.node.counters import PoseRate
 from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.scheduling import Rate
 from coview_stream.stream.node.session import Session
+from coview_stream.stream.node.status_size import encode_status
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Connection, Publisher, Transport
 from coview_stream.version import __version__
@@ -144,7 +144,7 @@ class Reporter:
             document["reason"] = "the node is shutting down"
             if state is State.TRACKING:
                 document["state"] = State.LOST.reported
-        self._publishers[robot].put(Encoded(json.dumps(document).encode(), _JSON))
+        self._publishers[robot].put(Encoded(encode_status(document), _JSON))
 
 
 def status(session: Session, connection: Connection, reconnects: int, rate: float, uptime: float) -> dict[str, Any]:
