@@ -25,7 +25,7 @@ COARSE_FLOAT32 = 1e6
 """From here on (metres) float32 is coarser than 6 cm; a file that stores it has lost precision already."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cloud:
     """Points, and the float64 origin that they are relative to.
 

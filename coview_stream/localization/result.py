@@ -7,8 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.pose_numbers import pose_fields, pose_in_words, position_of, quaternion_of, stddev_of
 from coview_stream.geometry.protection import ProtectionLevel
-from coview_stream.geometry.transforms import Pose
+from coview_stream.geometry.transforms import Pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import State
@@ -91,9 +92,9 @@ def _number(value: float | None, form: str) -> float | None:
     return None if value is None or not math.isfinite(value) else float(f"{value:{form}}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fix:
-    """The localizer's answer to one frame.
+    """The localizer's answer to one frame. Two are equal only if they are the same object.
 
     Attributes:
         stamp: seconds, of the frame.
@@ -103,7 +104,7 @@ class Fix:
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2; None unless TRACKING. The angles are small
             rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
             map, whose georeferencing is not in it, and calibrated on simulated drives: see docs/tracking.md. One sigma
-            of x, y and z, metres, is ``numpy.sqrt(numpy.diag(fix.covariance))[:3]``.
+            of x, y and z, metres, is ``fix.stddev[:3]``.
         confidence: in [0, 1]: probability that the robot is at this place and not at another or none, as the search
             that found it has it or, if that is less, the newest registration: see docs/integrity.md. 0 unless TRACKING.
         evidence: of the newest keyframe, None before the first.
@@ -124,3 +125,50 @@ class Fix:
     drift: Drift | None = None
     protection: ProtectionLevel | None = None
     calibration: Calibration | None = None
+
+    @property
+    def position(self) -> Floats | None:
+        """(3,) x, y, z of the body in the frame of the map's sources, metres; None unless TRACKING."""
+        return None if self.T_map_body is None else position_of(self.T_map_body)
+
+    @property
+    def yaw(self) -> float | None:
+        """Heading of the body's x axis, radians in (-pi, pi], counter-clockwise from the map's x; None likewise."""
+        return None if self.T_map_body is None else yaw_of(self.T_map_body)
+
+    @property
+    def quaternion(self) -> Floats | None:
+        """(4,) x, y, z, w of the rotation map <- body; None likewise."""
+        return None if self.T_map_body is None else quaternion_of(self.T_map_body)
+
+    @property
+    def stddev(self) -> Floats | None:
+        """(6,) one sigma of x, y, z, roll, pitch, yaw, metres and radians, of :attr:`covariance`; None likewise."""
+        return None if self.covariance is None else stddev_of(self.covariance)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, the names as in pose messages: always the same keys, None where a value is not known.
+
+        ``state`` is the reported one, of four; ``orientation`` is x, y, z, w; ``covariance`` is in rows;
+        ``T_map_odom`` is four rows.
+        """
+        pose: dict[str, Any] = dict.fromkeys(("position", "orientation", "covariance"))
+        if self.T_map_body is not None:
+            pose = pose_fields(self.T_map_body, self.covariance)
+        return {
+            "stamp": float(self.stamp),
+            "state": self.state.reported,
+            **pose,
+            "confidence": float(self.confidence),
+            "protection_level": None if self.protection is None else self.protection.to_json(),
+            "T_map_odom": None if self.T_map_odom is None else self.T_map_odom.tolist(),
+            "evidence": None if self.evidence is None else self.evidence.to_json(),
+            "calibration": None if self.calibration is None else self.calibration.to_json(),
+        }
+
+    def __repr__(self) -> str:
+        """Return stamp, state and pose, or why there is none, in one line."""
+        head = f"Fix({self.stamp:.3f} s, {self.state}"
+        if self.T_map_body is not None:
+            return f"{head}: {pose_in_words(self.T_map_body, self.covariance)}, confidence {self.confidence:.6g})"
+        return f"{head})" if self.evidence is None else f"{head}: {self.evidence.reason})"

@@ -20,7 +20,7 @@ _NAMES = ("x", "y", "z", "yaw", "probability", "log_ratio")
 _DIGITS = (2, 2, 2, 3, 6, 1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HypothesesMessage:
     """Places that a search for one robot considers, none of which is known to be right.
 

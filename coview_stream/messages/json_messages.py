@@ -88,20 +88,7 @@ def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
     """
     if sample.payload[:1] == b"{":
         return read_object(sample.payload)
-    row = pose_to_tum(pose.T_map_body).tolist()
-    return {
-        "stamp_ns": pose.stamp_ns,
-        "robot": pose.robot,
-        "state": pose.state,
-        "position": row[:3],
-        "orientation": row[3:],
-        "covariance": None if np.isnan(pose.covariance).any() else pose.covariance.ravel().tolist(),
-        "confidence": _known(pose.confidence),
-        "map_sha256": pose.map_sha256 or None,
-        "age_s": _known(pose.age),
-        "frame_id": pose.frame_id,
-        "protection_level": None if pose.protection is None else pose.protection.to_json(),
-    }
+    return pose.to_json()
 
 
 def read_object(payload: bytes, limit: int = _MAX_BYTES) -> dict[str, Any]:
@@ -176,7 +163,3 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) != len(pairs):
         raise MessageError("a field occurs twice")
     return found
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value

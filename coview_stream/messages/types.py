@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.pose_numbers import pose_fields, pose_in_words, position_of, quaternion_of, stddev_of
 from coview_stream.geometry.protection import ProtectionLevel
-from coview_stream.geometry.transforms import Points, Pose
+from coview_stream.geometry.transforms import Points, Pose, yaw_of
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Encoded:
     attachment: bytes | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CloudMessage:
     """One lidar frame.
 
@@ -75,7 +78,7 @@ class CloudMessage:
         return replace(self, points=np.ascontiguousarray(self.points[::step]), times=times, rings=rings)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OdometryMessage:
     """One odometry sample.
 
@@ -88,9 +91,9 @@ class OdometryMessage:
     T_odom_body: Pose
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PoseMessage:
-    """One published pose.
+    """One published pose, what :meth:`RobotClient.poses` yields. Two are equal only if they are the same object.
 
     Attributes:
         stamp_ns: sensor time that the pose holds at, nanoseconds.
@@ -116,3 +119,47 @@ class PoseMessage:
     age: float = 0.0
     frame_id: str = "map"
     protection: ProtectionLevel | None = None
+
+    @property
+    def stamp(self) -> float:
+        """Seconds of sensor time that the pose holds at, to a microsecond; :attr:`stamp_ns` is exact."""
+        return int(self.stamp_ns) / 1_000_000_000  # of integers: correctly rounded
+
+    @property
+    def position(self) -> Floats:
+        """(3,) x, y, z of the body in the map's frame, metres."""
+        return position_of(self.T_map_body)
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the body's x axis, radians in (-pi, pi], counter-clockwise from the map's x."""
+        return yaw_of(self.T_map_body)
+
+    @property
+    def quaternion(self) -> Floats:
+        """(4,) x, y, z, w of the rotation map <- body."""
+        return quaternion_of(self.T_map_body)
+
+    @property
+    def stddev(self) -> Floats:
+        """(6,) one sigma of x, y, z, roll, pitch, yaw, metres and radians; NaN where a format has no covariance."""
+        return stddev_of(self.covariance)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data with the fields of the native JSON message, null where the pose's format does not carry one."""
+        return {
+            "stamp_ns": int(self.stamp_ns),
+            "robot": self.robot,
+            "state": self.state,
+            **pose_fields(self.T_map_body, self.covariance),
+            "confidence": None if math.isnan(self.confidence) else self.confidence,
+            "map_sha256": self.map_sha256 or None,
+            "age_s": None if math.isnan(self.age) else self.age,
+            "frame_id": self.frame_id,
+            "protection_level": None if self.protection is None else self.protection.to_json(),
+        }
+
+    def __repr__(self) -> str:
+        """Return robot, stamp, state and pose in one line."""
+        pose = pose_in_words(self.T_map_body, self.covariance)
+        return f"PoseMessage({self.robot!r}, {self.stamp:.3f} s, {self.state}: {pose})"

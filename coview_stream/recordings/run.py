@@ -18,7 +18,7 @@ from coview_stream.geometry.transforms import Points, Pose, Poses
 from coview_stream.recordings.layouts import Layout
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One scan of a run.
 
@@ -62,7 +62,7 @@ class CloudSource(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """A validated run. Iterating reads lazily: one frame is in memory at a time.
 

@@ -31,7 +31,7 @@ Trajectory = tuple[Floats, Floats]
 """Stamps (N,) in seconds, increasing, and poses (N, 4, 4) in metres, as ``read_tum`` returns them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FrameErrors:
     """Errors of every estimated pose that has a true one.
 

@@ -24,7 +24,7 @@ _TOLERANCE_NS = 150_000_000  # beside the poses that are known: the next one is 
 _MAX_GAP_NS = 2_000_000_000  # between two poses: across a longer one nothing is interpolated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """One lidar frame of a robot, thinned.
 

@@ -46,7 +46,7 @@ Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ambiguity:
     """How far a robot has to drive from K stations until it is found.
 
