@@ -36,6 +36,7 @@ WORKS = (
     ["--version"],
     ["watch", "--help"],
     ["watch", "--seconds", "0.5"],
+    ["watch", "--web=127.0.0.1:0", "--map", "MAP", "--seconds", "0.5"],
     ["info", "MAP"],
     ["info", "MAP", "--json"],
 )

@@ -19,8 +19,8 @@ from importlib import resources
 from typing import Any
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.node.metrics_server import LimitedRequest
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.limited_request import LimitedRequest
 from coview_stream.viewers.web_hub import WebHub
 
 log = logging.getLogger("coview_stream.web")

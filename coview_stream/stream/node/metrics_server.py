@@ -9,7 +9,6 @@ import socket
 import socketserver
 import sys
 import threading
-import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
@@ -18,12 +17,9 @@ from coview_stream.config.node import METRICS_ADDRESS
 from coview_stream.errors import ConfigError
 from coview_stream.stream.node.health import prometheus_text
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
+from coview_stream.stream.transport.limited_request import MAX_SECONDS, LimitedRequest
 
 log = logging.getLogger("coview_stream.node")
-
-# set by hand
-_MAX_SECONDS = 2.0  # for a whole request, and for its answer
-_MAX_BYTES = 8192  # of a request
 
 
 class MetricsServer:
@@ -106,7 +102,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _reply(self, code: int, kind: str, text: str) -> None:
         body = text.encode()
-        self.connection.settimeout(_MAX_SECONDS)
+        self.connection.settimeout(MAX_SECONDS)
         self.send_response(code)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))
@@ -116,30 +112,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Log no requests."""
-
-
-class LimitedRequest(io.RawIOBase):
-    """What a socket sends, up to a number of bytes and seconds together, then its end."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        super().__init__()
-        self._connection = connection
-        self._deadline = time.monotonic() + _MAX_SECONDS
-        self._left = _MAX_BYTES
-
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        """Read what there is; 0 after the last byte or second that is allowed."""
-        seconds = self._deadline - time.monotonic()
-        if seconds <= 0 or self._left <= 0:
-            return 0
-        self._connection.settimeout(seconds)
-        try:
-            count = self._connection.recv_into(buffer, min(len(buffer), self._left))
-        except OSError:
-            return 0
-        self._left -= count
-        return count

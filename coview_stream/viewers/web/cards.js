@@ -33,7 +33,7 @@ export class Cards {
     follow.addEventListener("click", () => this.onFollow(robot.name));
     head.append(name, element("span", "state"), follow);
     const figure = element("figure", "body-scan");
-    figure.append(element("canvas"), element("figcaption", "", "newest scan, from above, in the robot's own frame"));
+    figure.append(element("canvas"), element("figcaption", "", "newest scan in the robot's own frame"));
     card.append(head, element("p", "reason"), element("dl"), element("ol", "places"), figure, element("ul", "notes"));
     this.parent.append(card);
     return card;
@@ -49,7 +49,7 @@ export class Cards {
     const located = robot.located(now);
     rows(card.querySelector("dl"), [
       ...(located ? poseRows(pose) : []),
-      ["rate, age", `${robot.rate(now).toFixed(1)} Hz, ${number(pose && located ? pose.age_s : null, 2, " s")}`],
+      ...(located ? [["rate, age", `${robot.rate(now).toFixed(1)} Hz, ${number(pose.age_s, 2, " s")}`]] : []),
       ["frame to fix", `p50 ${number(status.latency_ms?.p50, 0)}, p99 ${number(status.latency_ms?.p99, 0, " ms")}`],
       ["frames", `${number(status.counters?.received, 0)} received, ${number(status.counters?.dropped, 0)} dropped`],
     ]);
@@ -87,7 +87,7 @@ function round2(value) {
 function places(parent, robot, located) {
   const found = located || !robot.hypotheses ? [] : robot.hypotheses.places.slice(0, MAX_PLACES);
   const wanted = found.map((place) => [share(place.probability), place.probability, `${place.x.toFixed(0)}, ${place.y.toFixed(0)}`]);
-  if (found.length) wanted.push([share(robot.hypotheses.none), robot.hypotheses.none, "at none of them"]);
+  if (found.length) wanted.push([share(robot.hypotheses.none), robot.hypotheses.none, "none of them"]);
   while (parent.children.length > wanted.length) parent.lastChild.remove();
   wanted.forEach(([told, value, where], k) => {
     let item = parent.children[k];
@@ -117,7 +117,10 @@ function drawBodyScan(canvas, scan) {
   const style = getComputedStyle(document.documentElement);
   context.clearRect(0, 0, width, height);
   context.fillStyle = style.getPropertyValue("--scan");
-  const scale = (height / 60) * scan.step; // 60 m across
+  const reaches = [];
+  for (let k = 0; k < scan.points.length; k += 3) reaches.push(Math.hypot(scan.points[k], scan.points[k + 1]));
+  const reach = reaches.sort((a, b) => a - b)[Math.floor(0.9 * reaches.length)] || 1;
+  const scale = Math.min(height / 2.1 / reach, height * scan.step / 20); // most of it, and 20 m at least
   for (let k = 0; k < scan.points.length; k += 3) {
     context.fillRect(width / 2 + scan.points[k] * scale, height / 2 - scan.points[k + 1] * scale, 1.3, 1.3);
   }

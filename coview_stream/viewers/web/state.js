@@ -5,6 +5,7 @@ const TRAIL = 4000; // points of a trail
 const WINDOW_MS = 5000; // over which the rate of poses is measured
 export const STALE_MS = 2000; // without a pose: the last one is only where the robot was
 export const SILENT_MS = 5000; // without any message: a node sends one every second
+const GROUND_M = 0.6; // metres above the lowest points of a scan: its ground, which is drawn fainter
 const TRAIL_COLOURS = ["#0072B2", "#CC79A7", "#009E73", "#D55E00", "#E69F00", "#56B4E9", "#8C6BB1", "#7F7F00"];
 
 export class Robot {
@@ -87,10 +88,18 @@ export class Session {
     } else if (kind === "hypotheses") {
       robot.hypotheses = robot.located(now) ? null : data;
     } else if (kind === "scan") {
-      robot.scan = { ...data, points: unpack(data.points) };
+      const points = unpack(data.points);
+      robot.scan = { ...data, points, low: lowest(points) + GROUND_M / data.step };
       robot.scanAt = now;
     }
   }
+}
+
+// Height below which a twentieth of a scan's points lie, in its steps.
+function lowest(points) {
+  const heights = [];
+  for (let k = 2; k < points.length; k += 3) heights.push(points[k]);
+  return heights.sort((a, b) => a - b)[Math.floor(0.05 * heights.length)] ?? 0;
 }
 
 // base64 of little-endian int16 -> Int16Array

@@ -169,7 +169,7 @@ export class View {
     const { canvas, west, north, cell } = this.raster(entry);
     const [px, py] = this.toScreen(west, north);
     const scale = cell * this.camera.scale;
-    context.imageSmoothingEnabled = scale < 6;
+    context.imageSmoothingQuality = "high";
     context.drawImage(canvas, px, py, canvas.width * scale, canvas.height * scale);
   }
 
@@ -194,26 +194,36 @@ export class View {
     const scan = robot.scan;
     if (!scan?.in_map || now - robot.scanAt > SCAN_MAX_AGE_MS) return;
     context.fillStyle = this.colours.scan;
-    const size = Math.max(1.5, Math.min(3, 0.08 * this.camera.scale));
     const [cx, cy] = this.toScreen(scan.centre[0], scan.centre[1]);
     const step = scan.step * this.camera.scale;
-    for (let k = 0; k < scan.points.length; k += 3) {
-      context.fillRect(cx + scan.points[k] * step - size / 2, cy - scan.points[k + 1] * step - size / 2, size, size);
+    const size = Math.max(2, Math.min(4, 0.1 * this.camera.scale));
+    for (const ground of [true, false]) { // what stands is what the robot is found by: on top, and larger
+      const side = ground ? 0.6 * size : size;
+      context.globalAlpha = ground ? 0.35 : 1;
+      for (let k = 0; k < scan.points.length; k += 3) {
+        if (scan.points[k + 2] < scan.low !== ground) continue;
+        context.fillRect(cx + scan.points[k] * step - side / 2, cy - scan.points[k + 1] * step - side / 2, side, side);
+      }
     }
+    context.globalAlpha = 1;
   }
 
   drawHypotheses(context, robot, now) {
     if (!robot.hypotheses || robot.located(now)) return;
     const colour = this.colours[robot.state(now)] || this.colours.SEARCHING;
-    const places = [...robot.hypotheses.places].reverse(); // the most probable on top
-    for (const place of places) {
-      const [px, py] = this.toScreen(place.x, place.y);
+    const places = robot.hypotheses.places.map((place) => [place, ...this.toScreen(place.x, place.y)]);
+    for (const [place, px, py] of [...places].reverse()) { // the most probable on top
       const radius = 5 + 13 * Math.sqrt(place.probability);
       context.globalAlpha = 0.35 + 0.6 * Math.sqrt(place.probability);
       disc(context, px, py, radius, colour, this.colours.card);
       line(context, px, py, px + 1.9 * radius * Math.cos(place.yaw), py - 1.9 * radius * Math.sin(place.yaw), colour);
-      context.globalAlpha = 1;
-      if (place.probability >= 0.05) this.label(context, `${Math.round(100 * place.probability)} %`, px + radius + 4, py + 4);
+    }
+    context.globalAlpha = 1;
+    const labelled = [];
+    for (const [place, px, py] of places) {
+      if (place.probability < 0.05 || labelled.some(([qx, qy]) => Math.hypot(px - qx, py - qy) < 50)) continue;
+      labelled.push([px, py]);
+      this.label(context, `${Math.round(100 * place.probability)} %`, px + 24, py + 5);
     }
   }
 
