@@ -21,12 +21,15 @@ from coview_stream.basemap.signature import SigningKey, VerifyKey, read_verify_k
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.trust import FileIdentity, Trust
+from coview_stream.clouds.reference_system import short_name
 from coview_stream.config import Channel, DescriptorConfig, MapConfig, Preset, Reloc, map_preset
 from coview_stream.errors import ConfigError, CoViewError, MapError, naming_missing_libraries
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 
 if TYPE_CHECKING:
+    from coview_stream.basemap.sources import Given
+    from coview_stream.basemap.summary import MapSummary
     from coview_stream.descriptors.feature_map import FeatureMap
 
 _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner")
@@ -46,9 +49,11 @@ class BaseMap:
         crs: coordinate reference system text of the source, if it had one.
         sources: names and sha256 of the source files.
         sha256: hash of parameters and content; empty until saved or loaded.
-        identity: of the file it was loaded from, None if it was not.
+        path: of the file it was loaded from, None if it was not.
+        identity: of that file.
     """
 
+    path: Path | None = None
     identity: FileIdentity | None = None
 
     def __init__(self, arrays: file_format.Arrays, parameters: dict[str, Any], sha256: str = "") -> None:
@@ -81,32 +86,38 @@ class BaseMap:
     @classmethod
     def build(
         cls,
-        sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        sources: Given | Sequence[Given],
         preset: Preset = "slam",
         config: MapConfig | None = None,
         progress: bool = False,
+        crs: str | None = None,
         **options: Any,
     ) -> BaseMap:
-        """Build from one or several cloud files (tiles).
+        """Build from one or several cloud files (tiles), or arrays of points.
 
         Args:
-            sources: las/laz, ply, pcd, npy or bin files in one frame, metres.
+            sources: las/laz, ply, pcd, npy or bin files in one frame, metres, or arrays (N, 3) of such coordinates;
+                float64 where they are large (UTM).
             preset: ``slam`` (radius 50 m) or ``tls`` (100 m).
             config: takes the place of preset and options.
             progress: show a bar on stderr.
+            crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT; of metres.
             options: fields of :class:`MapConfig` or :class:`DescriptorConfig`.
 
         Raises:
-            CloudError: a source cannot be read. ConfigError: an option is unknown or out of range.
+            CloudError: a source cannot be read, or its system is not of metres.
+            ConfigError: an option is unknown or out of range.
             MapError: there is no ground to stand on.
             DependencyError, InputError: ``learned=True`` without onnxruntime or weights.
         """
         with naming_missing_libraries("building a map", "build"):
             from coview_stream.basemap.build import build_arrays
+            from coview_stream.basemap.sources import sources_of
 
-        paths = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
+        if not isinstance(config, MapConfig | None):
+            raise ConfigError(f"config is a {type(config).__name__}; give a MapConfig, or its fields as options")
         settings = config or map_preset(preset, **options)
-        arrays, parameters = build_arrays([Path(p) for p in paths], settings, progress)
+        arrays, parameters = build_arrays(sources_of(sources, crs), settings, progress)
         parameters["config"] = asdict(settings)
         # as :meth:`load` will read it: a tuple becomes a list
         return cls(arrays, json.loads(json.dumps(parameters)))
@@ -138,7 +149,7 @@ class BaseMap:
         trust = Trust(verify_key) if isinstance(verify_key, VerifyKey) else verify_key
         file = file_format.open_file(Path(path), check, trust)
         loaded = cls(file.arrays, file.parameters, file.sha256)
-        loaded.identity = file.identity
+        loaded.path, loaded.identity = Path(path).absolute(), file.identity
         check_arrays(loaded._arrays, loaded.config)
         return loaded
 
@@ -154,6 +165,63 @@ class BaseMap:
     def __len__(self) -> int:
         """Return the number of stations."""
         return len(self.stations)
+
+    def __repr__(self) -> str:
+        """Return file, content and reference system in one line, without a look at the points."""
+        name = "" if self.path is None else f"{str(self.path)!r}: "
+        content = f"{len(self._arrays['stations']):,} stations, {len(self.points):,} points"
+        return f"BaseMap({name}{content}, crs {short_name(self.crs)}, sha256 {self.sha256[:8] or 'none yet'})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle a map that was loaded as the path of its file, which has to be there, and the same, when it is read.
+
+        One that was built is pickled with all its arrays.
+        """
+        if self.path is None:
+            return type(self), (self._arrays, self.parameters, self.sha256)
+        return _load_again, (type(self), str(self.path), self.sha256, self.identity)
+
+    @cached_property
+    def summary(self) -> MapSummary:
+        """Extent, area, density and heights, and what about the map will make robots fail; printed it is one line."""
+        from coview_stream.basemap.summary import summary
+
+        return summary(self)
+
+    @cached_property
+    def bounds(self) -> Floats:
+        """(2, 3) float64 lowest and highest coordinates of the points, in the frame of the sources, metres."""
+        return np.array([self.points.min(axis=0), self.points.max(axis=0)], dtype=np.float64) + self.origin
+
+    @property
+    def area(self) -> float:
+        """Square metres that hold points, in squares of a metre."""
+        return self.summary.area
+
+    @property
+    def density(self) -> float | None:
+        """Points of the sources per square metre of :attr:`area`; None for a file that does not say."""
+        return self.summary.density
+
+    def world_points(self) -> Floats:
+        """Return :attr:`points` (N, 3) in the frame of the sources, float64 metres; a copy."""
+        return np.asarray(self.points, dtype=np.float64) + self.origin
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the map from above with matplotlib, in the frame of the sources, metres: poses can be drawn over it.
+
+        Args:
+            axes: to draw into; None makes a figure of its own (``matplotlib.pyplot.show()`` shows it).
+
+        Returns:
+            The axes.
+
+        Raises:
+            DependencyError: matplotlib is missing.
+        """
+        from coview_stream.basemap.plan import draw_plan
+
+        return draw_plan(self.sampled_points, self.origin, self.config.voxel, axes)
 
     @property
     def descriptor_config(self) -> DescriptorConfig:
@@ -298,3 +366,13 @@ class BaseMap:
                 raise
             return f"going without learned features: {error}"
         return None
+
+
+def _load_again(kind: type[BaseMap], path: str, sha256: str, identity: FileIdentity | None) -> BaseMap:
+    """Load a map that was pickled as its path; MapError where its file is gone or another."""
+    base_map = kind.load(path, check=False)
+    if base_map.identity != identity:  # a copy, or another file
+        base_map = kind.load(path)
+        if base_map.sha256 != sha256:
+            raise MapError(f"{path}: is another map than the one that was pickled; pickle it again")
+    return base_map

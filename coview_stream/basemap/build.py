@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,12 +15,12 @@ from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.floors import below_another
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.likelihood_field import field_arrays
+from coview_stream.basemap.sources import Source
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import Progress, describe_storeys, find_stations
 from coview_stream.basemap.tiles import scaled_normals, sort_by_tile, unit_normals
-from coview_stream.clouds.cloud import merge
-from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of, read_head
-from coview_stream.clouds.files import read_cloud
+from coview_stream.clouds.cloud import Cloud, merge
+from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of
 from coview_stream.clouds.filters import estimate_normals, remove_outliers, voxel_grid
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
@@ -32,12 +31,12 @@ _MIN_POINTS = 1000  # set by hand
 _SURVEY_MARGIN = 1  # cells; set by hand
 
 
-def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
-    """Read ``paths`` and return a map's arrays and the parameters that say where it came from.
+def build_arrays(sources: list[Source], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
+    """Read ``sources`` and return a map's arrays and the parameters that say where it came from.
 
     Raises:
         CloudError: a source cannot be read.
-        MapError: no sources, too few points, or no ground to put stations on.
+        MapError: too few points, or no ground to put stations on.
         DependencyError, InputError: learned features are asked for, and there is no onnxruntime or no weights.
     """
     if config.learned:
@@ -45,16 +44,11 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
 
         for view in VIEW_NAMES:  # before the clouds are read: they may be missing
             network(view)
-    if not paths:
-        raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
-    places = [path.resolve() for path in paths]
-    for path, place in zip(paths, places, strict=True):
-        if places.count(place) > 1:
-            raise MapError(f"{path}: given twice; name every source once")
-    told = check_together([read_head(path) for path in paths])  # all heads before the first points
+    paths = [source.path for source in sources]
+    told = check_together([source.head() for source in sources])  # all heads before the first points
     warn(told)
     with _progress_bar(progress, "reading") as step:
-        clouds = [_read(path, k, len(paths), step) for k, path in enumerate(paths)]
+        clouds = [_read(source, k, len(sources), step) for k, source in enumerate(sources)]
     heads = [head_of(path, cloud) for path, cloud in zip(paths, clouds, strict=True)]
     if told is None:  # some formats tell their extent with their points only
         warn(check_together(heads))
@@ -118,7 +112,7 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
     }
     parameters = {
         "crs": crs,
-        "sources": {_label(path, paths): _sha256(path) for path in paths},
+        "sources": {_label(source.path, paths): source.sha256() for source in sources},
         "source_points": source_points,
         "ground_filter": ground_filter(points),  # depends on the platform
         "stations_below_another": int(below_another(stations, config.block).sum()),
@@ -127,8 +121,8 @@ def build_arrays(paths: list[Path], config: MapConfig, progress: bool = False) -
     return arrays, parameters
 
 
-def _read(path: Path, done: int, total: int, step: Progress) -> Any:
-    cloud = read_cloud(path)
+def _read(source: Source, done: int, total: int, step: Progress) -> Cloud:
+    cloud = source.read()
     step(done + 1, total)
     return cloud
 
@@ -154,14 +148,6 @@ def _names(paths: list[Path]) -> str:
 def _label(path: Path, paths: list[Path]) -> str:
     """Name a source by its file name, or by its path where several have that name."""
     return path.name if [other.name for other in paths].count(path.name) == 1 else str(path)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        digest = hashlib.sha256()
-        while chunk := file.read(1 << 22):
-            digest.update(chunk)
-    return digest.hexdigest()
 
 
 @contextmanager

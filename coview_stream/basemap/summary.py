@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
+from coview_kernels import Raster
 from coview_stream.clouds.reference_system import short_name
-from coview_stream.geometry.arrays import Bools, Ints
+from coview_stream.config import MapConfig
+from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.rasters import cells
 from coview_stream.geometry.transforms import Points
-
-if TYPE_CHECKING:
-    from coview_stream.basemap.basemap import BaseMap
 
 _CELL = 1.0  # metres: the area that a map covers is counted in such squares
 _SAMPLED = 100_000  # points, where a sample will do; set by hand
@@ -62,7 +61,38 @@ class MapSummary:
         )
 
 
-def summary(base_map: BaseMap) -> MapSummary:
+class SummarizedMap(Protocol):
+    """What a summary needs of a :class:`~coview_stream.basemap.basemap.BaseMap`."""
+
+    config: MapConfig
+    crs: str | None
+    origin: Floats
+    parameters: dict[str, Any]
+
+    @property
+    def points(self) -> Points:
+        """(N, 3) points, relative to ``origin``."""
+
+    @property
+    def stations(self) -> Points:
+        """(M, 3) ground positions, likewise."""
+
+    @property
+    def survey(self) -> Raster:
+        """Cells that hold points."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+
+    def sampled_points(self, count: int) -> Points:
+        """Return some of the points."""
+
+    def sampled_normals(self, count: int) -> Points:
+        """Return their normals."""
+
+
+def summary(base_map: SummarizedMap) -> MapSummary:
     """Return what a map covers."""
     points = base_map.points
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
@@ -104,7 +134,7 @@ def _dense(density: float | None) -> str | None:
     )
 
 
-def _upright(base_map: BaseMap) -> str | None:
+def _upright(base_map: SummarizedMap) -> str | None:
     """Compare how many surfaces face each axis, and how far the points extend along it."""
     facing = (np.abs(base_map.sampled_normals(_SAMPLED)) > _FACING).mean(axis=0)
     wide = np.ptp(np.percentile(base_map.sampled_points(_SAMPLED), [1.0, 99.0], axis=0), axis=0)
@@ -133,7 +163,7 @@ def _structured(points: Points, index: Ints, covered: Bools) -> str | None:
     )
 
 
-def _covered(base_map: BaseMap) -> str | None:
+def _covered(base_map: SummarizedMap) -> str | None:
     """Look how much of the surroundings of stations has been surveyed."""
     radius, block = base_map.config.descriptor.radius, base_map.config.block
     survey = base_map.survey

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from coview_stream.config.checks import positive, require
+from coview_stream.config.checks import check_types, positive, require
 
 LEAST_RISK = 1e-6
 """Smaller risks are refused: errors below are not told apart, for the model of the evidence is not as good as that."""
@@ -34,5 +34,6 @@ class AcceptanceConfig:
     max_blind_s: float = 60.0
 
     def __post_init__(self) -> None:
+        check_types(self)
         require(LEAST_RISK <= self.risk < 0.5, self, "risk", "in [1e-6, 0.5)")
         positive(self, "max_tilt", "max_innovation", "max_doubt_s", "max_blind_s")

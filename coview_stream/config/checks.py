@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import fields
 from typing import Any
+
+import numpy as np
 
 from coview_stream.errors import ConfigError
 
@@ -14,6 +17,28 @@ def require(ok: bool, config: object, name: str, allowed: str) -> None:
     if not ok:
         value = getattr(config, name)
         raise ConfigError(f"{name} is {value!r}; it must be {allowed} ({type(config).__name__}.{name})")
+
+
+_NUMBERS = {"float": (numbers.Real, "a number"), "int": (numbers.Integral, "a whole number")}
+
+
+def check_types(config: Any) -> None:
+    """Refuse a configuration with a field of another type than its annotation: text for a number, a dict for a part."""
+    for item in fields(config):
+        value = getattr(config, item.name)
+        truth = isinstance(value, bool | np.bool_)
+        if item.type == "bool":
+            require(truth, config, item.name, "True or False")
+        elif item.type in _NUMBERS:
+            kind, allowed = _NUMBERS[str(item.type)]
+            require(isinstance(value, kind) and not truth, config, item.name, allowed)
+        elif str(item.type).startswith("tuple["):
+            require(isinstance(value, tuple | list), config, item.name, "a tuple")
+            plain = str(item.type) != "tuple[float, ...]" or all(isinstance(v, numbers.Real) for v in value)
+            require(plain, config, item.name, "a tuple of numbers")
+        elif isinstance(item.default_factory, type):
+            part = item.default_factory
+            require(isinstance(value, part), config, item.name, f"a {part.__name__}")
 
 
 def positive(config: object, *names: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import get_args
 
 from coview_stream.config.acceptance import AcceptanceConfig
-from coview_stream.config.checks import require
+from coview_stream.config.checks import check_types, require
 from coview_stream.config.registration import RegistrationConfig
 from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
 from coview_stream.config.tracking import GraphConfig, TrackingConfig
@@ -43,5 +43,6 @@ class LocalizerConfig:
     sensor_leans: bool = True
 
     def __post_init__(self) -> None:
+        check_types(self)
         known = get_args(Reloc)
         require(self.reloc in known, self, "reloc", f"one of {', '.join(known)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
-from coview_stream.config.checks import counts, positive, require
+from coview_stream.config.checks import check_types, counts, positive, require
 from coview_stream.errors import ConfigError
 
 Channel = Literal["scan_context", "coview", "coview_strict"]
@@ -40,6 +40,7 @@ class DescriptorConfig:
     ground_zero: bool = True
 
     def __post_init__(self) -> None:
+        check_types(self)
         positive(self, "radius", "voxel")
         require(self.radius <= 1000, self, "radius", "at most 1000 m")
         counts(self, "rings", "sectors", minimum=4)
@@ -77,6 +78,7 @@ class MapConfig:
     learned: bool = False
 
     def __post_init__(self) -> None:
+        check_types(self)
         positive(self, "block", "voxel", "tile", "outlier_std_ratio", "normal_radius")
         counts(self, "outlier_neighbours", minimum=0)
         counts(self, "normal_neighbours", minimum=3)

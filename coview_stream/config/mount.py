@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from coview_stream.config.checks import require
+from coview_stream.config.checks import check_types, require
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
@@ -39,6 +39,7 @@ class Mount:
     z: float = 0.0
 
     def __post_init__(self) -> None:
+        check_types(self)
         for name in ("roll", "pitch", "yaw"):
             require(abs(getattr(self, name)) <= 2 * math.pi + 1e-9, self, name, "at most 360 degrees, in radians")
         for name in ("x", "y", "z"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from coview_stream.config.checks import all_positive, require
+from coview_stream.config.checks import all_positive, check_types, require
 from coview_stream.config.mount import Mount
 
 METRICS_ADDRESS = "127.0.0.1:9464"
@@ -53,5 +53,6 @@ class NodeConfig:
     mount: Mount = field(default_factory=Mount)
 
     def __post_init__(self) -> None:
+        check_types(self)
         all_positive(self, "deskew", "mount")
         require(self.pose_rate <= 200, self, "pose_rate", "at most 200 Hz")

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from coview_stream.config.checks import all_positive, require
+from coview_stream.config.checks import all_positive, check_types, require
 from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats
 
@@ -54,6 +54,7 @@ class LidarOdometryConfig:
     iterations: int = 60
 
     def __post_init__(self) -> None:
+        check_types(self)
         all_positive(self, "gravity", "keep_level")
         require(self.max_range > self.min_range, self, "max_range", f"beyond min_range ({self.min_range} m)")
         if self.gravity not in ("ground", "level"):

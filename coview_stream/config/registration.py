@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from coview_stream.config.checks import all_positive, counts, fraction, require
+from coview_stream.config.checks import all_positive, check_types, counts, fraction, require
 
 RegistrationMethod = Literal["trimmed-icp", "gicp"]
 
@@ -74,6 +74,7 @@ class RegistrationConfig:
     weak_sigma: float = 10.0
 
     def __post_init__(self) -> None:
+        check_types(self)
         methods = get_args(RegistrationMethod)
         require(self.method in methods, self, "method", f"one of {', '.join(methods)}")
         fraction(self, "keep")

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from coview_stream.config.checks import counts, positive, require
+from coview_stream.config.checks import check_types, counts, positive, require
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class KeyframeConfig:
     min_points: int = 300
 
     def __post_init__(self) -> None:
+        check_types(self)
         positive(self, "distance", "voxel")
         counts(self, "capacity", "min_points")
         require(self.range_min >= 0, self, "range_min", "zero or more")
@@ -47,6 +48,7 @@ class RetrievalConfig:
     candidates: int = 200
 
     def __post_init__(self) -> None:
+        check_types(self)
         require(self.mode in ("exhaustive", "ring_key"), self, "mode", "exhaustive or ring_key")
         counts(self, "candidates")
 
@@ -72,6 +74,7 @@ class ConsensusConfig:
     distinct_yaw: float = math.radians(20)
 
     def __post_init__(self) -> None:
+        check_types(self)
         require(self.mode in ("consensus", "single"), self, "mode", "consensus or single")
         counts(self, "window", "peaks")
         positive(self, "distinct_distance", "distinct_yaw")
@@ -104,6 +107,7 @@ class LearnedConfig:
     peaks: int = 64
 
     def __post_init__(self) -> None:
+        check_types(self)
         positive(self, "dense_area")
         require(5.0 <= self.reach <= 32.0, self, "reach", "5 to 32 m, half a query's image")
         require(self.cell in (1.0, 2.0, 4.0), self, "cell", "1, 2 or 4 m")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from coview_stream.config.checks import all_positive, counts, positive, require
+from coview_stream.config.checks import all_positive, check_types, counts, positive, require
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ class TrackingConfig:
     drift_memory: float = 40.0
 
     def __post_init__(self) -> None:
+        check_types(self)
         all_positive(self)
         counts(self, "min_points", "max_points")
 
@@ -85,6 +86,7 @@ class GraphConfig:
     huber: float = 3.5
 
     def __post_init__(self) -> None:
+        check_types(self)
         counts(self, "window", "restart", minimum=2)
         require(self.restart > self.window, self, "restart", f"greater than window ({self.window})")
         positive(self, "huber")

@@ -43,13 +43,22 @@ def to_array(
         raise error(f"{name} is not an array of numbers ({reason})") from reason
 
 
-def cloud_rows(cloud: npt.ArrayLike, columns: tuple[int, ...] = (3,)) -> Points:
-    """Return a cloud's rows (N, 3) float32, or (N, one of ``columns``), without a copy; CloudError for other shapes."""
+def cloud_rows(cloud: npt.ArrayLike) -> Points:
+    """Return the points (N, 3) float32 of (N, 3) rows, or of (N, 4) with an intensity, without a copy.
+
+    CloudError for other shapes.
+    """
     rows = to_array(cloud, np.float32, "cloud")
-    if rows.ndim != 2 or rows.shape[1] not in columns:
-        expected = " or ".join(f"(N, {count})" for count in columns)
-        raise CloudError(f"cloud has shape {rows.shape}; expected {expected}")
-    return rows
+    if rows.ndim == 2 and rows.shape[1] in (3, 4):
+        return rows[:, :3]
+    remedy = ""
+    if rows.ndim == 2 and rows.shape[0] in (3, 4):
+        remedy = ": give cloud.T"
+    elif rows.ndim == 2 and rows.shape[1] > 4:
+        remedy = ": give cloud[:, :3]"
+    elif rows.ndim == 3 and rows.shape[2] >= 3:
+        remedy = ": give cloud[..., :3].reshape(-1, 3)"
+    raise CloudError(f"cloud has shape {rows.shape}; expected (N, 3), or (N, 4) with intensities{remedy}")
 
 
 def finite_rows(rows: Points) -> tuple[Points, Bools | None]:

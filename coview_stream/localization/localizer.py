@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
+from typing import NoReturn
 
 import numpy as np
 
@@ -10,6 +12,7 @@ import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor
+from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
@@ -47,16 +50,33 @@ class Localizer:
 
     def __init__(
         self,
-        base_map: BaseMap,
+        base_map: BaseMap | str | os.PathLike[str],
         config: LocalizerConfig | None = None,
         local_maps: LocalMaps | None = None,
         index: SearchIndex | None = None,
     ) -> None:
-        """Localize on a map; those of one thread may share ``local_maps``, its cache of crops, and ``index``.
+        """Localize on a map, or on the one in a file.
+
+        Args:
+            base_map: the map, or the path of its ``.coview`` file, which is loaded and checked.
+            config: how decisions are made; None takes the defaults.
+            local_maps: cache of crops of the map; localizers of one thread may share it.
+            index: likewise, of the search.
 
         Raises:
+            ConfigError: ``config`` is something else.
+            InputError: ``base_map`` is something else.
+            MapError: the file cannot be loaded.
             MapError, InputError, DependencyError: ``config.reloc`` is ``learned``, and that cannot be used here.
         """
+        if not isinstance(config, LocalizerConfig | None):
+            what = type(config).__name__
+            raise ConfigError(f"config is a {what}; give a LocalizerConfig, such as LocalizerConfig(reloc='coview')")
+        if isinstance(base_map, str | os.PathLike):
+            base_map = BaseMap.load(base_map)
+        if not isinstance(base_map, BaseMap):
+            what = type(base_map).__name__
+            raise InputError(f"base_map is a {what}; give a BaseMap or the path of a .coview file")
         self.base_map = base_map
         self.config = config or LocalizerConfig()
         self._local_maps = local_maps or LocalMaps(base_map, self.config.registration.source_range)
@@ -79,6 +99,14 @@ class Localizer:
         self._begin(epoch)
         self._tracker.ground.restore(ground)
 
+    def relocalize(self) -> None:
+        """Forget the place and search the whole map again, in the same odometry frame.
+
+        What is known of sensor, odometry and ground stays, as in :meth:`restart`; the next fixes have no pose until a
+        place is found.
+        """
+        self.restart(self._epoch.odometry)
+
     def _begin(self, epoch: int) -> None:
         self.state = State.SEARCHING
         self._events: list[Event] = []  # that have changed the state since take_events
@@ -99,6 +127,17 @@ class Localizer:
         self._levelled_at: Floats | None = None  # position in the odometry frame where the search was levelled anew
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
+
+    def __repr__(self) -> str:
+        """Return state, stamp of the newest frame, and map, in one line."""
+        newest = "no frame yet" if self._newest is None else f"frame of {self._newest.stamp:.3f} s"
+        return f"Localizer({self.state}, {newest}, on {self.base_map!r})"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a Localizer cannot be pickled or copied: make one in each process, Localizer(base_map); a BaseMap that "
+            "was loaded from a file pickles as its path"
+        )
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -130,7 +169,8 @@ class Localizer:
         """Localize by one more frame. Its steps are the headings of docs/method.md.
 
         Args:
-            cloud: (N, 3) float32 body-frame points (x forward, z up), deskewed, metres; rows with NaN are dropped.
+            cloud: (N, 3) float32 body-frame points (x forward, z up), deskewed, metres, or (N, 4) with intensities that
+                are not used; rows with NaN are dropped.
             T_odom_body: (4, 4) odometry pose of the frame, gravity aligned, metres.
             stamp: seconds.
 

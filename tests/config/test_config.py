@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from dataclasses import FrozenInstanceError, asdict, fields
 
+import numpy as np
 import pytest
 
 from coview_stream.config import (
@@ -84,6 +85,29 @@ BAD = [
 def test_value_out_of_range_is_refused_by_name(kind, name, value):
     with pytest.raises(ConfigError, match=rf"{name} is .*must be .*{kind.__name__}\.{name}"):
         kind(**{name: value})
+
+
+NUMBERS = ("float", "int", "bool", "tuple[float, ...]")
+TYPED = [(kind, item.name) for kind in CONFIGS for item in fields(kind) if item.type in NUMBERS]
+
+
+@pytest.mark.parametrize(("kind", "name"), TYPED)
+@pytest.mark.parametrize("value", ["a", None, [1.0, "b"]])
+def test_value_of_another_type_is_refused_by_name(kind, name, value):
+    """What is no number must not end in a TypeError, nor a text in a flag count as true."""
+    with pytest.raises(ConfigError, match=rf"^{name} is .*must be .*{kind.__name__}\.{name}"):
+        kind(**{name: value})
+
+
+def test_part_given_as_a_dictionary_is_refused_by_name():
+    with pytest.raises(ConfigError, match=r"must be a KeyframeConfig \(LocalizerConfig\.keyframe\)"):
+        LocalizerConfig(keyframe={"distance": 2.0})
+    with pytest.raises(ConfigError, match=r"MapConfig\.descriptor"):
+        MapConfig(descriptor={"radius": 50.0})
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert MapConfig(voxel=np.float32(0.5), levels=np.True_).voxel == 0.5
 
 
 def test_defaults_are_those_of_the_paper():

@@ -14,7 +14,25 @@ from coview_stream.geometry.validation import check_covariance, check_rigid, che
 )
 def test_cloud_of_another_shape_or_without_numbers_is_refused(bad):
     with pytest.raises(CloudError, match="cloud"):
-        cloud_rows(bad, columns=(3, 4))
+        cloud_rows(bad)
+
+
+def test_cloud_with_intensities_is_its_first_three_columns():
+    rows = np.arange(16, dtype=np.float32).reshape(4, 4)
+    np.testing.assert_array_equal(cloud_rows(rows), rows[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("bad", "remedy"),
+    [
+        (np.zeros((9, 6)), r"\(9, 6\); expected .*: give cloud\[:, :3\]$"),
+        (np.zeros((3, 900)), r"give cloud\.T$"),
+        (np.zeros((16, 900, 3)), r"give cloud\[\.\.\., :3\]\.reshape\(-1, 3\)$"),
+    ],
+)
+def test_cloud_of_another_shape_is_refused_with_what_to_give(bad, remedy):
+    with pytest.raises(CloudError, match=remedy):
+        cloud_rows(bad)
 
 
 def test_finite_rows_are_a_copy_with_the_mask():

@@ -62,7 +62,7 @@ class Sender:
         self._odometry = _publisher(transport, self.odometry_key, "data", keys.rmw)
 
     def cloud(self, points: npt.ArrayLike, stamp_ns: int, times: Floats | None = None) -> Encoded:
-        """Encode (N, 3) body-frame points, metres; further columns are not sent. ``times`` as in CloudMessage.
+        """Encode (N, 3) body-frame points, metres; a fourth column is not sent. ``times`` as in CloudMessage.
 
         Raises:
             CloudError: the array has another shape or no numbers, or there is no finite point.
@@ -70,13 +70,13 @@ class Sender:
         """
         from coview_stream.messages import encode_cloud
 
-        rows = cloud_rows(points, columns=(3, 4))
+        rows = cloud_rows(points)
         if times is not None and np.shape(times) != (len(rows),):
             raise InputError(f"times of shape {np.shape(times)} do not fit {len(rows)} points")
         encoding = self.cloud_encoding
         if times is not None and not self._chosen:
             encoding = _TIMED.get(encoding, encoding)
-        xyz = np.ascontiguousarray(rows[:, :3])
+        xyz = np.ascontiguousarray(rows)
         if not np.isfinite(xyz[:, 0] + xyz[:, 1] + xyz[:, 2]).any():  # many times faster than all(axis=1)
             raise CloudError(f"a cloud of {len(xyz)} points, none of them finite: leave such frames out")
         seconds = None if times is None else to_array(times, np.float64, "times", InputError)

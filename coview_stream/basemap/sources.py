@@ -1,0 +1,113 @@
+"""Sources of a base map: cloud files, and arrays of points that are in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.cloud import Cloud, CloudBuilder
+from coview_stream.clouds.cloud_head import CloudHead, read_head
+from coview_stream.clouds.files import read_cloud
+from coview_stream.clouds.reference_system import flaw_of_system, unchecked_system
+from coview_stream.errors import CloudError, ConfigError, MapError, warn
+from coview_stream.geometry.arrays import Reals
+from coview_stream.geometry.validation import to_array
+
+Given = str | os.PathLike[str] | npt.NDArray[Any]
+"""What a caller may name as a source: a file, or (N, 3) points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """One source.
+
+    Attributes:
+        path: the file; of an array its name, for messages.
+        rows: (N, 3) float32 or float64 coordinates of an array, metres; None of a file.
+        crs: reference system of an array, or of a file that states none.
+    """
+
+    path: Path
+    rows: Reals | None = None
+    crs: str | None = None
+
+    def head(self) -> CloudHead:
+        """Return what is known before the points are read; CloudError where the file cannot be used."""
+        head = CloudHead(self.path) if self.rows is not None else read_head(self.path)
+        return replace(head, crs=head.crs or self.crs)
+
+    def read(self) -> Cloud:
+        """Return its points; CloudError where there are none, or no map can be made in its reference system."""
+        if self.rows is None:
+            cloud = read_cloud(self.path)
+        else:
+            builder = CloudBuilder()
+            builder.add(self.rows)
+            cloud = builder.finish(str(self.path))
+        if self.crs is None or cloud.crs is not None:
+            return cloud
+        if unchecked_system(self.crs):
+            warn(f"{self.path}: the unit of {self.crs} is not known without pyproj: is it metres?")
+        low, high = cloud.points.min(axis=0) + cloud.origin, cloud.points.max(axis=0) + cloud.origin
+        if (flaw := flaw_of_system(self.crs, {}, low, high)) is not None:
+            raise CloudError(f"{self.path}: {flaw}")
+        return replace(cloud, crs=self.crs)
+
+    def sha256(self) -> str:
+        """Return the hash of the file, or of the array's numbers, row by row."""
+        digest = hashlib.sha256()
+        if self.rows is not None:
+            digest.update(np.ascontiguousarray(self.rows).data)
+            return digest.hexdigest()
+        with self.path.open("rb") as file:
+            while chunk := file.read(1 << 22):
+                digest.update(chunk)
+        return digest.hexdigest()
+
+
+def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[Source]:
+    """Return the sources that a caller names, each once.
+
+    Args:
+        given: a file or an array (N, 3), further columns are not used; or several.
+        crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT.
+
+    Raises:
+        MapError: there is none, or a file is named twice. CloudError: an array is no cloud.
+        ConfigError: ``crs`` is no text.
+    """
+    if not isinstance(crs, str | None):
+        raise ConfigError(f"crs is {crs!r}; give text such as 'EPSG:28992', or WKT")
+    several = [given] if isinstance(given, str | os.PathLike) or hasattr(given, "__array__") else list(given)
+    if not several:
+        raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
+    arrays = sum(not isinstance(item, str | os.PathLike) for item in several)
+    sources: list[Source] = []
+    for number, item in enumerate(several, 1):
+        if isinstance(item, str | os.PathLike):
+            sources.append(Source(Path(item), None, crs))
+        else:
+            name = "array" if arrays == 1 else f"array {number}"
+            sources.append(Source(Path(name), _rows(item, name), crs))
+    places = [source.path.resolve() for source in sources if source.rows is None]
+    for place in places:
+        if places.count(place) > 1:
+            path = next(source.path for source in sources if source.path.resolve() == place)
+            raise MapError(f"{path}: given twice; name every source once")
+    return sources
+
+
+def _rows(values: Any, name: str) -> Reals:
+    if getattr(values, "ndim", None) != 2 or values.shape[1] < 3:
+        what = f"has shape {np.shape(values)}" if hasattr(values, "__array__") else f"is a {type(values).__name__}"
+        raise CloudError(f"{name} {what}; give a cloud file, or an array (N, 3) of metres")
+    if getattr(values, "dtype", None) == np.float32:
+        return to_array(values[:, :3], np.float32, name)
+    return to_array(values[:, :3], np.float64, name)
