@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from coview_stream.cli.view import add_view
+from coview_stream.errors import ConfigError
+
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.localization.offline import RunResult
@@ -32,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=float, default=180.0, help="side of the map, metres (180)")
     parser.add_argument("--length", type=float, default=40.0, help="distance driven, metres (40)")
     parser.add_argument("--offline", action="store_true", help="frames straight from file to localizer, no zenoh")
+    add_view(parser)
     parser.epilog = (
         "Runs `serve`, `replay` and `watch` as processes of their own, which talk over zenoh on the loopback "
         "interface; at the robot's own pace. Exit code 0 if the robot was localised rightly, 1 if not."
@@ -45,6 +49,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.recordings.open_run import open_run
     from coview_stream.sim import SimulationConfig, simulate
 
+    if args.web is not None and args.offline:
+        raise ConfigError("--offline has no node to show: leave --web away")
     config = SimulationConfig(scene=args.scene, sensor=args.sensor, seed=args.seed, size=args.size, length=args.length)
     out = _prepare_folder(args.out)
     world, shown = out / "world", sys.stderr.isatty()
@@ -54,9 +60,10 @@ def run(args: argparse.Namespace) -> int:
     with _step(seconds, "build", "building the base map"):
         base_map = BaseMap.build(world / "base.laz", progress=shown)
         base_map.save(out / "site.coview")
-    with _step(seconds, "locate", f"driving {args.length:g} m without knowing where"):
+    seen = "" if args.web is None else f", to be seen at http://{args.web}/"
+    with _step(seconds, "locate", f"driving {args.length:g} m without knowing where{seen}"):
         recorded = open_run(world / "run")
-        located = _offline(base_map, recorded, shown) if args.offline else _live(recorded, out, shown)
+        located = _offline(base_map, recorded, shown) if args.offline else _live(recorded, out, shown, args.web)
     with _step(seconds, "report", "comparing with the truth, drawing"):
         evaluation = _write_results(located, base_map, read_tum(world / "truth.tum"), out)
     _write_report(evaluation, config, seconds, out)
@@ -115,7 +122,7 @@ def _offline(base_map: BaseMap, recorded: Run, shown: bool) -> RunResult:
         return locate(base_map, recorded, progress=step)
 
 
-def _live(recorded: Run, out: Path, shown: bool) -> RunResult:
+def _live(recorded: Run, out: Path, shown: bool, web: str | None) -> RunResult:
     """Serve, replay and watch the run as three processes; return what was published, frame by frame."""
     from tqdm import tqdm
 
@@ -131,7 +138,7 @@ def _live(recorded: Run, out: Path, shown: bool) -> RunResult:
                 bar.set_postfix_str(str(record["state"]))
 
         (out / "logs").mkdir(exist_ok=True)
-        recording = record_live(out / "site.coview", recorded.path, out / "logs", show)
+        recording = record_live(out / "site.coview", recorded.path, out / "logs", show, web)
     return from_stream(stamps, recording.poses, recording.statuses)
 
 

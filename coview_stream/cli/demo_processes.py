@@ -44,7 +44,11 @@ class Recording:
 
 
 def record_live(
-    map_path: Path, run_path: Path, logs: Path, on_record: Callable[[dict[str, Any]], None] = lambda record: None
+    map_path: Path,
+    run_path: Path,
+    logs: Path,
+    on_record: Callable[[dict[str, Any]], None] = lambda record: None,
+    web: str | None = None,
 ) -> Recording:
     """Serve a map, replay a run to it at its own pace, and record what is published.
 
@@ -53,6 +57,7 @@ def record_live(
         run_path: a run directory.
         logs: directory for the stderr of the three processes.
         on_record: called with every pose and status, as they come.
+        web: ``HOST:PORT`` of a web page of the drive; None for none.
 
     Raises:
         TransportError: a process failed; the message ends with the last line of its log.
@@ -64,7 +69,8 @@ def record_live(
         def start(name: str, *args: str) -> subprocess.Popen[bytes]:
             return stack.enter_context(_process(logs / f"{name}.log", name, *args))
 
-        node = start("serve", str(map_path), "--robot", ROBOT, "--listen", endpoint, "--no-state")
+        page = () if web is None else (f"--web={web}",)
+        node = start("serve", str(map_path), "--robot", ROBOT, "--listen", endpoint, "--no-state", *page)
         watcher = start("watch", "--json", "--robot", ROBOT, "--connect", endpoint)
         lines = _lines(watcher)
         _await_first(lines, recording, (node, watcher), logs)

@@ -13,8 +13,9 @@ import urllib.request
 import pytest
 from sockets import free_endpoint
 
-from coview_stream.cli import main
+from coview_stream.cli import demo_processes, main
 from coview_stream.clouds.python_child import python_command, python_environment
+from coview_stream.errors import TransportError
 
 
 @pytest.mark.parametrize("command", [["serve", "--robot", "r1", "--web", "site.coview"], ["watch", "--web", "here"]])
@@ -36,6 +37,25 @@ def test_a_port_that_is_taken_ends_watch_with_one_line(capsys):
 def test_a_map_that_is_none_ends_watch(tmp_path, capsys):
     assert main(["watch", "--web", "127.0.0.1:0", "--map", str(tmp_path / "none.coview")]) == 2
     assert "none.coview" in capsys.readouterr().err
+
+
+def test_a_demo_without_a_node_has_no_page(capsys):
+    assert main(["demo", "--offline", "--web"]) == 2
+    assert "leave --web away" in capsys.readouterr().err
+
+
+def test_a_demo_hands_its_page_to_the_node(monkeypatch, tmp_path):
+    started = []
+
+    def no_process(log, *args):
+        started.append(args)
+        raise TransportError("not started")
+
+    monkeypatch.setattr(demo_processes, "_process", no_process)
+    with pytest.raises(TransportError, match="not started"):
+        demo_processes.record_live(tmp_path / "site.coview", tmp_path, tmp_path, web="127.0.0.1:8642")
+    assert started[0][0] == "serve"
+    assert started[0][-1] == "--web=127.0.0.1:8642"
 
 
 class Command:

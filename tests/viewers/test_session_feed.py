@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 
 import numpy as np
@@ -104,6 +105,18 @@ def test_everything_comes_decoded_and_a_broken_sink_silences_no_other(net, kept)
         assert kept.wait("status")[0] == ("r1", {"state": "SEARCHING"})
         assert kept.wait("hypotheses")[0].robot == "r1"
     assert kept.closed
+
+
+def test_a_sink_that_hangs_holds_up_no_publisher(net, kept):
+    going_on = threading.Event()
+    kept.pose = lambda pose: going_on.wait(20.0)
+    with feed(net, kept, policy="newest"):
+        for k in range(5000):
+            put(net, KEYS.pose, encode_pose(pose_at(0.1 * k), "json"))
+            net.publish(cloud(0.1 * k))
+        assert not going_on.is_set()  # all have been published meanwhile
+        assert net.raised == []
+        going_on.set()
 
 
 def test_rubbish_ends_nothing(net, kept):
