@@ -125,6 +125,7 @@ def _rpc() -> Target:
     from coview_stream.stream.node.election import claim_in
     from coview_stream.stream.transport import zenoh_io
     from coview_stream.stream.transport.error_guard import RateLimitedErrors
+    from coview_stream.stream.transport.transport import MAX_REPLY
 
     log = logging.getLogger("coview_stream")
     log.setLevel(logging.CRITICAL)
@@ -143,7 +144,7 @@ def _rpc() -> Target:
             table = FleetTable()
             table.add_status("r1", read_object(data), 1.0)
             table.table(2.0)
-        return zenoh_io._json_object("k", data)
+        return zenoh_io._json_object("k", data, MAX_REPLY)
 
     return run
 

@@ -52,6 +52,10 @@ class StationGrid:
         each = np.arange(levels.shape[1])
         return np.where(gap[best, each] < _LEVEL_GAP, levels[best, each], -1).astype(np.intp)
 
+    def levels_at(self, positions: Reals) -> Indices:
+        """Return the stations (L, N), lowest first, in whose cells (N, 2 or 3) positions are; -1 for none."""
+        return np.asarray(self._levels[:, self.cell(positions)], dtype=np.intp)
+
     def storeys(self, station: int) -> list[int]:
         """Return the stations of a station's cell, lowest first, itself among them."""
         if len(self._levels) == 1:

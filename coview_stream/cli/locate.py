@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from coview_stream.cli.options import (
     acceptance_config,
     add_gravity,
+    add_initial,
     add_mount,
     add_registration,
     add_reloc,
@@ -17,6 +18,7 @@ from coview_stream.cli.options import (
     add_run_path,
     add_topics,
     add_verify_key,
+    initial_guess,
     lidar_config,
     mount_of,
 )
@@ -42,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_mount(parser)
     add_topics(parser)
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
+    add_initial(parser)
     add_registration(parser)
     add_reloc(parser)
     add_risk(parser)
@@ -64,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
     acceptance = acceptance_config(args.risk)
     mount = mount_of(args)
+    guess = None if args.initial is None else initial_guess(args.initial)
     lidar = _lidar_odometry(args.odometry, args.gravity)
     if args.registration == "gicp":
         library()  # before anything is read: it may be missing
@@ -98,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
             if fix is not None:
                 bar.set_postfix_str(fix.state.reported)
 
-        located = locate(base_map, recorded, config, step)
+        located = locate(base_map, recorded, config, step, guess)
     write(located, base_map, args.output)
     if draws:
         from coview_stream.report.run_pictures import draw_run

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from coview_stream.config import AcceptanceConfig
     from coview_stream.config.mount import Mount
     from coview_stream.config.odometry import LidarOdometryConfig
+    from coview_stream.localization.search.place_guess import PlaceGuess
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
 """Makers of odometry, as ``serve --odometry`` names them."""
@@ -46,6 +47,55 @@ def check_codec(option: str, name: str | None, known: Iterable[str]) -> None:
 
     if name is not None and name not in known:
         raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")
+
+
+def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> None:
+    """Declare ``--initial``, a guess of the place; ``of_robots``: one for each, by name."""
+    parser.add_argument(
+        "--initial",
+        action="append" if of_robots else "store",
+        default=[] if of_robots else None,
+        metavar="NAME=X,Y[,YAW]" if of_robots else "X,Y[,YAW]",
+        help="where the robot may be at first (map coordinates, degrees): tried, never trusted; write "
+        + ("--initial=..." if not of_robots else "one for each robot"),
+    )
+
+
+def initial_guess(text: str) -> PlaceGuess:
+    """Return the guess that ``X,Y[,YAW]`` means, metres and degrees.
+
+    Raises:
+        ConfigError: it is no such text.
+    """
+    from coview_stream.errors import ConfigError
+    from coview_stream.localization.search.place_guess import PlaceGuess
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+        if len(numbers) not in (2, 3):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(f"--initial {text!r}: give X,Y or X,Y,YAW (metres in the map, degrees)") from None
+    return PlaceGuess(numbers[0], numbers[1], math.radians(numbers[2]) if len(numbers) == 3 else None)
+
+
+def initial_guesses(texts: Iterable[str], robots: Iterable[str]) -> dict[str, PlaceGuess]:
+    """Return the guesses of ``NAME=X,Y[,YAW]`` by robot.
+
+    Raises:
+        ConfigError: a text is none, or names another robot.
+    """
+    from coview_stream.errors import ConfigError
+
+    out, known = {}, list(robots)
+    for text in texts:
+        name, sign, place = text.rpartition("=")
+        if not sign and len(known) == 1:
+            name = known[0]
+        if name not in known:
+            raise ConfigError(f"--initial {text!r}: write NAME=X,Y[,YAW], with one of {', '.join(known)}")
+        out[name] = initial_guess(place)
+    return out
 
 
 def add_registration(parser: argparse.ArgumentParser) -> None:

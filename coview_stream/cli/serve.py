@@ -13,6 +13,7 @@ from coview_stream.cli.options import (
     ROBOT,
     acceptance_config,
     add_gravity,
+    add_initial,
     add_mount,
     add_registration,
     add_reloc,
@@ -20,6 +21,7 @@ from coview_stream.cli.options import (
     add_state,
     add_verify_key,
     check_codec,
+    initial_guesses,
     lidar_config,
     mount_of,
     writable_state_folder,
@@ -89,6 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     limits.add_argument("--no-deskew", action="store_true", help="ignore per-point times")
     add_mount(limits)
+    add_initial(parser, of_robots=True)
     add_registration(parser)
     add_reloc(parser)
     add_risk(parser)
@@ -171,6 +174,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
         node_keys(args.base, args.node or args.robot[0]), args.metrics, verify_key,
+        initial_guesses(args.initial, args.robot),
     )  # fmt: skip
     sinks = open_sinks(args)
     hangups: list[int] = []

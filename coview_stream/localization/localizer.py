@@ -26,6 +26,7 @@ from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer, OdometryCheck
+from coview_stream.localization.search.place_guess import PlaceGuess, has_ground
 from coview_stream.localization.search.pose_hints import PoseHints
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import Epoch, SearchRequest
@@ -273,6 +274,22 @@ class Localizer:
         if not self.state.has_place:
             self._hints.robot_at(local)
 
+    def guess_place(self, guess: PlaceGuess) -> None:
+        """Have the search try, from the next frame on, where somebody says that the robot is.
+
+        Never trusted: what is tried there is judged like what the descriptors name. Ignored while a place is known.
+
+        Raises:
+            InputError: the map has no ground there.
+        """
+        if not has_ground(guess, self.base_map.origin, self.base_map.station_grid):
+            raise InputError(
+                f"guess {guess.x:.1f}, {guess.y:.1f}: the map has no ground within {guess.distance:g} m of it; "
+                "give coordinates of the frame of the map's sources (coview-stream info)"
+            )
+        if not self.state.has_place:
+            self._hints.guess(guess)
+
     def hint_calibration(self, known: Calibration) -> None:
         """Begin with what was known of this robot before, less well; it goes on being measured.
 
@@ -363,6 +380,7 @@ class Localizer:
         """Return what has to be searched for: the keyframe that a frame completes, if any."""
         assert self._frames.anchor is not None  # there is a frame
         hints = self._hints.about(self._frames.anchor, frame.T_odom_body)
+        guesses = self._hints.guessed(self.base_map.origin, self._frames.anchor, frame.T_odom_body)
         if self._odometry_check.contradicts(frame.voxels, frame.T_odom_body[:3, 3]):
             self._restart_search(frame.stamp)
             return None
@@ -370,7 +388,7 @@ class Localizer:
             return None
         spec, travelled = self._search.spec, self._tracker.travelled
         rays = RangeImage.rays(frame.cloud)
-        request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints)
+        request = SearchRequest.of(self._buffer, keyframe, rays, spec, travelled, self._epoch, hints, guesses)
         # what the search would begin with: a tenth of the points remains, and requests travel through pipes
         return replace(request, submap=thinned(request.submap, request.position, self.config.registration))
 

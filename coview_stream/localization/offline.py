@@ -25,6 +25,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix, KeyframeEvidence
+from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.state import State
 from coview_stream.recordings.run import Frame, Run, SweepCorrection
 
@@ -150,16 +151,23 @@ class RunResult:
 
 
 def locate(
-    base_map: BaseMap, run: Run, config: LocalizerConfig | None = None, progress: Progress | None = None
+    base_map: BaseMap,
+    run: Run,
+    config: LocalizerConfig | None = None,
+    progress: Progress | None = None,
+    guess: PlaceGuess | None = None,
 ) -> RunResult:
     """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead.
 
-    A frame that cannot be read is skipped and noted.
+    A frame that cannot be read is skipped and noted. ``guess``, of the place at the first frame, is tried, not trusted.
 
     Raises:
-        InputError: not one frame could be used; the message ends with the first frame's.
+        InputError: not one frame could be used; the message ends with the first frame's. Or the map has no ground where
+            the guess is.
     """
     localizer = Localizer(base_map, config)
+    if guess is not None:
+        localizer.guess_place(guess)
     localizer.prepare()
     located = RunResult(len(run), sources=localizer.sources, mount=run.mount)
     driven, before = 0.0, None

@@ -135,3 +135,27 @@ def test_run_of_damaged_frames_is_refused(world_file, world_run, tmp_path, capsy
     assert main(["locate", str(world_file), str(run), "-o", str(tmp_path / "out")]) == 2
     assert "000000.ply" in one_line(capsys)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("text", ["here", "1", "1,2,3,4", "nan,2"])
+def test_initial_place_that_is_none_is_refused(world_file, world_run, tmp_path, capsys, text):
+    assert main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), f"--initial={text}"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_initial_place_beside_the_map_is_refused(world_file, world_run, tmp_path, capsys):
+    assert main(["locate", str(world_file), str(world_run), "-o", str(tmp_path / "out"), "--initial=9000,9000"]) == 2
+    assert "no ground within 5 m" in capsys.readouterr().err
+
+
+def test_initial_places_of_robots_are_named():
+    from coview_stream.cli.options import initial_guesses
+    from coview_stream.errors import ConfigError
+
+    found = initial_guesses(["a=1,2,90", "b=3,4"], ["a", "b"])
+    assert (found["a"].x, found["a"].y, found["b"].yaw) == (1.0, 2.0, None)
+    assert found["a"].yaw == pytest.approx(1.5708, abs=1e-4)
+    assert initial_guesses(["1,2"], ["a"])["a"].y == 2.0
+    for wrong in (["c=1,2"], ["1,2"], ["a=1"]):
+        with pytest.raises(ConfigError):
+            initial_guesses(wrong, ["a", "b"])

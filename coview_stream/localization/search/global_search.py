@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
-from coview_stream.descriptors.coview import Descriptor
+from coview_stream.descriptors.coview import Descriptor, on_ground
 from coview_stream.localization.evidence.moved_part import find_moved_part
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
@@ -16,6 +16,7 @@ from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.considered import Considered
 from coview_stream.localization.search.modes import find_modes
+from coview_stream.localization.search.place_guess import on_the_ground
 from coview_stream.localization.search.pose_hints import HintSchedule, robot_position
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import Candidate, register_place
@@ -89,6 +90,7 @@ class GlobalSearch:
         for recognizer in self._recognizers:
             recognizer.clear()
         self._hints = HintSchedule()
+        self._guesses = HintSchedule()
         self._scorer.clear()
 
     def reset(self) -> None:
@@ -107,6 +109,8 @@ class GlobalSearch:
         )
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         named, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
+        guessed = self._guessed(request)
+        named, ranks = [*named, *guessed], [*ranks, *range(len(guessed))]
         hints = self._hints.due(request.hints)
         scored = self._scorer.score([*named, *hints], ranks, len(hints), scan)  # against chance, all keyframes
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
@@ -130,6 +134,15 @@ class GlobalSearch:
         """Return what the votes name, and the rank of each in its recognizer's votes."""
         each = [recognizer.hypotheses() for recognizer in self._recognizers]
         return [own for some in each for own in some], [rank for some in each for rank in range(len(some))]
+
+    def _guessed(self, request: SearchRequest) -> list[Hypothesis]:
+        """Return the places that somebody named, on the ground; seldom, once they have been tried a few times."""
+        due = self._guesses.due(request.guesses)
+        if not due:
+            return []
+        self._guesses.tried(refuted=True)
+        points = request.scan if len(request.scan) else request.submap
+        return on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
 
     def _register(self, scored: Scored, scan: ScanInput, request: SearchRequest) -> Candidate | None:
         """Register the most probable place and verify it there; None if it comes to another one, or leans."""

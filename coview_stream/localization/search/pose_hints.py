@@ -9,6 +9,7 @@ import numpy as np
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.place_guess import PlaceGuess
 
 _TRIES = 5  # keyframes in a row that must refute all hints before they are tried less often; set by hand
 _PAUSE = 4  # keyframes between two tries then; set by hand
@@ -28,10 +29,31 @@ class PoseHints:
         self._awaited: Pose | None = None  # T_map_body at the next frame
         self._known: tuple[Pose, ...] = ()
         self._led: tuple[Pose, ...] = ()
+        self._guess: PlaceGuess | None = None  # of the place at the next frame
+        self._guessed: tuple[Pose, ...] = ()
 
     def clear(self) -> None:
         """Forget them all: a place has been accepted."""
         self._awaited, self._known, self._led = None, (), ()
+        self._guess, self._guessed = None, ()
+
+    def guess(self, guess: PlaceGuess) -> None:
+        """Have a guess of the place at the next frame tried, in place of an earlier one."""
+        self._guess = guess
+
+    def guessed(self, origin: Floats, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
+        """Return the guess as ``T_map_odom`` about ``anchor``, heights open.
+
+        Args:
+            origin: (3,) of the map.
+            anchor: (3,) as of :meth:`about`.
+            T_odom_body: (4, 4) likewise.
+        """
+        if self._guess is not None:
+            guess, self._guess = self._guess, None
+            away = pose_from(np.eye(3), -anchor)
+            self._guessed = tuple(T @ away for T in guess.transforms(origin, T_odom_body))
+        return tuple(T @ pose_from(np.eye(3), anchor) for T in self._guessed)
 
     def robot_at(self, T_map_body: Pose) -> None:
         """Hint that the robot will be at ``T_map_body`` (4, 4) at the next frame."""

@@ -62,6 +62,7 @@ class SearchRequest:
         travelled: metres that odometry had driven.
         epoch: of the localizer's memory; a request of another epoch starts the search from nothing.
         hints: (4, 4) each, ``T_map_odom`` that may be right: verified and judged as what the votes find.
+        guesses: (4, 4) each, ``T_map_odom`` of a place that somebody named, heights open: tried like what votes name.
         surroundings: (N, 3) float32 all that is known around the robot, odometry frame; empty if features are not
             compared.
         R_body_cloud: (3, 3) rotation that ``cloud`` has been levelled by.
@@ -75,6 +76,7 @@ class SearchRequest:
     travelled: float = 0.0
     epoch: Epoch = FIRST_EPOCH
     hints: tuple[Pose, ...] = ()
+    guesses: tuple[Pose, ...] = ()
     surroundings: Points = field(default_factory=_no_points)
     R_body_cloud: Floats = field(default_factory=lambda: np.eye(3))
 
@@ -93,6 +95,7 @@ class SearchRequest:
         travelled: float = 0.0,
         epoch: Epoch = FIRST_EPOCH,
         hints: tuple[Pose, ...] = (),
+        guesses: tuple[Pose, ...] = (),
     ) -> SearchRequest:
         """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is its newest frame, body frame."""
         scan = surroundings = _no_points()
@@ -102,7 +105,8 @@ class SearchRequest:
             surroundings = buffer.virtual_scan(keyframe.position, spec.reach, buffer.config.voxel)
         submap = buffer.recent(_SUBMAP_KEYFRAMES)
         return cls(
-            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, surroundings,
+            keyframe.stamp, keyframe.T_odom_body, scan, submap, cloud, travelled, epoch, hints, guesses,
+            surroundings,
             keyframe.R_body_cloud,
         )  # fmt: skip
 

@@ -185,6 +185,28 @@ class RobotClient:
         self._check_open()
         return self._transport.query(self.keys.relocalize, timeout=timeout)
 
+    def suggest(
+        self, x: float, y: float, yaw: float | None = None, distance: float = 5.0, timeout: float = 5.0
+    ) -> dict[str, Any]:
+        """Tell the node where the robot may be: one more place for its search to try, which is never trusted.
+
+        Args:
+            x: in the frame of the map's sources, metres.
+            y: likewise.
+            yaw: heading, radians, counter-clockwise from the map's x axis; None: any.
+            distance: metres around it that are tried as well, 20 at most.
+            timeout: seconds.
+
+        Returns:
+            The reply; ``taken`` is False while the place is known.
+
+        Raises:
+            TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.
+        """
+        self._check_open()
+        given = {"x": x, "y": y, "distance": distance} | ({} if yaw is None else {"yaw": yaw})
+        return self._transport.query(self.keys.suggest, {k: repr(float(v)) for k, v in given.items()}, timeout)
+
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:
         """Make the node forget all that it knows of this robot; returns its reply. Errors as :meth:`relocalize`."""
         self._check_open()

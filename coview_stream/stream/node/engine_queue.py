@@ -8,6 +8,7 @@ from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.considered import Considered
+from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.search.request import Epoch, SearchRequest
 from coview_stream.localization.state import State
 from coview_stream.stream.node.counters import Counters, ErrorLog, Latency, last_line
@@ -104,7 +105,11 @@ class EngineQueue:
         return self._frame is not None and self._frame_under_way is None
 
     def take_frame(
-        self, require_verification: bool, hint: Pose | None = None, calibration: Calibration | None = None
+        self,
+        require_verification: bool,
+        hint: Pose | None = None,
+        calibration: Calibration | None = None,
+        guess: PlaceGuess | None = None,
     ) -> FrameJob | None:
         """Hand out the newest frame, with the result of a search if one has come; None while one is under way."""
         if self._frame is None or self._frame_under_way is not None:
@@ -114,6 +119,7 @@ class EngineQueue:
             require_verification=require_verification,
             search_result=self._search_result,
             hint=hint,
+            guess=guess,
             calibration=None if hint is None else calibration,
         )
         self._frame_under_way = replace(self._frame, job=job)

@@ -11,6 +11,7 @@ from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import Fix
 from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.state import Event
 from coview_stream.odometry.buffer import Segment
@@ -32,6 +33,7 @@ class FrameJob:
         search_result: of an earlier search, to be applied first.
         defer: frames wait for the engine: put off what need not be done at this one.
         hint: (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis.
+        guess: of the place by somebody; tried, never trusted.
         calibration: what was known of its sensor and odometry there; goes with ``hint``, a prior.
         first_epoch: the first one after a client asked to forget the robot; another one makes the engine forget what it
             knows of the sensor and the odometry, too.
@@ -48,6 +50,7 @@ class FrameJob:
     search_result: SearchResult | None = None
     defer: bool = False
     hint: Pose | None = None
+    guess: PlaceGuess | None = None
     calibration: Calibration | None = None
     first_epoch: int = 0
 

@@ -7,9 +7,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from coview_stream.errors import InputError
+from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages import encode_pose
 from coview_stream.messages.types import Encoded, Sample
 from coview_stream.stream.node.election import Elections
+from coview_stream.stream.node.initial_pose import decode_guess, guess_of_fields
 from coview_stream.stream.node.session import Session
 from coview_stream.stream.node.status import Reporter
 from coview_stream.stream.transport import rmw
@@ -75,6 +78,8 @@ class RobotEndpoints:
         transport.subscribe(keys.cloud, self.on_cloud, "newest")
         transport.answer(keys.relocalize, self.relocalize)
         transport.answer(keys.reset, self.reset)
+        transport.answer(keys.suggest, self.suggest)
+        transport.subscribe(keys.initial_pose, self.on_initial_pose, "all")
         transport.announce(keys.alive)
 
     def _pose_publisher(self, node_id: str, number: int) -> Publisher:
@@ -117,6 +122,23 @@ class RobotEndpoints:
         for session in self._sessions:
             session.reset()
         return self._answer()
+
+    def suggest(self, parameters: dict[str, str]) -> dict[str, Any]:
+        """Answer ``rpc/suggest``; InputError, which is replied, where it names no place."""
+        taken = self._guess(guess_of_fields(parameters))
+        note = "" if taken else "the place is known, the guess is ignored; ask rpc/relocalize first"
+        return self._answer() | {"taken": taken, "note": note}
+
+    def on_initial_pose(self, sample: Sample) -> None:
+        """Take in a guess of the place."""
+        try:
+            self._guess(decode_guess(sample))
+        except InputError as error:
+            self.session.errors.add_first(f"{sample.key}: initial poses of no use", str(error))
+
+    def _guess(self, guess: PlaceGuess) -> bool:
+        taken = [session.guess_place(guess) for session in self._sessions]  # all of them
+        return any(taken)
 
     def _answer(self) -> dict[str, Any]:
         self._reporter.changed.set()

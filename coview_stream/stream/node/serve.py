@@ -21,6 +21,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 
 if TYPE_CHECKING:
+    from coview_stream.localization.search.place_guess import PlaceGuess
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.reload import OpenedMap
     from coview_stream.stream.node.session import Session
@@ -50,6 +51,7 @@ class ServeOptions:
         risk: probability of a wrong place below which a search gives one.
         node_keys: of the node's own; None for none.
         metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
+        guesses: of the places of robots, by name: tried, never trusted.
         verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
     """
 
@@ -70,6 +72,7 @@ class ServeOptions:
     node_keys: NodeKeys | None = None
     metrics: str | None = None
     verify_key: VerifyKey | None = None
+    guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
 
 
 def open_node(
@@ -117,6 +120,9 @@ def open_node(
         elections = Elections(options.keys, options.node.status_rate, needs_connection=bool(options.connect))
         elections.declare(transport)
         sessions = make_sessions(options, sha256)
+        for session in sessions:
+            if (guess := options.guesses.get(session.keys.robot)) is not None:
+                session.guess_place(guess)
         prepare(*CLOUD_CODECS, *ODOMETRY_CODECS, *POSE_CODECS)
         for name, engine in engines.items():
             if name != "search":  # which has until the first keyframe

@@ -15,6 +15,7 @@ from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.acceptance import SearchResult
+from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.localization.state import State
 from coview_stream.messages import decode_cloud, decode_odometry
 from coview_stream.messages.hypotheses import HypothesesMessage
@@ -65,6 +66,7 @@ class Session:
         self._lock = threading.RLock()
         self._epoch = 0  # number of the odometry frame, counted through all resets
         self._hint = PoseHint()
+        self._guess: PlaceGuess | None = None  # that no frame has taken to the engine yet
         self._clear()
 
     def _clear(self) -> None:
@@ -205,6 +207,14 @@ class Session:
             if self.robot_state.correction is None and not self._hint.forgotten:
                 self._hint.offer(T_map_body, calibration)
 
+    def guess_place(self, guess: PlaceGuess) -> bool:
+        """Have the search try a place that somebody names; return False, and do nothing, while a place is known."""
+        with self._lock:
+            if self.robot_state.correction is not None:
+                return False
+            self._guess = guess
+            return True
+
     def begin_beside(self, old: Session) -> None:
         """Begin with the place that the robot's session on another map knows: a hypothesis, to be verified on this one.
 
@@ -244,7 +254,7 @@ class Session:
         """Hand the newest frame to the tracking engine."""
         with self._lock:
             return self.queue.take_frame(
-                self.robot_state.requires_verification, self._hint.pending, self._hint.calibration
+                self.robot_state.requires_verification, self._hint.pending, self._hint.calibration, self._guess
             )
 
     def take_search_request(self) -> SearchJob | None:
@@ -274,6 +284,8 @@ class Session:
                 frame = self.queue.frame_done(job, result, now)
                 if frame is not None:
                     self._hint.delivered(frame.job.hint)
+                    if frame.job.guess is self._guess:
+                        self._guess = None
                     self.robot_state.add_fix(result.fix, frame, result.events)
                     self._record_state()
             elif isinstance(job, SearchJob) and isinstance(result, SearchResult):

@@ -104,6 +104,8 @@ class RobotKeys(Preset):
         hypotheses: key to publish on which places a search considers.
         alive: key of the liveliness token.
         relocalize: key that answers queries to forget the pose and search again.
+        initial_pose: key to subscribe to for guesses of the place.
+        suggest: key that answers queries with a guess of the place in their parameters.
         reset: key that answers queries to forget everything.
         map_view: key that answers queries with the map, thinned, to look at.
     """
@@ -113,6 +115,8 @@ class RobotKeys(Preset):
     hypotheses: str
     alive: str
     relocalize: str
+    initial_pose: str
+    suggest: str
     reset: str
     map_view: str
 
@@ -190,6 +194,8 @@ def robot_keys(
         hypotheses=f"{own}/out/hypotheses",
         alive=f"{own}/alive",
         relocalize=f"{own}/rpc/relocalize",
+        initial_pose=f"{own}/in/initial_pose",
+        suggest=f"{own}/rpc/suggest",
         reset=f"{own}/rpc/reset",
         map_view=f"{own}/rpc/map_view",
     )

@@ -24,6 +24,8 @@ def test_node_declares_keys_with_urgencies(pair):
     assert pair.net.subscribed == {
         "coview/r1/in/cloud": "newest",
         "coview/r1/in/odom": "all",
+        "coview/r1/in/initial_pose": "all",
+        "coview/r2/in/initial_pose": "all",
         "coview/r2/in/cloud": "newest",
         "coview/r2/in/odom": "all",
     }
