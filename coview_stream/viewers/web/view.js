@@ -173,7 +173,7 @@ export class View {
     context.drawImage(canvas, px, py, canvas.width * scale, canvas.height * scale);
   }
 
-  drawTrail(context, robot) {
+  drawTrail(context, robot, now) {
     context.beginPath();
     let down = false;
     for (const point of robot.trail) {
@@ -182,6 +182,7 @@ export class View {
       if (down) context.lineTo(px, py); else context.moveTo(px, py);
       down = true;
     }
+    if (down && robot.located(now)) context.lineTo(...this.toScreen(robot.pose.x, robot.pose.y));
     context.strokeStyle = robot.colour;
     context.lineWidth = 3;
     context.lineJoin = context.lineCap = "round";
