@@ -52,10 +52,15 @@ function keepConnected(now) {
 
 async function loadMap(sha256) {
   if (session.maps.has(sha256)) return;
-  const answer = await fetch(`map/${encodeURIComponent(sha256)}`);
-  if (!answer.ok) return;
-  session.maps.set(sha256, { map: readMap(await answer.arrayBuffer()) });
-  view.fitAll();
+  try {
+    const answer = await fetch(`map/${encodeURIComponent(sha256)}`);
+    if (!answer.ok) return; // it is kept no more
+    session.maps.set(sha256, { map: readMap(await answer.arrayBuffer()) });
+  } catch { // the connection broke, and a new one may bring another map
+    setTimeout(() => loadMap(sha256), 2 * RETRY_MS);
+    return;
+  }
+  if (session.maps.size === 1) view.fitAll();
 }
 
 // ---- what is said
@@ -145,6 +150,7 @@ document.addEventListener("keydown", (event) => {
 let cardsDue = 0;
 
 function loop() {
+  requestAnimationFrame(loop); // first: what goes wrong with one picture does not end them all
   const now = performance.now();
   if (now >= cardsDue) {
     cardsDue = now + CARDS_MS;
@@ -159,7 +165,6 @@ function loop() {
     if (!view.placed) view.fitAll();
     view.draw(now);
   }
-  requestAnimationFrame(loop);
 }
 
 applyTheme();
