@@ -158,9 +158,8 @@ class SessionFeed:
             return
         topic, sample = item
         robot = _robot(topic, sample)
-        if robot not in self._robots and len(self._robots) >= MAX_ROBOTS:
+        if not self._admits(robot):
             return
-        self._robots.add(robot)
         try:
             if topic.kind == "pose":
                 self._take_pose(robot, topic, sample)
@@ -171,6 +170,13 @@ class SessionFeed:
                 self._hand_out("hypotheses", lambda sink: sink.hypotheses(found))
         except MessageError as error:
             self._errors.report(sample.key, error)
+
+    def _admits(self, robot: str) -> bool:
+        """Tell whether a robot is looked at: all are, up to the limit."""
+        if robot not in self._robots and len(self._robots) >= MAX_ROBOTS:
+            return False
+        self._robots.add(robot)
+        return True
 
     def _take_pose(self, robot: str, topic: Topic, sample: Sample) -> None:
         from coview_stream.messages import decode_pose
@@ -197,6 +203,8 @@ class SessionFeed:
             due = [robot for robot in self._clouds if self._next_scan.get(robot, 0.0) <= now]
             clouds = {robot: self._clouds.pop(robot) for robot in due if robot not in self._pending}
         for robot, (topic, sample) in clouds.items():
+            if not self._admits(robot):
+                continue
             self._next_scan[robot] = now + _SCAN_PERIOD
             try:
                 scan = self._scan(robot, topic, sample)

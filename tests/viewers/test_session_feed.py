@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 from fake_robot import KEYS, SHA, cloud, ns
+from sockets import until
 
 from coview_stream.basemap.map_view import MapView
 from coview_stream.config.mount import Mount
@@ -17,7 +18,9 @@ from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_pose
 from coview_stream.messages.hypotheses import HypothesesMessage, encode_hypotheses
 from coview_stream.messages.types import PoseMessage, Sample
+from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
+from coview_stream.viewers import session_feed
 from coview_stream.viewers.scene import PoseTrack, Sink
 from coview_stream.viewers.session_feed import SessionFeed, asked_of_node
 from coview_stream.viewers.topics import topics_of_base, topics_of_robots
@@ -117,6 +120,19 @@ def test_a_sink_that_hangs_holds_up_no_publisher(net, kept):
         assert not going_on.is_set()  # all have been published meanwhile
         assert net.raised == []
         going_on.set()
+
+
+def test_names_from_the_network_fill_no_memory(net, kept, monkeypatch):
+    monkeypatch.setattr(session_feed, "MAX_ROBOTS", 3)
+    with feed(net, kept, topics_of_base("coview")) as made:
+        for k in range(20):
+            put_status(net, f"coview/r{k}/out/status", state="LOST")
+            net.publish(cloud(0.0, keys=robot_keys("native", "coview", f"c{k}")))
+        kept.wait("status", 1)
+        put_status(net, "coview/r0/out/status", state="TRACKING")
+        until(lambda: ("r0", {"state": "TRACKING"}) in kept.wait("status"))
+        assert len({robot for robot, _ in kept.wait("status")}) <= 3
+        assert len(made._robots) + len(made._next_scan) <= 6
 
 
 def test_rubbish_ends_nothing(net, kept):
