@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from coview_stream.stream.transport.keys import RobotKeys
     from coview_stream.stream.transport.transport import Transport
     from coview_stream.viewers.scene import Sink
-    from coview_stream.viewers.session_feed import MapSource, SessionFeed
+    from coview_stream.viewers.session_feed import SessionFeed
 
 _WEB = "127.0.0.1:8642"
 
@@ -61,7 +61,8 @@ def feed_of_watch(
     if not sinks:
         return None
     from coview_stream.stream.transport.keys import robot_keys
-    from coview_stream.viewers.session_feed import SessionFeed, asked_of_node
+    from coview_stream.viewers.map_source import asked_of_node
+    from coview_stream.viewers.session_feed import SessionFeed
     from coview_stream.viewers.topics import topics_of_base, topics_of_robots
 
     topics = topics_of_base(args.base)
@@ -80,10 +81,11 @@ def feed_of_node(
     """
     if not sinks:
         return None
+    from coview_stream.viewers.map_source import read_from_file
     from coview_stream.viewers.session_feed import SessionFeed
     from coview_stream.viewers.topics import topics_of_robots
 
-    source = _file_of(node, path)
+    source = read_from_file(path, lambda: node.map_sha256)
     feed = SessionFeed(node.transport, topics_of_robots(keys), None, source, mount=mount, policy="newest")
     return _running(feed, sinks)
 
@@ -93,20 +95,6 @@ def _running(feed: SessionFeed, sinks: Sequence[Sink]) -> SessionFeed:
         feed.add(sink)
     feed.start()
     return feed
-
-
-def _file_of(node: Node, path: Path) -> MapSource:
-    from coview_stream.basemap.basemap import BaseMap
-    from coview_stream.basemap.map_view import MapView
-    from coview_stream.errors import MapError
-
-    def load(robot: str) -> MapView:
-        base_map = BaseMap.load(path, check=False)  # the node has compared it when it opened the map
-        if base_map.sha256 != node.map_sha256:
-            raise MapError(f"{path}: the file is of another map than the one that is served")
-        return MapView.of(base_map)
-
-    return load
 
 
 def map_of_watch(path: Path | None) -> MapView | None:

@@ -14,7 +14,7 @@ from operator import methodcaller
 
 import numpy as np
 
-from coview_stream.basemap.map_view import MAX_WIRE_BYTES, MapView
+from coview_stream.basemap.map_view import MapView
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CoViewError, MessageError
 from coview_stream.messages.hypotheses import decode_hypotheses
@@ -22,6 +22,7 @@ from coview_stream.messages.types import Sample
 from coview_stream.stream.client.client import LatestQueue
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Policy, Transport
+from coview_stream.viewers.map_source import MapSource
 from coview_stream.viewers.scene import PoseTrack, Scan, Sink
 from coview_stream.viewers.topics import Topic
 
@@ -37,10 +38,6 @@ _SCAN_POINTS = 6_000
 _POSE_WAIT = 0.4  # seconds that a scan waits for a pose of its time
 _JOIN_TIMEOUT = 0.2  # seconds for a thread to end; a map that is being thinned is not waited for
 _MAP_RETRY = 5.0  # seconds between two questions for a map
-_MAP_TIMEOUT = 10.0  # seconds of a question: the first makes the node thin its map
-
-MapSource = Callable[[str], MapView]
-"""Returns the map that a robot is served on; what goes wrong is a CoViewError."""
 
 
 class SessionFeed:
@@ -247,16 +244,6 @@ class SessionFeed:
                 self._errors.report(f"map of {robot}", error)
             except Exception as error:  # of any kind: the next map may be another one
                 self._errors.report(f"map of {robot}", error)
-
-
-def asked_of_node(transport: Transport, base: str) -> MapSource:
-    """Return a map source that asks the node of a robot."""
-
-    def ask(robot: str) -> MapView:
-        key = f"{base}/{robot}/rpc/map_view"
-        return MapView.from_json(transport.query(key, timeout=_MAP_TIMEOUT, max_bytes=MAX_WIRE_BYTES))
-
-    return ask
 
 
 def _robot(topic: Topic, sample: Sample) -> str:
