@@ -89,6 +89,7 @@ EXTRA_OF = {
     "open3d": "build",
     "CSF": "build",
     "matplotlib": "plot",
+    "pye57": "e57",
     "small_gicp": "gicp",
     "kiss_icp": "kiss-icp",
     "cryptography": "sign",

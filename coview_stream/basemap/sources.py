@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.cloud_head import CloudHead, read_head
+from coview_stream.clouds.cloud_paths import expand_cloud_paths
 from coview_stream.clouds.files import read_cloud
 from coview_stream.clouds.reference_system import flaw_of_system, unchecked_system
 from coview_stream.errors import CloudError, ConfigError, MapError, warn
@@ -76,7 +77,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
     """Return the sources that a caller names, each once.
 
     Args:
-        given: a file or an array (N, 3), further columns are not used; or several.
+        given: a file, a folder or pattern of them, or an array (N, 3), further columns are not used; or several.
         crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT.
 
     Raises:
@@ -92,7 +93,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
     sources: list[Source] = []
     for number, item in enumerate(several, 1):
         if isinstance(item, str | os.PathLike):
-            sources.append(Source(Path(item), None, crs))
+            sources += [Source(path, None, crs) for path in expand_cloud_paths([item])]
         else:
             name = "array" if arrays == 1 else f"array {number}"
             sources.append(Source(Path(name), _rows(item, name), crs))

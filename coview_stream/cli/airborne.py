@@ -26,14 +26,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the cloud, in the survey's own coordinates, and print its counts."""
-    from coview_stream.clouds import CLOUD_SUFFIXES, merge, read_cloud, write_cloud
+    from coview_stream.clouds import merge, read_cloud, write_cloud
+    from coview_stream.clouds.files import WRITABLE_SUFFIXES
     from coview_stream.errors import CloudError
     from coview_stream.sim.airborne_survey import Survey, airborne_survey
 
     names = ("density", "swath", "noise", "porosity", "misaligned", "seed")
     survey = Survey(**{name: getattr(args, name) for name in names})
-    if args.output.suffix.lower() not in CLOUD_SUFFIXES:
-        raise CloudError(f"{args.output}: name a cloud, one of {', '.join(sorted(CLOUD_SUFFIXES))}")
+    if args.output.suffix.lower() not in WRITABLE_SUFFIXES:
+        raise CloudError(f"{args.output}: name a cloud, one of {', '.join(sorted(WRITABLE_SUFFIXES))}")
     if args.output.resolve() in [path.resolve() for path in args.surveys]:
         raise CloudError(f"{args.output}: is the survey itself; name another file")
     cloud = merge([read_cloud(path) for path in args.surveys])

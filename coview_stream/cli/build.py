@@ -21,7 +21,10 @@ _FIELDS = {"block_size": "block"}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("maps", nargs="+", type=Path, metavar="MAP", help="las, laz, ply, pcd, npy or bin")
+    kinds = "las, laz, e57, ply, pcd, xyz, pts, npy, bin"
+    parser.add_argument(
+        "maps", nargs="+", type=Path, metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="SITE.coview")
     parser.add_argument("--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans")
     for name, (kind, text) in _OPTIONS.items():
@@ -32,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="store features for learned re-localization, 35 MB per km2 (they are, where onnxruntime can be loaded)",
     )
+    parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
     parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
 
@@ -55,7 +59,9 @@ def run(args: argparse.Namespace) -> int:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     options["learned"] = _networks_available() if args.learned is None else args.learned
     begin = time.perf_counter()
-    base_map = BaseMap.build(args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), **options)
+    base_map = BaseMap.build(
+        args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), crs=args.crs, **options
+    )
     base_map.save(args.output, key)
     print(
         f"{args.output}: {base_map.parameters['source_points']} points read, {len(base_map.points)} kept, "

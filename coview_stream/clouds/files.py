@@ -12,12 +12,22 @@ import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.cloud import LOCAL_LIMIT, Cloud
+from coview_stream.clouds.e57 import require_pye57
 from coview_stream.clouds.las import read_las, require_laspy
+from coview_stream.clouds.laz_process import read_in_child
 from coview_stream.clouds.npy_bin import read_bin, read_npy
 from coview_stream.clouds.pcd import read_pcd
 from coview_stream.clouds.ply import read_ply
+from coview_stream.clouds.text import TEXT_SUFFIXES, read_text
 from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Reals
+
+
+def read_e57(path: Path) -> Cloud:
+    """Read an E57 file, in a process of its own; CloudError where it is damaged, DependencyError without pye57."""
+    require_pye57()
+    return read_in_child(path)
+
 
 _READERS: dict[str, tuple[str, Callable[[Path], Cloud]]] = {
     ".las": ("LAS", read_las),
@@ -26,10 +36,15 @@ _READERS: dict[str, tuple[str, Callable[[Path], Cloud]]] = {
     ".ply": ("PLY", read_ply),
     ".npy": ("NPY", read_npy),
     ".bin": ("KITTI bin", read_bin),
+    ".e57": ("E57", read_e57),
+    **dict.fromkeys(TEXT_SUFFIXES, ("text", read_text)),
 }
 
 CLOUD_SUFFIXES = frozenset(_READERS)
 """Suffixes, lower case with their dot, that ``read_cloud`` accepts."""
+
+_ANY_TEXT = frozenset({".txt", ".csv"})
+"""Suffixes of which a file in a folder may be anything: stamps, poses, notes."""
 
 _MAGIC = (
     (b"LASF", "LAS"),
@@ -48,28 +63,25 @@ _MAGIC = (
 
 _LAS_SCALE = 0.001  # metres
 
-E57_REMEDY = "E57 is not supported yet: convert it to LAZ or PLY"
-
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
-    """Tell whether the suffix is one that ``read_cloud`` accepts (hidden files are not clouds)."""
+    """Tell whether a file in a folder is a cloud by its suffix; hidden files are not, nor .txt and .csv."""
     name = Path(path).name
-    return Path(name).suffix.lower() in CLOUD_SUFFIXES and not name.startswith(".")
+    return Path(name).suffix.lower() in CLOUD_SUFFIXES - _ANY_TEXT and not name.startswith(".")
 
 
 def check_format(path: Path) -> str:
     """Return the format that a file's suffix names; CloudError where it is not there, or its first bytes disagree."""
     suffix = path.suffix.lower()
     head = _head(path)
-    if suffix == ".e57" or head.startswith(b"ASTM-E57"):
-        raise CloudError(f"{path}: {E57_REMEDY}")
     if suffix not in _READERS:
         known = ", ".join(sorted(CLOUD_SUFFIXES))
         raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")
     name = _READERS[suffix][0]
     found = sniff(head)
-    # raw float rows have no magic: anything that is not recognisably something else may be one
-    if found != name and not (suffix == ".bin" and found is None):
+    # raw float rows and text have no magic: anything that is not recognisably something else may be one
+    silent = found is None and (suffix == ".bin" or (name == "text" and b"\0" not in head))
+    if found != name and not silent:
         what = f"is {found}" if found else f"does not begin like {name}"
         remedy = "unpack it" if found in ("zip", "gzip") else "rename it, or get the real file"
         raise CloudError(f"{path}: named {suffix} but its content {what}; {remedy}")
@@ -77,7 +89,7 @@ def check_format(path: Path) -> str:
 
 
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
-    """Read LAS, LAZ (COPC too), PCD, PLY, NPY or KITTI ``.bin``; metres, in the file's own frame.
+    """Read LAS, LAZ (COPC too), E57, PCD, PLY, NPY, text or KITTI ``.bin``; metres, in the file's own frame.
 
     The suffix names the format and the first bytes must agree with it. Rows that are not finite are dropped
     and counted, so are LAS points that are withheld or labelled as noise.
@@ -208,3 +220,6 @@ _WRITERS: dict[str, Callable[[BinaryIO, Reals, Path], None]] = {
     ".las": _las,
     ".laz": _las,
 }
+
+WRITABLE_SUFFIXES = frozenset(_WRITERS)
+"""Suffixes that ``write_cloud`` accepts."""

@@ -16,7 +16,7 @@ import numpy as np
 from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.las_header import read_las_header
 from coview_stream.clouds.laszip_pointwise import POINTWISE, is_pointwise, with_one_chunk
-from coview_stream.clouds.laz_process import read_laz
+from coview_stream.clouds.laz_process import read_in_child
 from coview_stream.clouds.reference_system import flaw_of_system, stated_system, unchecked_system
 from coview_stream.errors import CloudError, require_library, warn
 
@@ -41,7 +41,7 @@ def read_las(path: Path) -> Cloud:
     check_las(path)
     if _is_compressed(path):
         require_laspy()  # here: its process could not say so
-        return read_laz(path)
+        return read_in_child(path)
     return decode(path, CloudBuilder).finish(os.fspath(path))
 
 

@@ -1,4 +1,4 @@
-"""Process that decodes LAZ files for another one, with a limit on its memory: ``python -P -m ...laz_child``.
+"""Process that decodes LAZ and E57 files for another one, with a limit on its memory: ``python -P -m ...laz_child``.
 
 The decoder is native code that believes sizes in the file: what they ask for may abort the process. Reads one JSON
 string (a path) a line from stdin. Writes to stdout, for each, ``points`` and ``end`` lines of JSON; after each
@@ -7,6 +7,7 @@ string (a path) a line from stdin. Writes to stdout, for each, ``points`` and ``
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -25,7 +26,8 @@ def main() -> None:
     # laspy and others may print: only answers go to the pipe
     out = os.fdopen(os.dup(1), "wb", buffering=1 << 20)
     os.dup2(2, 1)
-    import laspy  # noqa: F401 - before the first limit
+    with contextlib.suppress(ImportError):  # E57 does without
+        import laspy  # noqa: F401 - before the first limit
 
     before = _address_space()
     for line in sys.stdin.buffer:
@@ -36,8 +38,8 @@ def main() -> None:
 
 
 def _answer(path: Path, out: BinaryIO) -> None:
+    from coview_stream.clouds import e57, las
     from coview_stream.clouds.cloud import CloudBuilder
-    from coview_stream.clouds.las import decode
     from coview_stream.errors import CloudError
 
     class Sender(CloudBuilder):
@@ -51,7 +53,7 @@ def _answer(path: Path, out: BinaryIO) -> None:
 
     end: dict[str, Any] = {"end": True}
     try:
-        decode(path, Sender)
+        (e57 if path.suffix.lower() == ".e57" else las).decode(path, Sender)
     except CloudError as error:
         end["error"] = str(error)
     except MemoryError:

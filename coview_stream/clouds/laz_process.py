@@ -1,4 +1,4 @@
-"""Decoding of LAZ files in a child process: an abort of the decoder costs an error, not this process."""
+"""Decoding of LAZ and E57 files in a child process: an abort of the decoder costs an error, not this process."""
 
 from __future__ import annotations
 
@@ -149,14 +149,15 @@ class _RefusedError(Exception):
 
 
 def _too_much(path: Path, reason: str) -> str:
-    return f"{path}: damaged or truncated LAS/LAZ ({reason} at what the file asks for); copy or export the file again"
+    what = path.suffix.removeprefix(".").upper()
+    return f"{path}: damaged or truncated {what} ({reason} at what the file asks for); copy or export the file again"
 
 
 _process = LazProcess()
 
 
-def read_laz(path: Path) -> Cloud:
-    """Decode a LAZ file in the child that all share.
+def read_in_child(path: Path) -> Cloud:
+    """Decode a LAZ or E57 file in the child that all share.
 
     Raises:
         CloudError: as :meth:`LazProcess.read`.

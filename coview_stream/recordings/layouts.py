@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coview_stream.clouds.files import CLOUD_SUFFIXES, E57_REMEDY, is_cloud_name
+from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
 from coview_stream.clouds.trajectory import columns_of, read_kitti_poses, read_times, read_tum
 from coview_stream.errors import RunError
 from coview_stream.geometry.arrays import Floats
@@ -47,9 +47,7 @@ def find_layout(path: Path) -> Layout:
     if not path.exists():
         raise RunError(f"{path}: no such run; give a directory with {_LAYOUTS}, or one cloud file")
     if path.is_file():
-        if not is_cloud_name(path):
-            if path.suffix.lower() == ".e57":
-                raise RunError(f"{path}: {E57_REMEDY}")
+        if path.suffix.lower() not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
     for folder in ("frames", "velodyne"):
@@ -60,9 +58,16 @@ def find_layout(path: Path) -> Layout:
             odometry = next((path / name for name in names if (path / name).exists()), None)
             times = path / "times.txt"
             return Layout(path, frames, odometry, times if times.exists() else None)
+    within = next((sub for sub in sorted(path.iterdir()) if sub.is_dir() and _is_run(sub)), None)
+    if within is not None:
+        raise RunError(f"{path}: is no run; did you mean {within}?")
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
+
+
+def _is_run(path: Path) -> bool:
+    return any((path / folder).is_dir() for folder in ("frames", "velodyne"))
 
 
 def find_bag(path: Path) -> Path | None:

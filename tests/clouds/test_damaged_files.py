@@ -58,8 +58,7 @@ def test_content_of_another_format_is_refused(tmp_path: Path, real: str, named: 
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("a.e57", b"ASTM-E57\0\0", "not supported yet"),
-        ("a.xyz", b"1 2 3\n", "unknown cloud suffix"),
+        ("a.wrl", b"1 2 3\n", "unknown cloud suffix"),
         ("a.pcd", HEADER.format(f="x y q", n=1).encode() + b"1 2 3\n", "no field z"),
         ("a.pcd", HEADER.format(f="x y z", n=2).encode() + b"1 2 3\n", "truncated"),
         ("a.pcd", HEADER.format(f="x y z", n=2).encode() + b"1 2 3\n1 a 3\n", "unreadable ascii"),

@@ -24,7 +24,7 @@ def _fresh_cache() -> Iterator[None]:
         (ImportError("libusb-1.0.so.0: cannot open shared object file"), "libusb-1.0-0.*libusb-package"),
         (ImportError("libGL.so.1: cannot open shared object file"), "apt-get install libgl1"),
         (ImportError("libgomp.so.1: cannot open shared object file"), "apt-get install libgomp1"),
-        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "pip install open3d-cpu"),
+        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "pip install 'coview-stream\\[build\\]'"),
         (ImportError("undefined symbol: xyz"), "undefined symbol: xyz.*reinstall"),
     ],
 )

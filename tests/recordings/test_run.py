@@ -168,8 +168,7 @@ def test_binary_odometry_file_is_refused(run: Path) -> None:
         (lambda d: write_cloud(d / "a.pcd", POINTS) or d, "in the directory itself"),
         (lambda d: (d / "a.mcap").touch() or d / "a.mcap", "seems to be empty.*copy or record"),
         (lambda d: (d / "metadata.yaml").touch() or d, r"cannot be read \(Invalid bag metadata.*reindex"),
-        (lambda d: (d / "a.txt").touch() or d / "a.txt", "neither a run nor a cloud"),
-        (lambda d: (d / "a.e57").touch() or d / "a.e57", "E57 is not supported yet: convert it"),
+        (lambda d: (d / "a.wrl").touch() or d / "a.wrl", "neither a run nor a cloud"),
     ],
 )
 def test_path_without_a_run_is_refused(tmp_path: Path, make, reason: str) -> None:  # type: ignore[no-untyped-def]  # a lambda of the table
