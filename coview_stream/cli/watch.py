@@ -19,8 +19,8 @@ from coview_stream.errors import ConfigError, MessageError
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
     from coview_stream.messages.types import PoseMessage, Sample
-    from coview_stream.stream.client.client import LatestQueue
     from coview_stream.stream.client.fleet import FleetTable
+    from coview_stream.stream.client.latest_queue import LatestQueue
     from coview_stream.stream.transport.transport import Transport
 
 HELP = "see robots' poses live: a table, JSON lines, or a viewer"
@@ -121,7 +121,7 @@ class _Watch:
         show_pose: Callable[[PoseMessage], None],
         transport: Transport,
     ) -> None:
-        from coview_stream.stream.client.client import LatestQueue
+        from coview_stream.stream.client.latest_queue import LatestQueue
 
         self._args, self._fleet, self._topics = args, fleet, topics
         self._show_pose, self._transport = show_pose, transport

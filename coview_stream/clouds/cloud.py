@@ -47,6 +47,10 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    def __repr__(self) -> str:
+        """Return size, origin and reference system in one line."""
+        return f"Cloud({len(self):,} points, origin {self.origin.tolist()}, crs {short_name(self.crs)})"
+
     def map_points(self) -> Floats:
         """Return (N, 3) float64 coordinates in the file's own frame, metres."""
         return self.points.astype(np.float64) + self.origin

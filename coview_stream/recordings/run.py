@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, SupportsIndex, overload
 
 import numpy as np
 
 from coview_stream.clouds.cloud import Cloud
 from coview_stream.clouds.files import read_cloud
 from coview_stream.config.mount import Mount
-from coview_stream.errors import CloudError
+from coview_stream.errors import CloudError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, Poses
 from coview_stream.recordings.layouts import Layout
@@ -40,6 +41,10 @@ class Frame:
     path: Path
     dropped: int = 0
 
+    def __repr__(self) -> str:
+        """Return index, stamp, size and file in one line."""
+        return f"Frame({self.index}: {self.stamp:.3f} s, {len(self.points):,} points, {self.path.name!r})"
+
 
 @dataclass(frozen=True)
 class SweepCorrection:
@@ -63,8 +68,28 @@ class CloudSource(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class _SelectedClouds:
+    """Reader of some of a source's clouds.
+
+    Attributes:
+        source: reads all of them.
+        indices: of those that are selected.
+    """
+
+    source: CloudSource
+    indices: range
+
+    def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
+        """Read one, by its place among those that are selected."""
+        return self.source.read(self.indices[index], correction)
+
+
+@dataclass(frozen=True, eq=False)
 class Run:
     """A validated run. Iterating reads lazily: one frame is in memory at a time.
+
+    ``run[3]`` reads a frame, ``run[-1]`` the last one; ``run[10:20]`` and ``run[::5]`` are runs of some of its frames,
+    numbered from zero again.
 
     Attributes:
         path: the directory, the single cloud file, or the recording.
@@ -90,6 +115,44 @@ class Run:
     def __iter__(self) -> Iterator[Frame]:
         """Yield every frame in order; raises like ``read`` (use ``read`` to skip a damaged frame)."""
         return (self.read(index) for index in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Run: ...
+
+    def __getitem__(self, index: SupportsIndex | slice) -> Frame | Run:
+        """Read one frame, negative indices from the end, as :meth:`read`; or return the run of a slice.
+
+        Raises:
+            RunError: the slice is empty or goes backwards.
+        """
+        if isinstance(index, slice):
+            return self._selected(index)
+        at = operator.index(index)
+        return self.read(at + len(self) if -len(self) <= at < 0 else at)
+
+    def __repr__(self) -> str:
+        """Return path, number of frames, duration and way driven in one line."""
+        driven = float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum())
+        return (
+            f"Run({str(self.path)!r}: {len(self)} frames, {self.stamps[-1] - self.stamps[0]:.1f} s, "
+            f"{driven:.1f} m driven)"
+        )
+
+    def _selected(self, part: slice) -> Run:
+        indices = range(len(self))[part]
+        if not indices or indices.step < 0:
+            what = "goes backwards" if indices else "holds no frame"
+            raise RunError(f"{self.path}: the slice {part.start}:{part.stop}:{part.step} of {len(self)} frames {what}")
+        return replace(
+            self,
+            frames_paths=self.frames_paths[part],
+            stamps=self.stamps[part],
+            poses=self.poses[part],
+            source=None if self.source is None else _SelectedClouds(self.source, indices),
+        )
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Frame:
         """Read frame ``index``; a raw sweep of a recording is deskewed by odometry, which ``correction`` corrects.

@@ -19,7 +19,7 @@ from coview_stream.config.mount import Mount
 from coview_stream.errors import CoViewError, MessageError
 from coview_stream.messages.hypotheses import decode_hypotheses
 from coview_stream.messages.types import Sample
-from coview_stream.stream.client.client import LatestQueue
+from coview_stream.stream.client.latest_queue import LatestQueue
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 from coview_stream.stream.transport.transport import Policy, Transport
 from coview_stream.viewers.map_source import MapSource

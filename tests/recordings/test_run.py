@@ -209,3 +209,36 @@ def test_unwritable_or_mismatched_trajectory_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="3 stamps for 4 poses"):
         write_tum(tmp_path / "a.tum", STAMPS[:3], POSES)
     assert not list(tmp_path.iterdir())
+
+
+def test_run_can_be_indexed(run: Path) -> None:
+    opened = open_run(run)
+    frames = list(opened)
+    assert opened[1].path == frames[1].path
+    assert opened[-1].index == opened[np.int64(len(frames) - 1)].index == len(frames) - 1
+    for beyond in (len(frames), -len(frames) - 1):
+        with pytest.raises(IndexError, match="no frame"):
+            opened[beyond]
+    with pytest.raises(TypeError):
+        opened["first"]  # type: ignore[call-overload]
+
+
+def test_slice_of_a_run_is_a_run(run: Path) -> None:
+    opened = open_run(run)
+    part = opened[1:]
+    assert [frame.stamp for frame in part] == opened.stamps[1:].tolist()
+    np.testing.assert_array_equal(part[0].points, opened[1].points)
+    np.testing.assert_array_equal(part[0].T_odom_body, opened[1].T_odom_body)
+    assert part[0].index == 0
+    with pytest.raises(RunError, match="goes backwards"):
+        opened[::-1]
+    with pytest.raises(RunError, match="holds no frame"):
+        opened[9:9]
+
+
+def test_runs_and_frames_say_what_they_are_in_one_line(run: Path) -> None:
+    opened = open_run(run)
+    assert repr(opened).startswith(f"Run({str(run)!r}: {len(opened)} frames, ")
+    assert repr(opened).endswith(" m driven)")
+    assert repr(opened[0]).startswith(f"Frame(0: {opened.stamps[0]:.3f} s, ")
+    assert "\n" not in repr(opened[0])

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import logging
-import threading
-import time
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy.typing as npt
 
-from coview_stream.errors import ConfigError, MessageError, TransportError
+from coview_stream.errors import MessageError, TransportError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.messages.json_messages import read_status
 from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.fleet import STALE
+from coview_stream.stream.client.latest_queue import LatestQueue, Received
 from coview_stream.stream.client.sender import Sender, nanoseconds
 from coview_stream.stream.transport.keys import RobotKeys, robot_keys
 from coview_stream.stream.transport.open_client import open_client
 from coview_stream.stream.transport.transport import Transport
 
 _log = logging.getLogger(__name__)
-
-_Item = TypeVar("_Item")
 
 # set by hand
 MAX_UNREAD_POSES = 100  # ten seconds of them
@@ -46,6 +42,9 @@ class RobotClient:
     ...         print(pose.T_map_body)
 
     Sending and reading may happen on different threads. Of unread poses the newest 100 are kept.
+
+    In an event loop ``async with`` and ``async for`` do the same; ``send_cloud`` and ``send_odometry`` never wait, and
+    what does goes to a thread: ``await asyncio.to_thread(robot.wait_for_node, 10)``.
 
     Args:
         robot: its name, as given to ``coview-stream serve --robot``.
@@ -153,17 +152,17 @@ class RobotClient:
         self._check_open()
         self._sender.put_odometry(self._sender.odometry(T_odom_body, nanoseconds(stamp)))
 
-    def poses(self, timeout: float | None = None) -> Iterator[PoseMessage]:
-        """Yield poses as they arrive, oldest unread first.
+    def poses(self, timeout: float | None = None) -> Received[PoseMessage]:
+        """Iterate over poses as they arrive, oldest unread first, by ``for`` or by ``async for``.
 
         Ends when the client is closed, or when no pose came for ``timeout`` seconds (None: waits for ever). Each pose
         is given once, even to several iterators.
         """
-        return _drain(self._poses, timeout)
+        return Received(self._poses, timeout)
 
-    def statuses(self, timeout: float | None = None) -> Iterator[dict[str, Any]]:
-        """Yield the node's statuses as they arrive; ends like :meth:`poses`."""
-        return _drain(self._statuses, timeout)
+    def statuses(self, timeout: float | None = None) -> Received[dict[str, Any]]:
+        """Iterate over the node's statuses as they arrive; as :meth:`poses`."""
+        return Received(self._statuses, timeout)
 
     def wait_for_node(self, seconds: float) -> bool:
         """Wait for a subscriber to this robot's clouds; False if there is none after ``seconds``.
@@ -229,6 +228,22 @@ class RobotClient:
     def __enter__(self) -> RobotClient:
         return self
 
+    async def __aenter__(self) -> RobotClient:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        import asyncio
+
+        await asyncio.to_thread(self.close)
+
+    def __repr__(self) -> str:
+        """Return robot, keys and the state that the node reports, in one line."""
+        status = self._latest_status
+        state = "no status yet" if status is None else f"state {str(status.get('state'))[:20]}"
+        return f"RobotClient({self.robot!r}, sends on {self._sender.cloud_key}, {'closed' if self._closed else state})"
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -271,60 +286,3 @@ class RobotClient:
         self._malformed += 1
         if self._malformed == 1:  # once: a wrong sender is wrong ten times a second
             _log.warning("%s: %s", sample.key, error)
-
-
-def _drain(unread: LatestQueue[_Item], timeout: float | None) -> Iterator[_Item]:
-    while (item := unread.get(timeout)) is not None:
-        yield item
-
-
-class LatestQueue(Generic[_Item]):
-    """Bounded queue in order of arrival; a new item replaces the oldest when it is full.
-
-    ``put`` never blocks, so that a slow reader does not block a subscription.
-
-    Args:
-        size: maximal number of items, at least 1.
-
-    Raises:
-        ConfigError: ``size`` is below 1.
-    """
-
-    def __init__(self, size: int) -> None:
-        if size < 1:
-            raise ConfigError(f"queue size: {size} is out of range; use at least 1")
-        self._items: deque[_Item] = deque(maxlen=size)
-        self._arrived = threading.Condition()
-        self._closed = False
-        self._dropped = 0
-
-    @property
-    def dropped(self) -> int:
-        """Number of items that were replaced unread."""
-        return self._dropped
-
-    def put(self, item: _Item) -> None:
-        """Add an item; after :meth:`close` it is ignored."""
-        with self._arrived:
-            if self._closed:
-                return
-            self._dropped += len(self._items) == self._items.maxlen
-            self._items.append(item)
-            self._arrived.notify()
-
-    def get(self, timeout: float | None = None) -> _Item | None:
-        """Take the oldest item; None if there is none for ``timeout`` seconds (None: for ever) or it is closed."""
-        deadline = None if timeout is None else time.monotonic() + timeout
-        with self._arrived:
-            while not self._items and not self._closed:
-                left = None if deadline is None else deadline - time.monotonic()
-                if left is not None and left <= 0:
-                    return None
-                self._arrived.wait(left)
-            return self._items.popleft() if self._items else None
-
-    def close(self) -> None:
-        """Wake every reader; the items inside can still be taken."""
-        with self._arrived:
-            self._closed = True
-            self._arrived.notify_all()

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from coview_stream.errors import ConfigError
-from coview_stream.stream.client.client import LatestQueue
+from coview_stream.stream.client.latest_queue import LatestQueue
 
 
 def test_latest_queue_keeps_order_and_drops_oldest():

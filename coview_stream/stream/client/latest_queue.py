@@ -1,0 +1,133 @@
+"""What comes from the network and waits to be read: a bounded queue, for threads and for event loops."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Generic, TypeVar
+
+from coview_stream.errors import ConfigError
+
+_Item = TypeVar("_Item")
+
+
+class LatestQueue(Generic[_Item]):
+    """Bounded queue in order of arrival; a new item replaces the oldest when it is full.
+
+    ``put`` never blocks, so that a slow reader does not block a subscription.
+
+    Args:
+        size: maximal number of items, at least 1.
+
+    Raises:
+        ConfigError: ``size`` is below 1.
+    """
+
+    def __init__(self, size: int) -> None:
+        if size < 1:
+            raise ConfigError(f"queue size: {size} is out of range; use at least 1")
+        self._items: deque[_Item] = deque(maxlen=size)
+        self._arrived = threading.Condition()
+        self._waking: set[Callable[[], None]] = set()  # of readers in event loops
+        self._closed = False
+        self._dropped = 0
+
+    @property
+    def dropped(self) -> int:
+        """Number of items that were replaced unread."""
+        return self._dropped
+
+    def put(self, item: _Item) -> None:
+        """Add an item; after :meth:`close` it is ignored."""
+        with self._arrived:
+            if self._closed:
+                return
+            self._dropped += len(self._items) == self._items.maxlen
+            self._items.append(item)
+            self._arrived.notify()
+            self._wake_loops()
+
+    def get(self, timeout: float | None = None) -> _Item | None:
+        """Take the oldest item; None if there is none for ``timeout`` seconds (None: for ever) or it is closed."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with self._arrived:
+            while not self._items and not self._closed:
+                left = None if deadline is None else deadline - time.monotonic()
+                if left is not None and left <= 0:
+                    return None
+                self._arrived.wait(left)
+            return self._items.popleft() if self._items else None
+
+    async def next(self, timeout: float | None = None) -> _Item | None:
+        """Take the oldest item as :meth:`get` does, from an event loop, which goes on meanwhile.
+
+        Cancelled, it takes nothing: the item that comes is the next reader's.
+        """
+        import asyncio
+
+        loop, arrived = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake() -> None:
+            with suppress(RuntimeError):  # the loop has been closed
+                loop.call_soon_threadsafe(arrived.set)
+
+        try:
+            async with asyncio.timeout(timeout):
+                while True:
+                    arrived.clear()
+                    with self._arrived:  # held for moments only
+                        if self._items or self._closed:
+                            return self._items.popleft() if self._items else None
+                        self._waking.add(wake)
+                    await arrived.wait()
+        except TimeoutError:
+            return None
+        finally:
+            with self._arrived:
+                self._waking.discard(wake)
+
+    def close(self) -> None:
+        """Wake every reader; the items inside can still be taken."""
+        with self._arrived:
+            self._closed = True
+            self._arrived.notify_all()
+            self._wake_loops()
+
+    def _wake_loops(self) -> None:
+        for wake in self._waking:
+            wake()
+
+
+class Received(Generic[_Item]):
+    """Items of a queue as they arrive, for ``for`` and for ``async for``.
+
+    Ends when the queue is closed, or when no item came for ``timeout`` seconds (None: never).
+    """
+
+    def __init__(self, unread: LatestQueue[_Item], timeout: float | None) -> None:
+        self._unread = unread
+        self._timeout = timeout
+        self._ended = False
+
+    def __iter__(self) -> Received[_Item]:
+        return self
+
+    def __next__(self) -> _Item:
+        item = None if self._ended else self._unread.get(self._timeout)
+        if item is None:
+            self._ended = True
+            raise StopIteration
+        return item
+
+    def __aiter__(self) -> Received[_Item]:
+        return self
+
+    async def __anext__(self) -> _Item:
+        item = None if self._ended else await self._unread.next(self._timeout)
+        if item is None:
+            self._ended = True
+            raise StopAsyncIteration
+        return item
