@@ -21,7 +21,7 @@ from coview_stream.errors import TransportError
 ROBOT = "demo"
 
 # all set by hand, seconds
-_MAX_START = 30.0  # until the node publishes something; a first run compiles its kernels
+_MAX_START = 60.0  # until the node publishes something and can search; a first run compiles its kernels
 _MAX_SHUTDOWN = 5.0  # for a process after a signal
 _IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
 
@@ -74,6 +74,7 @@ def record_live(
         watcher = start("watch", "--json", "--robot", ROBOT, "--connect", endpoint)
         lines = _lines(watcher)
         _await_first(lines, recording, (node, watcher), logs)
+        _await_engines(endpoint)
         robot = start("replay", str(run_path), "--robot", ROBOT, "--connect", endpoint)
         while robot.poll() is None or not lines.empty():
             with contextlib.suppress(queue.Empty):
@@ -153,6 +154,23 @@ def _await_first(
             if process.poll() is not None:
                 raise _failure(name, logs)
     raise TransportError(f"the node has said nothing for {_MAX_START:g} s; see {logs / 'serve.log'}")
+
+
+def _await_engines(endpoint: str) -> None:
+    """Wait until the node's engines can search: on a busy machine the drive would be over before."""
+    from coview_stream.stream.transport.keys import node_keys
+    from coview_stream.stream.transport.open_client import open_client
+
+    transport = open_client([endpoint], None, None)
+    try:
+        deadline = time.monotonic() + _MAX_START
+        while time.monotonic() < deadline:
+            with contextlib.suppress(TransportError):
+                if transport.query(node_keys("coview", ROBOT).ask_health, timeout=2.0)["ready"]["ok"]:
+                    return
+            time.sleep(0.2)
+    finally:
+        transport.close()
 
 
 def _failure(name: str, logs: Path) -> TransportError:
