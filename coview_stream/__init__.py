@@ -4,66 +4,112 @@
 >>> localizer = Localizer(BaseMap.load("site.coview"))      # doctest: +SKIP
 >>> fix = localizer.step(cloud, T_odom_body, stamp)          # doctest: +SKIP
 
+Maps: :class:`BaseMap`, :class:`MapConfig`, :func:`read_cloud`. Localization: :class:`Localizer`,
+:class:`LocalizerConfig`, :class:`Fix`, :func:`open_run` for recorded runs. A robot of a node: :class:`RobotClient`,
+:class:`PoseMessage`. Errors: :class:`CoViewError` and those below it.
+
 Names are loaded when they are first used: importing the package costs next to nothing.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
 
-from coview_stream.errors import naming_missing_libraries
+from coview_stream.errors import naming_missing_libraries as _naming_missing_libraries
 from coview_stream.version import __version__
 
 if TYPE_CHECKING:
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.summary import MapSummary
+    from coview_stream.clouds.files import read_cloud
     from coview_stream.config import LocalizerConfig, MapConfig
-    from coview_stream.errors import CoViewError
+    from coview_stream.errors import (
+        CloudError,
+        ConfigError,
+        CoViewError,
+        CoViewWarning,
+        DependencyError,
+        InputError,
+        MapError,
+        RunError,
+        TransportError,
+    )
     from coview_stream.geometry.protection import ProtectionLevel
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.result import Fix, KeyframeEvidence
     from coview_stream.localization.state import State
     from coview_stream.localization.tracking.monitor import RejectionReason
+    from coview_stream.messages.types import PoseMessage
+    from coview_stream.recordings.open_run import open_run
+    from coview_stream.recordings.run import Run
     from coview_stream.stream.client.client import RobotClient
 
 __all__ = [
     "BaseMap",
+    "CloudError",
     "CoViewError",
+    "CoViewWarning",
+    "ConfigError",
+    "DependencyError",
     "Fix",
+    "InputError",
     "KeyframeEvidence",
     "Localizer",
     "LocalizerConfig",
     "MapConfig",
+    "MapError",
+    "MapSummary",
+    "PoseMessage",
     "ProtectionLevel",
     "RejectionReason",
     "RobotClient",
+    "Run",
+    "RunError",
     "State",
+    "TransportError",
     "__version__",
+    "open_run",
+    "read_cloud",
 ]
 
 _HOMES = {
     "BaseMap": "basemap.basemap",
+    "CloudError": "errors",
     "CoViewError": "errors",
+    "CoViewWarning": "errors",
+    "ConfigError": "errors",
+    "DependencyError": "errors",
     "Fix": "localization.result",
+    "InputError": "errors",
     "KeyframeEvidence": "localization.result",
     "Localizer": "localization.localizer",
     "LocalizerConfig": "config",
     "MapConfig": "config",
+    "MapError": "errors",
+    "MapSummary": "basemap.summary",
+    "PoseMessage": "messages.types",
     "ProtectionLevel": "geometry.protection",
     "RejectionReason": "localization.tracking.monitor",
     "RobotClient": "stream.client.client",
+    "Run": "recordings.run",
+    "RunError": "errors",
     "State": "localization.state",
+    "TransportError": "errors",
+    "open_run": "recordings.open_run",
+    "read_cloud": "clouds.files",
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> _Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with naming_missing_libraries(name):
-        value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    with _naming_missing_libraries(name):
+        value = getattr(_import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

@@ -32,12 +32,23 @@ def test_import_loads_no_heavy_library(statement):
 
 def test_dunder_all_is_sorted_and_resolvable():
     names = coview_stream.__all__
-    assert sorted(names, key=lambda n: (n.startswith("_"), n)) == list(names)
+    assert sorted(names) == list(names)
     assert len(set(names)) == len(names)
     for name in names:
         assert getattr(coview_stream, name) is not None
     assert set(names) <= set(dir(coview_stream))
     assert {"BaseMap", "Localizer", "LocalizerConfig", "Fix", "RejectionReason", "KeyframeEvidence"} <= set(names)
+
+
+def test_dir_shows_nothing_but_public_names():
+    coview_stream.open_run  # noqa: B018  # what has been used is no different
+    shown = [name for name in dir(coview_stream) if not name.startswith("__")]
+    assert shown == [name for name in coview_stream.__all__ if name != "__version__"]
+
+
+def test_every_public_name_is_documented():
+    for name in set(coview_stream.__all__) - {"__version__"}:
+        assert (getattr(coview_stream, name).__doc__ or "").strip(), name
 
 
 def test_unknown_name_is_an_attribute_error():
