@@ -52,5 +52,6 @@ def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, ax
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
+    axes.locator_params(axis="x", nbins=5)  # numbers of UTM are long
     axes.ticklabel_format(useOffset=False, style="plain")
     return axes

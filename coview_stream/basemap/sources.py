@@ -16,7 +16,7 @@ from coview_stream.clouds.cloud import Cloud, CloudBuilder
 from coview_stream.clouds.cloud_head import CloudHead, read_head
 from coview_stream.clouds.cloud_paths import expand_cloud_paths
 from coview_stream.clouds.files import read_cloud
-from coview_stream.clouds.reference_system import flaw_of_system, unchecked_system
+from coview_stream.clouds.reference_system import flaw_of_name, flaw_of_system, unchecked_system
 from coview_stream.errors import CloudError, ConfigError, MapError, warn
 from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.validation import to_array
@@ -82,10 +82,14 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
 
     Raises:
         MapError: there is none, or a file is named twice. CloudError: an array is no cloud.
-        ConfigError: ``crs`` is no text.
+        ConfigError: ``crs`` is no text, or no system of metres.
     """
     if not isinstance(crs, str | None):
         raise ConfigError(f"crs is {crs!r}; give text such as 'EPSG:28992', or WKT")
+    if crs is not None and (flaw := flaw_of_name(crs)) is not None:
+        raise ConfigError(f"crs {crs[:60]!r} {flaw}")
+    if given is None or isinstance(given, bytes | int | float):
+        raise CloudError(f"sources is a {type(given).__name__}; give cloud files, or an array (N, 3) of metres")
     several = [given] if isinstance(given, str | os.PathLike) or hasattr(given, "__array__") else list(given)
     if not several:
         raise MapError("no source clouds given; name at least one las, laz, ply, pcd, npy or bin file")
@@ -106,9 +110,10 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
 
 
 def _rows(values: Any, name: str) -> Reals:
-    if getattr(values, "ndim", None) != 2 or values.shape[1] < 3:
-        what = f"has shape {np.shape(values)}" if hasattr(values, "__array__") else f"is a {type(values).__name__}"
+    array = np.asarray(values) if hasattr(values, "__array__") else None  # tables of pandas and tensors have it, too
+    if array is None or array.ndim != 2 or array.shape[1] < 3:
+        what = f"is a {type(values).__name__}" if array is None else f"has shape {array.shape}"
         raise CloudError(f"{name} {what}; give a cloud file, or an array (N, 3) of metres")
-    if getattr(values, "dtype", None) == np.float32:
-        return to_array(values[:, :3], np.float32, name)
-    return to_array(values[:, :3], np.float64, name)
+    if array.dtype == np.float32:
+        return to_array(array[:, :3], np.float32, name)
+    return to_array(array[:, :3], np.float64, name)

@@ -60,6 +60,18 @@ def unchecked_system(text: str | None) -> bool:
     return text is not None and text.startswith("EPSG:") and importlib.util.find_spec("pyproj") is None
 
 
+def flaw_of_name(text: str) -> str | None:
+    """Return why a system that a person names is none for coordinates in metres; None if it is, or without pyproj."""
+    if importlib.util.find_spec("pyproj") is None:
+        return None
+    system = _parse(text)
+    if system is None:
+        return "is no reference system; give EPSG:code or WKT"
+    if system.is_geographic:
+        return "is in degrees; give the system of metres that the coordinates are in"
+    return None
+
+
 def same_system(one: str | None, other: str | None) -> bool:
     """Tell whether two systems are the same, or may be: one is not stated, or states no heights."""
     if one is None or other is None or one == other:

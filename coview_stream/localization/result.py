@@ -11,6 +11,7 @@ from coview_stream.geometry.pose_numbers import pose_fields, pose_in_words, posi
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose, yaw_of
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.evidence.words import one_in
 from coview_stream.localization.registration.verification import Evidence
 from coview_stream.localization.state import State
 from coview_stream.localization.tracking.monitor import RejectionReason
@@ -170,5 +171,5 @@ class Fix:
         """Return stamp, state and pose, or why there is none, in one line."""
         head = f"Fix({self.stamp:.3f} s, {self.state}"
         if self.T_map_body is not None:
-            return f"{head}: {pose_in_words(self.T_map_body, self.covariance)}, confidence {self.confidence:.6g})"
+            return f"{head}: {pose_in_words(self.T_map_body, self.covariance)}, wrong: {one_in(1.0 - self.confidence)})"
         return f"{head})" if self.evidence is None else f"{head}: {self.evidence.reason})"

@@ -54,6 +54,8 @@ def test_arrays_and_files_can_be_mixed(cut, from_array, tmp_path):
         (np.zeros(3), r"array has shape \(3,\); give a cloud file, or an array \(N, 3\)"),
         (np.zeros((9, 2)), r"array has shape \(9, 2\)"),
         ([[1.0, 2.0, 3.0]] * 2, r"array 1 is a list; give"),
+        (None, "sources is a NoneType; give cloud files, or an array"),
+        (b"site.laz", "sources is a bytes"),
         (np.full((9, 3), "a"), "array is not an array of numbers"),
         (np.full((9, 3), np.nan), "array: none of the 9 points is usable"),
     ],
@@ -66,10 +68,23 @@ def test_array_that_is_no_cloud_is_refused(given, says):
 def test_system_that_is_not_of_metres_is_refused(cut):
     with pytest.raises(CloudError, match="array: coordinates are in US survey feet"):
         BaseMap.build(cut, crs="EPSG:2277")
+    pytest.importorskip("pyproj", reason="pip install 'coview-stream[build]'")
+    with pytest.raises(ConfigError, match="crs 'nonsense' is no reference system; give EPSG:code or WKT"):
+        BaseMap.build(cut, crs="nonsense")
+    with pytest.raises(ConfigError, match="crs 'EPSG:4326' is in degrees"):
+        BaseMap.build(cut, crs="EPSG:4326")
     with pytest.raises(ConfigError, match="crs is 32632; give text such as"):
         BaseMap.build(cut, crs=32632)
     with pytest.raises(ConfigError, match="config is a dict; give a MapConfig"):
         BaseMap.build(cut, config={"voxel": 0.5})
+
+
+def test_what_can_be_made_an_array_is_one(cut):
+    class Table:
+        def __array__(self, dtype=None, copy=None):
+            return cut[:9]
+
+    np.testing.assert_array_equal(sources_of(Table())[0].rows, cut[:9])
 
 
 def test_coarse_float32_coordinates_are_told(cut):

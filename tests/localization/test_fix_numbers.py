@@ -54,6 +54,7 @@ def test_real_fixes_can_be_written_as_json(world_fixes):
     np.testing.assert_array_equal(data["position"], known.position)
     np.testing.assert_array_equal(np.reshape(data["covariance"], (6, 6)), known.covariance)
     assert repr(known).startswith(f"Fix({known.stamp:.3f} s, TRACKING: x ")
+    assert repr(fix()).endswith("sigma 0.037 m, wrong: 1 in 100,000)")
 
 
 def test_doubted_fix_is_reported_as_ambiguous():
