@@ -29,6 +29,7 @@ FOLDERS = (
     "localization",
     "stream",
     "report",
+    "fusion",
     "viewers",
     "sim",
     "training",

@@ -19,6 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", default="town", help="town, campus, village, industrial or forest (town)")
     parser.add_argument("--sensor", default="vlp16", help="vlp16, os64, os64-2048 or mid360 (vlp16)")
     parser.add_argument("--seed", type=int, default=1, help="equal seeds give equal worlds (1)")
+    parser.add_argument(
+        "--drive-seed", type=int, default=0, help="others give other runs through the same world, for `fuse` (0)"
+    )
     parser.add_argument("--size", type=float, default=240.0, help="side of the map, metres (240)")
     parser.add_argument("--length", type=float, default=80.0, help="distance driven, metres (80)")
     parser.add_argument("--density", type=float, default=20.0, help="airborne pulses per square metre (20)")
@@ -57,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
         scene=args.scene,
         sensor=args.sensor,
         seed=args.seed,
+        drive_seed=args.drive_seed,
         size=args.size,
         length=args.length,
         density=args.density,

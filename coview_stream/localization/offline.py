@@ -7,7 +7,7 @@ import os
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +136,7 @@ class RunResult:
             "T_map_odom": None if last is None or last.T_map_odom is None else last.T_map_odom.tolist(),
             "protection_level": None if last is None or last.protection is None else last.protection.to_json(),
             "calibration": None if self.calibration is None else self.calibration.to_json(self.mount),
+            "mount": None if self.mount is None else asdict(self.mount),  # radians, metres
             "first_fix_stamp": None if self.first is None else self.first.stamp,
             "confidence": None if self.first is None else self.first.confidence,
             "first_fix_m": None if self.driven is None else round(self.driven, 3),

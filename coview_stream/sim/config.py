@@ -13,6 +13,7 @@ from coview_stream.sim.sensors import SENSORS
 
 _RANGES: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
+    "drive_seed": (0, 2**31 - 1),
     "size": (80.0, 2000.0),
     "length": (0.0, 10_000.0),
     "density": (0.5, 200.0),
@@ -39,6 +40,7 @@ class SimulationConfig:
         height: of the sensor above the ground, metres.
         odometry: errors of the odometry.
         dirt: what is imperfect beyond that; nothing by default.
+        drive_seed: of the drive, its scans and its odometry; others give other runs through the same world.
 
     Raises:
         ConfigError: unknown scene or sensor, or a value out of its range.
@@ -56,6 +58,7 @@ class SimulationConfig:
     height: float = 1.5
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     dirt: Dirt = field(default_factory=Dirt)
+    drive_seed: int = 0
 
     def __post_init__(self) -> None:
         for name, known in (("scene", KINDS), ("sensor", SENSORS)):
@@ -70,8 +73,10 @@ class SimulationConfig:
             raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values, for JSON; ``dirt`` is among them only if there is some."""
+        """Return all fields as plain values, for JSON; ``dirt`` and ``drive_seed`` only if there is some."""
         values = asdict(self) | {"dirt": self.dirt.to_dict()}
         if not self.dirt.kinds:
             del values["dirt"]
+        if not self.drive_seed:
+            del values["drive_seed"]
         return values

@@ -172,7 +172,8 @@ def _dirt_stream(config: SimulationConfig, purpose: Stream) -> np.random.Generat
 
 
 def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:
-    return np.random.default_rng([config.seed, purpose])
+    apart = [config.drive_seed] if config.drive_seed and purpose != _AIRBORNE else []
+    return np.random.default_rng([config.seed, purpose, *apart])
 
 
 @contextmanager

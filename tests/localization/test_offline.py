@@ -92,6 +92,11 @@ def test_calibration_is_written_and_summarized_as_the_mount_that_it_adds_to(worl
     assert RunResult(1, []).to_json(world_map)["calibration"] is None
 
 
+def test_mount_is_written(world_map):
+    assert RunResult(1, [], mount=Mount(yaw=0.5, x=1.0)).to_json(world_map)["mount"]["yaw"] == 0.5
+    assert RunResult(1, []).to_json(world_map)["mount"] is None
+
+
 def test_damaged_frames_are_skipped_and_listed(world_map, world_run, world_drive, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(world_run, run)

@@ -129,3 +129,15 @@ def test_bad_simulate_options_are_one_line_and_write_nothing(options, tmp_path, 
     assert err.startswith("coview-stream: error: ")
     assert err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_another_drive_seed_is_another_run_through_the_same_world():
+    from coview_stream.sim.simulate import scene_of, trajectories
+
+    first, other = SimulationConfig(seed=3), SimulationConfig(seed=3, drive_seed=1)
+    scenes = [scene_of(config) for config in (first, other)]
+    assert np.array_equal(scenes[0].now.solid.vertices, scenes[1].now.solid.vertices)
+    one, two = (trajectories(scene, config)[1] for scene, config in zip(scenes, (first, other), strict=True))
+    assert len(one) != len(two) or not np.allclose(one, two)
+    assert "drive_seed" not in first.to_dict()
+    assert other.to_dict()["drive_seed"] == 1

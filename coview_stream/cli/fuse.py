@@ -1,0 +1,88 @@
+"""``coview-stream fuse``: merge localized runs with the base map."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from coview_stream.cli.options import add_gravity, add_mount, add_topics, add_verify_key, check_picture, lidar_config
+
+HELP = "merge localized runs with the base map: one cloud, tagged by source, and what has changed"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments; ranges are checked by FuseConfig."""
+    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    parser.add_argument("pairs", nargs="+", metavar="RUN:OUT", help="a run, and what `locate` wrote for it on this map")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FUSED.laz", help="las, laz, ply, pcd, npy")
+    parser.add_argument("--voxel", type=float, metavar="M", help="metres from point to point, at least (the map's)")
+    parser.add_argument("--min-range", type=float, default=1.5, metavar="M", help="nearer is the robot itself (1.5)")
+    parser.add_argument("--max-range", type=float, default=50.0, metavar="M", help="farther is left out (50)")
+    parser.add_argument("--keep-moving", action="store_true", help="keep people and cars that drove")
+    parser.add_argument("--changes", action="store_true", help="tag what is new and what is gone")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it from above")
+    parser.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as `locate` was given (auto)")
+    add_gravity(parser)
+    add_mount(parser)
+    add_topics(parser)
+    add_verify_key(parser)
+    parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the cloud, the names of its sources and the picture; print what was added."""
+    from tqdm import tqdm
+
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.config.mount import Mount, parse_mount
+    from coview_stream.errors import require_library
+    from coview_stream.fusion.fuse import FuseConfig, check_count, fuse
+    from coview_stream.fusion.fused_file import check_name, write_fused
+    from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
+    from coview_stream.fusion.summary import summary
+    from coview_stream.recordings.open_run import open_run
+    from coview_stream.recordings.run import Run
+
+    pairs = [parse_pair(text) for text in args.pairs]
+    check_count(len(pairs))
+    check_name(args.output, [args.map, *(path for pair in pairs for path in (pair.run, pair.trajectory, pair.result))])
+    check_picture("--picture", args.picture)
+    if args.picture is not None:
+        require_library("matplotlib", "matplotlib>=3.8", "--picture")
+    given = None if args.mount is None else parse_mount(args.mount)
+    lidar_options = lidar_config(args.odometry, args.gravity)
+    base_map = BaseMap.load(args.map, verify_key=args.verify_key)
+    config = FuseConfig(
+        voxel=base_map.config.voxel if args.voxel is None else args.voxel,
+        range_min=args.min_range, range_max=args.max_range, keep_moving=args.keep_moving, changes=args.changes,
+    )  # fmt: skip
+
+    def open_it(path: Path, mount: Mount | None) -> Run:
+        lidar = None
+        if lidar_options is not None:
+            from coview_stream.odometry.lidar_odometry import LidarOdometry
+
+            lidar = LidarOdometry(lidar_options)
+        return open_run(path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, None, given or mount)
+
+    runs = [LocalizedRun(pair, base_map, open_it) for pair in pairs]
+    for note in (note for each in runs for note in each.notes):
+        print(note, file=sys.stderr)
+    with tqdm(unit="frame", disable=not (args.progress or sys.stderr.isatty()), leave=False) as bar:
+
+        def follow(what: str, done: int, total: int) -> None:
+            if done == 1 and not bar.disable:
+                bar.reset(total)
+                bar.set_description(what)
+            bar.update(done - bar.n)
+
+        fused = fuse(base_map, runs, config, follow)
+    write_fused(fused, args.output, [str(pair.run) for pair in pairs])
+    if args.picture is not None:
+        from coview_stream.fusion.picture import draw_fused
+
+        draw_fused(fused, args.picture, f"{args.map.stem} and {len(runs)} run{'s' * (len(runs) != 1)}")
+    print(summary(fused, [str(pair.run) for pair in pairs], args.changes))
+    print(f"{args.output}: {len(fused):,} points; sources are named in {args.output.name}.json")
+    return 0

@@ -1,0 +1,1 @@
+"""Fusion of localized runs with the base map: one cloud, tagged by source, and what has changed."""

@@ -1,0 +1,230 @@
+"""Fusing: runs on a base map to one cloud, each point with its source, and what has changed if that is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+import coview_kernels as kernels
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config.checks import check_types, require
+from coview_stream.errors import CloudError, ConfigError
+from coview_stream.fusion.localized_run import LocalizedRun
+from coview_stream.fusion.nearest_points import distances, within
+from coview_stream.fusion.records import GONE, NEW, SAME, records
+from coview_stream.fusion.sightings import REACH, Counts, Sightings, looks_at
+from coview_stream.fusion.survey_cover import SurveyCover
+from coview_stream.fusion.voxel_table import VoxelTable
+from coview_stream.geometry.arrays import Bools, Floats32, Ints
+from coview_stream.geometry.transforms import Points
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is done, frames done, frames)."""
+
+_CHUNK = 500_000
+_LOOKS = 3  # that see through a point before it counts as not there; set by hand, as are the following
+_THROUGH_MOVING, _THROUGH_GONE = 2, 4  # times as many as see something there
+_NEAR = 0.5  # metres: a point of the map this near is the same thing, and a blind spot is farther from all of them
+_ABOVE = 0.4  # metres over all that the survey saw around
+
+
+@dataclass(frozen=True)
+class FuseConfig:
+    """What of the runs is taken.
+
+    Attributes:
+        voxel: metres; one point of all runs is kept in each cube of this size, and none this near to the map's.
+        range_min: metres from the lidar; what is nearer may be the robot itself.
+        range_max: metres from the lidar; what is farther lies where the pose's angles put it.
+        keep_moving: keep what rays of the runs went through later or before: people, cars that drove.
+        changes: tell what is new and what is gone.
+
+    Raises:
+        ConfigError: a value out of its range.
+    """
+
+    voxel: float = 0.25
+    range_min: float = 1.5
+    range_max: float = 50.0
+    keep_moving: bool = False
+    changes: bool = False
+
+    def __post_init__(self) -> None:
+        check_types(self)
+        require(0.02 <= self.voxel <= 5.0, self, "voxel", "0.02 to 5 m")
+        require(0.0 <= self.range_min < self.range_max, self, "range_min", "at least 0, and less than range_max")
+
+
+@dataclass(frozen=True)
+class Added:
+    """What one run added.
+
+    Attributes:
+        frames: that were taken.
+        without_pose: frames that have no pose.
+        damaged: frames that could not be read.
+        points: of the run in the fused cloud; a voxel that several runs saw counts for the first of them.
+    """
+
+    frames: int
+    without_pose: int
+    damaged: int
+    points: int
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """The fused cloud, whose base map stays in its file until it is asked for.
+
+    Attributes:
+        base_map: the map.
+        base_change: (B,) uint8 tags of the map's points: same, or gone.
+        points: (N, 3) float32 of the runs, relative to the map's origin.
+        source: (N,) uint16 number of the run, from 1.
+        change: (N,) uint8 tag: same, or new.
+        stamp: (N,) float64 of the newest frame that saw it, seconds.
+        added: by run.
+        filled: square metres of surface, about, that lie in blind spots of the survey.
+        moving: voxels left out since rays went through them.
+    """
+
+    base_map: BaseMap
+    base_change: npt.NDArray[np.uint8]
+    points: Points
+    source: npt.NDArray[np.uint16]
+    change: npt.NDArray[np.uint8]
+    stamp: npt.NDArray[np.float64]
+    added: tuple[Added, ...]
+    filled: float
+    moving: int
+
+    def __len__(self) -> int:
+        """Return the number of points, the map's included."""
+        return len(self.base_map.points) + len(self.points)
+
+    def chunks(self) -> Iterator[npt.NDArray[np.void]]:
+        """Yield the points as records, in the coordinates of the map's sources; the map's come first."""
+        origin = self.base_map.origin
+        for begin in range(0, len(self.base_map.points), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            points = np.asarray(self.base_map.points[part], dtype=np.float64)
+            yield records(points + origin, 0, self.base_change[part], 0.0)
+        for begin in range(0, len(self.points), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            points = self.points[part].astype(np.float64) + origin
+            yield records(points, self.source[part], self.change[part], self.stamp[part])
+
+
+def fuse(
+    base_map: BaseMap, runs: Sequence[LocalizedRun], config: FuseConfig | None = None, progress: Progress | None = None
+) -> Fused:
+    """Merge localized runs with the map they were localized on.
+
+    The frames are read twice: once for their surfaces, once, a few of them, for what their rays went through.
+    What is held in memory is one row for each voxel that the runs hit, not their points.
+
+    Raises:
+        InputError: a frame lies beyond what a map can hold.
+        CloudError: not one point of the runs is in range.
+    """
+    config = config or FuseConfig(voxel=base_map.config.voxel)
+    table, taken = _surfaces(runs, config, progress)
+    if not len(table):
+        raise CloudError(f"no run has a point from {config.range_min:g} to {config.range_max:g} m from its lidar")
+    points, rows = table.points(), table.rows()
+    base = _base_near(base_map, points) if config.changes else np.zeros(0, dtype=np.int64)
+    base_points = np.asarray(base_map.points[base])
+    sightings = Sightings(np.concatenate([points, base_points]), max(0.3, 1.2 * config.voxel))
+    _look(runs, sightings, progress)
+    through, seen = sightings.given(sightings.through), sightings.given(sightings.seen)
+    n = len(points)
+    moving = _seen_through(through[:n], seen[:n], _THROUGH_MOVING)
+    to_map = distances(points, lambda centre, radius: base_map.crop(centre, radius)[0], max(_NEAR, config.voxel))
+    cover = SurveyCover(base_map, points[:, :2].min(axis=0), points[:, :2].max(axis=0))
+    base_change = np.full(len(base_map.points), SAME, dtype=np.uint8)
+    new = np.zeros(n, dtype=bool)
+    if config.changes:
+        enough = rows["hits"] >= min(2, sum(taken))
+        new = ~moving & enough & (to_map > _NEAR) & cover.saw(points, _ABOVE)
+        base_change[base[_gone(base_points, through[n:], seen[n:], points[~moving])]] = GONE
+    keep = (to_map > config.voxel) & (~moving | config.keep_moving)
+    blind = keep & ~new & (to_map > _NEAR) & np.isfinite(cover.top_around(points))
+    source = rows["source"][keep]
+    added = tuple(
+        Added(frames, run.without_pose, len(run.damaged), int((source == k).sum()))
+        for k, (run, frames) in enumerate(zip(runs, taken, strict=True), start=1)
+    )
+    return Fused(
+        base_map, base_change, points[keep], source, np.where(new, NEW, SAME)[keep].astype(np.uint8),
+        rows["stamp"][keep], added, float(blind.sum()) * config.voxel**2, int((moving & (to_map > config.voxel)).sum()),
+    )  # fmt: skip
+
+
+def _surfaces(
+    runs: Sequence[LocalizedRun], config: FuseConfig, progress: Progress | None
+) -> tuple[VoxelTable, list[int]]:
+    """Collect the voxels of all runs, and count the frames that were taken of each."""
+    table, taken = VoxelTable(config.voxel), []
+    for source, run in enumerate(runs, start=1):
+        thin = kernels.VoxelFilter(config.voxel)
+        count = 0
+        for done, frame in enumerate(run.frames(), start=1):
+            if frame is not None:
+                far = np.linalg.norm(frame.points - frame.eye.astype(np.float32), axis=1)
+                near = frame.points[(far >= config.range_min) & (far < config.range_max)]
+                table.add(thin(near, frame.T_map_body)[0], frame.stamp, source)
+                count += 1
+            if progress:
+                progress(f"run {source}", done, len(run))
+        taken.append(count)
+    return table, taken
+
+
+def _look(runs: Sequence[LocalizedRun], sightings: Sightings, progress: Progress | None) -> None:
+    for source, run in enumerate(runs, start=1):
+        chosen = looks_at(run.stamps, run.poses[:, :3, 3])
+        for done, frame in enumerate(run.frames(lambda k, chosen=chosen: bool(chosen[k])), start=1):  # type: ignore[misc]
+            if frame is not None:
+                sightings.look(frame)
+            if progress:
+                progress(f"rays of run {source}", done, len(run))
+
+
+def _seen_through(through: Counts, seen: Counts, times: int) -> Bools:
+    return np.asarray((through >= _LOOKS) & (through > times * seen.astype(np.int64)))
+
+
+def _gone(points: Points, through: Counts, seen: Counts, now: Points) -> Bools:
+    """Tell of the map's points (B, 3) which are gone: seen through, with nothing that stays around them now."""
+    gone = _seen_through(through, seen, _THROUGH_GONE)
+    far: Floats32 = distances(points[gone], within(now), _NEAR)
+    gone[gone] = ~np.isfinite(far)
+    return gone
+
+
+def _base_near(base_map: BaseMap, points: Points) -> Ints:
+    """Return the indices of the map's points near enough to the runs' that a ray may tell something of them."""
+    tile = 2.0 * REACH
+    low = np.floor(points[:, :2].min(axis=0).astype(np.float64) / tile) - 1
+    shape = (np.floor(points[:, :2].max(axis=0) / tile) + 2 - low).astype(int)
+    grid = np.zeros(tuple(shape), dtype=bool)
+    grid[tuple((np.floor(points[:, :2].astype(np.float64) / tile) - low).astype(int).T)] = True
+    found = []
+    for begin in range(0, len(base_map.points), _CHUNK):
+        cells = (np.floor(base_map.points[begin : begin + _CHUNK, :2] / tile) - low).astype(int)
+        inside = np.flatnonzero(((cells >= 0) & (cells < shape)).all(axis=1))
+        found.append(begin + inside[grid[tuple(cells[inside].T)]])
+    return np.concatenate(found)
+
+
+def check_count(runs: int) -> None:
+    """Refuse more runs than a point's source can name.
+
+    Raises:
+        ConfigError: there are more than 65,535.
+    """
+    if runs > np.iinfo(np.uint16).max:
+        raise ConfigError(f"{runs} runs: at most 65,535 can be told apart; fuse some of them first")

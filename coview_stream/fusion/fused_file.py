@@ -1,0 +1,134 @@
+"""Files of fused clouds: las and laz, ply, pcd and npy, written in chunks, and a JSON file that names the sources."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.clouds.atomic_file import atomic_file
+from coview_stream.clouds.las import require_laspy
+from coview_stream.errors import CloudError, DependencyError, require_library, warn
+from coview_stream.fusion.fuse import Fused
+from coview_stream.fusion.records import RECORD
+
+SUFFIXES = (".laz", ".las", ".ply", ".pcd", ".npy")
+_SCALE = 0.001  # metres
+_PLY_TYPES = {"f8": "double", "u2": "ushort", "u1": "uchar"}
+_PCD_TYPES = {"f8": "8 F", "u2": "2 U", "u1": "1 U"}
+
+
+def check_name(path: Path, inputs: Iterable[Path]) -> None:
+    """Refuse a name that no cloud can have, or that of a file that is read; and LAS where laspy is missing.
+
+    Raises:
+        CloudError: it is one. DependencyError: laspy is missing.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise CloudError(f"{path}: name a cloud, one of {', '.join(SUFFIXES)}")
+    if path.is_dir() or not path.resolve().parent.is_dir():
+        raise CloudError(f"{path}: is a directory, or in none; name a file in a directory that is there")
+    for other in inputs:
+        if path.resolve() == other.resolve() or (other.is_dir() and other.resolve() in path.resolve().parents):
+            raise CloudError(f"{path}: is, or lies in, {other}, which is read; name another file")
+    if path.suffix.lower() in (".las", ".laz"):
+        require_laspy()
+
+
+def write_fused(fused: Fused, path: Path, names: Sequence[str]) -> None:
+    """Write the cloud, and ``PATH.json`` beside it with the name of each source.
+
+    LAS and LAZ hold millimetres, the source as ``point_source_id``, the stamp as ``gps_time`` and ``change`` as a
+    dimension of its own; PLY and PCD have properties ``source``, ``change`` and ``stamp``, and NPY columns x, y, z,
+    stamp, source, change, all float64.
+
+    Raises:
+        CloudError: the file cannot be written.
+    """
+    write = _las if path.suffix.lower() in (".las", ".laz") else _plain
+    try:
+        with atomic_file(path) as stream:
+            write(stream, fused, path)
+        with atomic_file(path.with_name(f"{path.name}.json")) as stream:
+            stream.write((json.dumps(_sidecar(fused, names), indent=1) + "\n").encode())
+    except OSError as error:
+        reason = error.strerror or error
+        raise CloudError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
+
+
+def _sidecar(fused: Fused, names: Sequence[str]) -> dict[str, Any]:
+    base = fused.base_map
+    first = {"source": 0, "name": str(base.path or "base map"), "points": len(base.points), "files": base.sources}
+    runs = [
+        {"source": k, "name": name, **vars(added)}
+        for k, (name, added) in enumerate(zip(names, fused.added, strict=True), start=1)
+    ]
+    return {
+        "sources": [first, *runs], "change": {"0": "same", "1": "new", "2": "gone"}, "map_sha256": base.sha256,
+        "crs": base.crs, "filled_m2": round(fused.filled, 1), "moving_voxels_left_out": fused.moving,
+    }  # fmt: skip
+
+
+def _las(stream: BinaryIO, fused: Fused, path: Path) -> None:
+    laspy = require_laspy()
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, _SCALE)
+    header.offsets = np.floor(fused.base_map.origin)
+    header.add_extra_dim(laspy.ExtraBytesParams(name="change", type=np.uint8, description="0 same, 1 new, 2 gone"))
+    wkt = _wkt(fused.base_map.crs)
+    if wkt is not None:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+        header.global_encoding.wkt = True
+    with laspy.open(
+        stream, mode="w", header=header, do_compress=path.suffix.lower() == ".laz", closefd=False
+    ) as writer:
+        for rows in fused.chunks():
+            record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+            record.x, record.y, record.z = rows["x"], rows["y"], rows["z"]
+            record.point_source_id, record.gps_time, record.change = rows["source"], rows["stamp"], rows["change"]
+            record.return_number, record.number_of_returns = np.ones((2, len(rows)), dtype=np.uint8)
+            record.classification = np.ones(len(rows), dtype=np.uint8)  # unclassified
+            writer.write_points(record)
+
+
+def _wkt(crs: str | None) -> str | None:
+    """Return a reference system as WKT; None, with a warning, where it is only a code that cannot be looked up."""
+    if crs is None or not crs.startswith("EPSG:"):
+        return crs
+    try:
+        systems = require_library("pyproj", "pyproj>=3.6", "reference systems")
+        return str(systems.CRS.from_user_input(crs).to_wkt("WKT1_GDAL"))
+    except DependencyError:
+        warn(f"the cloud does not state its reference system, {crs}, for want of pyproj; pip install 'pyproj>=3.6'")
+    except Exception as error:  # pyproj raises many
+        warn(f"the cloud does not state its reference system, {crs} ({error})")
+    return None
+
+
+def _plain(stream: BinaryIO, fused: Fused, path: Path) -> None:
+    kind = path.suffix.lower()
+    count, names = len(fused), RECORD.names or ()
+    kinds = [RECORD[name].str.lstrip("<|") for name in names]
+    if kind == ".npy":
+        header = {"descr": "<f8", "fortran_order": False, "shape": (count, len(names))}
+        np.lib.format.write_array_header_1_0(stream, header)
+    elif kind == ".ply":
+        lines = "".join(f"property {_PLY_TYPES[k]} {name}\n" for k, name in zip(kinds, names, strict=True))
+        stream.write(f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{lines}end_header\n".encode())
+    else:
+        sizes, types = zip(*(_PCD_TYPES[k].split() for k in kinds), strict=True)
+        stream.write(
+            f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(sizes)}\nTYPE {' '.join(types)}\n"
+            f"COUNT {' '.join('1' * len(names))}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+            f"POINTS {count}\nDATA binary\n".encode()
+        )
+    for rows in fused.chunks():
+        stream.write((_columns(rows) if kind == ".npy" else rows).tobytes())
+
+
+def _columns(rows: npt.NDArray[np.void]) -> npt.NDArray[np.float64]:
+    return np.stack([rows[name].astype("<f8") for name in RECORD.names or ()], axis=1)

@@ -1,0 +1,202 @@
+"""Localized runs: a recorded run, and what ``locate`` wrote for it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.trajectory import read_tum
+from coview_stream.config.mount import Mount
+from coview_stream.errors import CloudError, InputError, warn
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, transform
+from coview_stream.recordings.run import Run, SweepCorrection
+
+_SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, frames are milliseconds apart at least
+_MAX_RESULT = 1 << 28  # bytes of a result.json
+
+
+@dataclass(frozen=True)
+class RunPair:
+    """A recorded run and the results of ``locate`` for it.
+
+    Attributes:
+        run: path of the run.
+        out: directory that ``locate`` wrote, or a trajectory (TUM, map <- body).
+    """
+
+    run: Path
+    out: Path
+
+    @property
+    def trajectory(self) -> Path:
+        """The trajectory's file."""
+        return self.out / "trajectory.tum" if self.out.is_dir() else self.out
+
+    @property
+    def result(self) -> Path:
+        """The ``result.json`` beside the trajectory, which need not be there."""
+        return self.trajectory.with_name("result.json")
+
+
+def parse_pair(text: str) -> RunPair:
+    """Read ``RUN:OUT``; paths may have colons as long as both are there for one way to part them only.
+
+    Raises:
+        InputError: no part before a colon is there together with the part after it, or there are several ways.
+    """
+    ways = [k for k, letter in enumerate(text) if letter == ":" and 0 < k < len(text) - 1]
+    if not ways:
+        raise InputError(f"{text}: write RUN:OUT, the run and what `coview-stream locate RUN -o OUT` wrote for it")
+    pairs = [RunPair(Path(text[:k]), Path(text[k + 1 :])) for k in ways]
+    there = [pair for pair in pairs if pair.run.exists() and pair.out.exists()]
+    if len(there) > 1:
+        raise InputError(f"{text}: can be parted in {len(there)} ways, and each names files; rename one of them")
+    if not there:
+        pair = next((pair for pair in pairs if pair.run.exists()), pairs[0])
+        absent = pair.out if pair.run.exists() else pair.run
+        raise InputError(f"{text}: there is no {absent}; write RUN:OUT, the run and what `locate` wrote for it")
+    return there[0]
+
+
+@dataclass(frozen=True)
+class PosedFrame:
+    """One frame of a run on the map.
+
+    Attributes:
+        stamp: seconds.
+        points: (N, 3) float32 in the body frame, levelled, metres, relative to ``origin``.
+        T_map_body: (4, 4), relative to the map's origin.
+        eye: (3,) of the lidar in the body frame, levelled.
+    """
+
+    stamp: float
+    points: Points
+    T_map_body: Pose
+    eye: Floats
+
+
+class LocalizedRun:
+    """Run with poses on the map; frames are read when they are asked for.
+
+    Attributes:
+        pair: where it is.
+        stamps: (K,) of the frames that have a pose, seconds.
+        poses: (K, 4, 4) theirs, map <- body, in the coordinates of the map's sources.
+        without_pose: frames of the run that have none.
+        damaged: frames that could not be read so far, by index.
+    """
+
+    def __init__(self, pair: RunPair, base_map: BaseMap, open_it: Callable[[Path, Mount | None], Run]) -> None:
+        """Read the results, then open the run with ``open_it`` (its path, the mount that ``locate`` had been given).
+
+        Raises:
+            InputError: the results are of another map, no frame has a pose, or files cannot be read.
+        """
+        self.pair = pair
+        if not pair.trajectory.is_file():
+            raise InputError(f"{pair.out}: holds no trajectory.tum; name what `coview-stream locate` wrote")
+        stamps, poses = read_tum(pair.trajectory)
+        told = _read_result(pair.result)
+        _check_map(pair, told, base_map)
+        calibration = _part(told, "calibration")
+        self._R_level = exp_so3(np.radians([_number(calibration, "roll_deg"), _number(calibration, "pitch_deg"), 0.0]))
+        scale = _number(calibration, "odometry_scale", 1.0) - 1.0
+        self._correction = SweepCorrection(self._R_level, scale)
+        self._run = open_it(pair.run, _mount(told))
+        self._origin = base_map.origin
+        self.damaged: set[int] = set()
+        self._index, at = _matched(self._run.stamps, stamps)
+        self.stamps, self.poses = self._run.stamps[self._index], poses[at]
+        self.without_pose = len(self._run) - len(self._index)
+        if not len(self._index):
+            why = f"none at a stamp of {pair.run}" if len(stamps) else "none at all: the run was not localised"
+            raise InputError(f"{pair.trajectory}: holds poses: {why}; leave it out, or name the right run")
+
+    def __len__(self) -> int:
+        """Return the number of frames that have a pose."""
+        return len(self._index)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks of the run's reader, a line each."""
+        return self._run.notes
+
+    def frames(self, every: Callable[[int], bool] | None = None) -> Iterator[PosedFrame | None]:
+        """Yield the frames with a pose, in order; None for those left out by ``every`` (by index) or damaged."""
+        lever = np.zeros(3) if self._run.mount is None else self._run.mount.T_body_sensor[:3, 3]
+        for k, index in enumerate(self._index):
+            if every is not None and not every(k):
+                yield None
+                continue
+            try:
+                frame = self._run.read(int(index), self._correction)
+            except CloudError:
+                self.damaged.add(int(index))
+                yield None
+                continue
+            finite = frame.points[np.isfinite(frame.points).all(axis=1)]
+            points = transform(pose_from(self._R_level, np.zeros(3)), finite)
+            # a single scan may be stored far from its zero: the pose is that of the file's own coordinates
+            T = self.poses[k] @ pose_from(np.eye(3), frame.origin)
+            T[:3, 3] -= self._origin
+            yield PosedFrame(float(self.stamps[k]), points, T, self._R_level @ lever)
+
+
+def _matched(frames: Floats, stamps: Floats) -> tuple[Any, Any]:
+    """Return indices of frames and of poses with the same stamp."""
+    if not len(stamps):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    after = np.clip(np.searchsorted(stamps, frames), 1, max(len(stamps) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(stamps) - 1)
+    nearest = np.where(np.abs(stamps[before] - frames) <= np.abs(stamps[after] - frames), before, after)
+    same = np.abs(stamps[nearest] - frames) <= _SAME_STAMP
+    return np.flatnonzero(same), nearest[same]
+
+
+def _read_result(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        if path.stat().st_size > _MAX_RESULT:
+            raise ValueError("too large")
+        told = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as what `locate` writes ({error}); run it again") from error
+    if not isinstance(told, dict):
+        raise InputError(f"{path}: is no result of `locate`; run it again")
+    return told
+
+
+def _check_map(pair: RunPair, told: dict[str, Any], base_map: BaseMap) -> None:
+    sha = told.get("map_sha256")
+    if not isinstance(sha, str) or not sha:
+        warn(f"{pair.out}: does not say which map it was localised on; taken for the one given")
+    elif base_map.sha256 and sha != base_map.sha256:
+        raise InputError(
+            f"{pair.result}: localised on another map ({sha[:8]}, not {base_map.sha256[:8]}); "
+            f"run `coview-stream locate` with this one"
+        )
+
+
+def _part(told: dict[str, Any], name: str) -> dict[str, Any]:
+    value = told.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _number(told: dict[str, Any], name: str, otherwise: float = 0.0) -> float:
+    value = told.get(name, otherwise)
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else otherwise
+
+
+def _mount(told: dict[str, Any]) -> Mount | None:
+    value = _part(told, "mount")
+    return Mount(**{name: _number(value, name) for name in ("roll", "pitch", "yaw", "x", "y", "z")}) if value else None

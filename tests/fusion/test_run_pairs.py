@@ -1,0 +1,96 @@
+"""Runs and their results: how they are named, and which are refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coview_stream.clouds.trajectory import write_tum
+from coview_stream.errors import InputError
+from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
+from coview_stream.recordings.open_run import open_run
+
+
+def opened(path, mount):
+    return open_run(path, mount=mount)
+
+
+def test_paths_with_colons_are_parted_where_both_are_there(tmp_path):
+    run, out = tmp_path / "a:b", tmp_path / "c:d"
+    run.mkdir(), out.mkdir()
+    pair = parse_pair(f"{run}:{out}")
+    assert (pair.run, pair.out) == (run, out)
+    assert pair.trajectory == out / "trajectory.tum"
+
+
+def test_what_is_not_there_is_named(tmp_path):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(InputError, match=r"there is no .*nowhere"):
+        parse_pair(f"{tmp_path / 'run'}:{tmp_path / 'nowhere'}")
+    with pytest.raises(InputError, match="RUN:OUT"):
+        parse_pair("run")
+
+
+def test_two_ways_to_part_are_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b:c", "a:b", "c"):
+        (tmp_path / name).mkdir()
+    with pytest.raises(InputError, match="2 ways"):
+        parse_pair("a:b:c")
+
+
+@pytest.fixture
+def results(world_run, world_drive, world_map, tmp_path):
+    """Results of all frames but the first two."""
+    stamps = [float(line.split()[0]) for line in (world_run / "odometry.tum").read_text().splitlines()]
+    write_tum(tmp_path / "trajectory.tum", stamps[2:], world_drive.T_map_body[2 : len(stamps)])
+    return tmp_path
+
+
+def test_frames_without_a_pose_are_counted(world_run, world_map, results):
+    with pytest.warns(UserWarning, match="which map"):
+        run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
+    assert (len(run), run.without_pose) == (5, 2)
+    assert all(frame is not None for frame in run.frames())
+    assert [frame is not None for frame in run.frames(lambda k: k == 1)] == [False, True, False, False, False]
+
+
+def test_a_trajectory_alone_will_do(world_run, world_map, results):
+    with pytest.warns(UserWarning, match="which map"):
+        run = LocalizedRun(parse_pair(f"{world_run}:{results / 'trajectory.tum'}"), world_map, opened)
+    assert len(run) == 5
+
+
+def test_results_of_another_map_are_refused(world_run, world_file, results):
+    from coview_stream.basemap.basemap import BaseMap
+
+    (results / "result.json").write_text(json.dumps({"map_sha256": "0" * 64}))
+    with pytest.raises(InputError, match="another map"):
+        LocalizedRun(parse_pair(f"{world_run}:{results}"), BaseMap.load(world_file), opened)
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "[" * 100_000])
+def test_damaged_results_are_refused(world_run, world_map, results, text):
+    (results / "result.json").write_text(text)
+    with pytest.raises(InputError, match=r"result\.json"):
+        LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
+
+
+def test_a_run_that_was_not_localised_is_refused(world_run, world_map, tmp_path):
+    write_tum(tmp_path / "trajectory.tum", [], [])
+    with pytest.warns(UserWarning, match="which map"), pytest.raises(InputError, match="not localised"):
+        LocalizedRun(parse_pair(f"{world_run}:{tmp_path}"), world_map, opened)
+
+
+def test_mount_and_lean_of_the_results_are_applied(world_run, world_drive, world_map, results):
+    told = {"map_sha256": "", "mount": {"yaw": float(np.radians(90.0)), "z": 1.0}, "calibration": {"roll_deg": 180.0}}
+    (results / "result.json").write_text(json.dumps(told))
+    with pytest.warns(UserWarning, match="which map"):
+        run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
+    frame = next(frame for frame in run.frames() if frame is not None)
+    raw = world_drive.clouds[2]
+    expected = np.column_stack([-raw[:, 1], -raw[:, 0], -(raw[:, 2] + 1.0)])
+    assert np.allclose(frame.points, expected, atol=1e-4)
+    assert np.allclose(frame.eye, [0.0, 0.0, -1.0], atol=1e-9)

@@ -1,0 +1,39 @@
+"""Sightings: rays that end at points, and rays that go through them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coview_stream.fusion.localized_run import PosedFrame
+from coview_stream.fusion.sightings import Sightings, looks_at
+from coview_stream.geometry.transforms import pose_from, rot_z
+
+T = pose_from(rot_z(0.7), [30.0, -20.0, 2.0])
+EYE = np.array([0.0, 0.0, 0.5])
+
+
+def wall(x: float) -> np.ndarray:
+    y, z = np.meshgrid(np.arange(-4, 4, 0.03), np.arange(-1.5, 3, 0.03))
+    return np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()]).astype(np.float32)
+
+
+def test_points_before_at_behind_and_beside_a_wall():
+    frame = PosedFrame(0.0, wall(10.0), T, EYE)
+    body = np.array([[5.0, 0.0, 0.6], [10.1, 1.0, 0.5], [15.0, 0.0, 0.6], [-5.0, 0.0, 0.6], [9.9, -1.0, 0.5]])
+    points = (body @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    sightings = Sightings(points, 0.3)
+    for _ in range(2):
+        sightings.look(frame)
+    assert sightings.given(sightings.through).tolist() == [2, 0, 0, 0, 0]
+    assert sightings.given(sightings.seen).tolist() == [0, 2, 0, 0, 2]
+
+
+def test_no_points_and_no_rays():
+    sightings = Sightings(np.zeros((0, 3), np.float32), 0.3)
+    sightings.look(PosedFrame(0.0, np.zeros((0, 3), np.float32), T, EYE))
+    assert len(sightings.through) == 0
+
+
+def test_looks_are_apart_in_space_or_time():
+    positions = np.column_stack([np.r_[0.0, 0.2, 0.4, 0.6, 0.6, 0.6], np.zeros(6), np.zeros(6)])
+    assert looks_at(np.r_[0.0, 0.1, 0.2, 0.3, 0.9, 1.4], positions).tolist() == [True, False, False, True, False, True]
