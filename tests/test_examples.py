@@ -104,7 +104,7 @@ def test_readme_python_runs(world, monkeypatch, capsys):
 def test_readme_commands_parse():
     lines = [line.split("#")[0] for name in ("command 1", "live", "commands") for line in block(name).splitlines()]
     calls = [line.split("coview-stream ")[1] for line in lines if "coview-stream " in line]
-    assert len(calls) == 11
+    assert len(calls) == 12
     for call in calls:
         build_parser().parse_args(shlex.split(call))
 
