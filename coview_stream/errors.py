@@ -85,7 +85,7 @@ EXTRA_OF = {
     "rosbags": "messages",
     "foxglove_schemas_protobuf": "messages",
     "google": "messages",
-    "pyproj": "build",
+    "pyproj": "geo",
     "open3d": "build",
     "CSF": "build",
     "matplotlib": "plot",

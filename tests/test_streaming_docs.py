@@ -145,7 +145,7 @@ def test_documented_fields_missing_in_smaller_pose_formats():
         encoded = encode_pose(full, name)
         record = pose_record(decode_pose(Sample("k", encoded.payload, encoded.encoding)), Sample("k", encoded.payload))
         missing[name] = {field for field, value in record.items() if not value} | {"state"}
-    assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s", "protection_level"}
+    assert missing["cdr"] == {"robot", "state", "confidence", "map_sha256", "age_s", "protection_level", "T_map_odom"}
     assert missing["foxglove"] == missing["cdr"] | {"covariance"}
     said = re.search(r"These leave out .*?`covariance`", TEXT, re.DOTALL)[0]
     assert set(re.findall(r"`(\w+)`", said)) == missing["foxglove"]

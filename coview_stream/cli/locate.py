@@ -44,6 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_mount(parser)
     add_topics(parser)
     parser.add_argument("--retrieval", choices=("exhaustive", "ring_key"), default="exhaustive")
+    parser.add_argument(
+        "--export", metavar="A,B", help="also trajectory.csv, .kitti, .geojson or .gpx: csv,kitti,geojson,gpx"
+    )
     add_initial(parser)
     add_registration(parser)
     add_reloc(parser)
@@ -64,8 +67,10 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.localization.registration.gicp import library
     from coview_stream.localization.result import Fix
     from coview_stream.recordings.open_run import open_run
+    from coview_stream.report.export import chosen_formats, export, reference_for, trajectory_of
 
     acceptance = acceptance_config(args.risk)
+    formats = () if args.export is None else chosen_formats(args.export)
     mount = mount_of(args)
     guess = None if args.initial is None else initial_guess(args.initial)
     lidar = _lidar_odometry(args.odometry, args.gravity)
@@ -75,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     draws = not args.no_pictures and _can_draw()
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
+    geo = reference_for(base_map.crs, formats)  # before anything slow: there may be none
     missing = base_map.require_features(args.reloc)
     if missing is not None:
         print(f"{args.map}: {missing}", file=sys.stderr)
@@ -104,6 +110,10 @@ def run(args: argparse.Namespace) -> int:
 
         located = locate(base_map, recorded, config, step, guess)
     write(located, base_map, args.output)
+    if formats:
+        posed = located.posed
+        stamps, poses = [fix.stamp for fix in posed], [fix.T_map_body for fix in posed if fix.T_map_body is not None]
+        export(trajectory_of(args.run_path.name, stamps, poses, geo), args.output, formats)
     if draws:
         from coview_stream.report.run_pictures import draw_run
 

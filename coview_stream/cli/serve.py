@@ -66,6 +66,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     keys.add_argument("--cloud-encoding", metavar="CODEC", help="xyz, xyzi, cdr, foxglove or keelson, for all frames")
     keys.add_argument("--odometry-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson, likewise")
     keys.add_argument("--pose-encoding", metavar="CODEC", help="json, cdr, foxglove or keelson (the preset's)")
+    keys.add_argument(
+        "--geo", nargs="?", const="json", choices=("json", "cdr", "foxglove"),
+        help="publish latitude, longitude and height as well: JSON, NavSatFix or foxglove.LocationFix (json)",
+    )  # fmt: skip
     source = parser.add_argument_group("odometry")
     source.add_argument(
         "--odometry",
@@ -174,7 +178,7 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
         node_keys(args.base, args.node or args.robot[0]), args.metrics, verify_key,
-        initial_guesses(args.initial, args.robot),
+        args.geo, initial_guesses(args.initial, args.robot),
     )  # fmt: skip
     sinks = open_sinks(args)
     hangups: list[int] = []

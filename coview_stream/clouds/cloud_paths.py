@@ -29,7 +29,8 @@ def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
                 raise CloudError(f"{path}: holds no cloud ({', '.join(sorted(CLOUD_SUFFIXES))}); {_instead(path)}")
             out += found
         elif not path.exists() and glob.has_magic(str(path)):  # where the shell has not expanded it
-            found = sorted((Path(name) for name in glob.glob(str(path), recursive=True)), key=natural_key)
+            names = glob.glob(str(path), recursive=True)  # noqa: PTH207 - Path.glob takes no absolute pattern
+            found = sorted(map(Path, names), key=natural_key)
             out += [name for name in found if is_cloud_name(name) and name.is_file()]
             if not any(map(is_cloud_name, found)):
                 raise CloudError(f"{path}: no cloud has such a name; check the pattern")

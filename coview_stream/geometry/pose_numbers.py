@@ -36,6 +36,11 @@ def pose_fields(T: Pose, covariance: Floats | None) -> dict[str, Any]:
     }
 
 
+def place_fields(T: Pose) -> dict[str, Any]:
+    """Return a pose as plain data: position and orientation (quaternion)."""
+    return {"position": position_of(T).tolist(), "orientation": quaternion_of(T).tolist()}
+
+
 def pose_in_words(T: Pose, covariance: Floats | None) -> str:
     """Return a pose in half a line: ``x 12.30, y 4.00, z 1.70 m, yaw 12.3 deg, sigma 0.02 m``."""
     x, y, z = T[:3, 3].tolist()

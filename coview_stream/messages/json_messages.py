@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from coview_stream.errors import MessageError
+from coview_stream.geometry.pose_numbers import place_fields
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Pose, pose_to_tum
 from coview_stream.messages.types import Encoded, OdometryMessage, PoseMessage, Sample
@@ -29,7 +30,7 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read what :func:`encode_pose` writes; ``age_s``, ``frame_id`` and ``protection_level`` may be missing."""
+    """Read what :func:`encode_pose` writes; what follows ``map_sha256`` may be missing."""
     fields = read_object(sample.payload)
     return PoseMessage(
         stamp_ns=stamp_from(fields.get("stamp_ns")),
@@ -42,6 +43,7 @@ def decode_pose(sample: Sample) -> PoseMessage:
         age=number(fields.get("age_s", 0.0), "age_s"),
         frame_id=text(fields, "frame_id", "map"),
         protection=_protection(fields.get("protection_level")),
+        T_map_odom=_transform(fields.get("T_map_odom")),
     )
 
 
@@ -54,7 +56,7 @@ def encode_pose(message: PoseMessage) -> Encoded:
     """Write a pose with its covariance in rows, (x, y, z, roll, pitch, yaw).
 
     Fields: stamp_ns, robot, state, position, orientation, covariance, confidence, map_sha256, age_s, frame_id,
-    protection_level (null where it is not known).
+    protection_level and T_map_odom (position and orientation, map <- odometry; null where they are not known).
     NaN is a MessageError.
     """
     after = {
@@ -64,6 +66,7 @@ def encode_pose(message: PoseMessage) -> Encoded:
         "age_s": float(message.age),
         "frame_id": message.frame_id,
         "protection_level": None if message.protection is None else message.protection.to_json(),
+        "T_map_odom": None if message.T_map_odom is None else place_fields(message.T_map_odom),
     }
     before = {"robot": message.robot, "state": message.state}
     return _dump(message.stamp_ns, message.T_map_body, before, after)
@@ -133,6 +136,14 @@ def text(fields: dict[str, Any], name: str, default: str | None = None) -> str:
 
 def _pose(fields: dict[str, Any]) -> Pose:
     return checked_pose(numbers(fields, "position", 3), numbers(fields, "orientation", 4))
+
+
+def _transform(value: object) -> Pose | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict):
+        raise MessageError("T_map_odom: write position and orientation")
+    return _pose(value)
 
 
 def _protection(value: object) -> ProtectionLevel | None:

@@ -106,43 +106,46 @@ def decode_pose(sample: Sample) -> PoseMessage:
     return bare_pose(_stamp(message), _pose(message), message.header.frame_id, covariance)
 
 
-def _new(type_name: str, /, **fields: Any) -> Any:
+def new(type_name: str, /, **fields: Any) -> Any:
+    """Return a message of a type by its fields."""
     return store().types[type_name](**fields)
 
 
-def _write(message: Any, name: str) -> Encoded:
+def write(message: Any, name: str) -> Encoded:
+    """Write a message of the type ``name`` in CDR, little-endian."""
     payload = bytes(store().serialize_cdr(message, name, little_endian=True))
     return Encoded(payload, f"application/cdr;{name}")
 
 
-def _header(stamp_ns: int, frame_id: str) -> Any:
+def header(stamp_ns: int, frame_id: str) -> Any:
+    """Return a std_msgs/Header; MessageError where the stamp exceeds its seconds."""
     sec, nanosec = stamp_split(stamp_ns)
     if not -(2**31) <= sec < 2**31:
         raise MessageError(f"stamp {stamp_ns} ns exceeds the 32-bit seconds of a ROS header")
-    stamp = _new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return _new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+    stamp = new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
 def _pose_out(T: Pose, covariance: Any) -> Any:
     x, y, z, qx, qy, qz, qw = pose_to_tum(T).tolist()
-    position = _new("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    orientation = _new("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
-    pose = _new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+    position = new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    orientation = new("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
+    pose = new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
     rows = np.ascontiguousarray(covariance, dtype=np.float64).ravel()
-    return _new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=rows)
+    return new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=rows)
 
 
 def encode_cloud(message: CloudMessage) -> Encoded:
     """Write a PointCloud2 in frame ``base_link``."""
     table = write_table(message)
     field = "sensor_msgs/msg/PointField"
-    return _write(
-        _new(
+    return write(
+        new(
             CLOUD,
-            header=_header(message.stamp_ns, "base_link"),
+            header=header(message.stamp_ns, "base_link"),
             height=1,
             width=table.width,
-            fields=[_new(field, name=n, offset=o, datatype=_NUMBERS[k], count=1) for n, k, o in table.fields],
+            fields=[new(field, name=n, offset=o, datatype=_NUMBERS[k], count=1) for n, k, o in table.fields],
             is_bigendian=False,
             point_step=table.step,
             row_step=table.step * table.width,
@@ -156,18 +159,18 @@ def encode_cloud(message: CloudMessage) -> Encoded:
 def encode_odometry(message: OdometryMessage) -> Encoded:
     """Write an Odometry ``odom`` <- ``base_link``; covariances and velocities are zero: not known."""
     zero = dict.fromkeys("xyz", 0.0)
-    twist = _new(
+    twist = new(
         "geometry_msgs/msg/Twist",
-        linear=_new("geometry_msgs/msg/Vector3", **zero),
-        angular=_new("geometry_msgs/msg/Vector3", **zero),
+        linear=new("geometry_msgs/msg/Vector3", **zero),
+        angular=new("geometry_msgs/msg/Vector3", **zero),
     )
-    return _write(
-        _new(
+    return write(
+        new(
             ODOMETRY,
-            header=_header(message.stamp_ns, "odom"),
+            header=header(message.stamp_ns, "odom"),
             child_frame_id="base_link",
             pose=_pose_out(message.T_odom_body, np.zeros(36)),
-            twist=_new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+            twist=new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         ),
         ODOMETRY,
     )
@@ -175,5 +178,5 @@ def encode_odometry(message: OdometryMessage) -> Encoded:
 
 def encode_pose(message: PoseMessage) -> Encoded:
     """Write a PoseWithCovarianceStamped in the map frame; covariance order x, y, z, roll, pitch, yaw, as there."""
-    header = _header(message.stamp_ns, message.frame_id)
-    return _write(_new(POSE, header=header, pose=_pose_out(message.T_map_body, message.covariance)), POSE)
+    head = header(message.stamp_ns, message.frame_id)
+    return write(new(POSE, header=head, pose=_pose_out(message.T_map_body, message.covariance)), POSE)

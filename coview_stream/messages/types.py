@@ -10,7 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.pose_numbers import pose_fields, pose_in_words, position_of, quaternion_of, stddev_of
+from coview_stream.geometry.pose_numbers import (
+    place_fields,
+    pose_fields,
+    pose_in_words,
+    position_of,
+    quaternion_of,
+    stddev_of,
+)
 from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import Points, Pose, yaw_of
 
@@ -107,6 +114,7 @@ class PoseMessage:
         age: seconds of sensor time since the lidar frame that last corrected it.
         frame_id: name of the map frame, for formats that carry one.
         protection: metres and degrees that the error exceeds at most once in a thousand; None where a format has none.
+        T_map_odom: (4, 4) map <- odometry, for users of transforms; None where a format has none.
     """
 
     stamp_ns: int
@@ -119,6 +127,7 @@ class PoseMessage:
     age: float = 0.0
     frame_id: str = "map"
     protection: ProtectionLevel | None = None
+    T_map_odom: Pose | None = None
 
     @property
     def stamp(self) -> float:
@@ -157,6 +166,7 @@ class PoseMessage:
             "age_s": None if math.isnan(self.age) else self.age,
             "frame_id": self.frame_id,
             "protection_level": None if self.protection is None else self.protection.to_json(),
+            "T_map_odom": None if self.T_map_odom is None else place_fields(self.T_map_odom),
         }
 
     def __repr__(self) -> str:

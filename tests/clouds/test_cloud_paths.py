@@ -33,7 +33,7 @@ def test_folder_or_pattern_without_clouds_says_so(folder, tmp_path):
     with pytest.raises(CloudError, match=r"holds no cloud .*did you mean .*tiles\?"):
         expand_cloud_paths([tmp_path])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CloudError, match="holds no cloud .*name another folder"):
+    with pytest.raises(CloudError, match=r"holds no cloud .*name another folder"):
         expand_cloud_paths([tmp_path / "empty"])
     with pytest.raises(CloudError, match="no cloud has such a name"):
         expand_cloud_paths([folder / "*.ply"])

@@ -45,7 +45,7 @@ JSON_POSE = (
     b'{"stamp_ns":1700000000123456789,"robot":"r1","state":"TRACKING","position":[1.0,2.0,3.0],'
     b'"orientation":[0.5,0.5,0.5,0.5],"covariance":['
     + b",".join(b"%d.0" % i for i in range(36))
-    + b'],"confidence":0.75,"map_sha256":"ab","age_s":0.1,"frame_id":"map","protection_level":null}'
+    + b'],"confidence":0.75,"map_sha256":"ab","age_s":0.1,"frame_id":"map","protection_level":null,"T_map_odom":null}'
 )
 
 CLOUDS = {
@@ -136,7 +136,7 @@ def test_json_pose_has_the_documented_fields():
     fields = json.loads(codecs.encode_pose(message, "json").payload)
     assert list(fields) == [
         "stamp_ns", "robot", "state", "position", "orientation", "covariance", "confidence", "map_sha256",
-        "age_s", "frame_id", "protection_level",
+        "age_s", "frame_id", "protection_level", "T_map_odom",
     ]  # fmt: skip
     assert fields["frame_id"] == "utm"
     assert fields["protection_level"] == {"m": 0.25, "deg": 1.5}

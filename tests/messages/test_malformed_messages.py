@@ -213,6 +213,8 @@ def test_json_over_64_kib_is_oversized_and_extra_fields_are_ignored():
         {"age_s": None},
         {"map_sha256": "\ud800"},
         {"protection_level": 0.1},
+        {"T_map_odom": [1, 2, 3]},
+        {"T_map_odom": {"position": [1, 2, 3]}},
         {"protection_level": {"m": 0.1}},
     ],
 )

@@ -96,6 +96,7 @@ class Node:
             RobotEndpoints(session, transport, self._reporter, self._wake_engines_for, pose_format, elections)
             for session in self.sessions
         ]
+        self.endpoints = {robot.session.keys.robot: robot for robot in self._robots}
         self._ending: threading.Thread | None = None
         self.started = self.beat = time.monotonic()
         self.reloader: Reloader | None = None

@@ -10,7 +10,7 @@ from typing import Any
 from coview_stream.errors import InputError
 from coview_stream.localization.search.place_guess import PlaceGuess
 from coview_stream.messages import encode_pose
-from coview_stream.messages.types import Encoded, Sample
+from coview_stream.messages.types import Encoded, PoseMessage, Sample
 from coview_stream.stream.node.election import Elections
 from coview_stream.stream.node.initial_pose import decode_guess, guess_of_fields
 from coview_stream.stream.node.session import Session
@@ -51,6 +51,7 @@ class RobotEndpoints:
         self._pose_format = pose_format or session.keys.pose_format
         self._bare = session.keys.bare and pose_format is None
         self._publisher: Publisher | None = None
+        self.beside: list[Callable[[PoseMessage], None]] = []  # called with every pose that goes out
 
     @property
     def session(self) -> Session:
@@ -159,4 +160,6 @@ class RobotEndpoints:
         if serves and self._publisher is not None and (pose := self.session.pose()) is not None:
             encoded = encode_pose(pose, self._pose_format)
             self._publisher.put(Encoded(encoded.payload) if self._bare else encoded)
+            for take in self.beside:
+                take(pose)
             self._reporter.rates[robot].add(now)

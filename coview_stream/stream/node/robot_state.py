@@ -250,6 +250,7 @@ class OdomCorrection:
             map_sha256=map_sha256,
             age=self.age(newest.stamp_ns),
             protection=protection_level(covariance, self.doubt),
+            T_map_odom=self.T_map_odom,
         )
 
 

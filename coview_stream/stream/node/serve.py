@@ -51,6 +51,7 @@ class ServeOptions:
         risk: probability of a wrong place below which a search gives one.
         node_keys: of the node's own; None for none.
         metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
+        geo: encoding in which poses go out as places on Earth as well; None: they do not.
         guesses: of the places of robots, by name: tried, never trusted.
         verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
     """
@@ -72,6 +73,7 @@ class ServeOptions:
     node_keys: NodeKeys | None = None
     metrics: str | None = None
     verify_key: VerifyKey | None = None
+    geo: str | None = None
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
 
 
@@ -107,6 +109,7 @@ def open_node(
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.election import Elections
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
+        from coview_stream.stream.node.locations import LocationPublisher, MapReference
         from coview_stream.stream.node.map_view import MapViewAnswer
         from coview_stream.stream.node.memory import MemoryRelease
         from coview_stream.stream.node.node import Node
@@ -114,6 +117,7 @@ def open_node(
         from coview_stream.stream.node.systemd import Notifier
         from coview_stream.stream.transport.zenoh_transport import open_transport
 
+        reference = None if options.geo is None else MapReference(options.map_path)
         transport = open_transport(
             options.connect, options.listen, options.zenoh_config, options.node.max_payload, check_silence=True
         )
@@ -146,6 +150,10 @@ def open_node(
         map_view = MapViewAnswer(options.map_path, lambda: node.map_sha256)
         for keys in options.keys:
             transport.answer(keys.map_view, map_view)
+        if reference is not None and options.geo is not None:
+            for keys in options.keys:
+                publisher = transport.publisher(keys.location, "data")
+                node.endpoints[keys.robot].beside.append(LocationPublisher(publisher, reference, options.geo))
         node.start()
     except BaseException as error:
         for engine in engines.values():

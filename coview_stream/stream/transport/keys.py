@@ -102,6 +102,7 @@ class RobotKeys(Preset):
         robot: its name.
         status: key to publish the status on.
         hypotheses: key to publish on which places a search considers.
+        location: key to publish places on Earth on, if that is asked for.
         alive: key of the liveliness token.
         relocalize: key that answers queries to forget the pose and search again.
         initial_pose: key to subscribe to for guesses of the place.
@@ -113,6 +114,7 @@ class RobotKeys(Preset):
     robot: str
     status: str
     hypotheses: str
+    location: str
     alive: str
     relocalize: str
     initial_pose: str
@@ -192,6 +194,7 @@ def robot_keys(
         robot=robot,
         status=f"{own}/out/status",
         hypotheses=f"{own}/out/hypotheses",
+        location=f"{own}/out/location",
         alive=f"{own}/alive",
         relocalize=f"{own}/rpc/relocalize",
         initial_pose=f"{own}/in/initial_pose",
