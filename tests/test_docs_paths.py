@@ -25,7 +25,7 @@ MEMBER = re.compile(r"`([A-Z]\w+)\.([a-z]\w*)[`(]")
 IMPORT = re.compile(r"^\s*(?:>>> )?from (coview_\w[\w.]*|bench[\w.]*) import ([\w, ]+)", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#\s]*)(?:#([\w-]+))?\)")
 ROLE = re.compile(r":(?:mod|class|func|meth|data|attr|exc):`~?([\w.]+)`")
-SUFFIXES = {"py", "json", "toml", "md", "cpp"}  # bench.json is a file, not a module
+SUFFIXES = {"py", "json", "toml", "md", "cpp", "tum"}  # bench.json is a file, not a module; TRUTH.tum no member
 
 
 @cache
@@ -68,7 +68,11 @@ def unknown_names(text):
     dotted = {name for name in DOTTED.findall(text) if name.rsplit(".", 1)[1] not in SUFFIXES}
     files = set(FILE.findall(text))
     bare = set(BARE_FILE.findall(text)) - file_names()
-    members = {f"{name}.{member}" for name, member in MEMBER.findall(text) if not has_member(name, member)}
+    members = {
+        f"{name}.{member}"
+        for name, member in MEMBER.findall(text)
+        if member not in SUFFIXES and not has_member(name, member)
+    }
     imported = {
         f"{module}.{name.strip()}"
         for module, names in IMPORT.findall(text)
