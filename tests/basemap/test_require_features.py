@@ -78,7 +78,7 @@ SPOILT = [
     (other_ground, RELEARN),
     (drawn_otherwise, RELEARN),
     (not_of_the_card, "not the weights that card.json beside it names; install"),
-    (no_onnxruntime, "pip install 'onnxruntime>=1.18'"),
+    (no_onnxruntime, "pip install 'coview-stream[node]'"),
     (rest_of_onnxruntime, "pip install --force-reinstall 'onnxruntime>=1.18'"),
 ]
 

@@ -16,7 +16,7 @@ def test_locate_registration_option_names_missing_library(world_file, tmp_path, 
     run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
     assert main(["locate", str(world_file), str(run), "-o", str(out), "--registration", "gicp"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'small-gicp>=1.0.1'" in said
+    assert "pip install 'coview-stream[gicp]'" in said
     assert said.count("\n") == 1
 
 

@@ -73,7 +73,7 @@ def test_build_learned_names_missing_library(tmp_path, monkeypatch, capsys):
     scan = tmp_path / "not-even-looked-for.ply"
     assert main(["build", str(scan), "-o", str(tmp_path / "site.coview"), "--learned"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'onnxruntime>=1.18'" in said
+    assert "pip install 'coview-stream[node]'" in said
     assert said.count("\n") == 1
 
 

@@ -138,7 +138,7 @@ def test_serve_odometry_kiss_icp_names_missing_library(tmp_path, monkeypatch, wo
     command = ["serve", str(world_file), "--robot", "r1", "--listen", free_endpoint(), "--quiet"]
     assert main([*command, "--odometry", "kiss-icp"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'kiss-icp>=1.2'" in said
+    assert "pip install 'coview-stream[kiss-icp]'" in said
     assert said.count("\n") == 1
 
 

@@ -268,7 +268,7 @@ def test_unknown_registration_method_is_refused():
 def test_missing_small_gicp_is_named(monkeypatch, world_file):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
     target = local_map(*courtyard())
-    with pytest.raises(DependencyError, match=r"small-gicp .*pip install 'small-gicp>="):
+    with pytest.raises(DependencyError, match=r"small-gicp .*pip install 'coview-stream\[gicp\]'"):
         register(scan_of(target), TRUTH, target, CONFIG, CONFIG.track)
     with pytest.raises(DependencyError, match="pip install"):
         open_engine("track", world_file, "0" * 64, LocalizerConfig(registration=CONFIG))

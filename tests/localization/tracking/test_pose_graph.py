@@ -179,7 +179,7 @@ def test_poses_stay_rigid_over_hundreds_of_moves(graph):
 
 def test_missing_gtsam_is_named_with_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "gtsam", None)
-    with pytest.raises(DependencyError, match="pip install 'gtsam"):
+    with pytest.raises(DependencyError, match=r"pip install 'coview-stream\[node\]'"):
         PoseGraph()
 
 

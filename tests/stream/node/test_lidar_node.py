@@ -212,7 +212,7 @@ def test_missing_kiss_icp_is_one_line(tmp_path, monkeypatch):
     engine = EngineProcess("odometry", "unused", "")
     try:
         engine.start()
-        with pytest.raises(CoViewError, match="pip install 'kiss-icp>=") as caught:
+        with pytest.raises(CoViewError, match=r"pip install 'coview-stream\[kiss-icp\]'") as caught:
             engine.wait_ready()
     finally:
         engine.close()
