@@ -72,6 +72,26 @@ def test_options_are_those_of_the_code():
     )
 
 
+def test_python_of_the_page_about_frames_runs():
+    block = re.search(r"```python\n(.*?)```", (DOCS / "frames.md").read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(block[1], "frames.md", "exec"), {})
+
+
+def test_map_of_the_pages_for_language_models_leads_somewhere():
+    text = (DOCS / "llms.txt").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert text.startswith("# coview_stream\n\n> ")
+    assert len(links) > 10
+    assert [link for link in links if not (DOCS / link).exists()] == []
+
+
+def test_citation_is_of_this_version():
+    lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    fields = dict(line.split(": ", 1) for line in lines if re.match(r"[a-z-]+: ", line))
+    assert {"cff-version", "message", "title", "version", "license"} <= set(fields)
+    assert fields["version"] == coview_stream.__version__
+
+
 def test_every_option_and_field_says_what_it_means():
     """What stands for itself (an output, a robot's name) may say nothing; a field of the configuration may not."""
     page = (DOCS / "options.md").read_text(encoding="utf-8").partition("## Configuration in Python")[2]
