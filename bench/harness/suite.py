@@ -86,6 +86,7 @@ BENCHMARKS = {
     "forest_scale": Benchmark("forest.scale", "time of a learned query on 0.1 and 1 km2"),
     "forest_plot": Benchmark("forest.plot", "a real plot among real airborne tiles"),
     "recognition": Benchmark("forest.recognition", "place recognition on public sets: AR@1, AR@5, AR@1 %, MRR"),
+    "changes": Benchmark("fusion.changes", "what fuse --changes tags as new and gone, and what it leaves out"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
     "many": Benchmark("stream.many_robots", "sixteen robots on one node, of which eight search without end"),
     "fuzz": Benchmark("fuzz.fuzz", "untrusted bytes into every decoder and reader, within limits"),

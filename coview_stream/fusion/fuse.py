@@ -88,7 +88,7 @@ class Fused:
         stamp: (N,) float64 of the newest frame that saw it, seconds.
         added: by run.
         filled: square metres of surface, about, that lie in blind spots of the survey.
-        moving: voxels left out since rays went through them.
+        moving: voxels apart from the map that rays went through; left out unless they were to be kept.
     """
 
     base_map: BaseMap

@@ -20,7 +20,7 @@ def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
         told = ", ".join([f"{added.points:,} points of {added.frames} frames", *left])
         lines.append(f"{f'{k} {name}':<18} {told}")
     lines.append(f"{'blind spots':<18} about {fused.filled:,.0f} m2 of surface filled")
-    lines.append(f"{'moving':<18} {fused.moving:,} voxels {'seen through' if fused.moving else 'left out'}")
+    lines.append(f"{'moving':<18} {fused.moving:,} voxels that rays went through")
     if changes:
         lines.append(f"{'new':<18} {int((fused.change == NEW).sum()):,} points")
         lines.append(f"{'gone':<18} {int((fused.base_change == GONE).sum()):,} points of the base map")

@@ -1,0 +1,139 @@
+"""What ``fuse --changes`` tags, and what it leaves out as moving, against the truth of simulated worlds.
+
+Sites surveyed from the air, ten years later, after one drive of 60 m. Truth is the distance of each point to all
+surfaces of the world then and now. A point of the run is truly new if it lies on a surface now (within 0.4 m: crowns
+are deep) and half a metre from all of then, a point of the map truly gone if half a metre from all of now. A tag within
+0.3 m of a surface of the other time is wrong, and so is a new point that lies on no surface. Recall of new is of all
+points that the run added, so what stands below roofs and crowns counts against it; recall of gone is of all points of
+the map within 25 m of the way, seen or not.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.harness.files import folder
+from bench.harness.rows import Row
+from bench.harness.tables import table
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.clouds.open3d_loader import open3d
+from coview_stream.fusion.fuse import FuseConfig, Fused, fuse
+from coview_stream.fusion.localized_run import LocalizedRun, RunPair
+from coview_stream.fusion.records import GONE, NEW
+from coview_stream.fusion.sightings import REACH
+from coview_stream.geometry.arrays import Bools, Floats, Floats32
+from coview_stream.localization.offline import locate, write
+from coview_stream.recordings.open_run import open_run
+from coview_stream.sim import SimulationConfig, parse_dirt, simulate
+from coview_stream.sim.mesh import Mesh
+from coview_stream.sim.scenes import SceneState
+from coview_stream.sim.simulate import scene_of
+
+_WORLDS = (("town", "os64", 6101), ("village", "vlp16", 6102), ("industrial", "os64", 6103), ("campus", "vlp16", 6104))
+_DIRT = "traffic,years"
+_ON, _OFF, _APART = 0.4, 0.3, 0.5  # metres
+_COLUMNS = (
+    *("new", "precision", "recall", "gone", "precision", "recall"),
+    *("left out as moving", "of these standing", "of all that stands"),
+)
+
+
+def options(parser: ArgumentParser) -> None:
+    """Worlds can be chosen."""
+    parser.add_argument("worlds", nargs="*", metavar="SCENE", help="scenes to look at (all)")
+
+
+def rows(asked: Namespace) -> Iterator[Row]:
+    """Yield a row for each world: precision and recall."""
+    chosen = [each for each in _WORLDS if not asked.worlds or each[0] in asked.worlds][: 1 if asked.quick else None]
+    for scene, sensor, seed in chosen:
+        config = SimulationConfig(scene, sensor, seed, size=160.0, length=60.0, changed=0.4, dirt=parse_dirt(_DIRT, 0))
+        figures = measure(config, folder() / f"changes-{scene}-{sensor}-{seed}")
+        said = f"new {_pair(figures['new'])}, gone {_pair(figures['gone'])}"
+        yield Row(f"changes/{scene}, {sensor}", said=said, details={"world": f"{scene}, {sensor}", **figures})
+
+
+def tables(rows: Sequence[Row], _: Namespace) -> dict[str, str]:
+    """Lay out a line for each world."""
+    lines = []
+    for figures in (row.details for row in rows):
+        cells = [str(figures["world"])]
+        for name in ("new", "gone"):
+            count, precision, recall = figures[name]
+            cells += [f"{count:,}", f"{precision:.0%}", f"{recall:.0%}"]
+        count, standing, lost = figures["moving"]
+        lines.append([*cells, f"{count:,}", f"{standing:.1%}", f"{lost:.2%}"])
+    return {"": table(("world", *_COLUMNS), lines)}
+
+
+def measure(config: SimulationConfig, place: Path) -> dict[str, Any]:
+    """Simulate, localize, fuse and compare: (count, precision, recall) of new and gone, and what moved."""
+    if not (place / "world.json").exists():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        simulate(place, config)
+    base_map = BaseMap.build(place / "base.laz")
+    base_map.save(place / "site.coview")
+    write(locate(base_map, open_run(place / "run")), base_map, place / "out")
+    run = LocalizedRun(RunPair(place / "run", place / "out"), base_map, lambda path, mount: open_run(path, mount=mount))
+    whole = fuse(base_map, [run], FuseConfig(changes=True, keep_moving=True))
+    fused = fuse(base_map, [run], FuseConfig(changes=True))
+    scene = scene_of(config)
+    origin = base_map.origin - np.array(config.origin)
+    return {
+        "new": _new(fused, scene.mapped, scene.now, origin),
+        "gone": _gone(fused, scene.now, origin, run.poses[:, :3, 3] - config.origin),
+        "moving": _moving(whole, fused, scene.now, origin),
+    }
+
+
+def _new(fused: Fused, then: SceneState, now: SceneState, origin: Floats) -> tuple[int, float, float]:
+    points = fused.points + origin
+    tagged, to_then, to_now = fused.change == NEW, distance(then, points), distance(now, points)
+    truly = (to_now < _ON) & (to_then > _APART)
+    return int(tagged.sum()), _share((to_then > _OFF) & (to_now < _ON), tagged), _share(tagged, truly)
+
+
+def _gone(fused: Fused, now: SceneState, origin: Floats, way: Floats) -> tuple[int, float, float]:
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(fused.base_map.points) + origin
+    tagged, to_now = fused.base_change == GONE, distance(now, points)
+    near = np.isfinite(cKDTree(way).query(points, distance_upper_bound=REACH)[0])
+    return int(tagged.sum()), _share(to_now > _OFF, tagged), _share(tagged, near & (to_now > _APART))
+
+
+def _moving(whole: Fused, fused: Fused, now: SceneState, origin: Floats) -> tuple[int, float, float]:
+    """Return what was left out, the share of it that stands, and the share of all that stands which that is."""
+    from scipy.spatial import cKDTree
+
+    out = ~np.isfinite(cKDTree(fused.points).query(whole.points, distance_upper_bound=1e-4)[0])
+    standing = distance(now, whole.points + origin) < _ON
+    return int(out.sum()), _share(standing, out), _share(out, standing)
+
+
+def distance(state: SceneState, points: Floats) -> Floats32:
+    """Return the distance (N,) of points (N, 3), scene frame, to the nearest surface, foliage included."""
+    return np.minimum(_to_mesh(state.solid, points), _to_mesh(state.foliage, points))
+
+
+def _to_mesh(mesh: Mesh, points: Floats) -> Floats32:
+    library = open3d()
+    scene = library.t.geometry.RaycastingScene(nthreads=2)
+    if not len(mesh.triangles) or not len(points):
+        return np.full(len(points), np.inf, dtype=np.float32)
+    tensor = library.core.Tensor
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
+    return np.asarray(scene.compute_distance(tensor(points.astype(np.float32))).numpy(), dtype=np.float32)
+
+
+def _share(what: Bools, of: Bools) -> float:
+    return float(what[of].mean()) if of.any() else float("nan")
+
+
+def _pair(figures: tuple[int, float, float]) -> str:
+    return f"precision {figures[1]:.0%}, recall {figures[2]:.0%}"
