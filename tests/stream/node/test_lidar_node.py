@@ -112,9 +112,9 @@ def status(node, net):
     return json.loads(net.samples(KEYS.status)[-1].payload)
 
 
-def test_lidar_node_subscribes_to_clouds_only(quiet):
+def test_lidar_node_subscribes_to_no_odometry(quiet):
     node, net, _ = quiet
-    assert net.subscribed == {KEYS.cloud: "newest"}
+    assert net.subscribed == {KEYS.cloud: "newest", "coview/r1/in/initial_pose": "all"}
     net.publish(odometry(0.0))
     assert status(node, net)["odometry"] == "kiss-icp"
     assert status(node, net)["counters"]["odometry_received"] == 0
