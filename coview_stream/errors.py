@@ -94,6 +94,7 @@ EXTRA_OF = {
     "kiss_icp": "kiss-icp",
     "cryptography": "sign",
     "rerun": "viz",
+    "foxglove": "foxglove",
     "torch": "learn-train",
     "onnx": "learn-train",
     "psutil": "bench",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from coview_stream.viewers.session_feed import SessionFeed
 
 _WEB = "127.0.0.1:8642"
+_FOXGLOVE = "127.0.0.1:8765"
 
 
 def add_view(parser: argparse._ActionsContainer) -> None:
@@ -30,11 +31,22 @@ def add_view(parser: argparse._ActionsContainer) -> None:
         metavar="HOST:PORT",
         help=f"show map and robots as a web page there (no page; {_WEB} if no address is named)",
     )
+    parser.add_argument(
+        "--foxglove",
+        nargs="?",
+        const=_FOXGLOVE,
+        type=_host_port,
+        metavar="HOST:PORT",
+        help=f"serve the same to the Foxglove app there (extra: foxglove; {_FOXGLOVE} if no address is named)",
+    )
+    parser.add_argument("--record", type=Path, metavar="F.mcap", help="record the same as MCAP (extra: foxglove)")
+    parser.add_argument("--rerun", action="store_true", help="show the same in the rerun viewer (extra: viz)")
+    parser.add_argument("--save", type=Path, metavar="F.rrd", help="write it for rerun to a file, without a viewer")
 
 
 def _host_port(text: str) -> str:
     if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
-        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --web={_WEB}")
+        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write for example --web={_WEB}")
     return text
 
 
@@ -42,9 +54,26 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
     """Open what the options ask for, and print where it is to be seen.
 
     Raises:
-        ConfigError: an address cannot be listened on.
+        ConfigError: an address cannot be listened on, or there is no display. InputError: a file cannot be written.
+        DependencyError: a library is missing.
     """
     sinks: list[Sink] = []
+    if args.rerun or args.save is not None:
+        from coview_stream.viewers.rerun_sink import RerunSink
+
+        sinks.append(RerunSink(args.save))
+    if args.foxglove is not None or args.record is not None:
+        from coview_stream.viewers.foxglove_sink import FoxgloveSink
+
+        foxglove = FoxgloveSink()
+        if args.record is not None:
+            foxglove.record(args.record)
+        if args.foxglove is not None:
+            host, _, port = args.foxglove.rpartition(":")
+            host = host.strip("[]") or "127.0.0.1"
+            port = foxglove.serve(host, int(port))
+            print(f"Foxglove at ws://{host}:{port}", file=sys.stderr, flush=True)
+        sinks.append(foxglove)
     if args.web is not None:
         from coview_stream.viewers.web_page import WebPage
 

@@ -18,7 +18,7 @@ from coview_stream.errors import ConfigError, MessageError
 
 if TYPE_CHECKING:
     from coview_stream.cli.signals import Stop
-    from coview_stream.messages.types import PoseMessage, Sample
+    from coview_stream.messages.types import Sample
     from coview_stream.stream.client.fleet import FleetTable
     from coview_stream.stream.client.latest_queue import LatestQueue
     from coview_stream.stream.transport.transport import Transport
@@ -40,7 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset", default="native", help="native, ros2dds, rmw_zenoh or keelson; needs --robot (native)"
     )
     parser.add_argument("--json", action="store_true", help="print every pose and status as one line of JSON")
-    parser.add_argument("--rerun", action="store_true", help="show poses in the rerun viewer (extra: viz)")
     add_view(parser)
     parser.add_argument("--map", type=Path, metavar="SITE.coview", help="the map to show (the node is asked for one)")
     parser.add_argument(
@@ -59,13 +58,12 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
     topics = _topics(args)
-    show_pose = _viewer() if args.rerun else lambda pose: None
     view, sinks, feed = map_of_watch(args.map), open_sinks(args), None
     transport = open_client(args.connect, args.listen, args.config)
     try:
         with stop_on_signals() as stop:
             feed = feed_of_watch(args, transport, sinks, view)
-            watch = _Watch(args, FleetTable(), topics, show_pose, transport)
+            watch = _Watch(args, FleetTable(), topics, transport)
             watch.run(stop, None if args.seconds is None else time.monotonic() + args.seconds)
     finally:
         if feed is not None:
@@ -104,27 +102,14 @@ def _topics(args: argparse.Namespace) -> list[_Topic]:
     return [_Topic(f"{base}/*/out/pose", True), _Topic(f"{base}/*/out/status", False)]
 
 
-def _viewer() -> Callable[[PoseMessage], None]:
-    from coview_stream.report.viewer import PoseViewer
-
-    return PoseViewer().show
-
-
 class _Watch:
     """Display of samples on this thread; the network's threads deliver them."""
 
-    def __init__(
-        self,
-        args: argparse.Namespace,
-        fleet: FleetTable,
-        topics: list[_Topic],
-        show_pose: Callable[[PoseMessage], None],
-        transport: Transport,
-    ) -> None:
+    def __init__(self, args: argparse.Namespace, fleet: FleetTable, topics: list[_Topic], transport: Transport) -> None:
         from coview_stream.stream.client.latest_queue import LatestQueue
 
         self._args, self._fleet, self._topics = args, fleet, topics
-        self._show_pose, self._transport = show_pose, transport
+        self._transport = transport
         self._queue: LatestQueue[tuple[float, _Topic, Sample]] = LatestQueue(_MAX_QUEUED)
         self._terminal = sys.stdout.isatty() and not args.json
         self._lines_drawn = 0  # of the table
@@ -174,7 +159,6 @@ class _Watch:
 
         pose = replace(decode_pose(sample, hint=topic.hint), robot=self._robot(topic, sample))
         self._fleet.add_pose(pose, arrived)
-        self._show_pose(pose)
         return pose_record(pose, sample)
 
     def _status(self, arrived: float, topic: _Topic, sample: Sample) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import types
 
 import numpy as np
 import pytest
@@ -217,28 +216,6 @@ def test_closed_pipe_prints_no_traceback(node):
         assert running.stderr.read() == ""
     finally:
         running.kill()
-
-
-def test_viewer_receives_every_pose(node, watch, monkeypatch):
-    logged = []
-    viewer = types.ModuleType("rerun")
-    viewer.init = lambda name, spawn: logged.append(("init", name))
-    viewer.set_time = lambda timeline, timestamp: logged.append((timeline, timestamp))
-    viewer.log = lambda path, entity, static=False: logged.append((path, entity))
-    viewer.Arrows3D = lambda vectors, colors: vectors
-    viewer.Quaternion = lambda xyzw: xyzw
-    viewer.Transform3D = lambda **fields: fields
-    viewer.LineStrips3D = lambda strips: strips
-    monkeypatch.setitem(sys.modules, "rerun", viewer)
-    assert watch(node.endpoint, "--rerun", "--robot", "r1", "--json", times=8) == 0
-    assert logged[0] == ("init", "coview_stream")
-    assert ("sensor", pytest.approx(7e-9)) in logged
-    axes, *bodies = [entity for path, entity in logged if path == "robots/r1/body"]
-    np.testing.assert_array_equal(axes, np.eye(3))
-    ways = [entity for path, entity in logged if path == "robots/r1/way/0"]
-    assert bodies[0]["translation"] == pytest.approx([0, 0, 0])  # the first place is the origin: float32
-    assert len(ways) == len(bodies) - 1 > 0
-    assert ways[-1][0].shape == (len(bodies), 3)
 
 
 def test_watch_ends_after_seconds_option(node, capsys):

@@ -1,0 +1,80 @@
+"""What Foxglove shows: a recording is read back, and a client of the server sees the same topics."""
+
+from __future__ import annotations
+
+import socket
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.map_view import MapView
+from coview_stream.errors import ConfigError, InputError
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.messages.hypotheses import HypothesesMessage
+from coview_stream.messages.types import PoseMessage
+from coview_stream.viewers.scene import Scan
+
+pytest.importorskip("foxglove", reason="foxglove-sdk is not there; pip install 'coview-stream[foxglove]'")
+ORIGIN = np.array([500_000.0, 5_400_000.0, 100.0])
+T = pose_from(rot_z(0.5), np.add(ORIGIN, (12.0, -3.0, 1.5)))
+POINTS = np.random.default_rng(1).uniform(-20, 20, (500, 3)).astype(np.float32)
+TOPICS = {"/map", "/tf", *(f"/robots/r1/{name}" for name in ("pose", "scene", "scan", "hypotheses", "status", "state"))}
+
+
+def shown(sink):
+    sink.map(MapView(ORIGIN, POINTS, POINTS[:, 2] < 0, "EPSG:25832", "ab"))
+    sink.status("r1", {"state": "SEARCHING", "reason": "too little has been seen"})
+    places = np.array([[*T[:3, 3], 0.5, 0.9, 12.0], [*(T[:3, 3] + 5.0), 0.1, 0.05, 3.0]])
+    sink.hypotheses(HypothesesMessage(5_000_000_000, "r1", places, 0.05, "ab"))
+    sink.status("r1", {"state": "TRACKING", "reason": "found"})
+    sink.pose(PoseMessage(6_000_000_000, "r1", "TRACKING", T, np.eye(6) * 0.01, 0.99, "ab"))
+    sink.scan(Scan("r1", 6_000_000_000, POINTS, T))
+
+
+def opened():
+    from coview_stream.viewers.foxglove_sink import FoxgloveSink
+
+    return FoxgloveSink()
+
+
+def test_recording_holds_every_topic_in_schemas_of_foxglove(tmp_path):
+    sink = opened()
+    sink.record(tmp_path / "a.mcap")
+    shown(sink)
+    sink.close()
+    reader = pytest.importorskip("mcap.reader", reason="mcap is not there; pip install mcap")
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+
+    messages = {}
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        for schema, channel, message in reader.make_reader(stream).iter_messages():
+            messages.setdefault(channel.topic, []).append((schema and schema.name, message.data))
+    assert set(messages) == TOPICS
+    assert messages["/map"][0][0] == "foxglove.PointCloud"
+    rows = np.frombuffer(PointCloud.FromString(messages["/map"][0][1]).data, "<f4").reshape(-1, 4)
+    np.testing.assert_array_equal(rows[:, :3], POINTS)
+    poses = PosesInFrame.FromString(messages["/robots/r1/hypotheses"][0][1]).poses
+    assert [round(each.position.x, 3) for each in poses] == [12.0, 17.0]  # about the map's origin
+    assert len(messages["/robots/r1/state"]) == 2
+
+
+def test_recording_does_not_overwrite_and_names_what_is_wrong(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"mine")
+    with pytest.raises(InputError, match=r"a\.mcap: is there already"):
+        opened().record(tmp_path / "a.mcap")
+    with pytest.raises(InputError, match="cannot be written"):
+        opened().record(tmp_path / "none" / "a.mcap")
+
+
+def test_server_listens_where_it_is_told_and_says_where_it_cannot():
+    sink = opened()
+    port = sink.serve("127.0.0.1", 0)
+    try:
+        with socket.create_connection(("127.0.0.1", port), timeout=5):
+            pass
+        shown(sink)
+        with pytest.raises(ConfigError, match=f"--foxglove 127.0.0.1:{port}"):
+            opened().serve("127.0.0.1", port)
+    finally:
+        sink.close()
