@@ -143,7 +143,10 @@ def _transform(value: object) -> Pose | None:
         return None
     if not isinstance(value, dict):
         raise MessageError("T_map_odom: write position and orientation")
-    return _pose(value)
+    try:
+        return _pose(value)
+    except MessageError as error:
+        raise MessageError(f"T_map_odom: {error}") from error
 
 
 def _protection(value: object) -> ProtectionLevel | None:
