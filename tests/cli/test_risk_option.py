@@ -54,9 +54,9 @@ def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path
     """Whose result is none where nothing is that certain."""
     usual, asked = offline.locate, []
 
-    def never_sure(base_map, run, config, progress):
+    def never_sure(base_map, run, config, progress, guess):
         asked.append(config.acceptance.risk)
-        return usual(base_map, run, replace(config, acceptance=NEVER), progress)
+        return usual(base_map, run, replace(config, acceptance=NEVER), progress, guess)
 
     monkeypatch.setattr(offline, "locate", never_sure)
     out = tmp_path / "out"

@@ -31,8 +31,8 @@ from coview_stream.stream.node.engine_process import (
 from coview_stream.stream.node.jobs import FrameJob
 
 
-def job(points=None, robot="r1"):
-    return FrameJob(robot, 1, 1_000_000_000, np.zeros((20, 3), np.float32) if points is None else points, np.eye(4))
+def job(points=None, robot="r1", stamp_ns=1_000_000_000):
+    return FrameJob(robot, 1, stamp_ns, np.zeros((20, 3), np.float32) if points is None else points, np.eye(4))
 
 
 class Engine:
@@ -97,7 +97,8 @@ def test_killed_engine_process_is_restarted(world_file, world_drive):
         np.testing.assert_array_equal(result.request.cloud, world_drive.clouds[0])
         with pytest.raises(RejectedError, match="finite points"):
             process.run(job(np.zeros((3, 3), np.float32)))
-        assert process.run(good).request is None  # the same child, and it remembers: no keyframe without driving on
+        later = job(world_drive.clouds[0], stamp_ns=1_100_000_000)
+        assert process.run(later).request is None  # the same child, and it remembers: no keyframe without driving on
         assert process.pid == first
 
         os.kill(first, signal.SIGKILL)
