@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nightly import nightly
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
@@ -57,6 +58,7 @@ def test_real_run_is_localized(located):
 
 
 @pytest.mark.slow
+@nightly
 def test_real_run_is_localized_on_an_airborne_like_map(tmp_path):
     """Seen from above, thinned to 8 pulses per square metre, without facades."""
     folder = data("kitti04")

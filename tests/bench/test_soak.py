@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nightly import nightly
 
 from bench.harness.suite import ROOT, environment
 from bench.soak.faults import FAULTS
@@ -158,6 +159,7 @@ def through(ours: socket.socket, message: bytes) -> bytes:
 
 
 @pytest.mark.slow
+@nightly
 def test_a_short_soak_survives_two_faults(tmp_path: Path) -> None:
     pytest.importorskip("psutil")
     out = tmp_path / "rows.json"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_world
+from nightly import nightly
 
 from coview_stream.config.mount import parse_mount
 from coview_stream.doctor.frame_checks import frame_findings
@@ -119,6 +120,7 @@ def test_unspoilt_run_is_ok(real, name):
 @pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("fault", FAULTS)
+@nightly
 def test_fault_is_found_on_a_real_run(real, fault):
     spoil, words = FAULTS[fault]
     findings = list(frame_findings([spoil(f) for f in real("riverside_a")]))

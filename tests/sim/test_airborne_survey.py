@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nightly import nightly
 
 from coview_stream.clouds import read_cloud
 from coview_stream.errors import ConfigError, InputError
@@ -114,6 +115,7 @@ def test_what_cannot_be_flown_is_refused():
 
 @pytest.mark.realdata
 @pytest.mark.slow
+@nightly
 def test_a_real_street_loses_its_facades_and_keeps_its_ground():
     root = Path(os.environ.get("COVIEW_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
     if not (root / "kitti04" / "base.laz").is_file():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import small_world
 from any_risk import NEVER
+from nightly import nightly
 from small_world import Box
 
 from coview_stream.basemap.basemap import BaseMap
@@ -40,6 +41,7 @@ def test_distinct_buildings_are_told_apart_and_equal_rows_are_not(world_map, row
         assert 0.0 <= found.share(5.0) <= found.share(FARTHEST) <= 1.0
 
 
+@nightly
 def test_changes_and_a_smaller_risk_make_places_harder_to_tell_apart(world_map):
     as_it_was, changed = (ambiguity(world_map, count=PLACES, changed=share) for share in (0.0, 0.6))
     assert np.median(as_it_was.evidence) > np.median(changed.evidence)

@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from nightly import nightly
 from serving import FALSE, Service
 from sockets import until
 
@@ -35,6 +36,7 @@ def serve(world_file, slow_drive, tmp_path):
         service.end()
 
 
+@nightly
 def test_steps_of_the_host_clock_change_nothing(serve, tmp_path):
     from coview_stream.clouds.python_child import python_environment
 
@@ -61,6 +63,7 @@ def test_robot_whose_clock_is_set_is_found_again(serve, step):
     assert max(service.errors()) < FALSE
 
 
+@nightly
 def test_frozen_stamps_give_no_pose(serve):
     service = serve()
     service.tracks()
@@ -84,6 +87,7 @@ def test_frozen_stamps_give_no_pose(serve):
     assert max(off.values()) < FALSE
 
 
+@nightly
 def test_more_frames_than_can_be_processed_are_counted_and_bounded(serve):
     service = serve()
     service.tracks()
@@ -106,6 +110,7 @@ def test_more_frames_than_can_be_processed_are_counted_and_bounded(serve):
     assert max(service.errors()) < FALSE
 
 
+@nightly
 def test_full_disk_is_one_warning_and_the_poses_go_on(serve):
     service = serve()
     service.tracks()

@@ -15,6 +15,7 @@ import urllib.request
 
 import pytest
 from bad_link import BadLink
+from nightly import nightly
 from serving import FALSE, Service
 from sockets import until
 from zenoh_routers import Router
@@ -124,6 +125,7 @@ def serving(service, *nodes, settle=3.0, seconds=3.0):
     return next(k for k, count in enumerate(made) if count)
 
 
+@nightly
 def test_first_node_is_killed_then_a_second_first_and_nobody_waits_for_the_dead(world_file, slow_drive, tmp_path):
     with Router() as router:
         service = Service(world_file, slow_drive, tmp_path, router=router.endpoint, robots_router=router.endpoint)
