@@ -15,9 +15,16 @@ from coview_stream.geometry.transforms import Pose, Poses, inverse
 
 _KITTI_COLUMNS = 12
 _BAGS = (".mcap", ".db3", ".bag")
+_FOLDERS = {
+    "frames": ("odometry.tum",),
+    "velodyne": ("odometry.tum", "poses.txt"),  # KITTI's
+    "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # what SC-LIO-SAM and SC-A-LOAM save
+}
+"""Folders of frames, and the files beside them that may hold the odometry: the first that is there."""
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
-    "poses.txt, or a ROS recording (rosbag2 directory, .mcap, .db3, .bag)"
+    "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, or a ROS recording "
+    "(rosbag2 directory, .mcap, .db3, .bag)"
 )
 
 
@@ -50,11 +57,9 @@ def find_layout(path: Path) -> Layout:
         if path.suffix.lower() not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
-    for folder in ("frames", "velodyne"):
+    for folder, names in _FOLDERS.items():
         if (path / folder).is_dir():
             frames = _frames(path / folder)
-            # KITTI poses belong to the velodyne folder; a TUM file says what it is
-            names = ("odometry.tum", "poses.txt") if folder == "velodyne" else ("odometry.tum",)
             odometry = next((path / name for name in names if (path / name).exists()), None)
             times = path / "times.txt"
             return Layout(path, frames, odometry, times if times.exists() else None)
@@ -67,7 +72,7 @@ def find_layout(path: Path) -> Layout:
 
 
 def _is_run(path: Path) -> bool:
-    return any((path / folder).is_dir() for folder in ("frames", "velodyne"))
+    return any((path / folder).is_dir() for folder in _FOLDERS)
 
 
 def find_bag(path: Path) -> Path | None:

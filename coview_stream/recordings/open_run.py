@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
 from coview_stream.recordings.layouts import find_bag, find_layout, read_odometry
+from coview_stream.recordings.mulran import find_sweeps, open_mulran
 from coview_stream.recordings.run import Run, single_frame_run
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ def open_run(
     """Open a run and validate all but the clouds themselves.
 
     Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
-    ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); one cloud file, or
+    ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); SC-LIO-SAM (``Scans/*.pcd``,
+    ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); one cloud file, or
     one frame without odometry, is a run of one frame with stamp 0 and the identity; a recording with PointCloud2 and
     Odometry (rosbag2 directory, ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry at the stamps
     in their headers, interpolated, and are deskewed by it where their points have times.
@@ -64,6 +66,8 @@ def open_run(
         return open_bag(bag, explicit, cloud_topic, odometry_topic, mount=mount)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):
         raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out")
+    if explicit is None and (sweeps := find_sweeps(path)) is not None:
+        return open_mulran(path, sweeps, mount)
     layout = find_layout(path)
     count = len(layout.frames)
     if explicit is None and layout.odometry is None:
