@@ -53,7 +53,14 @@ def open_mulran(path: Path, sweeps: Path, mount: Mount | None = None) -> Run:
     left_out = int(len(files) - kept.sum())
     notes = (f"{left_out} of {len(files)} sweeps have no pose around them in {poses_file.name} and are left out",)
     chosen = tuple(file for file, keep in zip(files, kept, strict=True) if keep)
-    return Run(path, chosen, wanted[kept] * 1e-9, between, notes=notes if left_out else (), mount=mount)
+    return Run(
+        path,
+        chosen,
+        np.asarray(wanted[kept] * 1e-9, dtype=np.float64),
+        between,
+        notes=notes if left_out else (),
+        mount=mount,
+    )
 
 
 def _poses(path: Path) -> tuple[Ints, Poses]:
