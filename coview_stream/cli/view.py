@@ -46,7 +46,7 @@ def add_view(parser: argparse._ActionsContainer) -> None:
 
 def _host_port(text: str) -> str:
     if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
-        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write for example --web={_WEB}")
+        raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write --web={_WEB}")
     return text
 
 

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 import pytest
 from made_up_scans import CHANCE, PASSED, chance_places, observation
+from nightly import nightly
 from scipy.stats import beta
 
 from coview_stream.localization.evidence import likelihood
@@ -182,7 +183,7 @@ def test_stated_error_is_reached_by_chance_no_more_often_than_it_says():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [15, 60])
+@pytest.mark.parametrize("number", [15, pytest.param(60, marks=nightly)])
 def test_stated_error_is_reached_by_chance_no_more_often_than_it_says_in_20000_searches(number):
     errors = np.fromiter(searches_by_chance(10_000, 40, number, 5 + number), dtype=float)
     assert holds(errors)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nightly import nightly
 from serving import FALSE, Service
 from sockets import until
 
@@ -71,7 +72,7 @@ def test_signs_of_life_and_the_end_are_told_to_systemd(service):
     assert service.end() == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=nightly)])
 def test_engines_that_are_killed_or_stopped_at_any_time_come_back(service, number):
     rng = random.Random(int(number))
     service.tracks()
