@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
 from coview_stream.localization.evidence.moved_part import find_moved_part
+from coview_stream.localization.evidence.observed_scan import ObservedScan
 from coview_stream.localization.registration.local_map import LocalMaps
 from coview_stream.localization.registration.prepare_scan import prepare_scan
 from coview_stream.localization.registration.register import ScanInput
@@ -24,6 +27,7 @@ from coview_stream.localization.search.request import Epoch, RequestSpec, Search
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough; set by hand
+_GUESSES = 12  # places of a guess that are tried at a keyframe; set by hand
 
 
 class GlobalSearch:
@@ -109,7 +113,7 @@ class GlobalSearch:
         )
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         named, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
-        guessed = self._guessed(request)
+        guessed = self._guessed(request, scan)
         named, ranks = [*named, *guessed], [*ranks, *range(len(guessed))]
         hints = self._hints.due(request.hints)
         scored = self._scorer.score([*named, *hints], ranks, len(hints), scan)  # against chance, all keyframes
@@ -135,14 +139,23 @@ class GlobalSearch:
         each = [recognizer.hypotheses() for recognizer in self._recognizers]
         return [own for some in each for own in some], [rank for some in each for rank in range(len(some))]
 
-    def _guessed(self, request: SearchRequest) -> list[Hypothesis]:
-        """Return the places that somebody named, on the ground; seldom, once they have been tried a few times."""
+    def _guessed(self, request: SearchRequest, scan: ScanInput) -> list[Hypothesis]:
+        """Return the best of the places that somebody named, on the ground; seldom, once they have been tried.
+
+        Only a few: all of them, around one place, would be taken for what chance finds on this map.
+        """
         due = self._guesses.due(request.guesses)
         if not due:
             return []
         self._guesses.tried(refuted=True)
         points = request.scan if len(request.scan) else request.submap
-        return on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
+        named = on_the_ground(due, on_ground(points, request.position), self.base_map.station_grid)
+        if len(named) <= _GUESSES:
+            return named
+        seen = ObservedScan.of(scan)
+        poses = seen.poses(np.array([each.T_map_odom for each in named]))
+        scores = seen.few.look_up(self.base_map.field, poses, "far")[2]
+        return [named[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
 
     def _register(self, scored: Scored, scan: ScanInput, request: SearchRequest) -> Candidate | None:
         """Register the most probable place and verify it there; None if it comes to another one, or leans."""
