@@ -31,6 +31,7 @@ _MAX_POINTS = 500_000  # that are read
 _SAMPLED = 8  # times as many points as asked for are thinned, evenly spread over the map
 _GROWTH = 1.2  # of the cells, until few enough are left
 _GROUND_BAND = 0.4  # metres above the ground's height: still the ground
+_GROUND_CELL = 4.0  # metres: of a survey without a map, in which the lowest point is the ground
 _MAX_CRS = 8000  # letters
 _FINEST = 0.005  # metres: a step on the wire
 _MAX_COORDINATE = 1e8  # metres: no place on this planet
@@ -60,6 +61,20 @@ class MapView:
         points = base_map.sampled_points(_SAMPLED * count)
         chosen = points[_thinned(points, count)]
         return cls(base_map.origin.copy(), chosen, _is_ground(base_map, chosen), base_map.crs, base_map.sha256)
+
+    @classmethod
+    def of_cloud(cls, points: Points, origin: Floats, count: int = POINTS_OF_FILE) -> MapView:
+        """Thin a survey of which no map has been built: (N, 3) float32 about ``origin``, metres.
+
+        The ground is taken for what lies near the lowest point of its cell.
+        """
+        chosen = points[_thinned(points[:: max(1, len(points) // (_SAMPLED * count))], count)]
+        cells = np.floor(chosen[:, :2] / _GROUND_CELL).astype(np.int64)
+        _, cell = np.unique(cells, axis=0, return_inverse=True)
+        lowest = np.full(int(cell.max(initial=-1)) + 1, np.inf, dtype=np.float32)
+        np.minimum.at(lowest, cell.ravel(), chosen[:, 2])
+        is_ground = chosen[:, 2] - lowest[cell.ravel()] < _GROUND_BAND
+        return cls(origin.copy(), chosen, is_ground, None, "")
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:

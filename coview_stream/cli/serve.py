@@ -182,8 +182,12 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
     )  # fmt: skip
     sinks = open_sinks(args)
     hangups: list[int] = []
-    with stop_on_signals(lambda: hangups.append(1)) as stop:
-        ended = _serve(options, stop, children, hangups, sinks)
+    try:
+        with stop_on_signals(lambda: hangups.append(1)) as stop:
+            ended = _serve(options, stop, children, hangups, sinks)
+    finally:
+        for sink in sinks:  # a feed that was never opened has not closed them
+            sink.close()
     if not ended:
         _exit_now()
     return 0

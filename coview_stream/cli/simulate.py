@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from coview_stream.errors import ConfigError
+from coview_stream.errors import ConfigError, InputError, require_library
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
 
@@ -43,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--origin", type=float, nargs=3, metavar=("X", "Y", "Z"), help="put the map at these coordinates"
     )
+    parser.add_argument(
+        "--mcap",
+        type=Path,
+        metavar="F.mcap",
+        help="record survey, scans, truth and odometry for Foxglove or rerun as well (extra: foxglove)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace a world simulated there before")
     parser.add_argument("--progress", action="store_true", help="draw a progress bar even without a terminal")
 
@@ -55,6 +61,10 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError("--utm and --origin: give one of them")
     if not 0.0 <= args.drift <= 20.0:
         raise ConfigError(f"drift: {args.drift!r} is out of range; use 0 to 20")
+    if args.mcap is not None:
+        require_library("foxglove", "foxglove-sdk>=0.20", "--mcap")
+        if args.mcap.exists() or not args.mcap.parent.is_dir():
+            raise InputError(f"{args.mcap}: is there already, or its directory is not; name a new file")
     drift = OdometryConfig()
     config = SimulationConfig(
         scene=args.scene,
@@ -81,4 +91,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"{world.directory}: {facts}")
     for line in config.dirt.describe():
         print(f"dirt: {line}")
+    if args.mcap is not None:
+        from coview_stream.viewers.world_recording import record_world
+
+        print(f"{args.mcap}: {record_world(args.out, args.mcap)} frames")
     return 0

@@ -32,17 +32,23 @@ class FoxgloveSink(Sink):
     Topics: ``/map``, ``/tf``, and for each robot ``/robots/NAME/`` ``pose``, ``scene`` (covariance), ``scan``,
     ``hypotheses``, ``status`` (the node's JSON) and ``state`` (changes, as a log).
 
+    Args:
+        by_stamp: log each message at its own stamp, as for what was recorded earlier; otherwise at the time of now.
+
     Raises:
         DependencyError: there is no foxglove-sdk.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, by_stamp: bool = False) -> None:
         self._sdk = require_library("foxglove", "foxglove-sdk>=0.20", "Foxglove")
         self._messages = require_library("foxglove.messages", "foxglove-sdk>=0.20", "Foxglove")
         self._kinds = require_library("foxglove.channels", "foxglove-sdk>=0.20", "Foxglove")
         self._context = self._sdk.Context()
         self._channels: dict[str, Any] = {}
         self._closing: list[Callable[[], object]] = []
+        self._recording: Path | None = None
+        self._by_stamp = by_stamp
+        self._newest_ns = 0
         self._origin: Floats = np.zeros(3)
         self._map: MapView | None = None
         self._states: dict[str, str] = {}
@@ -74,7 +80,7 @@ class FoxgloveSink(Sink):
         return int(server.port)
 
     def record(self, path: Path) -> None:
-        """Record into an MCAP file from now on; it is whole after :meth:`close`.
+        """Record into an MCAP file from now on; it is whole after :meth:`close`, and not there if nothing came.
 
         Raises:
             InputError: it is there already, or cannot be written.
@@ -86,6 +92,7 @@ class FoxgloveSink(Sink):
         except Exception as error:
             raise InputError(f"{path}: cannot be written ({error}); check the directory") from error
         self._closing.append(writer.close)
+        self._recording = path
 
     def map(self, view: MapView) -> None:
         """Draw the map."""
@@ -93,14 +100,14 @@ class FoxgloveSink(Sink):
         self._log_map(view)
 
     def _log_map(self, view: MapView) -> None:
-        self._channel("/map", "PointCloud").log(self._cloud(view.points, 0, view.is_ground.astype(np.float32)))
+        self._log("/map", "PointCloud", self._cloud(view.points, 0, view.is_ground.astype(np.float32)))
         origin = self._messages.FrameTransform(
             parent_frame_id=_SOURCE,
             child_frame_id=_FRAME,
             translation=self._vector(self._origin),
             rotation=self._messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
         )
-        self._channel("/tf", "FrameTransforms").log(self._messages.FrameTransforms(transforms=[origin]))
+        self._log("/tf", "FrameTransforms", self._messages.FrameTransforms(transforms=[origin]))
 
     def pose(self, pose: PoseMessage) -> None:
         """Draw a pose and how uncertain it is."""
@@ -114,9 +121,9 @@ class FoxgloveSink(Sink):
             translation=position,
             rotation=turn,
         )
-        self._channel("/tf", "FrameTransforms").log(m.FrameTransforms(transforms=[at]))
+        self._log("/tf", "FrameTransforms", m.FrameTransforms(transforms=[at]), pose.stamp_ns)
         own = m.PoseInFrame(timestamp=stamp, frame_id=_FRAME, pose=place)
-        self._channel(f"/robots/{name}/pose", "PoseInFrame").log(own)
+        self._log(f"/robots/{name}/pose", "PoseInFrame", own)
         spread = pose.covariance[:3, :3]
         if np.isfinite(spread).all():
             sigmas, axes = np.linalg.eigh(spread)
@@ -126,20 +133,20 @@ class FoxgloveSink(Sink):
             size = 2.0 * _SIGMAS * np.sqrt(np.maximum(sigmas, 1e-6))
             ball = m.SpherePrimitive(pose=self._pose(turned), size=self._vector(size), color=self._colour(name, 0.4))
             entity = m.SceneEntity(timestamp=stamp, frame_id=_FRAME, id=name, spheres=[ball])
-            self._channel(f"/robots/{name}/scene", "SceneUpdate").log(m.SceneUpdate(entities=[entity]))
+            self._log(f"/robots/{name}/scene", "SceneUpdate", m.SceneUpdate(entities=[entity]))
 
     def status(self, robot: str, status: dict[str, Any]) -> None:
         """Hand on a status, and log a change of state."""
         topic = f"/robots/{robot}/status"
         if topic not in self._channels:
             self._channels[topic] = self._sdk.Channel(topic, message_encoding="json", context=self._context)
-        self._channels[topic].log(status)
+        self._channels[topic].log(status, log_time=self._newest_ns if self._by_stamp else None)
         state, reason = str(status.get("state"))[:40], str(status.get("reason"))[:500]
         if self._states.get(robot) != state:
             self._states[robot] = state
             level = self._messages.LogLevel.Info if state == "TRACKING" else self._messages.LogLevel.Warning
             line = self._messages.Log(level=level, name=robot, message=f"{state}: {reason}")
-            self._channel(f"/robots/{robot}/state", "Log").log(line)
+            self._log(f"/robots/{robot}/state", "Log", line)
 
     def hypotheses(self, hypotheses: HypothesesMessage) -> None:
         """Draw the places that a search considers."""
@@ -149,7 +156,7 @@ class FoxgloveSink(Sink):
             T[:3, :3], T[:3, 3] = rot_z(yaw), (x, y, z)
             poses.append(self._pose(T))
         message = self._messages.PosesInFrame(timestamp=self._stamp(hypotheses.stamp_ns), frame_id=_FRAME, poses=poses)
-        self._channel(f"/robots/{hypotheses.robot}/hypotheses", "PosesInFrame").log(message)
+        self._log(f"/robots/{hypotheses.robot}/hypotheses", "PosesInFrame", message, hypotheses.stamp_ns)
 
     def scan(self, scan: Scan) -> None:
         """Draw a scan where its pose is known."""
@@ -159,13 +166,21 @@ class FoxgloveSink(Sink):
         T[:3, 3] -= self._origin
         points = transform(T, scan.points.astype(np.float64)).astype(np.float32)
         cloud = self._cloud(points, scan.stamp_ns, points[:, 2])
-        self._channel(f"/robots/{scan.robot}/scan", "PointCloud").log(cloud)
+        self._log(f"/robots/{scan.robot}/scan", "PointCloud", cloud, scan.stamp_ns)
 
     def close(self) -> None:
         """End the server and complete the recording."""
         for close in self._closing:
             close()
         self._closing.clear()
+        if self._recording is not None and not self._channels:
+            self._recording.unlink(missing_ok=True)
+        self._recording = None
+
+    def _log(self, topic: str, kind: str, message: Any, stamp_ns: int | None = None) -> None:
+        if stamp_ns is not None:
+            self._newest_ns = stamp_ns
+        self._channel(topic, kind).log(message, log_time=self._newest_ns if self._by_stamp else None)
 
     def _channel(self, topic: str, kind: str) -> Any:
         if topic not in self._channels:

@@ -59,6 +59,13 @@ def test_recording_holds_every_topic_in_schemas_of_foxglove(tmp_path):
     assert len(messages["/robots/r1/state"]) == 2
 
 
+def test_recording_of_nothing_is_not_left_behind(tmp_path):
+    sink = opened()
+    sink.record(tmp_path / "a.mcap")
+    sink.close()
+    assert not (tmp_path / "a.mcap").exists()
+
+
 def test_recording_does_not_overwrite_and_names_what_is_wrong(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"mine")
     with pytest.raises(InputError, match=r"a\.mcap: is there already"):
