@@ -86,6 +86,7 @@ EXTRA_OF = {
     "foxglove_schemas_protobuf": "messages",
     "google": "messages",
     "pyproj": "geo",
+    "distributed": "cluster",
     "open3d": "build",
     "CSF": "build",
     "matplotlib": "plot",

@@ -105,7 +105,6 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
         "tile_index": index,
         "surveyed": surveyed,
         "surveyed_corner": surveyed_corner,
-        **{f"descriptor.{name}": values for name, values in described.items()},
         **StationIndex.of(described).arrays(),
         **field,
         **learned[0],

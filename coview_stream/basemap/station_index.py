@@ -69,7 +69,7 @@ class StationIndex:
         if stations > StationCodes.MAX_STATIONS:
             limit = StationCodes.MAX_STATIONS
             raise MapError(f"{stations} stations, {limit} at most: build the map in parts, or with a larger block size")
-        chosen = _chosen(stations)
+        chosen = sampled_stations(stations)
         sample = {name: np.array(values[chosen]) for name, values in descriptors.items()}
         codes, rest = StationCodes.tiers(list(descriptors.values()), 2)
         return cls(codes, rest, sample)
@@ -80,7 +80,7 @@ class StationIndex:
         if any(name not in arrays for tier in _TIERS for name in _names(tier)) or _SAMPLED not in arrays:
             return None
         sample, stations = arrays[_SAMPLED], len(arrays[_TIERS[0]])
-        if sample.ndim != 4 or sample.shape[:2] != (len(channels), len(_chosen(stations))):
+        if sample.ndim != 4 or sample.shape[:2] != (len(channels), len(sampled_stations(stations))):
             return None
         count, _, rings, sectors = sample.shape
         # kernels look up what the shapes promise
@@ -115,7 +115,9 @@ class StationIndex:
     def _sample(self) -> tuple[Ints, dict[Channel, Complexes]]:
         """Every so many stations (K,), and the spectra of their descriptors by channel."""
         known = self._descriptors.items()
-        return _chosen(len(self)), {name: kernels.column_spectra(each.astype(np.float32)) for name, each in known}
+        return sampled_stations(len(self)), {
+            name: kernels.column_spectra(each.astype(np.float32)) for name, each in known
+        }
 
     def prepare(self) -> None:
         """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
@@ -159,8 +161,8 @@ class StationIndex:
         return found
 
 
-def _chosen(stations: int) -> Ints:
-    """Choose the stations (K,) of the sample, as evenly as they come."""
+def sampled_stations(stations: int) -> Ints:
+    """Choose the numbers (K,) of the stations that an index keeps as they are, as evenly as they come."""
     return np.arange(0, stations, max(1, -(-stations // _SAMPLE)))
 
 

@@ -13,7 +13,7 @@ from coview_stream.basemap.floors import LevelConfig, below_another, ground_leve
 from coview_stream.basemap.ground import ground_mask
 from coview_stream.config import Channel, DescriptorConfig
 from coview_stream.descriptors.coview import channel
-from coview_stream.geometry.arrays import Floats, Floats32, Reals
+from coview_stream.geometry.arrays import Floats, Floats32, Ints, Reals
 from coview_stream.geometry.transforms import Points
 
 Described = dict[Channel, npt.NDArray[np.float16]]
@@ -45,14 +45,29 @@ def find_stations(points: Points, block: float, levels: bool = True) -> Floats32
 
 
 def describe_storeys(
-    points: Points, stations: Floats32, block: float, config: DescriptorConfig, progress: Progress | None = None
+    points: Points,
+    stations: Floats32,
+    block: float,
+    config: DescriptorConfig,
+    progress: Progress | None = None,
+    wanted: Ints | None = None,
 ) -> Described:
-    """Describe all stations by channels (M, R, S), those with a storey above them storey by storey.
+    """Describe stations by channels (M, R, S), those with a storey above them storey by storey.
 
     A robot below another floor sees up to it, not the roof: such stations of similar height share a raster of the
     points from a metre below their floor up to the highest ceiling that counts as one.
+
+    Args:
+        points: (N, 3) of the map, or of all that lies within the radius and two blocks of the stations.
+        stations: (M, 3) all stations of the blocks that any of them is in.
+        block: metres.
+        config: of the descriptors.
+        progress: called with stations done and all stations.
+        wanted: (K,) numbers of those that are to be described, in the order of the answer; None takes all.
     """
     indoors = below_another(stations, block)
+    if wanted is not None:
+        stations, indoors = stations[wanted], indoors[wanted]
     corner = aligned_corner(points, block, RASTER_CELL)
     # a block at the upper edge may have its centre beyond the last point
     margin = int(np.ceil(block / RASTER_CELL))

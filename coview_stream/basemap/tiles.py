@@ -25,14 +25,18 @@ def sort_by_tile(points: Points, normals: Points, tile: float) -> tuple[Points, 
     An index row is (column, row, begin, end): the tile covers ``[column, column + 1) * tile`` in x, likewise in y.
     A normal of length 1 in int8 is off by less than 0.5 degrees.
     """
+    return sort_by_tile_packed(points, np.rint(normals * _NORMAL_SCALE).astype(np.int8), tile)
+
+
+def sort_by_tile_packed(points: Points, packed: Int8s, tile: float) -> tuple[Points, Int8s, Ints]:
+    """Return the same for normals (N, 3) that are int8 already."""
     cells = np.floor(points[:, :2].astype(np.float64) / tile).astype(np.int64)
     order = np.lexsort((cells[:, 1], cells[:, 0]))
     cells = cells[order]
     change = np.flatnonzero((np.diff(cells, axis=0) != 0).any(axis=1)) + 1
     begin = np.concatenate([[0], change])
     end = np.concatenate([change, [len(cells)]])
-    packed = np.rint(normals[order] * _NORMAL_SCALE).astype(np.int8)
-    return points[order], packed, np.column_stack([cells[begin], begin, end])
+    return points[order], packed[order], np.column_stack([cells[begin], begin, end])
 
 
 def spans(index: Ints, tile: float, centre: Floats, radius: float) -> Ints:

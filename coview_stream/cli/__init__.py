@@ -25,7 +25,7 @@ from coview_stream.version import __version__
 PROGRAM = "coview-stream"
 
 COMMANDS = (
-    *("demo", "build", "info", "locate", "fuse", "eval", "simulate", "airborne"),
+    *("demo", "build", "info", "convert", "locate", "fuse", "eval", "simulate", "airborne"),
     *("serve", "replay", "watch", "doctor", "train", "keygen"),
 )
 """Names in the order of ``--help``."""

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-HELP = "build a base map file from one or many clouds of the same frame"
+if TYPE_CHECKING:
+    from coview_stream.basemap.signature import SigningKey
+    from coview_stream.config import MapConfig
+
+HELP = "build a base map from one or many clouds of the same frame"
 
 _OPTIONS: dict[str, tuple[Any, str]] = {
     "block_size": (float, "edge of the station grid, metres (2)"),
@@ -17,6 +21,7 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
     "sectors": (int, "sectors of the descriptor (60)"),
 }
 _FIELDS = {"block_size": "block"}
+_MAX_WORKERS = 8  # unless more are asked for: each may take 2 GB; set by hand
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "maps", nargs="+", type=Path, metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="SITE.coview")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="SITE.coview|SITE/",
+        help="one file; or a directory of tiles, for sites that do not fit into memory",
+    )
     parser.add_argument("--preset", choices=("slam", "tls"), default="slam", help="tls: for terrestrial scans")
     for name, (kind, text) in _OPTIONS.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar="N", help=text)
@@ -38,34 +49,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--crs", metavar="EPSG:N", help="reference system of clouds that state none, metres")
     parser.add_argument("--sign", type=Path, metavar="NAME.key", help="sign the map with this private key (keygen)")
     parser.add_argument("--progress", action="store_true", help="draw progress bars even without a terminal")
+    tiles = parser.add_argument_group("directories of tiles")
+    tiles.add_argument(
+        "--workers", type=int, metavar="N", help="processes that build tiles (as many as cores, 8 at most)"
+    )
+    tiles.add_argument(
+        "--dask", metavar="HOST:PORT", help="have the workers of this Dask scheduler do it (local: start some here)"
+    )
+    tiles.add_argument("--keep-going", action="store_true", help="leave out, and name, sources and tiles that fail")
 
 
 def run(args: argparse.Namespace) -> int:
     """Build and save the map, and print its sizes."""
-    import time
-
-    from coview_stream.basemap import file_format
-    from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.signature import SigningKey
-    from coview_stream.basemap.summary import summary
-    from coview_stream.errors import MapError, warn
+    from coview_stream.config import map_preset
+    from coview_stream.errors import ConfigError, MapError
 
-    if args.output.resolve() in [path.resolve() for path in args.maps]:
-        raise MapError(f"{args.output}: is one of the scans to read; give the map another name")
-    file_format.check_target(args.output)
+    output = Path(args.output)
+    if output.resolve() in [path.resolve() for path in args.maps]:
+        raise MapError(f"{output}: is one of the scans to read; give the map another name")
     key = None if args.sign is None else SigningKey(args.sign)  # before anything slow
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     options["learned"] = _networks_available() if args.learned is None else args.learned
+    if args.output.endswith("/") or output.is_dir():
+        return _build_site(args, output, map_preset(args.preset, **options), key)
+    if args.workers is not None or args.dask is not None or args.keep_going:
+        raise ConfigError(
+            "--workers, --dask and --keep-going build directories of tiles; end the name of -o with a slash"
+        )
+    return _build_file(args, output, options, key)
+
+
+def _build_file(args: argparse.Namespace, output: Path, options: dict[str, Any], key: SigningKey | None) -> int:
+    import time
+
+    from coview_stream.basemap import file_format
+    from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.summary import summary
+    from coview_stream.errors import warn
+
+    file_format.check_target(output)
     begin = time.perf_counter()
     base_map = BaseMap.build(
         args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), crs=args.crs, **options
     )
-    base_map.save(args.output, key)
+    base_map.save(output, key)
     print(
-        f"{args.output}: {base_map.parameters['source_points']} points read, {len(base_map.points)} kept, "
-        f"{len(base_map)} stations, {time.perf_counter() - begin:.1f} s, {args.output.stat().st_size} bytes"
+        f"{output}: {base_map.parameters['source_points']} points read, {len(base_map.points)} kept, "
+        f"{len(base_map)} stations, {time.perf_counter() - begin:.1f} s, {output.stat().st_size} bytes"
         + ("" if key is None else f", signed with {key.fingerprint}")
     )
     covered = summary(base_map)
@@ -73,6 +106,48 @@ def run(args: argparse.Namespace) -> int:
         warn(warning)
     print(covered)
     return 0
+
+
+def _build_site(args: argparse.Namespace, output: Path, config: MapConfig, key: SigningKey | None) -> int:
+    import os
+    import time
+
+    from coview_stream.basemap.site.executors import DaskExecutor, Executor, ProcessExecutor
+    from coview_stream.basemap.site.site_build import build_site
+
+    begin = time.perf_counter()
+    executor: Executor
+    if args.dask is not None:
+        executor = DaskExecutor(args.dask, args.workers)
+    else:
+        executor = ProcessExecutor(args.workers if args.workers is not None else min(_MAX_WORKERS, os.cpu_count() or 1))
+    try:
+        built = build_site(
+            args.maps,
+            output,
+            config,
+            executor=executor,
+            crs=args.crs,
+            key=key,
+            keep_going=args.keep_going,
+            progress=args.progress or sys.stderr.isatty(),
+        )
+    finally:
+        executor.close()
+    site = built.manifest
+    area, stations = (sum(counts) for counts in zip(*((t.area, t.stations) for t in site.tiles), strict=True))
+    print(
+        f"{output}: {built.source_points} points read, {sum(tile.points for tile in site.tiles)} kept, "
+        f"{stations} stations, {time.perf_counter() - begin:.1f} s, {site.nbytes} bytes"
+        + ("" if key is None else f", signed with {key.fingerprint}")
+    )
+    print(
+        f"{len(site.tiles)} tiles of {site.tile:g} m, {built.reused} of them as they were, points on {area} m2: "
+        f"{site.nbytes / max(area, 1):.0f} MB per km2; manifest {site.sha256[:12]}"
+    )
+    for line in built.skipped:
+        print(f"left out: {line}", file=sys.stderr)
+    return 1 if built.skipped else 0
 
 
 def _networks_available() -> bool:

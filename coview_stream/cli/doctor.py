@@ -101,7 +101,7 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
         yield finding
         if base_map is not None:
             sha256 = base_map.sha256
-            yield from map_findings(base_map, args.map.stat().st_size, memory()[1])
+            yield from map_findings(base_map, base_map.nbytes, memory()[1])
     if args.run_path is not None:
         yield from _recorded(args, base_map)
     if connect is not None and zenoh:

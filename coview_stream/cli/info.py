@@ -53,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
     check_picture("--plot", args.plot)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     facts = describe(base_map)
+    if args.map.is_dir():
+        facts["site"] = _site(args.map)
     facts["signature"] = _signature(args.map, args.verify_key is not None)
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
@@ -119,11 +121,30 @@ def describe(base_map: BaseMap) -> dict[str, object]:
     }
 
 
+def _site(directory: Path) -> dict[str, object]:
+    """Describe the directory that a map's tiles are in."""
+    from coview_stream.basemap.site.manifest import Manifest
+
+    site = Manifest.load(directory)
+    layers = {
+        name: sum(tile.layers[name].bytes for tile in site.tiles if name in tile.layers)
+        for name in ("cloud", "stations", "features")
+    }
+    return {"tiles": len(site.tiles), "edge": site.tile, "bytes": site.nbytes, "manifest": site.sha256} | {
+        f"bytes of {name}": size for name, size in layers.items()
+    }
+
+
 def _signature(path: Path, verified: bool) -> str:
     """Describe who signed a map, and whether that has been verified."""
     from coview_stream.basemap.file_format import signer
 
-    by = signer(path)
+    if path.is_dir():
+        from coview_stream.basemap.site.manifest import Manifest
+
+        by = Manifest.load(path).signer or None
+    else:
+        by = signer(path)
     if by is None:
         return "none"
     return f"by {by}, verified" if verified else f"by {by}, it says; --verify-key verifies it"

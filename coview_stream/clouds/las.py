@@ -39,7 +39,7 @@ def read_las(path: Path) -> Cloud:
         CloudError: the file is damaged, truncated, empty or not in metres.
     """
     check_las(path)
-    if _is_compressed(path):
+    if is_compressed(path):
         require_laspy()  # here: its process could not say so
         return read_in_child(path)
     return decode(path, CloudBuilder).finish(os.fspath(path))
@@ -100,7 +100,8 @@ def las_system(path: Path) -> str | None:
     return text
 
 
-def _is_compressed(path: Path) -> bool:
+def is_compressed(path: Path) -> bool:
+    """Tell whether a file's points are compressed (LAZ), whatever its suffix."""
     with path.open("rb") as stream:
         return bool(stream.read(105)[104] & _COMPRESSED)
 

@@ -38,14 +38,26 @@ class LazProcess:
         """Decode a file.
 
         Raises:
+            CloudError: as of :meth:`stream`; or it holds no point that can be used.
+        """
+        builder = CloudBuilder()
+        builder.crs = self.stream(path, builder)
+        return builder.finish(os.fspath(path))
+
+    def stream(self, path: Path, builder: CloudBuilder) -> str | None:
+        """Decode a file into a builder, and return its reference system.
+
+        Raises:
             CloudError: it is damaged, or asked for more memory than a file of its size can need.
         """
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
-            whole = False
+            whole, crs = False, None
             try:
-                cloud = self._read(path)
+                for answer, raw, classes in self._answers(path):
+                    crs = answer.get("crs") or crs
+                    builder.add(raw, classes, answer["dropped"])
                 whole = True
             except _RefusedError as error:
                 whole = True
@@ -57,22 +69,12 @@ class LazProcess:
                     self._timer.start()
                 else:  # what it sends next is of the file that was given up
                     self._end(kill=True)
-            return cloud
+            return crs
 
     def close(self) -> None:
         """End the child."""
         with self._lock:
             self._end(kill=False)
-
-    def _read(self, path: Path) -> Cloud:
-        builder = CloudBuilder()
-        for answer, raw, classes in self._answers(path):
-            builder.crs = answer.get("crs") or builder.crs
-            builder.add(raw, classes, answer["dropped"])
-        try:
-            return builder.finish(os.fspath(path))
-        except CloudError as error:
-            raise _RefusedError(str(error)) from error
 
     def _answers(self, path: Path) -> Iterator[tuple[dict[str, Any], Any, Any]]:
         child = self._running()
@@ -163,3 +165,12 @@ def read_in_child(path: Path) -> Cloud:
         CloudError: as :meth:`LazProcess.read`.
     """
     return _process.read(path)
+
+
+def stream_from_child(path: Path, builder: CloudBuilder) -> str | None:
+    """Decode a LAZ or E57 file in the child that all share, into a builder, and return its reference system.
+
+    Raises:
+        CloudError: as :meth:`LazProcess.stream`.
+    """
+    return _process.stream(path, builder)

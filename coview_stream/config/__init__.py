@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from coview_stream.config.acceptance import AcceptanceConfig
 from coview_stream.config.localizer import LocalizerConfig
-from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, map_preset
+from coview_stream.config.map import Channel, DescriptorConfig, MapConfig, Preset, config_of_map, map_preset
 from coview_stream.config.mount import Mount
 from coview_stream.config.registration import RegistrationConfig, RegistrationMethod
 from coview_stream.config.search import ConsensusConfig, KeyframeConfig, LearnedConfig, Reloc, RetrievalConfig
@@ -31,5 +31,6 @@ __all__ = [
     "Reloc",
     "RetrievalConfig",
     "TrackingConfig",
+    "config_of_map",
     "map_preset",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
@@ -108,3 +109,23 @@ def map_preset(name: Preset, **changes: Any) -> MapConfig:
         else:
             raise ConfigError(f"unknown map option {key!r}; choose from {sorted(descriptor_names | map_names)}")
     return MapConfig(descriptor=DescriptorConfig(**descriptor), **rest)
+
+
+_BUILT_IN = {"visibility": "paper", "eye": 1.5}
+"""Descriptor options that only earlier versions had, which their files name, and the value that is built in now."""
+
+
+def config_of_map(plain: Mapping[str, Any]) -> MapConfig:
+    """Return the settings that a map's file holds as plain data.
+
+    Raises:
+        ConfigError: a value is out of range. KeyError, TypeError, ValueError: it is no such data.
+    """
+    fields_of_map = dict(plain)
+    fields_of_map.setdefault("learned", False)  # maps older than this field
+    descriptor = dict(fields_of_map.pop("descriptor"))
+    descriptor["channels"] = tuple(descriptor["channels"])
+    for name, only in _BUILT_IN.items():
+        if (value := descriptor.pop(name, only)) != only:
+            raise ConfigError(f"{name} is {value!r}; only {only!r} is known now")
+    return MapConfig(descriptor=DescriptorConfig(**descriptor), **fields_of_map)

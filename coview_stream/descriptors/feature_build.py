@@ -59,6 +59,25 @@ def feature_arrays(
     return arrays, {"weights": weights_sha256(), "cell": LOCAL_CELL}
 
 
+def features_of_square(points: Points, corner: Ints, size: int) -> dict[str, npt.NDArray[Any]]:
+    """Return the features of one square of a map, by the names of :class:`FeatureMap` without ``learned.``.
+
+    Args:
+        points: (N, 3) of the square and 112 m around it, metres, relative to the map's origin.
+        corner: (2,) its lower corner, multiples of 32 m.
+        size: its edge, a multiple of 32 m.
+
+    Raises:
+        DependencyError: no onnxruntime. InputError: no weights.
+    """
+    edge = (size + 2 * (_NET_MARGIN + _DRAW_MARGIN)) * _CELLS
+    whole = birds_eye_view(points, (corner - _NET_MARGIN - _DRAW_MARGIN).astype(np.float32), (edge, edge))
+    rim = _DRAW_MARGIN * _CELLS
+    around = whole[:, rim:-rim, rim:-rim].copy()
+    # one thread: sums in another order could round another way
+    return _stored(network("aerial", 1)(around), around, corner, (size, size))
+
+
 def _drawn(points: Points, low: Ints, high: Ints, window: int) -> Windows:
     """Draw bird's-eye views of the windows that have points, by column and row."""
     columns, rows = (-(-(high - low) // window)).tolist()

@@ -31,6 +31,6 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
     winner = result.winner
     if winner is not None and winner.station is not None and winner.shift is not None and result.query:
         channel = next(iter(result.query))
-        station = base_map.descriptors(channel)[winner.station].astype(np.float32)
+        station = base_map.descriptors_of(winner.station)[channel].astype(np.float32)
         titles = (f"keyframe ({channel})", f"winning station {winner.station}")
         plot_descriptor_pair(result.query[channel], station, winner.shift, folder / DESCRIPTORS_PNG, titles)

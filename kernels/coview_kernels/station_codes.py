@@ -157,21 +157,48 @@ class StationCodes:
         Raises:
             ValueError: the channels' shapes differ.
         """
-        stations, rings, sectors = descriptors[0].shape
-        if any(each.shape != (stations, rings, sectors) for each in descriptors):
-            raise ValueError(f"descriptors have shapes {[each.shape for each in descriptors]}, expected one for all")
-        sample = _spectra(_columns([each[:: -(-stations // _SAMPLE) or 1] for each in descriptors]))
-        empty = np.empty((stations, _ROWS, _LANES), dtype=np.int16)
-        made = [
-            cls(empty.copy(), basis, _steps(sample, basis), np.zeros(2 * _LANES + 1, dtype=np.float32), sectors)
-            for basis in _eigenvectors(sample, count)
-        ]
+        _check_shapes(descriptors)
+        stations = len(descriptors[0])
+        made = cls.empty_tiers([each[cls.learned_from(stations)] for each in descriptors], count, stations)
         for start in range(0, stations, _BATCH):
-            part = slice(start, start + _BATCH)
-            spectra = _spectra(_columns([each[part] for each in descriptors]))
-            for each in made:
-                each._encode(part, spectra)
+            part = slice(start, min(start + _BATCH, stations))
+            cls.encode_tiers(made, part, [each[part] for each in descriptors])
         return made
+
+    @staticmethod
+    def learned_from(stations: int) -> I64:
+        """Return the numbers (K,) of the stations that codes of so many are learned from."""
+        return np.arange(0, stations, -(-stations // _SAMPLE) or 1)
+
+    @classmethod
+    def empty_tiers(cls, sample: Sequence[npt.NDArray[Any]], count: int, stations: int) -> list[StationCodes]:
+        """Return codes of which none is filled in yet, learned from the descriptors of a sample.
+
+        Args:
+            sample: descriptors (K, R, S) of :meth:`learned_from`, one array per channel.
+            count: of tiers, each of what those before leave out.
+            stations: that are to be coded.
+
+        Raises:
+            ValueError: the channels' shapes differ.
+        """
+        _check_shapes(sample)
+        sectors, spectra = sample[0].shape[2], _spectra(_columns(sample))
+        empty = np.empty((stations, _ROWS, _LANES), dtype=np.int16)
+        return [
+            cls(empty.copy(), basis, _steps(spectra, basis), np.zeros(2 * _LANES + 1, dtype=np.float32), sectors)
+            for basis in _eigenvectors(spectra, count)
+        ]
+
+    @staticmethod
+    def encode_tiers(tiers: Sequence[StationCodes], part: slice, descriptors: Sequence[npt.NDArray[Any]]) -> None:
+        """Fill in a part of the codes, by the descriptors (m, R, S) of these stations, one array per channel."""
+        for start in range(part.start, part.stop, _BATCH):
+            some = slice(start, min(start + _BATCH, part.stop))
+            own = slice(some.start - part.start, some.stop - part.start)
+            spectra = _spectra(_columns([each[own] for each in descriptors]))
+            for each in tiers:
+                each._encode(some, spectra)
 
     def _encode(self, part: slice, spectra: C64) -> None:
         """Code some stations by their spectra (32, m, D)."""
@@ -324,6 +351,11 @@ def _turns(sectors: int) -> C64:
     angle = (2.0 * np.pi / sectors) * np.arange(sectors)[:, None, None] * _frequencies()[_GROUP]
     turns: C64 = np.exp(1j * angle).astype(np.complex64)
     return turns
+
+
+def _check_shapes(descriptors: Sequence[npt.NDArray[Any]]) -> None:
+    if any(each.shape != descriptors[0].shape for each in descriptors):
+        raise ValueError(f"descriptors have shapes {[each.shape for each in descriptors]}, expected one for all")
 
 
 def _columns(descriptors: Sequence[npt.NDArray[Any]]) -> F32:

@@ -185,7 +185,7 @@ def test_configuration_replaces_preset_and_options(cut, tmp_path):
     assert np.allclose((built.stations[:, :2] / 4.0) % 1.0, 0.5)
 
 
-@pytest.mark.parametrize("name", ["origin", "stations", "points", "surveyed", "descriptor.coview"])
+@pytest.mark.parametrize("name", ["origin", "stations", "points", "surveyed"])
 def test_map_with_missing_array_is_refused(whole, name):
     arrays = {k: v for k, v in whole._arrays.items() if k != name}
     with pytest.raises(MapError, match=r"lacks.*build it again"):

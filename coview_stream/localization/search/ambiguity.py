@@ -191,8 +191,7 @@ class _Rehearsal:
         scan = self._scan(place)
         if scan is None:
             return _Seen(False, False, 0.0, 0.0, 1.0)
-        channels = self.base_map.descriptor_config.channels
-        query = {name: self.base_map.descriptors(name)[station].astype(np.float32) for name in channels}
+        query = {name: own.astype(np.float32) for name, own in self.base_map.descriptors_of(station).items()}
         self._consensus.vote(self._retrieval.vote(self.base_map.stations[station].astype(np.float64), query))
         named = self._consensus.hypotheses()
         beside = np.tile(np.eye(4), (len(_AROUND), 1, 1))

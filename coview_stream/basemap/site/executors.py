@@ -1,0 +1,175 @@
+"""Executors of a build's steps: in this process, in processes of this machine, or by a Dask scheduler.
+
+All give the same results: a step is a pure function of its arguments and of files that no other step changes.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar
+
+from coview_stream.errors import ConfigError, MapError, require_library
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+MAX_WORKERS = 256
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Executor(Protocol):
+    """Runner of one function for many items."""
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        """Yield the number of each item with its result, or with what it raised, in whatever order they end."""
+        ...
+
+    def close(self) -> None:
+        """End the workers."""
+        ...
+
+
+class SerialExecutor:
+    """Executor in this very process."""
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        """Yield the results in the order of the items."""
+        for number, item in enumerate(items):
+            try:
+                yield number, function(item)
+            except Exception as error:
+                yield number, error
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class ProcessExecutor:
+    """Executor in processes of this machine, each with one thread for its libraries.
+
+    A process that dies is no reason to lose the others' work: what was under way is done again, an item at a time, so
+    that the one which kills its process is told.
+
+    Args:
+        workers: how many processes.
+
+    Raises:
+        ConfigError: none, or too many.
+    """
+
+    def __init__(self, workers: int) -> None:
+        if not 1 <= workers <= MAX_WORKERS:
+            raise ConfigError(f"workers: {workers} is out of range; use 1 to {MAX_WORKERS}")
+        self.workers = workers
+        self._pool: ProcessPoolExecutor | None = None
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        """Yield results as they come."""
+        suspects: list[int] = []
+        with _one_thread():
+            pool = self._pool = self._pool or self._new(self.workers)
+            futures: dict[Future[Any], int] = {pool.submit(function, item): k for k, item in enumerate(items)}
+            for future in as_completed(futures):
+                try:
+                    yield futures[future], future.result()
+                except BrokenProcessPool:
+                    suspects.append(futures[future])
+                except Exception as error:
+                    yield futures[future], error
+            if suspects:
+                self.close()
+            for number in sorted(suspects):
+                with self._new(1) as alone:
+                    try:
+                        yield number, alone.submit(function, items[number]).result()
+                    except BrokenProcessPool:
+                        yield (
+                            number,
+                            MapError("its process died (killed, or out of memory?); fewer --workers take less"),
+                        )
+                    except Exception as error:
+                        yield number, error
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+    @staticmethod
+    def _new(workers: int) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+
+
+class DaskExecutor:
+    """Executor by a Dask scheduler, whose workers see the same files under the same names.
+
+    Args:
+        address: ``HOST:PORT`` or ``tcp://HOST:PORT`` of a scheduler; ``local`` starts a cluster on this machine.
+        workers: of a local cluster; None leaves that to Dask.
+
+    Raises:
+        DependencyError: no ``distributed``. ConfigError: the scheduler cannot be reached.
+    """
+
+    def __init__(self, address: str, workers: int | None = None) -> None:
+        distributed = require_library("distributed", "distributed>=2024.5", "--dask")
+        options: dict[str, Any] = {"set_as_default": False}
+        if address == "local":
+            options |= {"processes": True, "threads_per_worker": 1, "dashboard_address": None}
+            options |= {} if workers is None else {"n_workers": workers}
+        else:
+            options |= {"address": address if "://" in address else f"tcp://{address}", "timeout": 10}
+        try:
+            with _one_thread():
+                self._client = distributed.Client(**options)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ConfigError(
+                f"--dask {address}: no scheduler answers there ({error}); start `dask scheduler`"
+            ) from error
+        self._as_completed = distributed.as_completed
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        """Yield results as they come."""
+        futures = {self._client.submit(function, item, pure=False): k for k, item in enumerate(items)}
+        for future in self._as_completed(list(futures), loop=self._client.loop):
+            error = future.exception()
+            if error is None:
+                yield futures[future], future.result()
+            elif isinstance(error, Exception):
+                yield futures[future], error
+            else:
+                raise error
+            future.release()
+
+    def close(self) -> None:
+        """Leave the scheduler; a local cluster ends."""
+        self._client.close()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Have processes that are started meanwhile use one thread each: the workers are the threads."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

@@ -1,0 +1,95 @@
+"""Bytes of a tile's layer: named arrays, each compressed by itself (LZMA), under a JSON header.
+
+Layout: ``COVIEWL1``, the header's length (4 bytes, little endian), the header, the compressed arrays in its order. The
+same arrays give the same bytes. Nothing is believed on reading: sizes are bounded before memory is taken.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from coview_stream.errors import MapError
+
+Arrays = Mapping[str, npt.NDArray[Any]]
+
+_MAGIC = b"COVIEWL1"
+_TYPES = {"u1": "|u1", "i1": "|i1", "u2": "<u2", "i2": "<i2", "i4": "<i4", "f4": "<f4"}
+_MAX_HEADER = 1 << 16  # bytes
+_MAX_ARRAYS = 32
+MAX_BYTES = 1 << 29
+"""Bytes that a layer may take in memory: ten times what the densest tile does; set by hand."""
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 22}]
+"""Bytes are predicted by nothing: rows of small numbers, whose neighbours in memory tell little of each other."""
+
+
+def encode(arrays: Arrays) -> bytes:
+    """Return the bytes of arrays of small integers or float32, whose names are sorted."""
+    entries, parts = [], []
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        kind = next(kind for kind, dtype in _TYPES.items() if np.dtype(dtype) == array.dtype)
+        part = lzma.compress(_planes(array), format=lzma.FORMAT_RAW, filters=_FILTERS)
+        entries.append({"name": name, "type": kind, "shape": list(array.shape), "bytes": len(part)})
+        parts.append(part)
+    header = json.dumps(entries, separators=(",", ":")).encode()
+    return b"".join([_MAGIC, len(header).to_bytes(4, "little"), header, *parts])
+
+
+def decode(raw: bytes, name: str) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays that :func:`encode` wrote, from anywhere.
+
+    Args:
+        raw: all of it.
+        name: of the layer, for messages.
+
+    Raises:
+        MapError: it is something else, cut off, or larger than a layer can be.
+    """
+    try:
+        return _decode(raw)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError, lzma.LZMAError) as error:
+        raise MapError(f"{name}: is no layer of a tile ({error}); fetch or build it again") from error
+
+
+def _decode(raw: bytes) -> dict[str, npt.NDArray[Any]]:
+    size = int.from_bytes(raw[8:12], "little")
+    if raw[:8] != _MAGIC or size > _MAX_HEADER or 12 + size > len(raw):
+        raise ValueError("its header is not one")
+    entries = json.loads(raw[12 : 12 + size])
+    if not isinstance(entries, list) or len(entries) > _MAX_ARRAYS:
+        raise ValueError("its header lists no arrays")
+    at, total, arrays = 12 + size, 0, {}
+    for entry in entries:
+        dtype, shape, length = np.dtype(_TYPES[entry["type"]]), entry["shape"], entry["bytes"]
+        if not all(type(n) is int and 0 <= n < 1 << 31 for n in [*shape, length]) or len(shape) > 4:
+            raise ValueError("a shape is impossible")
+        wanted = math.prod(shape) * dtype.itemsize
+        total += wanted
+        if total > MAX_BYTES or at + length > len(raw):
+            raise ValueError("it is too large or cut off")
+        arrays[str(entry["name"])] = _unpacked(raw[at : at + length], wanted, dtype, shape)
+        at += length
+    if at != len(raw):
+        raise ValueError("something follows its end")
+    return arrays
+
+
+def _unpacked(part: bytes, wanted: int, dtype: np.dtype[Any], shape: list[int]) -> npt.NDArray[Any]:
+    decoder = lzma.LZMADecompressor(format=lzma.FORMAT_RAW, filters=_FILTERS)
+    found = decoder.decompress(part, max_length=wanted + 1)
+    if len(found) != wanted:
+        raise ValueError(f"an array has {len(found)} bytes or more, not {wanted}")
+    planes = np.frombuffer(found, dtype=np.uint8).reshape(dtype.itemsize, -1)
+    return np.ascontiguousarray(planes.T).view(dtype).reshape(shape)
+
+
+def _planes(array: npt.NDArray[Any]) -> bytes:
+    """Return an array's bytes, the lowest ones of all numbers first: of small numbers the others are alike."""
+    return array.reshape(-1, 1).view(np.uint8).reshape(array.size, array.itemsize).T.tobytes()

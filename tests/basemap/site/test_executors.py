@@ -1,0 +1,78 @@
+"""Executors of a build's steps: the same results wherever they run, and what fails or dies is named."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from coview_stream.basemap.site.executors import DaskExecutor, ProcessExecutor, SerialExecutor
+from coview_stream.errors import ConfigError, MapError
+
+
+def step(number: int) -> int:
+    if number == 3:
+        raise MapError("three is damaged")
+    return number * number
+
+
+def deadly(number: int) -> int:
+    if number == 2:
+        os._exit(9)
+    return number
+
+
+def told(results):
+    return {k: str(r) if isinstance(r, Exception) else r for k, r in results}
+
+
+EXPECTED = {0: 1, 1: 4, 2: "three is damaged", 3: 16}
+
+
+def test_steps_in_this_process():
+    assert told(SerialExecutor().run(step, [1, 2, 3, 4])) == EXPECTED
+
+
+@pytest.mark.slow
+def test_steps_in_processes_and_one_that_kills_its_process():
+    executor = ProcessExecutor(2)
+    try:
+        assert told(executor.run(step, [1, 2, 3, 4])) == EXPECTED
+        found = told(executor.run(deadly, [1, 2, 3, 4]))
+        assert "its process died" in found.pop(1)
+        assert found == {0: 1, 2: 3, 3: 4}
+        assert told(executor.run(step, [5])) == {0: 25}  # the next ones have a pool again
+    finally:
+        executor.close()
+
+
+@pytest.mark.slow
+def test_steps_by_a_cluster_of_dask():
+    pytest.importorskip("distributed", reason="pip install 'coview-stream[cluster]'")
+    executor = DaskExecutor("local", 1)
+    try:
+        assert told(executor.run(step, [1, 2, 3, 4])) == EXPECTED
+    finally:
+        executor.close()
+
+
+def test_numbers_of_workers_and_schedulers_that_do_not_answer():
+    for workers in (0, -1, 10_000):
+        with pytest.raises(ConfigError, match="workers"):
+            ProcessExecutor(workers)
+    pytest.importorskip("distributed", reason="pip install 'coview-stream[cluster]'")
+    with pytest.raises(ConfigError, match="--dask no-host:nothing"):
+        DaskExecutor("no-host:nothing")
+
+
+def test_environment_is_as_it_was(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    executor = ProcessExecutor(1)
+    try:
+        assert dict(executor.run(Path, [])) == {}
+    finally:
+        executor.close()
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ

@@ -1,0 +1,63 @@
+"""Bytes of a layer: what was written comes back, and nothing else is believed."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.site.layer_bytes import decode, encode
+from coview_stream.errors import MapError
+
+RNG = np.random.default_rng(4)
+ARRAYS = {
+    "levels": RNG.integers(-4, 900, 1000).astype(np.int32),
+    "counts": RNG.integers(0, 3, (40, 50)).astype(np.uint16),
+    "inside": RNG.integers(0, 12, (3, 77)).astype(np.uint8),
+    "place": RNG.normal(size=(5, 2)).astype(np.float32),
+    "none": np.zeros((0, 2), dtype=np.int8),
+}
+
+
+def test_arrays_come_back_and_the_same_arrays_are_the_same_bytes():
+    raw = encode(ARRAYS)
+    assert raw == encode(dict(reversed(ARRAYS.items())))
+    found = decode(raw, "a")
+    assert set(found) == set(ARRAYS)
+    for name, array in ARRAYS.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+@pytest.mark.parametrize("at", [0, 9, 20, 300, -1])
+def test_changed_bytes_are_refused_or_change_only_numbers(at):
+    raw = bytearray(encode(ARRAYS))
+    raw[at] ^= 0x5A
+    try:
+        found = decode(bytes(raw), "tile")
+    except MapError as error:
+        assert "tile: is no layer of a tile" in str(error)
+    else:
+        assert all(found[name].nbytes <= 1 << 20 for name in found)
+
+
+@pytest.mark.parametrize("cut", [0, 7, 30, 200, -1])
+def test_cut_bytes_are_refused(cut):
+    with pytest.raises(MapError, match="is no layer of a tile"):
+        decode(encode(ARRAYS)[:cut], "tile")
+
+
+@pytest.mark.parametrize("shape", [[1 << 30], [1 << 15, 1 << 15], [-1], [2.0], ["a"], [1, 1, 1, 1, 1]])
+def test_impossible_shapes_take_no_memory(shape):
+    header = json.dumps([{"name": "a", "type": "f4", "shape": shape, "bytes": 0}]).encode()
+    with pytest.raises(MapError, match="is no layer of a tile"):
+        decode(b"COVIEWL1" + len(header).to_bytes(4, "little") + header, "tile")
+
+
+def test_array_that_unpacks_to_more_than_it_says_is_refused():
+    raw = encode({"a": np.zeros(1 << 20, dtype=np.uint8)})
+    small = raw.replace(b"[1048576]", b"[1048575]")
+    assert small != raw
+    with pytest.raises(MapError, match="not 1048575"):
+        decode(small, "tile")

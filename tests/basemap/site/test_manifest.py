@@ -1,0 +1,93 @@
+"""Manifest of a site: written, read, signed; what does not belong there is refused by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from coview_stream.basemap.site.manifest import LayerEntry, Manifest, TileEntry
+from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.errors import MapError
+
+SHA = "ab" * 32
+TILE = TileEntry(-1, 2, 10, 3, 7, -1.5, 20.25, {name: LayerEntry(SHA, 99) for name in ("cloud", "stations")})
+SITE = Manifest((500_000.0, 5_400_000.0, 100.0), 320.0, "EPSG:25832", {"config": {"block": 2.0}}, (TILE,))
+
+
+def test_manifest_comes_back_with_the_same_hash(tmp_path):
+    SITE.save(tmp_path)
+    found = Manifest.load(tmp_path)
+    assert found == SITE
+    assert found.sha256 == SITE.sha256 != replace(SITE, crs=None).sha256
+    assert (found.nbytes, found.hashes()) == (198, {SHA})
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("format",), "x"), (("version",), 2), (("origin",), [1, 2]), (("tile",), "a"), (("tile",), 0.1),
+        (("tiles", 0, "column"), 1.5), (("tiles", 0, "row"), True), (("tiles", 0, "points"), -1),
+        (("tiles", 0, "layers", "cloud", "sha256"), "../../etc/passwd"),
+        (("tiles", 0, "layers", "cloud", "bytes"), 1 << 40), (("tiles", 0, "layers"), {}),
+        (("tiles", 0, "layers", "other"), {"sha256": SHA, "bytes": 1}), (("tiles",), None), (("parameters",), []),
+        (("tiles", 0, "low"), 1e300), (("crs",), 4),
+    ],
+)  # fmt: skip
+def test_manifest_with_something_else_is_refused(path, value):
+    plain = json.loads(SITE.to_bytes())
+    at = plain
+    for name in path[:-1]:
+        at = at[name]
+    at[path[-1]] = value
+    with pytest.raises(MapError, match=r"site\.json"):
+        Manifest.from_bytes(json.dumps(plain).encode(), "site.json")
+
+
+def test_manifest_names_a_tile_once():
+    with pytest.raises(MapError, match="named twice"):
+        Manifest.from_bytes(replace(SITE, tiles=(TILE, TILE)).to_bytes(), "site.json")
+
+
+def test_signature_covers_the_hashes_of_the_layers(tmp_path):
+    pytest.importorskip("cryptography", reason="pip install 'coview-stream[sign]'")
+    from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
+
+    private, public, _ = make_keys(tmp_path / "mine")
+    other = read_verify_key(make_keys(tmp_path / "other")[1])
+    key = read_verify_key(public)
+    signed = Manifest.from_bytes(SITE.signed(SigningKey(private)).to_bytes(), "a")
+    signed.check_signature(key, "site")
+    assert signed.sha256 == SITE.sha256
+    with pytest.raises(MapError, match="not signed"):
+        SITE.check_signature(key, "site")
+    swapped = replace(signed, tiles=(replace(TILE, layers=TILE.layers | {"cloud": LayerEntry("cd" * 32, 99)}),))
+    for wrong, by in ((swapped, key), (signed, other)):
+        with pytest.raises(MapError, match="is not signed with"):
+            wrong.check_signature(by, "site")
+
+
+def test_store_gives_back_only_what_its_name_says(tmp_path):
+    store = TileStore(tmp_path)
+    sha = store.put(b"hello")
+    assert store.get(sha, 5) == b"hello"
+    assert store.put(b"hello") == sha
+    for content in (b"hellO", b"hell", b"hello!", None):
+        if content is None:
+            store.path(sha).unlink()
+        else:
+            store.path(sha).write_bytes(content)
+        with pytest.raises(MapError, match=sha):
+            store.get(sha, 5)
+        assert not store.is_whole(sha, 5)
+    with pytest.raises(MapError, match="is no sha256"):
+        store.path("../x")
+
+
+def test_store_keeps_what_is_named(tmp_path):
+    store = TileStore(tmp_path)
+    kept, other = store.put(b"kept"), store.put(b"other")
+    assert store.prune({kept}) == 5
+    assert store.holds(kept, 4)
+    assert not store.holds(other, 5)
