@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import numpy as np
 import pytest
 
@@ -108,9 +111,31 @@ def test_failed_build_keeps_the_old_map(cloud, tmp_path, capsys):
 
 
 def test_missing_output_directory_is_refused_before_building(tmp_path, capsys):
-    for target in (tmp_path / "no" / "site.coview", tmp_path):
-        assert main(["build", str(tmp_path / "none.las"), "-o", str(target)]) == 2
-        assert "not a place for a file" in one_line(capsys)
+    assert main(["build", str(tmp_path / "none.las"), "-o", str(tmp_path / "no" / "site.coview")]) == 2
+    assert "not a place for a file" in one_line(capsys)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    for cloud in ("none.las", "mine/thesis.txt"):
+        assert main(["build", str(tmp_path / cloud), "-o", str(tmp_path / "mine")]) == 2
+        assert "mine: is no site, and not empty" in one_line(capsys)
+
+
+@pytest.mark.slow
+def test_directory_of_tiles_is_built_converted_and_shown(cloud, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    assert main(["build", str(cloud), "-o", str(tmp_path / "x.coview"), "--workers", "2"]) == 2
+    assert "end the name of -o with a slash" in one_line(capsys)
+    site = f"{tmp_path}/site/"
+    assert main(["build", str(cloud), "-o", site, "--workers", "1", "--no-learned"]) == 0
+    assert re.search(r"\d+ tiles of 320 m, 0 of them as they were.* MB per km2", capsys.readouterr().out)
+    assert main(["info", site, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["site"]["tiles"] > 0
+    assert main(["convert", site, str(tmp_path / "one.coview")]) == 0
+    assert main(["convert", str(tmp_path / "one.coview"), str(tmp_path / "back")]) == 0
+    assert "tiles of 320 m" in capsys.readouterr().out
+    assert main(["convert", site, str(cloud)]) == 2
+    assert "no coview map" in one_line(capsys)
 
 
 def test_only_a_map_file_is_overwritten(cloud, tmp_path, capsys):

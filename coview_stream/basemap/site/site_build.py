@@ -85,8 +85,8 @@ def build_site(
         CloudError: a source cannot be read. MapError: nothing to stand on, or the directory cannot be used.
         ConfigError: a setting that sites cannot have.
     """
-    sources = _named(sources_of(given, crs))
     check_directory(directory)
+    sources = _named(sources_of(given, crs))
     work = directory / WORK
     try:
         work.mkdir(parents=True, exist_ok=True)
