@@ -1,4 +1,4 @@
-"""A site built of clouds: the same bytes whatever the order and the workers, resumed, and as good a map as one file's."""
+"""A site built of clouds: the same bytes whatever the order and the workers, resumed, as good a map as one file."""
 
 from __future__ import annotations
 
