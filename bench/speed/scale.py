@@ -34,10 +34,11 @@ from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import ConsensusConfig
 from coview_stream.descriptors.coview import describe
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
+from coview_stream.geometry.selection import argsmallest
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z
 from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
 from coview_stream.localization.search.coview_vote import CoViewVote
-from coview_stream.localization.search.votes import argsmallest, robust_zscore
+from coview_stream.localization.search.votes import robust_zscore
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 CHECKED = {10_000: 1, 100_000: 3, 1_000_000: 9}

@@ -281,7 +281,7 @@ class BaseMap:
         return self._described[name] if kept is None else kept
 
     def descriptors_of(self, station: int) -> dict[Channel, npt.NDArray[np.float16]]:
-        """Return the descriptors (R, S) of one station by channel, made of the cloud around it if the map holds none."""
+        """Return the descriptors (R, S) of one station by channel, made of the cloud if the map holds none."""
         channels = self.config.descriptor.channels
         if all(f"descriptor.{name}" in self._arrays for name in channels):
             return {name: self.descriptors(name)[station] for name in channels}

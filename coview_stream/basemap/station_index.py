@@ -18,15 +18,22 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_kernels import CodedQuery, StationCodes
+from coview_kernels.station_codes import COARSE_ROWS
 from coview_stream.config import Channel
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Complexes, Floats32, Ints
+from coview_stream.geometry.selection import argsmallest
 
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
 _SAMPLE = 128  # stations at all whose shifts medians are taken; set by hand
 _TIERS, _SAMPLED = ("station_codes", "station_codes.rest"), "station_codes.sample"
+_COARSE, _COARSE_NORM = "station_codes.coarse", "station_codes.coarse.norm"
+_COARSE_FROM = 50_000
+"""Stations from which coarse codes are made, and all stations screened by them first; set by hand: 25 MB."""
+_WIDER = 2  # times as many stations as are asked for are taken from the coarse screening; `bench scale` tells the loss
+_PART = 8192  # stations that are screened at a time, of those that the coarse codes leave: 4 MB
 
 
 @dataclass(frozen=True)
@@ -36,12 +43,14 @@ class ScoredQuery:
     Attributes:
         coded: the query, its channels weighted by how far they spread.
         rest: the same, for the second tier.
+        coarse: the same, for coarse codes; None where there are none.
         screen_zero: z-score of no correlation at all by the first tier alone.
         zero: that by both.
     """
 
     coded: CodedQuery
     rest: CodedQuery
+    coarse: CodedQuery | None
     screen_zero: float
     zero: float
 
@@ -53,9 +62,15 @@ class StationIndex:
     (eqs 7-9) exceeds the median; negative is better. It is the mean of the channels'.
     """
 
-    def __init__(self, codes: StationCodes, rest: StationCodes, sample: Descriptors) -> None:
+    def __init__(
+        self, codes: StationCodes, rest: StationCodes, sample: Descriptors, coarse: StationCodes | None = None
+    ) -> None:
         self.codes = codes
         self.rest = rest
+        if coarse is None and len(codes) >= _COARSE_FROM:
+            coarse = codes.coarse()
+        self.coarse = coarse
+        self._part: StationCodes | None = None
         self._descriptors = sample
 
     @classmethod
@@ -92,7 +107,13 @@ class StationIndex:
                 return None
             vectors = (basis[..., 0] + 1j * basis[..., 1]).astype(np.complex64)
             tiers.append(StationCodes(codes, vectors, np.array(step), np.array(norm), sectors))
-        return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)))
+        coarse = None
+        if _COARSE in arrays and _COARSE_NORM in arrays:
+            codes, norm = arrays[_COARSE], arrays[_COARSE_NORM]
+            if codes.dtype != np.int16 or codes.shape != (stations, COARSE_ROWS, 16) or norm.shape != (33,):
+                return None
+            coarse = tiers[0].coarse(codes, np.array(norm))
+        return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)), coarse)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return what a map's file holds of it."""
@@ -100,6 +121,8 @@ class StationIndex:
         for tier, codes in zip(_TIERS, (self.codes, self.rest), strict=True):
             basis = np.stack([codes.basis.real, codes.basis.imag], axis=-1)
             found |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
+        if self.coarse is not None:
+            found |= {_COARSE: self.coarse.codes, _COARSE_NORM: self.coarse.norm}
         return found
 
     def __len__(self) -> int:
@@ -123,7 +146,7 @@ class StationIndex:
         """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
         if len(self):
             query = self.query({name: values[0].astype(np.float32) for name, values in self._descriptors.items()})
-            _ = self.best(query), self.at(query, [0], [0])
+            _ = self.screened(query, 1), self.at(query, [0], [0])
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
@@ -138,15 +161,39 @@ class StationIndex:
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
         stacked = np.concatenate(columns)
         coded, rest = self.codes.query(stacked), self.rest.query(stacked)
+        coarse = None if self.coarse is None else self.coarse.query(stacked)
         # the codes leave parts out that no query lacks: what that adds on the mean is made up for here
         mean += self.codes.all_shifts(coded, chosen)
         screen_zero = float(np.median(mean))
         mean += self.rest.all_shifts(rest, chosen)
-        return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
+        return ScoredQuery(coded, rest, coarse, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:
         """Return the best z-score (M,) of each station at any heading, by the first tier."""
         return np.float32(query.screen_zero) - self.codes.best(query.coded)
+
+    def screened(self, query: ScoredQuery, count: int) -> Ints:
+        """Return the ``count`` stations that are best at any heading, the best first.
+
+        On large maps coarse codes choose twice as many, of which the first tier chooses: memory of a quarter, and of
+        what is left hardly anything is touched.
+        """
+        if self.coarse is None or query.coarse is None or _WIDER * count >= len(self):
+            return argsmallest(self.best(query), count)
+        likely = np.sort(argsmallest(-self.coarse.best(query.coarse), _WIDER * count))
+        return likely[argsmallest(-self._best_of(query, likely), count)]
+
+    def _best_of(self, query: ScoredQuery, stations: Ints) -> Floats32:
+        """Return the greatest correlations (K,) with some stations at any heading, by the first tier."""
+        if self._part is None:
+            codes = np.zeros((_PART, *self.codes.codes.shape[1:]), dtype=np.int16)
+            self._part = StationCodes(codes, self.codes.basis, self.codes.step, self.codes.norm, self.sectors)
+        found = np.empty(len(stations), dtype=np.float32)
+        for start in range(0, len(stations), _PART):
+            some = stations[start : start + _PART]
+            self._part.codes[: len(some)] = self.codes.codes[some]
+            found[start : start + len(some)] = self._part.best(query.coded)[: len(some)]
+        return found
 
     def all_shifts(self, query: ScoredQuery, stations: Ints) -> Floats32:
         """Return z-scores (K, S) of stations (K,) at all shifts, by the first tier."""

@@ -35,6 +35,8 @@ ANGLES = 60
 
 _LANES, _LOW, _HIGH = 16, 12, 4  # as in _ti_station_codes.py
 _ROWS = _LOW + _HIGH
+COARSE_ROWS = 4
+"""Rows of coarse codes, 128 bytes a station: of the frequencies below 16 what varies most."""
 _GROUP = np.repeat([0, 1], [_LOW, _HIGH])  # of each row
 _LANE = np.concatenate([np.arange(0, 16, 2), np.arange(1, 16, 2)])  # frequency of each lane in the first group
 _FREQUENCIES = 32
@@ -52,7 +54,7 @@ class Screen(NamedTuple):
     """A query in integers.
 
     Attributes:
-        integers: (2, 16, 2, 16) int16 for real and imaginary products.
+        integers: (2, R, 2, 16) int16 for real and imaginary products.
         turn: (65, 16) int16 table of rotations.
         unit: value of one unit of the turned products.
     """
@@ -83,17 +85,19 @@ class CodedQuery:
         """The query in integers."""
         p, s = self.numbers.real, self.numbers.imag
         pair = np.stack([np.stack([p, s], axis=1), np.stack([s, -p], axis=1)]) * self.step
-        size = np.sqrt(np.stack([(pair[:, g == _GROUP] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
+        rows = len(pair[0])
+        group = _GROUP[:rows]
+        size = np.sqrt(np.stack([(pair[:, g == group] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
         limit = np.minimum((_MAX_SUM - 4.0 * _ROWS) * 256.0 / np.maximum(self.norm[:-1].reshape(2, -1), 1.0), 32_000.0)
         gain = limit / np.maximum(size, 1e-30)
         scale = np.where(size > 0, 256.0 / gain, 0.0)  # of one unit of a product
-        span = float(self.norm[-1]) * float(np.linalg.norm(self.numbers)) + _ROWS * float(scale.sum())
+        span = float(self.norm[-1]) * float(np.linalg.norm(self.numbers)) + rows * float(scale.sum())
         unit = max(2.01 * float(scale.max()), span / 31_000.0, 1e-30)
         angle = (2.0 * np.pi / ANGLES) * _frequencies()[:, :, None] * np.arange(_LANES)
         factor = (65_536.0 / unit * scale)[:, :, None]
         turn = np.concatenate([np.cos(angle) * factor, -np.sin(angle) * factor]).reshape(-1, _LANES)
         return Screen(
-            np.rint(pair * gain[_GROUP][:, None]).astype(np.int16),
+            np.rint(pair * gain[group][:, None]).astype(np.int16),
             np.rint(np.concatenate([np.zeros((1, _LANES)), turn])).astype(np.int16),
             unit,
         )
@@ -118,6 +122,8 @@ class CodedQuery:
 
 class StationCodes:
     """M stations in 512 bytes each, and what it takes to compare a query with them.
+
+    Coarse codes have the first four of the 16 rows, and only :meth:`best` works with them.
 
     Attributes:
         codes: (M, 16, 16) int16; a memory map stays one.
@@ -203,11 +209,33 @@ class StationCodes:
     def _encode(self, part: slice, spectra: C64) -> None:
         """Code some stations by their spectra (32, m, D)."""
         self.codes[part] = _pack(_parts(_projected(spectra, self.basis)) / self.step)
-        whole = _unpack(self.codes[part])
+        self._add_norms(_unpack(self.codes[part]))
+
+    def _add_norms(self, whole: F32) -> None:
+        """Raise the norms to those of some stations' integers (m, R, 2, 16), where these are greater."""
         groups = whole[:, :_LOW], whole[:, _LOW:]
         blocks = np.concatenate([(each * each).sum(axis=(1, 2)) for each in groups], axis=1)
         self.norm[:-1] = np.maximum(self.norm[:-1], np.sqrt(blocks.max(axis=0)))
         self.norm[-1] = max(self.norm[-1], np.sqrt(((whole * self.step) ** 2).sum(axis=(1, 2, 3)).max()))
+
+    def coarse(self, codes: I16 | None = None, norm: F32 | None = None) -> StationCodes:
+        """Return the same stations in a quarter of the bytes, for :meth:`best` alone.
+
+        Args:
+            codes: (M, 4, 16) int16 of an earlier call; None copies them.
+            norm: (33,) float32 of an earlier call.
+        """
+        rows = slice(0, COARSE_ROWS)
+        found = StationCodes(
+            np.ascontiguousarray(self.codes[:, rows]) if codes is None else codes,
+            self.basis[rows],
+            self.step[rows],
+            np.zeros(2 * _LANES + 1, dtype=np.float32) if norm is None else norm,
+            self.sectors,
+        )
+        for start in range(0, len(self) if norm is None else 0, _BATCH):
+            found._add_norms(_unpack(found.codes[start : start + _BATCH]))
+        return found
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -283,7 +311,8 @@ class _Kernels:
 
     def __init__(self, codes: I16) -> None:
         flat = codes.reshape(-1)
-        self._query = np.zeros((2, _ROWS, 2, _LANES), dtype=np.int16)
+        rows = codes.shape[1]
+        self._query = np.zeros((2, rows, 2, _LANES), dtype=np.int16)
         self._turn = np.zeros((1 + 4 * _LANES, _LANES), dtype=np.int16)
         self._best = np.empty(len(codes), dtype=np.int32)
         self._stations, self._shifts = np.zeros((2, _CHUNK), dtype=np.int32)
@@ -291,7 +320,7 @@ class _Kernels:
         self._products = np.zeros((_CHUNK, 2, 2, _LANES), dtype=np.float32)
         self._values = np.zeros(_CHUNK, dtype=np.float32)
         serial = runtime.workers() == 1 or len(codes) < _MIN_PARALLEL
-        name = "best_serial" if serial else "best_parallel"
+        name = ("best_" if rows == _ROWS else "coarse_") + ("serial" if serial else "parallel")
         common = self._query.reshape(-1), self._turn.reshape(-1), self._best, _LANES
         self._launches = (
             Launch("station_codes", name, flat, *common),
@@ -400,9 +429,11 @@ def _steps(sample: C64, basis: C64) -> F32:
 
 
 def _projected(spectra: C64, basis: C64) -> C64:
-    """(m, 16, 16) numbers of spectra (32, m, D)."""
-    numbers = np.empty((spectra.shape[1], _ROWS, _LANES), dtype=np.complex64)
-    for group, rows in enumerate((slice(0, _LOW), slice(_LOW, _ROWS))):
+    """(m, R, 16) numbers of spectra (32, m, D)."""
+    numbers = np.empty((spectra.shape[1], len(basis), _LANES), dtype=np.complex64)
+    for group, rows in enumerate((slice(0, min(_LOW, len(basis))), slice(_LOW, len(basis)))):
+        if rows.start >= rows.stop:
+            continue
         lanes = spectra[_frequencies()[group]]  # (16, m, D)
         numbers[:, rows] = np.matmul(lanes, basis[rows].conj().transpose(1, 2, 0)).transpose(1, 2, 0)
     return numbers

@@ -82,3 +82,21 @@ def test_codes_begin_with_a_cache_line(world_map, tmp_path):
     world_map.save(tmp_path / "site.coview")
     codes = BaseMap.load(tmp_path / "site.coview").station_index.codes.codes
     assert codes.__array_interface__["data"][0] % 64 == 0
+
+
+def test_coarse_screening_names_the_same_stations(world_map, monkeypatch):
+    monkeypatch.setattr("coview_stream.basemap.station_index._COARSE_FROM", 1)
+    names = world_map.config.descriptor.channels
+    descriptors = {name: world_map.descriptors(name) for name in names}
+    coarse, plain = StationIndex.of(descriptors), world_map.station_index
+    assert coarse.coarse is not None
+    assert plain.coarse is None
+    again = StationIndex.from_arrays(coarse.arrays(), names)
+    for station in (3, 150, 600):
+        query = {name: np.roll(descriptors[name][station], 7, axis=1).astype(np.float32) for name in names}
+        wanted = set(plain.screened(plain.query(query), 20).tolist())
+        for index in (coarse, again):
+            found = index.screened(index.query(query), 20).tolist()
+            assert found[0] == station
+            assert len(wanted & set(found)) >= 14  # of a map so small that twice as many are few
+    assert "station_codes.coarse" not in plain.arrays()

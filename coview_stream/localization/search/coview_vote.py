@@ -9,7 +9,7 @@ import numpy as np
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.localization.search.votes import argsmallest
+from coview_stream.geometry.selection import argsmallest
 
 _MIN_STATIONS = 2048  # whose shifts are looked at one by one: the best; set by hand
 _SHARE = 32  # on large maps it is one in so many; set by hand
@@ -36,7 +36,7 @@ class CoViewVote:
     def candidates(self) -> tuple[Ints, Ints]:
         """Return stations and shifts (K,): the best of the headings at which the best stations are most alike."""
         count = max(_MIN_STATIONS, len(self._index) // _SHARE)
-        stations = argsmallest(self._index.best(self._query), count)
+        stations = self._index.screened(self._query, count)
         scores = self._index.all_shifts(self._query, stations)
         # every one of them has a heading that is no worse than the last one's best
         station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)

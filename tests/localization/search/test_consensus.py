@@ -8,10 +8,11 @@ from dense_consensus import dense_scores
 
 from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import ConsensusConfig
+from coview_stream.geometry.selection import argsmallest
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, transform, wrap_angle, yaw_of
 from coview_stream.localization.search.consensus import Consensus, yaw_of_shift
 from coview_stream.localization.search.smallest_distance import SmallestDistance
-from coview_stream.localization.search.votes import TableVote, argsmallest, robust_zscore
+from coview_stream.localization.search.votes import TableVote, robust_zscore
 
 BLOCK, S, SIDE = 2.0, 12, 12
 SHIFT = 2  # yaw of odometry in the map: -60 degrees
