@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nightly import nightly
 
+from coview_stream import BaseMap
 from coview_stream.cli import COMMANDS, build_parser
 from coview_stream.clouds import read_tum
 from coview_stream.messages import decode_cloud, encode_pose
@@ -29,6 +31,24 @@ def world(tmp_path_factory):
     config = SimulationConfig(scene="campus", sensor="os64", seed=1, size=100.0, length=10.0)
     simulate(folder, config)
     return folder
+
+
+@pytest.fixture(scope="module")
+def one_map():
+    return {}
+
+
+@pytest.fixture
+def built_once(one_map, monkeypatch):
+    """Examples whose idea is not the building share one map."""
+    real = BaseMap.build
+
+    def build(path, learned=True):
+        if path not in one_map:
+            one_map[path] = real(path, learned=learned)
+        return one_map[path]
+
+    monkeypatch.setattr(BaseMap, "build", build)
 
 
 def example(name):
@@ -57,6 +77,85 @@ def test_example_custom_descriptor(world, capsys):
     assert set(shares) == {"scan_context", "coview", "coview_strict"}
     assert max(shares["scan_context"], shares["coview"]) >= 0.5
     assert capsys.readouterr().out.count("keyframes") == len(shares)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("built_once")
+def test_example_poses_on_the_map(world, tmp_path):
+    picture = tmp_path / "poses.png"
+    assert example("poses_on_the_map.py")(world, picture) > 10
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 5000
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("built_once")
+def test_example_errors_and_bounds(world, tmp_path):
+    table = example("errors_and_bounds.py")(world, tmp_path / "errors.png")
+    assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+    assert len(table) > 10
+    assert (table[:, 1] < table[:, 3]).mean() > 0.95  # errors stay within their protection levels
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("built_once")
+def test_example_carried_away(world, capsys):
+    assert len(example("carried_away.py")(world)) == 2
+    assert "carried back: found after" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_example_map_of_arrays(world, tmp_path, capsys):
+    base_map = example("map_of_arrays.py")(world, tmp_path / "site.coview")
+    assert base_map.crs == "EPSG:25832"
+    assert base_map.bounds[0][0] > 499_000.0
+    assert "points/m2" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_example_trajectory_for_gis(world, tmp_path, capsys):
+    pytest.importorskip("pyproj", reason="pip install 'coview-stream[geo]'")
+    files = example("trajectory_for_gis.py")(world, tmp_path / "out")
+    assert [path.name for path in files] == ["trajectory.geojson", "trajectory.csv"]
+    assert files[1].read_text().startswith("stamp,x,y,z,qx,qy,qz,qw,latitude,longitude,height")
+    assert "ends at 48." in capsys.readouterr().out
+
+
+@nightly
+def test_example_tiles_of_a_city(world, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    base_map = example("tiles_of_a_city.py")(world, tmp_path / "city", workers=1)
+    assert len(base_map)
+    out = capsys.readouterr().out
+    first, second = re.findall(r"(\d+) tiles, (\d+) as they were", out)
+    assert (first[1], second[1]) == ("0", first[0])
+
+
+def test_example_transforms(capsys):
+    import asyncio
+    import threading
+    import time
+
+    net, ended = MemoryTransport(), threading.Event()
+    T = np.eye(4)
+    T[:3, 3] = 5.0, 6.0, 7.0
+
+    def publish():
+        for k in range(1, 400):
+            pose = PoseMessage(k * 100_000_000, "r1", "TRACKING", T, np.eye(6), 0.9, "ab", T_map_odom=T)
+            net.publish(Sample("coview/r1/out/pose", encode_pose(pose, "json").payload))
+            if ended.wait(0.01):
+                return
+
+    sender = threading.Thread(target=publish, daemon=True)
+    sender.start()
+    begin = time.monotonic()
+    found = asyncio.run(example("transforms.py")("r1", count=3, transport=net))
+    ended.set()
+    sender.join()
+    assert time.monotonic() - begin < 20
+    np.testing.assert_array_equal(found, [T] * 3)
+    assert "odometry's zero is at 5.00 6.00 7.00 on the map" in capsys.readouterr().out
 
 
 @pytest.mark.slow
