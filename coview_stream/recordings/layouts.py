@@ -18,13 +18,14 @@ _BAGS = (".mcap", ".db3", ".bag")
 _FOLDERS = {
     "frames": ("odometry.tum",),
     "velodyne": ("odometry.tum", "poses.txt"),  # KITTI's
+    "velodyne_points/data": ("odometry.tum",),  # KITTI's raw data, whose own poses lie elsewhere
     "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # what SC-LIO-SAM and SC-A-LOAM save
 }
 """Folders of frames, and the files beside them that may hold the odometry: the first that is there."""
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
-    "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, or a ROS recording "
-    "(rosbag2 directory, .mcap, .db3, .bag)"
+    "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, a drive of KITTI's raw "
+    "data, or a ROS recording (rosbag2 directory, .mcap, .db3, .bag)"
 )
 
 
@@ -63,6 +64,11 @@ def find_layout(path: Path) -> Layout:
             odometry = next((path / name for name in names if (path / name).exists()), None)
             times = path / "times.txt"
             return Layout(path, frames, odometry, times if times.exists() else None)
+    if fused := next((each for each in (path, path / "PCD") if any(each.glob("scans*.pcd"))), None):
+        raise RunError(
+            f"{fused}: scans*.pcd, as FAST-LIO saves them, lie in its own world frame: a map, and no run; record its "
+            "/cloud_registered_body and /Odometry in a bag, and give that"
+        )
     within = next((sub for sub in sorted(path.iterdir()) if sub.is_dir() and _is_run(sub)), None)
     if within is not None:
         raise RunError(f"{path}: is no run; did you mean {within}?")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
+from coview_stream.recordings.kitti_raw import is_kitti_raw, open_kitti_raw
 from coview_stream.recordings.layouts import find_bag, find_layout, read_odometry
 from coview_stream.recordings.mulran import find_sweeps, open_mulran
 from coview_stream.recordings.run import Run, single_frame_run
@@ -34,7 +35,8 @@ def open_run(
 
     Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
     ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); SC-LIO-SAM (``Scans/*.pcd``,
-    ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); one cloud file, or
+    ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); a drive of
+    KITTI's raw data (``velodyne_points/``, ``oxts/``); one cloud file, or
     one frame without odometry, is a run of one frame with stamp 0 and the identity; a recording with PointCloud2 and
     Odometry (rosbag2 directory, ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry at the stamps
     in their headers, interpolated, and are deskewed by it where their points have times.
@@ -68,6 +70,8 @@ def open_run(
         raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out")
     if explicit is None and (sweeps := find_sweeps(path)) is not None:
         return open_mulran(path, sweeps, mount)
+    if explicit is None and is_kitti_raw(path):
+        return open_kitti_raw(path, mount)
     layout = find_layout(path)
     count = len(layout.frames)
     if explicit is None and layout.odometry is None:

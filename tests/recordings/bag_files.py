@@ -78,7 +78,7 @@ def odometry(stamp_ns: int, T: np.ndarray, child: str = "body"):
 def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compression: str = "") -> Path:
     """Write messages, or raw CDR bytes (as clouds), by topic; all topics arrive side by side."""
     if path.suffix == ".bag":
-        return _write_ros1(path, topics)
+        return _write_ros1(path, topics, compression)
     plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
     writer = Writer(path, version=9, storage_plugin=plugin)
     if compression:
@@ -91,8 +91,11 @@ def write_bag(path: Path, topics: dict[str, list], storage: str = "mcap", compre
     return path
 
 
-def _write_ros1(path: Path, topics: dict[str, list]) -> Path:
-    with Ros1Writer(path) as writer:
+def _write_ros1(path: Path, topics: dict[str, list], compression: str = "") -> Path:
+    writer = Ros1Writer(path)
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    with writer:
         connections = {topic: writer.add_connection(topic, _type(m), typestore=ROS1) for topic, m in topics.items()}
         for arrived, topic, kind, item in _in_turn(topics):
             raw = STORE.cdr_to_ros1(bytes(STORE.serialize_cdr(item, kind)), kind)

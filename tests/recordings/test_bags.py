@@ -59,6 +59,8 @@ def only_file(folder: Path) -> Path:
         ("zstd_messages", "sqlite3", "MESSAGE", False),
         ("zstd_file", "sqlite3", "FILE", False),
         ("ros1.bag", "", "", False),
+        ("ros1_lz4.bag", "", "LZ4", False),
+        ("ros1_bz2.bag", "", "BZ2", False),
     ],
 )
 def test_every_bag_storage_is_read(tmp_path, name, storage, compression, single):

@@ -1,4 +1,4 @@
-"""Folders as SC-LIO-SAM and MulRan have them."""
+"""Folders as SC-LIO-SAM, MulRan, KITTI's raw data and FAST-LIO have them."""
 
 from __future__ import annotations
 
@@ -66,3 +66,65 @@ def test_incomplete_folder_of_mulran_names_what_is_missing(mulran):
     file.unlink()
     with pytest.raises(RunError, match=r"global_pose\.csv: no such file"):
         open_run(mulran)
+
+
+@pytest.fixture
+def kitti_raw(tmp_path):
+    """A drive to the north-east, a metre from sweep to sweep; the lidar sits 0.8 m ahead of the IMU, 0.3 m aside."""
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    for name in ("velodyne_points", "oxts"):
+        (drive / name / "data").mkdir(parents=True)
+    latitude, longitude = 49.0, 8.4
+    metre = 180.0 / (np.pi * 6_378_137.0)
+    stamps = []
+    for k in range(5):
+        north_east = k * 1.0 / np.sqrt(2.0)
+        oxts = [latitude + north_east * metre, longitude + north_east * metre / np.cos(np.radians(latitude)), 110.0]
+        values = [*oxts, 0.0, 0.0, np.pi / 4, *([0.0] * 24)]
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(" ".join(f"{v:.12f}" for v in values))
+        stamps.append(f"2011-09-26 13:02:25.{100_000_000 * k + 64_389_445:09d}")
+        if k != 2:  # as in some drives, a sweep is missing
+            sweep = np.column_stack([POINTS, np.zeros(len(POINTS))]).astype("<f4")
+            sweep.tofile(drive / "velodyne_points" / "data" / f"{k:010d}.bin")
+    for name in ("velodyne_points", "oxts"):
+        (drive / name / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    calibration = "calib_time: 25-May-2012\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n"
+    (drive.parent / "calib_imu_to_velo.txt").write_text(calibration)
+    return drive
+
+
+def test_drive_of_kittis_raw_data(kitti_raw):
+    run = open_run(kitti_raw)
+    assert len(run) == 4
+    np.testing.assert_allclose(np.diff(run.stamps), [0.1, 0.2, 0.1], atol=1e-6)
+    lidar = pose_from(rot_z(np.pi / 4), [0.0, 0.0, 0.0]) @ pose_from(np.eye(3), [0.8, -0.3, 0.8])
+    np.testing.assert_allclose(run.poses[0], lidar, atol=1e-6)
+    steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps, [1.0, 2.0, 1.0], atol=1e-4)
+    assert run.notes == ()
+    (kitti_raw.parent / "calib_imu_to_velo.txt").unlink()
+    assert "taken to sit at the inertial system" in open_run(kitti_raw).notes[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "match"),
+    [
+        ("oxts/data/0000000001.txt", "49.0 8.4 nan 0 0 0", r"0000000001\.txt: no latitude"),
+        ("oxts/data/0000000001.txt", "a b", r"0000000001\.txt: no pose"),
+        ("oxts/timestamps.txt", "2011-09-26 13:02:25.1\n", r"5 poses and 1 stamps"),
+        ("velodyne_points/timestamps.txt", "yesterday\n", r"timestamps\.txt:1: no stamp"),
+        ("velodyne_points/timestamps.txt", "2011-09-26 13:02:25.1\n", r"has 1 stamps"),
+        ("../calib_imu_to_velo.txt", "R: 1 2 3\nT: 0 0 0\n", r"calib_imu_to_velo\.txt: has no R of nine"),
+    ],
+)
+def test_damaged_drive_of_kittis_raw_data_names_the_file(kitti_raw, file, text, match):
+    (kitti_raw / file).write_text(text)
+    with pytest.raises(RunError, match=match):
+        open_run(kitti_raw)
+
+
+def test_map_that_fast_lio_saved_is_no_run(tmp_path):
+    (tmp_path / "PCD").mkdir()
+    write_cloud(tmp_path / "PCD" / "scans.pcd", POINTS)
+    with pytest.raises(RunError, match=r"as FAST-LIO saves them.*/cloud_registered_body"):
+        open_run(tmp_path)
