@@ -87,6 +87,7 @@ BENCHMARKS = {
     "forest_plot": Benchmark("forest.plot", "a real plot among real airborne tiles"),
     "recognition": Benchmark("forest.recognition", "place recognition on public sets: AR@1, AR@5, AR@1 %, MRR"),
     "changes": Benchmark("fusion.changes", "what fuse --changes tags as new and gone, and what it leaves out"),
+    "joint": Benchmark("fusion.joint", "whether fuse --joint pays: errors of two runs, and the distance between them"),
     "stream": Benchmark("stream.stream", "robots over zenoh: rates, delays, attacks"),
     "many": Benchmark("stream.many_robots", "sixteen robots on one node, of which eight search without end"),
     "fuzz": Benchmark("fuzz.fuzz", "untrusted bytes into every decoder and reader, within limits"),

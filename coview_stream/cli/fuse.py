@@ -21,6 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-range", type=float, default=50.0, metavar="M", help="farther is left out (50)")
     parser.add_argument("--keep-moving", action="store_true", help="keep people and cars that drove")
     parser.add_argument("--changes", action="store_true", help="tag what is new and what is gone")
+    parser.add_argument(
+        "--joint", action="store_true", help="adjust the runs' poses to each other and to the map first"
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw it from above")
     parser.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as `locate` was given (auto)")
     add_gravity(parser)
@@ -38,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.config.mount import Mount, parse_mount
     from coview_stream.errors import require_library
     from coview_stream.fusion.fuse import FuseConfig, check_count, fuse
-    from coview_stream.fusion.fused_file import check_name, write_fused
+    from coview_stream.fusion.fused_file import check_name, write_fused, write_trajectories
     from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
     from coview_stream.fusion.summary import summary
     from coview_stream.recordings.open_run import open_run
@@ -48,6 +51,8 @@ def run(args: argparse.Namespace) -> int:
     check_count(len(pairs))
     check_name(args.output, [args.map, *(path for pair in pairs for path in (pair.run, pair.trajectory, pair.result))])
     check_picture("--picture", args.picture)
+    if args.joint:
+        require_library("gtsam", "gtsam>=4.3", "--joint")
     if args.picture is not None:
         require_library("matplotlib", "matplotlib>=3.8", "--picture")
     given = None if args.mount is None else parse_mount(args.mount)
@@ -77,8 +82,20 @@ def run(args: argparse.Namespace) -> int:
                 bar.set_description(what)
             bar.update(done - bar.n)
 
+        joint = None
+        if args.joint:
+            from coview_stream.fusion.joint import adjust
+
+            joint = adjust(base_map, runs, follow)
+            for each, poses in zip(runs, joint.poses, strict=True):
+                each.poses = poses
         fused = fuse(base_map, runs, config, follow)
     write_fused(fused, args.output, [str(pair.run) for pair in pairs])
+    if joint is not None:
+        print(joint.said())
+        names = write_trajectories(args.output, runs)
+        kept = "adjusted" if joint.accepted else "as locate had them"
+        print(f"{', '.join(names)}: trajectories of the runs, {kept}")
     if args.picture is not None:
         from coview_stream.fusion.picture import draw_fused
 

@@ -12,8 +12,10 @@ import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.las import require_laspy
+from coview_stream.clouds.trajectory import write_tum
 from coview_stream.errors import CloudError, DependencyError, require_library, warn
 from coview_stream.fusion.fuse import Fused
+from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.fusion.records import RECORD
 
 SUFFIXES = (".laz", ".las", ".ply", ".pcd", ".npy")
@@ -58,6 +60,18 @@ def write_fused(fused: Fused, path: Path, names: Sequence[str]) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise CloudError(f"{path}: cannot be written ({reason}); check the directory and the disk") from error
+
+
+def write_trajectories(path: Path, runs: Sequence[LocalizedRun]) -> list[str]:
+    """Write the poses of each run beside the cloud, TUM, map <- body: ``PATH.run1.tum`` and so on; return the names.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    names = [f"{path.name}.run{k}.tum" for k in range(1, len(runs) + 1)]
+    for name, run in zip(names, runs, strict=True):
+        write_tum(path.with_name(name), run.stamps, run.poses)
+    return names
 
 
 def _sidecar(fused: Fused, names: Sequence[str]) -> dict[str, Any]:

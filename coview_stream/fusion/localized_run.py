@@ -16,7 +16,9 @@ from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.mount import Mount
 from coview_stream.errors import CloudError, InputError, warn
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, transform
+from coview_stream.geometry.transforms import Points, Pose, Poses, exp_so3, pose_from, transform
+from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.calibration.odometry_correction import OdometryCorrection
 from coview_stream.recordings.run import Run, SweepCorrection
 
 _SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, frames are milliseconds apart at least
@@ -110,6 +112,8 @@ class LocalizedRun:
         self._R_level = exp_so3(np.radians([_number(calibration, "roll_deg"), _number(calibration, "pitch_deg"), 0.0]))
         scale = _number(calibration, "odometry_scale", 1.0) - 1.0
         self._correction = SweepCorrection(self._R_level, scale)
+        turn = np.radians(_number(calibration, "odometry_turn_deg_per_m"))
+        self._calibration = Calibration(scale=scale, turn=float(turn))
         self._run = open_it(pair.run, _mount(told))
         self._origin = base_map.origin
         self.damaged: set[int] = set()
@@ -123,6 +127,13 @@ class LocalizedRun:
     def __len__(self) -> int:
         """Return the number of frames that have a pose."""
         return len(self._index)
+
+    @property
+    def odometry(self) -> Poses:
+        """Odometry (K, 4, 4) of these frames' bodies, metres, scale and heading as ``locate`` last corrected them."""
+        correction = OdometryCorrection()
+        every = np.array([correction.correct(T, self._calibration) for T in self._run.poses])
+        return np.asarray(every[self._index])
 
     @property
     def notes(self) -> tuple[str, ...]:

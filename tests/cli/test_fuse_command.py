@@ -11,7 +11,7 @@ import pytest
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 from coview_stream.clouds import read_cloud
-from coview_stream.clouds.trajectory import write_tum
+from coview_stream.clouds.trajectory import read_tum, write_tum
 
 ORIGIN = np.array([412_000.0, 5_318_000.0, 200.0])
 
@@ -67,6 +67,21 @@ def test_other_formats_are_clouds_that_this_package_reads(site, world_run, tmp_p
     assert len(points) == sum(each["points"] for each in told["sources"])
     expected = BaseMap.load(site / "site.coview").world_points()
     assert np.abs(points[: len(expected)] - expected).max() < 0.01
+
+
+@pytest.mark.slow
+def test_joint_writes_trajectories_and_says_what_it_kept(site, world_run, tmp_path, capsys):
+    pytest.importorskip("gtsam", reason="pip install 'coview-stream[node]'")
+    pair = f"{world_run}:{site / 'out'}"
+    out = tmp_path / "f.npy"
+    assert main(["fuse", str(site / "site.coview"), pair, pair, "-o", str(out), "--joint"]) == 0
+    said = capsys.readouterr().out
+    assert "between runs" in said
+    assert "f.npy.run1.tum, f.npy.run2.tum: trajectories" in said
+    stamps, poses = read_tum(tmp_path / "f.npy.run2.tum")
+    before = read_tum(site / "out" / "trajectory.tum")
+    assert np.array_equal(stamps, before[0])
+    assert np.abs(poses[:, :3, 3] - before[1][:, :3, 3]).max() < 0.1
 
 
 @pytest.mark.slow

@@ -1,0 +1,259 @@
+"""Joint adjustment: the poses of several runs, from their registrations to the map, to each other, and odometry.
+
+Unknown are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), gtsam finds the most probable ones given
+
+* registrations to the map: e(Y_k, X_k) ~ N(0, R_k)
+* odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q measured from the registrations, as while tracking
+* registrations of overlapping submaps, of two runs or of two times of one: e(Z_jk, X_j^-1 X_k) ~ N(0, R_jk)
+
+under Cauchy's kernel all of them. Whether it is better is asked of pairs of submaps that took no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.config import LocalizerConfig
+from coview_stream.errors import require_library
+from coview_stream.fusion.constraints import AGREE, Constraint, Registrar, off_by, overlapping
+from coview_stream.fusion.localized_run import LocalizedRun
+from coview_stream.fusion.submaps import Submap, path_of, submaps_of
+from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.transforms import Pose, Poses, along_body, along_map, boxminus, interpolate, inverse
+from coview_stream.localization.registration.local_map import LocalMaps
+from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is done, how many, of how many)."""
+
+# set by hand
+_KERNEL = 3.0  # sigmas, of Cauchy's weights
+_ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # belief in a pose that nothing else holds
+_HELD_OUT = 4  # one of so many pairs takes no part, to be judged by
+_MIN_HELD_OUT = 3
+_MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distance to the map may grow
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Medians of distances between surfaces before and after, metres; NaN where there are none.
+
+    Attributes:
+        runs: between submaps that overlap and were not used: before, after.
+        to_map: between submaps and the base map: before, after.
+    """
+
+    runs: tuple[float, float]
+    to_map: tuple[float, float]
+
+    @property
+    def better(self) -> bool:
+        """Runs agree better, and no worse with the map."""
+        allowed = _MAP_WORSE * self.to_map[0] + _MAP_ROUNDING
+        return self.runs[1] < self.runs[0] and not self.to_map[1] > allowed
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """What came of a joint adjustment.
+
+    Attributes:
+        located: of each run, (K, 4, 4) map <- body in the coordinates of the map's sources, as ``locate`` had them.
+        adjusted: likewise, adjusted.
+        keyframes: how many.
+        on_map: registrations to the map.
+        odometry: steps from keyframe to keyframe.
+        between: pairs of submaps of two runs.
+        loops: pairs of submaps of one run.
+        held_out: pairs that took no part and were judged by.
+        residuals: median of |e| in sigmas of all constraints between submaps that took part: before, after.
+        judgement: distances; None where too few pairs were there to judge by.
+    """
+
+    located: tuple[Poses, ...]
+    adjusted: tuple[Poses, ...]
+    keyframes: int
+    on_map: int
+    odometry: int
+    between: int
+    loops: int
+    held_out: int
+    residuals: tuple[float, float]
+    judgement: Judgement | None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the adjusted poses are better, as far as the overlaps that took no part tell."""
+        return self.judgement is not None and self.judgement.better
+
+    @property
+    def poses(self) -> tuple[Poses, ...]:
+        """The adjusted poses if they are accepted; else those of ``locate``."""
+        return self.adjusted if self.accepted else self.located
+
+    def said(self) -> str:
+        """Say it in lines."""
+        first = (
+            f"{'joint':<18} {self.keyframes} keyframes, {self.on_map} on the map, {self.odometry} by odometry, "
+            f"{self.between} between runs, {self.loops} loops"
+        )
+        if self.judgement is None:
+            why = f"only {self.held_out} overlaps to judge by; the poses of locate are kept"
+            return f"{first}\n{'':<18} {why}"
+        runs, to_map = self.judgement.runs, self.judgement.to_map
+        both = zip(self.adjusted, self.located, strict=True)
+        moved = [float(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1).max()) for a, b in both]
+        shift = f"runs moved by up to {', '.join(f'{each:.2f}' for each in moved)} m"
+        return "\n".join([
+            first,
+            f"{'':<18} constraints between submaps off by {self.residuals[0]:.1f} sigma, then {self.residuals[1]:.1f}",
+            f"{'':<18} {self.held_out} overlaps not used: surfaces {100 * runs[0]:.1f} cm apart, then "
+            f"{100 * runs[1]:.1f}; from the map {100 * to_map[0]:.1f} cm, then {100 * to_map[1]:.1f} (medians)",
+            f"{'':<18} {shift if self.accepted else 'not better: the poses of locate are kept'}",
+        ])  # fmt: skip
+
+
+def adjust(
+    base_map: BaseMap, runs: Sequence[LocalizedRun], progress: Progress | None = None, *, relative: bool = True
+) -> Joint:
+    """Adjust the poses of runs jointly; the runs themselves stay as they are.
+
+    Args:
+        base_map: they were localized on it.
+        runs: one or more.
+        progress: is told what is done.
+        relative: use registrations of submaps to each other; without, the map's and odometry alone, for comparison.
+
+    Raises:
+        DependencyError: gtsam is missing.
+        CloudError: a frame cannot be read, as :meth:`LocalizedRun.frames` has it.
+    """
+    require_library("gtsam", "gtsam>=4.3", "fuse --joint")
+    submaps: list[Submap] = []
+    for number, run in enumerate(runs):
+        submaps += submaps_of(run, number, base_map.origin)
+        if progress:
+            progress("submaps", number + 1, len(runs))
+    registrar = Registrar(submaps, LocalMaps(base_map, 40.0))
+    on_map = [found for k in range(len(submaps)) if (found := registrar.to_map(k))]
+    pairs = []
+    candidates = overlapping(submaps)
+    for done, (k, other) in enumerate(candidates, start=1):
+        found = registrar.to_submap(k, other)
+        if found is not None:
+            pairs.append(found)
+        if progress:
+            progress("overlaps", done, len(candidates))
+    held_out, used = pairs[::_HELD_OUT], [pair for k, pair in enumerate(pairs) if k % _HELD_OUT]
+    steps = _odometry(submaps, on_map)
+    before = np.array([submap.T_map_body for submap in submaps])
+    after = _solved(submaps, on_map, [*steps, *(used if relative else [])])
+    judgement = None
+    if len(held_out) >= _MIN_HELD_OUT:
+        judgement = Judgement(
+            _medians(lambda at: [registrar.apart(each.source, each.target, at) for each in held_out], before, after),
+            _medians(lambda at: [registrar.apart_from_map(k, at[k]) for k in range(len(submaps))], before, after),
+        )
+    adjusted = tuple(
+        _spread(run, [(s, T) for s, T in zip(submaps, after, strict=True) if s.run == number], base_map.origin)
+        for number, run in enumerate(runs)
+    )
+    loops = sum(submaps[each.source].run == submaps[each.target].run for each in used)
+    residuals = (_residual(used, before), _residual(used, after))
+    return Joint(
+        tuple(run.poses for run in runs), adjusted, len(submaps), len(on_map), len(steps), len(used) - loops, loops,
+        len(held_out), residuals, judgement,
+    )  # fmt: skip
+
+
+def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[Constraint]:
+    """Return the steps of odometry, as uncertain as the registrations of their run to the map show it to be.
+
+    Where an end has no registration, the step is the one of ``locate`` unless it jumps: nothing else has what it knew.
+    """
+    config = LocalizerConfig().tracking
+    registered = {each.source: each for each in on_map}
+    drifts = {submap.run: DriftEstimator(config) for submap in submaps}
+    steps = [k for k in range(1, len(submaps)) if submaps[k].run == submaps[k - 1].run]
+    out = []
+    for k in steps:
+        a, b = submaps[k - 1], submaps[k]
+        driven, turned = b.driven - a.driven, b.turned - a.turned
+        if k in registered and k - 1 in registered and worth_learning(driven, turned):
+            first, second = registered[k - 1], registered[k]
+            step = inverse(a.T_odom_body) @ b.T_odom_body
+            noise = np.array([np.diag(_in_map(each)) for each in (first, second)]).sum(axis=0)
+            drifts[a.run].add(boxminus(second.T, first.T @ step), noise, driven, turned)
+    for k in steps:
+        a, b = submaps[k - 1], submaps[k]
+        spread = drifts[a.run].drift.covariance(b.driven - a.driven, b.turned - a.turned)
+        T = inverse(a.T_odom_body) @ b.T_odom_body
+        by_odometry = Constraint(k, k - 1, T, along_body(spread, b.T_map_body))
+        T_located = inverse(a.T_map_body) @ b.T_map_body
+        alone = k not in registered or k - 1 not in registered
+        smooth = alone and off_by(by_odometry, T_located) < AGREE
+        out.append(replace(by_odometry, T=T_located) if smooth else by_odometry)
+    return out
+
+
+def _in_map(constraint: Constraint) -> Floats:
+    return along_map(constraint.covariance, constraint.T)
+
+
+def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: Sequence[Constraint]) -> Floats:
+    """Return the most probable poses (S, 4, 4)."""
+    gtsam: Any = require_library("gtsam", "gtsam>=4.3", "fuse --joint")
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(_KERNEL)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def robust(covariance: Floats) -> Any:
+        return gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Gaussian.Covariance(covariance))
+
+    anywhere = gtsam.noiseModel.Diagonal.Sigmas(_ANYWHERE)
+    for k, submap in enumerate(submaps):
+        values.insert(k, gtsam.Pose3(submap.T_map_body))
+        graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(submap.T_map_body), anywhere))
+    for each in on_map:
+        graph.add(gtsam.PriorFactorPose3(each.source, gtsam.Pose3(each.T), robust(each.covariance)))
+    for each in relative:
+        T = gtsam.Pose3(each.T)
+        graph.add(gtsam.BetweenFactorPose3(each.target, each.source, T, robust(each.covariance)))
+    answer = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return np.asarray([answer.atPose3(k).matrix() for k in range(len(submaps))], dtype=np.float64)
+
+
+def _residual(constraints: Sequence[Constraint], poses: Floats) -> float:
+    """Median of the whitened differences between submaps, in sigmas per degree of freedom."""
+    if not constraints:
+        return float("nan")
+    return float(np.median([off_by(each, inverse(poses[each.target]) @ poses[each.source]) for each in constraints]))
+
+
+def _medians(apart: Callable[[Floats], list[Floats]], before: Floats, after: Floats) -> tuple[float, float]:
+    def median(poses: Floats) -> float:
+        every = [each for each in apart(poses) if len(each)]
+        return float(np.mean([np.median(each) for each in every])) if every else float("nan")
+
+    return median(before), median(after)
+
+
+def _spread(run: LocalizedRun, keyframes: Sequence[tuple[Submap, Pose]], origin: Floats) -> Poses:
+    """Return poses (K, 4, 4) of all frames: moved as the keyframes before and after, blended by the way driven."""
+    driven, _ = path_of(run.odometry)
+    at = np.array([submap.driven for submap, _ in keyframes])
+    moves = [T @ inverse(submap.T_map_body) for submap, T in keyframes]
+    old = run.poses.copy()
+    old[:, :3, 3] -= origin
+    out = np.empty_like(old)
+    for k in range(len(out)):
+        after = int(np.clip(np.searchsorted(at, driven[k]), 1, max(len(at) - 1, 1)))
+        before, after = after - 1, min(after, len(at) - 1)
+        share = 0.0 if after == before else float(np.clip((driven[k] - at[before]) / (at[after] - at[before]), 0, 1))
+        out[k] = interpolate(moves[before] @ old[k], moves[after] @ old[k], share)
+    out[:, :3, 3] += origin
+    return np.asarray(out)
