@@ -8,7 +8,7 @@ query nor the memory of a search then needs the descriptors, which take five tim
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,6 +19,7 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_kernels import CodedQuery, StationCodes
 from coview_kernels.station_codes import COARSE_ROWS
+from coview_stream.basemap.stored_rows import stored_rows
 from coview_stream.config import Channel
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Complexes, Floats32, Ints
@@ -70,7 +71,7 @@ class StationIndex:
         if coarse is None and len(codes) >= _COARSE_FROM:
             coarse = codes.coarse()
         self.coarse = coarse
-        self._part: StationCodes | None = None
+        self._readers: dict[int, _SomeCodes] = {}
         self._descriptors = sample
 
     @classmethod
@@ -146,7 +147,7 @@ class StationIndex:
         """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
         if len(self):
             query = self.query({name: values[0].astype(np.float32) for name, values in self._descriptors.items()})
-            _ = self.screened(query, 1), self.at(query, [0], [0])
+            _ = self.screen(query, 1), self.at(query, [0], [0])
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
@@ -172,28 +173,28 @@ class StationIndex:
         """Return the best z-score (M,) of each station at any heading, by the first tier."""
         return np.float32(query.screen_zero) - self.codes.best(query.coded)
 
-    def screened(self, query: ScoredQuery, count: int) -> Ints:
-        """Return the ``count`` stations that are best at any heading, the best first.
+    def screen(self, query: ScoredQuery, count: int) -> tuple[Ints, Floats32]:
+        """Return the ``count`` stations that are best at any heading, best first, and z-scores (K, S) at all shifts.
 
-        On large maps coarse codes choose twice as many, of which the first tier chooses: memory of a quarter, and of
-        what is left hardly anything is touched.
+        By the first tier. On large maps coarse codes choose twice as many, of which the first tier chooses: of what is
+        not coarse hardly anything is read.
         """
         if self.coarse is None or query.coarse is None or _WIDER * count >= len(self):
-            return argsmallest(self.best(query), count)
+            stations = argsmallest(self.best(query), count)
+            return stations, self.all_shifts(query, stations)
         likely = np.sort(argsmallest(-self.coarse.best(query.coarse), _WIDER * count))
-        return likely[argsmallest(-self._best_of(query, likely), count)]
+        some = self._some(0)
+        rows = some.rows(likely)
+        best = np.concatenate([part.best(query.coded)[:length] for part, length in some.parts(rows)])
+        chosen = argsmallest(-best, count)
+        turned = [part.all_shifts(query.coded, np.arange(length)) for part, length in some.parts(rows[chosen])]
+        return likely[chosen], np.float32(query.screen_zero) - np.concatenate(turned)
 
-    def _best_of(self, query: ScoredQuery, stations: Ints) -> Floats32:
-        """Return the greatest correlations (K,) with some stations at any heading, by the first tier."""
-        if self._part is None:
-            codes = np.zeros((_PART, *self.codes.codes.shape[1:]), dtype=np.int16)
-            self._part = StationCodes(codes, self.codes.basis, self.codes.step, self.codes.norm, self.sectors)
-        found = np.empty(len(stations), dtype=np.float32)
-        for start in range(0, len(stations), _PART):
-            some = stations[start : start + _PART]
-            self._part.codes[: len(some)] = self.codes.codes[some]
-            found[start : start + len(some)] = self._part.best(query.coded)[: len(some)]
-        return found
+    def _some(self, tier: int) -> _SomeCodes:
+        """Return what reads some stations of a tier."""
+        if tier not in self._readers:
+            self._readers[tier] = _SomeCodes(self.rest if tier else self.codes)
+        return self._readers[tier]
 
     def all_shifts(self, query: ScoredQuery, stations: Ints) -> Floats32:
         """Return z-scores (K, S) of stations (K,) at all shifts, by the first tier."""
@@ -202,9 +203,52 @@ class StationIndex:
     def at(self, query: ScoredQuery, stations: npt.ArrayLike, shifts: npt.ArrayLike) -> Floats32:
         """Return z-scores (K,) of stations (K,) at shifts (K,), by both tiers; 0 for station -1."""
         index = np.asarray(stations)
-        found = np.float32(query.zero) - self.codes.at(query.coded, index, shifts)
-        found -= self.rest.at(query.rest, index, shifts)
+        found = np.full(len(index), query.zero, dtype=np.float32)
+        for tier, (codes, coded) in enumerate(((self.codes, query.coded), (self.rest, query.rest))):
+            found -= (
+                codes.at(coded, index, shifts) if self.coarse is None else self._some(tier).at(coded, index, shifts)
+            )
         found[index < 0] = 0.0
+        return found
+
+
+class _SomeCodes:
+    """Some stations of a large map's codes at a time, read from the file where it is one."""
+
+    def __init__(self, codes: StationCodes) -> None:
+        self._codes = codes
+        self._stored = stored_rows(codes.codes)
+        scratch = np.zeros((_PART, *codes.codes.shape[1:]), dtype=np.int16)
+        self._part = StationCodes(scratch, codes.basis, codes.step, codes.norm, codes.sectors)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what may be sent to another process: all but the open file."""
+        return self.__dict__ | {"_stored": None}
+
+    def rows(self, stations: Ints) -> npt.NDArray[np.int16]:
+        """Return the codes (K, 16, 16) of stations (K,), whose numbers increase."""
+        if self._stored is None:
+            return np.array(self._codes.codes[stations])
+        return self._stored.take(stations)
+
+    def parts(self, rows: npt.NDArray[np.int16]) -> Iterator[tuple[StationCodes, int]]:
+        """Yield codes that begin with the next of the rows (K, 16, 16), and their number; valid until the next."""
+        for start in range(0, len(rows), _PART):
+            some = rows[start : start + _PART]
+            self._part.codes[: len(some)] = some
+            yield self._part, len(some)
+
+    def at(self, query: CodedQuery, stations: npt.NDArray[Any], shifts: npt.ArrayLike) -> Floats32:
+        """Return the correlations (K,) with stations (K,) at shifts (K,); 0 for station -1."""
+        found = np.zeros(len(stations), dtype=np.float32)
+        turned = np.broadcast_to(np.asarray(shifts), (len(stations),))
+        known = np.flatnonzero(stations >= 0)
+        each, number = np.unique(stations[known], return_inverse=True)
+        done = 0
+        for part, length in self.parts(self.rows(each)):
+            own = (number >= done) & (number < done + length)
+            found[known[own]] = part.at(query, number[own] - done, turned[known[own]])
+            done += length
         return found
 
 

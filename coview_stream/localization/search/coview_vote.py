@@ -36,8 +36,7 @@ class CoViewVote:
     def candidates(self) -> tuple[Ints, Ints]:
         """Return stations and shifts (K,): the best of the headings at which the best stations are most alike."""
         count = max(_MIN_STATIONS, len(self._index) // _SHARE)
-        stations = self._index.screened(self._query, count)
-        scores = self._index.all_shifts(self._query, stations)
+        stations, scores = self._index.screen(self._query, count)
         # every one of them has a heading that is no worse than the last one's best
         station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)
         found = scores[station, shift]
