@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
+    import os
+    from collections.abc import Sequence
+
     from coview_stream.basemap.signature import SigningKey
     from coview_stream.config import MapConfig
 
@@ -20,6 +23,8 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
     "rings": (int, "rings of the descriptor (20)"),
     "sectors": (int, "sectors of the descriptor (60)"),
 }
+Clouds: TypeAlias = "Sequence[str | os.PathLike[str]]"
+
 _FIELDS = {"block_size": "block"}
 _MAX_WORKERS = 8  # unless more are asked for: each may take 2 GB; set by hand
 
@@ -28,7 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     kinds = "las, laz, e57, ply, pcd, xyz, pts, npy, bin"
     parser.add_argument(
-        "maps", nargs="+", type=Path, metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them"
+        "maps", nargs="+", metavar="MAP", help=f"clouds ({kinds}), folders or patterns of them, http(s):// addresses"
+    )
+    parser.add_argument(
+        "--window", metavar="X0,Y0,X1,Y1", help="read only this rectangle, of COPC files (also by http ranges)"
     )
     parser.add_argument(
         "-o",
@@ -62,27 +70,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Build and save the map, and print its sizes."""
     from coview_stream.basemap.signature import SigningKey
+    from coview_stream.cli.fetched_clouds import local_clouds
     from coview_stream.config import map_preset
     from coview_stream.errors import ConfigError, MapError
 
     output = Path(args.output)
-    if output.resolve() in [path.resolve() for path in args.maps]:
+    if output.resolve() in [Path(name).resolve() for name in args.maps]:
         raise MapError(f"{output}: is one of the scans to read; give the map another name")
     key = None if args.sign is None else SigningKey(args.sign)  # before anything slow
     options = {_FIELDS.get(n, n): getattr(args, n) for n in _OPTIONS if getattr(args, n) is not None}
     if args.channels is not None:
         options["channels"] = tuple(name.strip() for name in args.channels.split(","))
     options["learned"] = _networks_available() if args.learned is None else args.learned
-    if args.output.endswith("/") or output.is_dir():
-        return _build_site(args, output, map_preset(args.preset, **options), key)
-    if args.workers is not None or args.dask is not None or args.keep_going:
+    tiles = args.output.endswith("/") or output.is_dir()
+    if not tiles and (args.workers is not None or args.dask is not None or args.keep_going):
         raise ConfigError(
             "--workers, --dask and --keep-going build directories of tiles; end the name of -o with a slash"
         )
-    return _build_file(args, output, options, key)
+    with local_clouds(args.maps, args.window) as clouds:
+        if tiles:
+            return _build_site(clouds, args, output, map_preset(args.preset, **options), key)
+        return _build_file(clouds, args, output, options, key)
 
 
-def _build_file(args: argparse.Namespace, output: Path, options: dict[str, Any], key: SigningKey | None) -> int:
+def _build_file(
+    clouds: Clouds, args: argparse.Namespace, output: Path, options: dict[str, Any], key: SigningKey | None
+) -> int:
     import time
 
     from coview_stream.basemap import file_format
@@ -93,7 +106,7 @@ def _build_file(args: argparse.Namespace, output: Path, options: dict[str, Any],
     file_format.check_target(output)
     begin = time.perf_counter()
     base_map = BaseMap.build(
-        args.maps, args.preset, progress=args.progress or sys.stderr.isatty(), crs=args.crs, **options
+        clouds, args.preset, progress=args.progress or sys.stderr.isatty(), crs=args.crs, **options
     )
     base_map.save(output, key)
     print(
@@ -108,7 +121,9 @@ def _build_file(args: argparse.Namespace, output: Path, options: dict[str, Any],
     return 0
 
 
-def _build_site(args: argparse.Namespace, output: Path, config: MapConfig, key: SigningKey | None) -> int:
+def _build_site(
+    clouds: Clouds, args: argparse.Namespace, output: Path, config: MapConfig, key: SigningKey | None
+) -> int:
     import os
     import time
 
@@ -123,7 +138,7 @@ def _build_site(args: argparse.Namespace, output: Path, config: MapConfig, key: 
         executor = ProcessExecutor(args.workers if args.workers is not None else min(_MAX_WORKERS, os.cpu_count() or 1))
     try:
         built = build_site(
-            args.maps,
+            clouds,
             output,
             config,
             executor=executor,

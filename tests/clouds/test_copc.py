@@ -1,0 +1,173 @@
+"""Windows of COPC files, local and by HTTP ranges from a server on this machine."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coview_stream.cli import main
+from coview_stream.clouds import read_cloud
+from coview_stream.clouds.copc import Window, fetch_cloud, is_copc
+from coview_stream.clouds.http_file import HttpFile, download
+from coview_stream.errors import CloudError, ConfigError
+from tests.clouds.copc_file import write_copc
+
+pytestmark = pytest.mark.slow
+
+WINDOW = Window((500_100.0, 5_600_050.0), (500_200.0, 5_600_150.0))
+
+
+class Handler(SimpleHTTPRequestHandler):
+    """Serves a folder, parts of files where ``ranges`` is set, and keeps what it sent."""
+
+    ranges = True
+    sent: list[int] = []  # noqa: RUF012
+    busy = 0
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
+
+    def do_GET(self) -> None:
+        """Answer with the file, or the part that is asked for."""
+        if type(self).busy:
+            type(self).busy -= 1
+            self.send_error(503)
+            return
+        path, asked = Path(self.translate_path(self.path)), self.headers.get("Range")
+        if asked is None or not self.ranges or not path.is_file():
+            super().do_GET()
+            return
+        begin, end = map(int, asked.removeprefix("bytes=").split("-"))
+        raw = path.read_bytes()[begin : end + 1]
+        type(self).sent.append(len(raw))
+        self.send_response(206 if raw else 416)
+        self.send_header("Content-Length", str(len(raw)))
+        self.end_headers()
+        self.wfile.write(raw)
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    """Return points (N, 3) of a site in UTM coordinates."""
+    rng = np.random.default_rng(4)
+    return rng.uniform([500_000.0, 5_600_000.0, 100.0], [500_400.0, 5_600_300.0, 130.0], (20_000, 3))
+
+
+@pytest.fixture(scope="module")
+def site(points: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a COPC file of them."""
+    path = tmp_path_factory.mktemp("copc") / "site.copc.laz"
+    assert write_copc(path, points) > 10
+    return path
+
+
+@pytest.fixture
+def server(site: Path) -> Iterator[str]:
+    """Return the address of a server of its folder."""
+    Handler.ranges, Handler.sent, Handler.busy = True, [], 0
+    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(site.parent)))
+    threading.Thread(target=served.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{served.server_address[1]}"
+    served.shutdown()
+    served.server_close()
+
+
+def inside(points: np.ndarray) -> np.ndarray:
+    """Return the points in the window."""
+    return points[((points[:, :2] >= WINDOW.low) & (points[:, :2] <= WINDOW.high)).all(axis=1)]
+
+
+def test_window_of_a_file_has_the_points_in_it_and_the_reference_system(
+    site: Path, points: np.ndarray, tmp_path: Path
+) -> None:
+    assert is_copc(site)
+    path, fetched = fetch_cloud(site, tmp_path, WINDOW)
+    cloud = read_cloud(path)
+    assert fetched.points == len(cloud) == len(inside(points))
+    np.testing.assert_allclose(
+        np.sort(cloud.map_points(), axis=0), np.sort(inside(points), axis=0), atol=0.03
+    )  # float32 near an origin
+    assert cloud.crs is not None
+    assert "32N" in cloud.crs
+    assert len(read_cloud(site)) == len(points)  # the whole of it, as any LAZ file
+
+
+def test_of_a_web_server_only_parts_are_fetched(server: str, site: Path, points: np.ndarray, tmp_path: Path) -> None:
+    Handler.busy = 1
+    path, fetched = fetch_cloud(f"{server}/site.copc.laz", tmp_path, WINDOW)
+    assert len(read_cloud(path)) == fetched.points == len(inside(points))
+    assert fetched.received == sum(Handler.sent)
+    assert fetched.requests == len(Handler.sent)
+
+
+def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    write_copc(tmp_path / "wide.copc.laz", rng.uniform([0.0, 0.0, 0.0], [900.0, 900.0, 40.0], (60_000, 3)), levels=5)
+    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(tmp_path)))
+    threading.Thread(target=served.serve_forever, daemon=True).start()
+    Handler.sent, Handler.ranges = [], True
+    try:
+        address = f"http://127.0.0.1:{served.server_address[1]}/wide.copc.laz"
+        fetch_cloud(address, tmp_path, Window((10.0, 10.0), (20.0, 20.0)))
+    finally:
+        served.shutdown()
+        served.server_close()
+    assert sum(Handler.sent) < 0.7 * (tmp_path / "wide.copc.laz").stat().st_size
+
+
+def test_whole_files_are_downloaded(server: str, site: Path, tmp_path: Path) -> None:
+    path, _ = fetch_cloud(f"{server}/site.copc.laz", tmp_path)
+    assert path.read_bytes() == site.read_bytes()
+    assert path.name == "site.copc.laz"
+    other, _ = fetch_cloud(f"{server}/site.copc.laz", tmp_path)
+    assert other != path
+
+
+def test_servers_and_files_that_cannot_be_used_are_named(
+    server: str, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coview_stream.clouds.http_file._WAIT", 0.0)
+    with pytest.raises(CloudError, match=r"none\.laz: the server answers 404"):
+        fetch_cloud(f"{server}/none.laz", tmp_path)
+    with pytest.raises(CloudError, match="cannot be reached"):
+        HttpFile("http://127.0.0.1:1/x.laz").read(10)
+    with pytest.raises(CloudError, match="not an http"):
+        download("ftp://127.0.0.1/x.laz", tmp_path / "x")
+    Handler.ranges = False
+    with pytest.raises(CloudError, match="serves no parts"):
+        fetch_cloud(f"{server}/site.copc.laz", tmp_path, WINDOW)
+    np.save(tmp_path / "cloud.npy", np.zeros((3, 3)))
+    with pytest.raises(CloudError, match="not a COPC file"):
+        fetch_cloud(tmp_path / "cloud.npy", tmp_path, WINDOW)
+    with pytest.raises(CloudError, match="the window is beside it"):
+        fetch_cloud(site, tmp_path, Window((0.0, 0.0), (10.0, 10.0)))
+    raw = bytearray(site.read_bytes())
+    raw[len(raw) // 3 : len(raw) // 2] = b"\xff" * (len(raw) // 2 - len(raw) // 3)
+    (tmp_path / "broken.copc.laz").write_bytes(raw)
+    with pytest.raises(CloudError, match="broken"):
+        fetch_cloud(tmp_path / "broken.copc.laz", tmp_path, WINDOW)
+    assert not list(tmp_path.glob("*.las"))
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d", "5,5,1,1", "0,0,nan,1", "0,0,inf,1", ""])
+def test_windows_without_area_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="window"):
+        Window.parse(text)
+
+
+def test_build_takes_addresses_and_windows(server: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "site.coview"
+    args = ["build", f"{server}/site.copc.laz", "--window", str(WINDOW), "-o", str(output), "--no-learned"]
+    assert main([*args, "--block-size", "10", "--radius", "20"]) == 0
+    said = capsys.readouterr()
+    assert "points in the window" in said.err
+    assert "EPSG:32632" in said.out
+    assert main(["build", f"{server}/nothing.laz", "-o", str(tmp_path / "b.coview")]) == 2
+    assert "404" in capsys.readouterr().err
