@@ -108,6 +108,7 @@ def test_of_a_web_server_only_parts_are_fetched(server: str, site: Path, points:
 
 
 def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
+    """Of a file as small as this one the bytes beside what is asked for are many: they are allowed for."""
     rng = np.random.default_rng(5)
     write_copc(tmp_path / "wide.copc.laz", rng.uniform([0.0, 0.0, 0.0], [900.0, 900.0, 40.0], (60_000, 3)), levels=5)
     served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(tmp_path)))
@@ -119,7 +120,8 @@ def test_small_window_takes_few_bytes(tmp_path: Path) -> None:
     finally:
         served.shutdown()
         served.server_close()
-    assert sum(Handler.sent) < 0.7 * (tmp_path / "wide.copc.laz").stat().st_size
+    beside = 65_536 * len(Handler.sent)
+    assert sum(Handler.sent) - beside < 0.3 * (tmp_path / "wide.copc.laz").stat().st_size
 
 
 def test_whole_files_are_downloaded(server: str, site: Path, tmp_path: Path) -> None:
