@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels.reference.field import TILE as FIELD_TILE
-from coview_kernels.station_codes import COARSE_ROWS
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError
 
@@ -33,8 +32,6 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
             ".norm": ("<f4", (33,)),
         }.items()
     },
-    "station_codes.coarse": ("<i2", ("stations", COARSE_ROWS, 16)),
-    "station_codes.coarse.norm": ("<f4", (33,)),
     "field.tiles": ("<i4", ("field tiles", 3)),
     "field.occupied": ("<i8", ("field tiles", FIELD_TILE, FIELD_TILE)),
     "field.ground": ("<i2", ("field tiles", FIELD_TILE, FIELD_TILE)),

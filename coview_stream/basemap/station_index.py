@@ -8,7 +8,7 @@ query nor the memory of a search then needs the descriptors, which take five tim
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,23 +18,15 @@ import numpy.typing as npt
 
 import coview_kernels as kernels
 from coview_kernels import CodedQuery, StationCodes
-from coview_kernels.station_codes import COARSE_ROWS
-from coview_stream.basemap.stored_rows import stored_rows
 from coview_stream.config import Channel
 from coview_stream.errors import MapError
 from coview_stream.geometry.arrays import Complexes, Floats32, Ints
-from coview_stream.geometry.selection import argsmallest
 
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
 _SAMPLE = 128  # stations at all whose shifts medians are taken; set by hand
 _TIERS, _SAMPLED = ("station_codes", "station_codes.rest"), "station_codes.sample"
-_COARSE, _COARSE_NORM = "station_codes.coarse", "station_codes.coarse.norm"
-_COARSE_FROM = 50_000
-"""Stations from which coarse codes are made, and all stations screened by them first; set by hand: 25 MB."""
-_WIDER = 2  # times as many stations as are asked for are taken from the coarse screening; `bench scale` tells the loss
-_PART = 8192  # stations that are screened at a time, of those that the coarse codes leave: 4 MB
 
 
 @dataclass(frozen=True)
@@ -44,14 +36,12 @@ class ScoredQuery:
     Attributes:
         coded: the query, its channels weighted by how far they spread.
         rest: the same, for the second tier.
-        coarse: the same, for coarse codes; None where there are none.
         screen_zero: z-score of no correlation at all by the first tier alone.
         zero: that by both.
     """
 
     coded: CodedQuery
     rest: CodedQuery
-    coarse: CodedQuery | None
     screen_zero: float
     zero: float
 
@@ -63,15 +53,9 @@ class StationIndex:
     (eqs 7-9) exceeds the median; negative is better. It is the mean of the channels'.
     """
 
-    def __init__(
-        self, codes: StationCodes, rest: StationCodes, sample: Descriptors, coarse: StationCodes | None = None
-    ) -> None:
+    def __init__(self, codes: StationCodes, rest: StationCodes, sample: Descriptors) -> None:
         self.codes = codes
         self.rest = rest
-        if coarse is None and len(codes) >= _COARSE_FROM:
-            coarse = codes.coarse()
-        self.coarse = coarse
-        self._readers: dict[int, _SomeCodes] = {}
         self._descriptors = sample
 
     @classmethod
@@ -108,13 +92,7 @@ class StationIndex:
                 return None
             vectors = (basis[..., 0] + 1j * basis[..., 1]).astype(np.complex64)
             tiers.append(StationCodes(codes, vectors, np.array(step), np.array(norm), sectors))
-        coarse = None
-        if _COARSE in arrays and _COARSE_NORM in arrays:
-            codes, norm = arrays[_COARSE], arrays[_COARSE_NORM]
-            if codes.dtype != np.int16 or codes.shape != (stations, COARSE_ROWS, 16) or norm.shape != (33,):
-                return None
-            coarse = tiers[0].coarse(codes, np.array(norm))
-        return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)), coarse)
+        return cls(tiers[0], tiers[1], dict(zip(channels, np.array(sample), strict=True)))
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return what a map's file holds of it."""
@@ -122,8 +100,6 @@ class StationIndex:
         for tier, codes in zip(_TIERS, (self.codes, self.rest), strict=True):
             basis = np.stack([codes.basis.real, codes.basis.imag], axis=-1)
             found |= dict(zip(_names(tier), (codes.codes, basis, codes.step, codes.norm), strict=True))
-        if self.coarse is not None:
-            found |= {_COARSE: self.coarse.codes, _COARSE_NORM: self.coarse.norm}
         return found
 
     def __len__(self) -> int:
@@ -147,7 +123,7 @@ class StationIndex:
         """Make what the first query would, and compile its kernels, of which the number of stations chooses."""
         if len(self):
             query = self.query({name: values[0].astype(np.float32) for name, values in self._descriptors.items()})
-            _ = self.screen(query, 1), self.at(query, [0], [0])
+            _ = self.best(query), self.at(query, [0], [0])
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
         """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
@@ -162,39 +138,15 @@ class StationIndex:
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
         stacked = np.concatenate(columns)
         coded, rest = self.codes.query(stacked), self.rest.query(stacked)
-        coarse = None if self.coarse is None else self.coarse.query(stacked)
         # the codes leave parts out that no query lacks: what that adds on the mean is made up for here
         mean += self.codes.all_shifts(coded, chosen)
         screen_zero = float(np.median(mean))
         mean += self.rest.all_shifts(rest, chosen)
-        return ScoredQuery(coded, rest, coarse, screen_zero, float(np.median(mean)))
+        return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:
         """Return the best z-score (M,) of each station at any heading, by the first tier."""
         return np.float32(query.screen_zero) - self.codes.best(query.coded)
-
-    def screen(self, query: ScoredQuery, count: int) -> tuple[Ints, Floats32]:
-        """Return the ``count`` stations that are best at any heading, best first, and z-scores (K, S) at all shifts.
-
-        By the first tier. On large maps coarse codes choose twice as many, of which the first tier chooses: of what is
-        not coarse hardly anything is read.
-        """
-        if self.coarse is None or query.coarse is None or _WIDER * count >= len(self):
-            stations = argsmallest(self.best(query), count)
-            return stations, self.all_shifts(query, stations)
-        likely = np.sort(argsmallest(-self.coarse.best(query.coarse), _WIDER * count))
-        some = self._some(0)
-        rows = some.rows(likely)
-        best = np.concatenate([part.best(query.coded)[:length] for part, length in some.parts(rows)])
-        chosen = argsmallest(-best, count)
-        turned = [part.all_shifts(query.coded, np.arange(length)) for part, length in some.parts(rows[chosen])]
-        return likely[chosen], np.float32(query.screen_zero) - np.concatenate(turned)
-
-    def _some(self, tier: int) -> _SomeCodes:
-        """Return what reads some stations of a tier."""
-        if tier not in self._readers:
-            self._readers[tier] = _SomeCodes(self.rest if tier else self.codes)
-        return self._readers[tier]
 
     def all_shifts(self, query: ScoredQuery, stations: Ints) -> Floats32:
         """Return z-scores (K, S) of stations (K,) at all shifts, by the first tier."""
@@ -202,54 +154,19 @@ class StationIndex:
 
     def at(self, query: ScoredQuery, stations: npt.ArrayLike, shifts: npt.ArrayLike) -> Floats32:
         """Return z-scores (K,) of stations (K,) at shifts (K,), by both tiers; 0 for station -1."""
-        index = np.asarray(stations)
-        found = np.full(len(index), query.zero, dtype=np.float32)
-        for tier, (codes, coded) in enumerate(((self.codes, query.coded), (self.rest, query.rest))):
-            found -= (
-                codes.at(coded, index, shifts) if self.coarse is None else self._some(tier).at(coded, index, shifts)
-            )
-        found[index < 0] = 0.0
-        return found
+        return self.at_all([(query, stations, shifts)])[0]
 
-
-class _SomeCodes:
-    """Some stations of a large map's codes at a time, read from the file where it is one."""
-
-    def __init__(self, codes: StationCodes) -> None:
-        self._codes = codes
-        self._stored = stored_rows(codes.codes)
-        scratch = np.zeros((_PART, *codes.codes.shape[1:]), dtype=np.int16)
-        self._part = StationCodes(scratch, codes.basis, codes.step, codes.norm, codes.sectors)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what may be sent to another process: all but the open file."""
-        return self.__dict__ | {"_stored": None}
-
-    def rows(self, stations: Ints) -> npt.NDArray[np.int16]:
-        """Return the codes (K, 16, 16) of stations (K,), whose numbers increase."""
-        if self._stored is None:
-            return np.array(self._codes.codes[stations])
-        return self._stored.take(stations)
-
-    def parts(self, rows: npt.NDArray[np.int16]) -> Iterator[tuple[StationCodes, int]]:
-        """Yield codes that begin with the next of the rows (K, 16, 16), and their number; valid until the next."""
-        for start in range(0, len(rows), _PART):
-            some = rows[start : start + _PART]
-            self._part.codes[: len(some)] = some
-            yield self._part, len(some)
-
-    def at(self, query: CodedQuery, stations: npt.NDArray[Any], shifts: npt.ArrayLike) -> Floats32:
-        """Return the correlations (K,) with stations (K,) at shifts (K,); 0 for station -1."""
-        found = np.zeros(len(stations), dtype=np.float32)
-        turned = np.broadcast_to(np.asarray(shifts), (len(stations),))
-        known = np.flatnonzero(stations >= 0)
-        each, number = np.unique(stations[known], return_inverse=True)
-        done = 0
-        for part, length in self.parts(self.rows(each)):
-            own = (number >= done) & (number < done + length)
-            found[known[own]] = part.at(query, number[own] - done, turned[known[own]])
-            done += length
-        return found
+    def at_all(self, requests: Sequence[tuple[ScoredQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[Floats32]:
+        """Return what :meth:`at` does of each request; the index of a large map is gone through once for all."""
+        first = self.codes.at_all([(query.coded, stations, shifts) for query, stations, shifts in requests])
+        second = self.rest.at_all([(query.rest, stations, shifts) for query, stations, shifts in requests])
+        out = []
+        for (query, stations, _), one, other in zip(requests, first, second, strict=True):
+            found = np.float32(query.zero) - one
+            found -= other
+            found[np.asarray(stations) < 0] = 0.0
+            out.append(found)
+        return out
 
 
 def sampled_stations(stations: int) -> Ints:

@@ -12,7 +12,7 @@ from coview_kernels import runtime
 
 ti = runtime.library()
 f32, i16, i32 = ti.f32, ti.i16, ti.i32
-LANES, LOW, HIGH, COARSE = 16, 12, 4, 4  # as in station_codes.py
+LANES, LOW, HIGH = 16, 12, 4  # as in station_codes.py
 ROWS = LOW + HIGH
 SIZE = ROWS * LANES
 
@@ -29,11 +29,7 @@ def real_part(w):
 
 
 @lru_cache
-def _best(serial: bool, low: int, more: int):
-    # rows of the frequencies below 16, and of those from 16 on: of coarse codes there are none
-    size = (low + more) * LANES
-    groups = 2 if more else 1
-
+def _best(serial: bool):
     @ti.func
     def products(
         codes: ti.template(),
@@ -54,7 +50,7 @@ def _best(serial: bool, low: int, more: int):
                     w = codes[start + row * LANES + b]
                     v = ti.cast(w << ti.cast(8, i16), i16)
                     sx += high(v, query[at]) + high(w, query[at + LANES])
-                    sy += high(v, query[2 * size + at]) + high(w, query[2 * size + at + LANES])
+                    sy += high(v, query[2 * SIZE + at]) + high(w, query[2 * SIZE + at + LANES])
                 x[b] += sx
                 y[b] += sy
 
@@ -70,19 +66,18 @@ def _best(serial: bool, low: int, more: int):
             ti.loop_config(serialize=True)
         for m in range(found.shape[0]):
             # what the upper halves miss on the mean, half a unit each
-            x0 = ti.Vector([ti.cast(low, i16)] * LANES)
-            y0 = ti.Vector([ti.cast(low, i16)] * LANES)
-            x1 = ti.Vector([ti.cast(more, i16)] * LANES)
-            y1 = ti.Vector([ti.cast(more, i16)] * LANES)
-            products(codes, query, m * size, 0, low, x0, y0)
-            if ti.static(more > 0):
-                products(codes, query, m * size, low, more, x1, y1)
+            x0 = ti.Vector([ti.cast(LOW, i16)] * LANES)
+            y0 = ti.Vector([ti.cast(LOW, i16)] * LANES)
+            x1 = ti.Vector([ti.cast(HIGH, i16)] * LANES)
+            y1 = ti.Vector([ti.cast(HIGH, i16)] * LANES)
+            products(codes, query, m * SIZE, 0, LOW, x0, y0)
+            products(codes, query, m * SIZE, LOW, HIGH, x1, y1)
             # sums over even frequencies, and over odd ones, which change their sign half a turn on
             even = ti.Vector([ti.cast(8, i16)] * LANES)
             odd = ti.Vector([ti.cast(8, i16)] * LANES)
             even_sine = ti.Vector([ti.cast(8, i16)] * LANES)
             odd_sine = ti.Vector([ti.cast(8, i16)] * LANES)
-            for g in ti.static(range(groups)):
+            for g in ti.static(range(2)):
                 for h in range(2):
                     xs = ti.Vector.zero(i16, 8)
                     ys = ti.Vector.zero(i16, 8)
@@ -179,8 +174,7 @@ def at(
 
 
 def __getattr__(name):
-    """Return ``best_serial``, ``best_parallel``, or these for coarse codes: ``coarse_serial``, ``coarse_parallel``."""
-    kind, _, threads = name.partition("_")
-    if kind not in ("best", "coarse") or threads not in ("serial", "parallel"):
+    """Return ``best_serial`` or ``best_parallel``."""
+    if name not in ("best_serial", "best_parallel"):
         raise AttributeError(name)
-    return _best(threads == "serial", *((LOW, HIGH) if kind == "best" else (COARSE, 0)))
+    return _best(name == "best_serial")

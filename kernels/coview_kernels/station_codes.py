@@ -17,7 +17,7 @@ either takes no unpacking but one shift.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -28,6 +28,7 @@ import numpy.typing as npt
 from coview_kernels import reference, runtime
 from coview_kernels.arrays import C64, F32, I16, I32, I64, as_float32
 from coview_kernels.launch import Launch
+from coview_kernels.mapped import Windows
 from coview_kernels.similarity import unit_columns
 
 ANGLES = 60
@@ -35,8 +36,6 @@ ANGLES = 60
 
 _LANES, _LOW, _HIGH = 16, 12, 4  # as in _ti_station_codes.py
 _ROWS = _LOW + _HIGH
-COARSE_ROWS = 4
-"""Rows of coarse codes, 128 bytes a station: of the frequencies below 16 what varies most."""
 _GROUP = np.repeat([0, 1], [_LOW, _HIGH])  # of each row
 _LANE = np.concatenate([np.arange(0, 16, 2), np.arange(1, 16, 2)])  # frequency of each lane in the first group
 _FREQUENCIES = 32
@@ -54,7 +53,7 @@ class Screen(NamedTuple):
     """A query in integers.
 
     Attributes:
-        integers: (2, R, 2, 16) int16 for real and imaginary products.
+        integers: (2, 16, 2, 16) int16 for real and imaginary products.
         turn: (65, 16) int16 table of rotations.
         unit: value of one unit of the turned products.
     """
@@ -85,19 +84,17 @@ class CodedQuery:
         """The query in integers."""
         p, s = self.numbers.real, self.numbers.imag
         pair = np.stack([np.stack([p, s], axis=1), np.stack([s, -p], axis=1)]) * self.step
-        rows = len(pair[0])
-        group = _GROUP[:rows]
-        size = np.sqrt(np.stack([(pair[:, g == group] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
+        size = np.sqrt(np.stack([(pair[:, g == _GROUP] ** 2).sum(axis=(1, 2)).max(axis=0) for g in (0, 1)]))
         limit = np.minimum((_MAX_SUM - 4.0 * _ROWS) * 256.0 / np.maximum(self.norm[:-1].reshape(2, -1), 1.0), 32_000.0)
         gain = limit / np.maximum(size, 1e-30)
         scale = np.where(size > 0, 256.0 / gain, 0.0)  # of one unit of a product
-        span = float(self.norm[-1]) * float(np.linalg.norm(self.numbers)) + rows * float(scale.sum())
+        span = float(self.norm[-1]) * float(np.linalg.norm(self.numbers)) + _ROWS * float(scale.sum())
         unit = max(2.01 * float(scale.max()), span / 31_000.0, 1e-30)
         angle = (2.0 * np.pi / ANGLES) * _frequencies()[:, :, None] * np.arange(_LANES)
         factor = (65_536.0 / unit * scale)[:, :, None]
         turn = np.concatenate([np.cos(angle) * factor, -np.sin(angle) * factor]).reshape(-1, _LANES)
         return Screen(
-            np.rint(pair * gain[group][:, None]).astype(np.int16),
+            np.rint(pair * gain[_GROUP][:, None]).astype(np.int16),
             np.rint(np.concatenate([np.zeros((1, _LANES)), turn])).astype(np.int16),
             unit,
         )
@@ -120,13 +117,14 @@ class CodedQuery:
         return table
 
 
+_Request = tuple[CodedQuery, I32, I32]
+
+
 class StationCodes:
     """M stations in 512 bytes each, and what it takes to compare a query with them.
 
-    Coarse codes have the first four of the 16 rows, and only :meth:`best` works with them.
-
     Attributes:
-        codes: (M, 16, 16) int16; a memory map stays one.
+        codes: (M, 16, 16) int16; a memory map stays one, and of a large one only a window is held in memory.
         basis: (16, 16, D) complex64 eigenvectors; D is rings times channels.
         step: (16, 2, 16) float32 what one unit of int8 stands for, real and imaginary.
         norm: (33,) float32 greatest norm of the integers of any station by frequency block, and of all its numbers.
@@ -209,33 +207,11 @@ class StationCodes:
     def _encode(self, part: slice, spectra: C64) -> None:
         """Code some stations by their spectra (32, m, D)."""
         self.codes[part] = _pack(_parts(_projected(spectra, self.basis)) / self.step)
-        self._add_norms(_unpack(self.codes[part]))
-
-    def _add_norms(self, whole: F32) -> None:
-        """Raise the norms to those of some stations' integers (m, R, 2, 16), where these are greater."""
+        whole = _unpack(self.codes[part])
         groups = whole[:, :_LOW], whole[:, _LOW:]
         blocks = np.concatenate([(each * each).sum(axis=(1, 2)) for each in groups], axis=1)
         self.norm[:-1] = np.maximum(self.norm[:-1], np.sqrt(blocks.max(axis=0)))
         self.norm[-1] = max(self.norm[-1], np.sqrt(((whole * self.step) ** 2).sum(axis=(1, 2, 3)).max()))
-
-    def coarse(self, codes: I16 | None = None, norm: F32 | None = None) -> StationCodes:
-        """Return the same stations in a quarter of the bytes, for :meth:`best` alone.
-
-        Args:
-            codes: (M, 4, 16) int16 of an earlier call; None copies them.
-            norm: (33,) float32 of an earlier call.
-        """
-        rows = slice(0, COARSE_ROWS)
-        found = StationCodes(
-            np.ascontiguousarray(self.codes[:, rows]) if codes is None else codes,
-            self.basis[rows],
-            self.step[rows],
-            np.zeros(2 * _LANES + 1, dtype=np.float32) if norm is None else norm,
-            self.sectors,
-        )
-        for start in range(0, len(self) if norm is None else 0, _BATCH):
-            found._add_norms(_unpack(found.codes[start : start + _BATCH]))
-        return found
 
     def __len__(self) -> int:
         """Return the number of stations M."""
@@ -270,8 +246,15 @@ class StationCodes:
 
     def at(self, query: CodedQuery, stations: npt.ArrayLike, shifts: npt.ArrayLike) -> F32:
         """Return the correlations (K,) with stations (K,) at shifts (K,); 0 for station -1."""
-        index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
-        return runtime.dispatch_here(self._ready(_AT), self._native_at, self._plain_at, query, index, turned)
+        return self.at_all([(query, stations, shifts)])[0]
+
+    def at_all(self, requests: Sequence[tuple[CodedQuery, npt.ArrayLike, npt.ArrayLike]]) -> list[F32]:
+        """Return what :meth:`at` does of each request; large memory maps are gone through once for all of them."""
+        plain = []
+        for query, stations, shifts in requests:
+            index, turned = (np.ascontiguousarray(each, dtype=np.int32) for each in (stations, shifts))
+            plain.append((query, index, np.broadcast_to(turned, index.shape)))
+        return runtime.dispatch_here(self._ready(_AT), self._native_at, self._plain_at, plain)
 
     @cached_property
     def _rotations(self) -> F32:
@@ -299,20 +282,20 @@ class StationCodes:
     def _plain_products(self, query: CodedQuery, stations: I32) -> F32:
         return reference.code_products(self.codes, query.factors, stations)
 
-    def _native_at(self, query: CodedQuery, stations: I32, shifts: I32) -> F32:
-        return self._prepared().at(query.table, stations, shifts)
+    def _native_at(self, requests: Sequence[_Request]) -> list[F32]:
+        return self._prepared().at(requests)
 
-    def _plain_at(self, query: CodedQuery, stations: I32, shifts: I32) -> F32:
-        return reference.codes_at(self.codes, query.table, stations, shifts)
+    def _plain_at(self, requests: Sequence[_Request]) -> list[F32]:
+        return [reference.codes_at(self.codes, query.table, *asked) for query, *asked in requests]
 
 
 class _Kernels:
     """The kernels' launches and the memory that they share with NumPy; to be used as :meth:`ready` says."""
 
     def __init__(self, codes: I16) -> None:
-        flat = codes.reshape(-1)
-        rows = codes.shape[1]
-        self._query = np.zeros((2, rows, 2, _LANES), dtype=np.int16)
+        self._codes, flat = codes, codes.reshape(-1)
+        self._windows = Windows(codes)
+        self._query = np.zeros((2, _ROWS, 2, _LANES), dtype=np.int16)
         self._turn = np.zeros((1 + 4 * _LANES, _LANES), dtype=np.int16)
         self._best = np.empty(len(codes), dtype=np.int32)
         self._stations, self._shifts = np.zeros((2, _CHUNK), dtype=np.int32)
@@ -320,7 +303,7 @@ class _Kernels:
         self._products = np.zeros((_CHUNK, 2, 2, _LANES), dtype=np.float32)
         self._values = np.zeros(_CHUNK, dtype=np.float32)
         serial = runtime.workers() == 1 or len(codes) < _MIN_PARALLEL
-        name = ("best_" if rows == _ROWS else "coarse_") + ("serial" if serial else "parallel")
+        name = "best_serial" if serial else "best_parallel"
         common = self._query.reshape(-1), self._turn.reshape(-1), self._best, _LANES
         self._launches = (
             Launch("station_codes", name, flat, *common),
@@ -340,33 +323,60 @@ class _Kernels:
 
     def best(self, query: I16, turn: I16) -> I32:
         self._query[:], self._turn[:] = query, turn
-        self._launches[_BEST]()
+        launch = self._launches[_BEST]
+        for part in self._windows:
+            launch.put(0, self._codes[part].reshape(-1))
+            launch.put(3, self._best[part])
+            launch()
         copied: I32 = self._best.copy()
         return copied
 
     def products(self, factors: F32, stations: I32) -> F32:
         self._factors[:] = factors
         found = np.empty((len(stations), 2, 2, _LANES), dtype=np.float32)
-        for start in range(0, len(stations), _CHUNK):
-            part = stations[start : start + _CHUNK]
-            self._stations[: len(part)] = part
-            self._launches[_PRODUCTS].put(4, len(part))
-            self._launches[_PRODUCTS]()
-            found[start : start + len(part)] = self._products[: len(part)]
+        launch, chosen = self._launches[_PRODUCTS], _ByWindow(stations, self._windows)
+        for part in self._windows:
+            launch.put(0, self._codes[part].reshape(-1))
+            for own in chosen.chunks(part):
+                self._stations[: len(own)] = stations[own] - part.start
+                launch.put(4, len(own))
+                launch()
+                found[own] = self._products[: len(own)]
         return found
 
-    def at(self, table: F32, stations: I32, shifts: I32) -> F32:
-        self._launches[_AT].put(1, table.reshape(-1))
-        found = np.zeros(len(stations), dtype=np.float32)
-        for start in range(0, len(stations), _CHUNK):
-            part = slice(start, min(start + _CHUNK, len(stations)))
-            count = part.stop - part.start
-            self._stations[:count], self._shifts[:count] = stations[part], shifts[part]
-            self._values[:count] = 0.0
-            self._launches[_AT].put(5, count)
-            self._launches[_AT]()
-            found[part] = self._values[:count]
+    def at(self, requests: Sequence[_Request]) -> list[F32]:
+        launch = self._launches[_AT]
+        found = [np.zeros(len(stations), dtype=np.float32) for _, stations, _ in requests]
+        chosen = [_ByWindow(stations, self._windows) for _, stations, _ in requests]
+        for part in self._windows:
+            launch.put(0, self._codes[part].reshape(-1))
+            for (query, stations, shifts), into, each in zip(requests, found, chosen, strict=True):
+                launch.put(1, query.table.reshape(-1))
+                for own in each.chunks(part):
+                    count = len(own)
+                    self._stations[:count], self._shifts[:count] = stations[own] - part.start, shifts[own]
+                    self._values[:count] = 0.0
+                    launch.put(5, count)
+                    launch()
+                    into[own] = self._values[:count]
         return found
+
+
+class _ByWindow:
+    """Some stations (K,) by the window that they are in; stations of -1 are in none, or in the only one."""
+
+    def __init__(self, stations: I32, windows: Windows) -> None:
+        self._several = windows.several
+        self._order = np.argsort(stations, kind="stable") if windows.several else np.arange(len(stations))
+        self._sorted = stations[self._order]
+
+    def chunks(self, part: slice) -> Iterator[I64]:
+        """Yield which of the stations are in a window, not too many at a time."""
+        begin, end = 0, len(self._order)
+        if self._several:
+            begin, end = np.searchsorted(self._sorted, [part.start, part.stop]).tolist()
+        for start in range(begin, end, _CHUNK):
+            yield self._order[start : min(start + _CHUNK, end)]
 
 
 def _frequencies() -> I64:
@@ -429,11 +439,9 @@ def _steps(sample: C64, basis: C64) -> F32:
 
 
 def _projected(spectra: C64, basis: C64) -> C64:
-    """(m, R, 16) numbers of spectra (32, m, D)."""
-    numbers = np.empty((spectra.shape[1], len(basis), _LANES), dtype=np.complex64)
-    for group, rows in enumerate((slice(0, min(_LOW, len(basis))), slice(_LOW, len(basis)))):
-        if rows.start >= rows.stop:
-            continue
+    """(m, 16, 16) numbers of spectra (32, m, D)."""
+    numbers = np.empty((spectra.shape[1], _ROWS, _LANES), dtype=np.complex64)
+    for group, rows in enumerate((slice(0, _LOW), slice(_LOW, _ROWS))):
         lanes = spectra[_frequencies()[group]]  # (16, m, D)
         numbers[:, rows] = np.matmul(lanes, basis[rows].conj().transpose(1, 2, 0)).transpose(1, 2, 0)
     return numbers

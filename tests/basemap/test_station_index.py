@@ -7,7 +7,6 @@ import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
-from coview_stream.basemap.stored_rows import stored_rows
 from coview_stream.config import RetrievalConfig
 from coview_stream.errors import MapError
 from coview_stream.localization.search.retrieval import Retrieval
@@ -83,45 +82,3 @@ def test_codes_begin_with_a_cache_line(world_map, tmp_path):
     world_map.save(tmp_path / "site.coview")
     codes = BaseMap.load(tmp_path / "site.coview").station_index.codes.codes
     assert codes.__array_interface__["data"][0] % 64 == 0
-
-
-def test_coarse_screening_names_the_same_stations(world_map, monkeypatch, tmp_path):
-    monkeypatch.setattr("coview_stream.basemap.station_index._COARSE_FROM", 1)
-    names = world_map.config.descriptor.channels
-    descriptors = {name: world_map.descriptors(name) for name in names}
-    coarse, plain = StationIndex.of(descriptors), world_map.station_index
-    assert coarse.coarse is not None
-    assert plain.coarse is None
-    arrays = {}
-    for name, values in coarse.arrays().items():
-        np.save(tmp_path / f"{name}.npy", values)
-        arrays[name] = np.load(tmp_path / f"{name}.npy", mmap_mode="r")
-    mapped = StationIndex.from_arrays(arrays, names)
-    for station in (3, 150, 600):
-        query = {name: np.roll(descriptors[name][station], 7, axis=1).astype(np.float32) for name in names}
-        wanted = set(plain.screen(plain.query(query), 20)[0].tolist())
-        asked = np.array([600, -1, 3, 3, 150]), np.array([7, 7, 7, 9, 0])
-        exact = plain.at(plain.query(query), *asked)
-        for index in (coarse, mapped):
-            found, scores = index.screen(index.query(query), 20)
-            assert found[0] == station
-            assert scores[0].argmin() == 7
-            np.testing.assert_array_equal(scores, index.all_shifts(index.query(query), found))
-            assert len(wanted & set(found.tolist())) >= 14  # of a map so small that twice as many are few
-            np.testing.assert_allclose(index.at(index.query(query), *asked), exact, atol=1e-5)
-    assert "station_codes.coarse" not in plain.arrays()
-
-
-def test_rows_are_read_from_the_file_that_is_mapped(tmp_path):
-    values = np.random.default_rng(1).integers(-99, 99, (500, 4, 3)).astype(np.int16)
-    np.save(tmp_path / "a.npy", values)
-    mapped = np.load(tmp_path / "a.npy", mmap_mode="r")
-    rows = stored_rows(mapped)
-    for chosen in ([], [0], [499], [3, 4, 9, 200, 480, 499], range(500)):
-        numbers = np.array(chosen, dtype=np.int64)
-        np.testing.assert_array_equal(rows.take(numbers), values[numbers])
-    assert stored_rows(values) is None
-    np.save(tmp_path / "b.npy", values + 1)
-    (tmp_path / "b.npy").replace(tmp_path / "a.npy")
-    assert stored_rows(mapped) is None  # the map is still of the file before
-    np.testing.assert_array_equal(rows.take(np.arange(5)), values[:5])

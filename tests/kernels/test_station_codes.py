@@ -155,30 +155,3 @@ def test_channels_of_different_shapes_raise():
     codes = StationCodes.of(descriptors)
     with pytest.raises(ValueError, match="columns has shape"):
         codes.query(np.ones((3, S)))
-
-
-@pytest.mark.parametrize("m", [M, 5000])  # one thread, and several
-def test_coarse_codes_agree_with_their_twin_and_rank_the_right_station_first(m):
-    descriptors, _ = scene(7, m=m)
-    columns = stacked([np.roll(each[70], 11, axis=1).astype(np.float32) for each in descriptors])
-    coarse = StationCodes.of(descriptors).coarse()
-    assert coarse.codes.nbytes == 128 * m
-    query = coarse.query(columns)
-    found = coarse.best(query)
-    twin = reference.best_codes(coarse.codes, query.screen.integers, query.screen.turn)
-    np.testing.assert_array_equal(found, twin * np.float32(query.screen.unit))
-    assert found.argmax() == 70
-    # the sums that are rounded here, in float64
-    numbers = station_codes._unpack(coarse.codes) * coarse.step
-    stored = numbers[:, :, 0].astype(np.complex128) + 1j * numbers[:, :, 1]
-    angles = np.exp(2j * np.pi / 60 * station_codes._LANE[:, None] * np.arange(60))
-    exactly = ((stored.conj() * query.numbers).sum(axis=1) @ angles).real.max(axis=1)
-    np.testing.assert_allclose(found, exactly, atol=0.02 * np.abs(exactly).max())
-
-
-def test_coarse_codes_of_a_file_are_those_that_were_made():
-    codes = StationCodes.of(scene(8)[0])
-    made = codes.coarse()
-    again = codes.coarse(made.codes, made.norm)
-    np.testing.assert_array_equal(again.norm, made.norm)
-    assert again.codes is made.codes

@@ -19,7 +19,7 @@ from coview_stream.basemap.station_grid import StationGrid
 from coview_stream.config import ConsensusConfig
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose
-from coview_stream.localization.search.votes import Vote
+from coview_stream.localization.search.votes import Request, Vote
 
 _KEPT = 8  # places are kept from keyframe to keyframe for each hypothesis that is asked for: the best; set by hand
 _BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # of what makes places distinct: bins that keep the best place each; set by hand
@@ -102,8 +102,15 @@ class Consensus:
         """Add one keyframe's vote: on the places that are known, and with all older votes on those that it names."""
         column = (self._votes[-1][0] + 1) % self.config.window if self._votes else 0
         self._votes.append((column, vote))
-        known = self._moved(self._places, column, vote)
-        places = known + self._named(column, vote)
+        known, named = self._moved(self._places, vote), self._named(vote)
+        asked = [Request(vote, each.station, each.shift) for each in (known, named)]
+        into = [each.votes[:, column] for each in (known, named)]
+        for other, older in list(self._votes)[:-1]:
+            asked.append(Request(older, self.grid.at(self._seen(named, older)), named.shift))
+            into.append(named.votes[:, other])
+        for votes, found in zip(into, vote.at_all(asked), strict=True):
+            votes[:] = found
+        places = known + named
         order = np.argsort(places.votes.sum(axis=1), kind="stable")
         _, first = np.unique(self._bins(places, vote)[order], return_index=True)
         self._places = places[order[np.sort(first)[: _KEPT * self.config.peaks]]]
@@ -142,25 +149,21 @@ class Consensus:
         turned = np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(yaw), z)], axis=1)
         return np.asarray(places.offset + turned[places.shift])
 
-    def _moved(self, places: _Places, column: int, vote: Vote) -> _Places:
-        """Let a keyframe vote on known places, which follow the height of the stations that they put it at."""
+    def _moved(self, places: _Places, vote: Vote) -> _Places:
+        """Return known places at the stations at which they put a keyframe, whose height they follow."""
         there = self._seen(places, vote)
         station = self.grid.at(there)
-        places.votes[:, column] = vote.at(station, places.shift)
         found = station >= 0
         places.offset[found, 2] += self.grid.stations[station[found], 2] - there[found, 2]
         return _Places(places.shift, places.offset, station, places.votes)
 
-    def _named(self, column: int, vote: Vote) -> _Places:
-        """Return the places that a keyframe names (eq. 12, corrected: the yaw turns about it), all votes on them."""
+    def _named(self, vote: Vote) -> _Places:
+        """Return the places that a keyframe names (eq. 12, corrected: the yaw turns about it), no votes on them yet."""
         station, shift = vote.candidates()
         offset = np.zeros((len(station), 3))
         votes = np.zeros((len(station), self.config.window), dtype=np.float32)
         places = _Places(shift, offset, station, votes)
         offset[:] = self.grid.stations[station] - self._seen(places, vote)
-        votes[:, column] = vote.at(station, shift)
-        for other, older in list(self._votes)[:-1]:
-            votes[:, other] = older.at(self.grid.at(self._seen(places, older)), shift)
         return places
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from coview_stream.basemap.station_index import StationIndex
 from coview_stream.config import Channel
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.selection import argsmallest
+from coview_stream.localization.search.votes import Request
 
 _MIN_STATIONS = 2048  # whose shifts are looked at one by one: the best; set by hand
 _SHARE = 32  # on large maps it is one in so many; set by hand
@@ -36,7 +37,8 @@ class CoViewVote:
     def candidates(self) -> tuple[Ints, Ints]:
         """Return stations and shifts (K,): the best of the headings at which the best stations are most alike."""
         count = max(_MIN_STATIONS, len(self._index) // _SHARE)
-        stations, scores = self._index.screen(self._query, count)
+        stations = argsmallest(self._index.best(self._query), count)
+        scores = self._index.all_shifts(self._query, stations)
         # every one of them has a heading that is no worse than the last one's best
         station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)
         found = scores[station, shift]
@@ -48,3 +50,7 @@ class CoViewVote:
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1."""
         return self._index.at(self._query, stations, shifts)
+
+    def at_all(self, requests: Sequence[Request[CoViewVote]]) -> list[Floats32]:
+        """Return what :meth:`at` of each does, in one go through the index."""
+        return self._index.at_all([(vote._query, stations, shifts) for vote, stations, shifts in requests])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,23 @@ ScoreVolume = Floats32
 """(M, S): one number for each station and shift."""
 
 _SAMPLE = 100_000  # distances that a median is taken of; set by hand
+
+
+V = TypeVar("V")
+
+
+class Request(NamedTuple, Generic[V]):
+    """What a vote is asked for.
+
+    Attributes:
+        vote: it.
+        stations: (K,), -1 for none.
+        shifts: (K,).
+    """
+
+    vote: V
+    stations: Ints
+    shifts: Ints
 
 
 class Vote(Protocol):
@@ -35,6 +52,10 @@ class Vote(Protocol):
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1, which is none."""
+        ...
+
+    def at_all(self, requests: Sequence[Request[Self]]) -> list[Floats32]:
+        """Return what :meth:`at` of each request's vote does; all votes are of the same kind and map as this one."""
         ...
 
 
@@ -76,6 +97,10 @@ class TableVote:
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
         """Look z-scores (K,) up; 0 for station -1."""
         return np.where(stations < 0, np.float32(0.0), self.scores[stations, shifts])
+
+    def at_all(self, requests: Sequence[Request[TableVote]]) -> list[Floats32]:
+        """Look all up, one after the other."""
+        return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
 
 def robust_zscore(volume: ScoreVolume) -> ScoreVolume:

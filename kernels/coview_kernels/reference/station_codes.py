@@ -17,11 +17,10 @@ def best_codes(codes: I16, query: I16, turn: I16) -> I32:
     """Greatest correlation over the angles, (M,) int32, in units of the turn.
 
     Args:
-        codes: (M, R, 16) int16, two numbers in each; 16 rows, or as many of the first as coarse codes have.
-        query: (2, R, 2, 16) int16, for real and imaginary products.
+        codes: (M, 16, 16) int16, two numbers in each.
+        query: (2, 16, 2, 16) int16, for real and imaginary products.
         turn: (65, 16) int16: zeros, cosines and sines of the blocks at the angles.
     """
-    low = min(_LOW, codes.shape[1])
     wide, t = query.astype(np.int32), turn[1:].astype(np.int32)
     even = np.r_[0:8, 16:24]
     cosine, sine = t[:32], t[32:]
@@ -33,7 +32,7 @@ def best_codes(codes: I16, query: I16, turn: I16) -> I32:
             np.hstack(
                 [
                     _upper_half(part[:, rows], w[rows]).sum(axis=(1, 2)) + (rows.stop - rows.start)
-                    for rows in (slice(0, low), slice(low, codes.shape[1]))
+                    for rows in (slice(0, _LOW), slice(_LOW, codes.shape[1]))
                 ]
             )
             for w in wide

@@ -8,6 +8,7 @@ cells scatters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from coview_kernels import WindowImages, WindowRaster, window_products
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.localization.search.learned.correlation import MIN_COVERAGE
+from coview_stream.localization.search.votes import Request
 
 WEIGHT = 7
 """Number of the dimension, of the eight of a cell, that is the query's weight, and whether the map knows the cell."""
@@ -94,6 +96,10 @@ class FeatureVote:
         compared = np.isfinite(scores)
         found[compared] = (self._median - scores[compared]) * np.float32(1.0 / self._deviation)
         return found
+
+    def at_all(self, requests: Sequence[Request[FeatureVote]]) -> list[Floats32]:
+        """Return what :meth:`at` of each does, one after the other."""
+        return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
     def scores(self, stations: Ints, shifts: Ints) -> Floats32:
         """Return scores (K,), higher is better: of a station's block the best cell; -inf where nothing was compared."""
