@@ -4,7 +4,7 @@
 >>> localizer = Localizer(BaseMap.load("site.coview"))      # doctest: +SKIP
 >>> fix = localizer.step(cloud, T_odom_body, stamp)          # doctest: +SKIP
 
-Maps: :class:`BaseMap`, :class:`MapConfig`, :func:`read_cloud`. Localization: :class:`Localizer`,
+Maps: :class:`BaseMap`, :class:`MapConfig`, :func:`fetch_map`, :func:`read_cloud`. Localization: :class:`Localizer`,
 :class:`LocalizerConfig`, :class:`Fix`, :func:`open_run` for recorded runs. A robot of a node: :class:`RobotClient`,
 :class:`PoseMessage`. Errors: :class:`CoViewError` and those below it.
 
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from coview_stream.recordings.open_run import open_run
     from coview_stream.recordings.run import Run
     from coview_stream.stream.client.client import RobotClient
+    from coview_stream.stream.maps.fetch_map import fetch_map
 
 __all__ = [
     "BaseMap",
@@ -70,6 +71,7 @@ __all__ = [
     "State",
     "TransportError",
     "__version__",
+    "fetch_map",
     "open_run",
     "read_cloud",
 ]
@@ -97,6 +99,7 @@ _HOMES = {
     "RunError": "errors",
     "State": "localization.state",
     "TransportError": "errors",
+    "fetch_map": "stream.maps.fetch_map",
     "open_run": "recordings.open_run",
     "read_cloud": "clouds.files",
 }

@@ -87,6 +87,7 @@ EXTRA_OF = {
     "google": "messages",
     "pyproj": "geo",
     "distributed": "cluster",
+    "obstore": "s3",
     "open3d": "build",
     "CSF": "build",
     "matplotlib": "plot",

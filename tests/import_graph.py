@@ -40,7 +40,7 @@ FOLDERS = (
 
 INNER = {
     "localization": ("state", "registration", "evidence", "calibration", "tracking", "result", "search"),
-    "stream": ("transport", "node", "client"),
+    "stream": ("transport", "maps", "node", "client"),
 }
 """Parts of a folder that has folders of its own, likewise; what is not named here may import all of them."""
 

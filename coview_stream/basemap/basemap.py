@@ -120,7 +120,8 @@ class BaseMap:
         """Memory-map a ``.coview`` file, or a site's.
 
         Args:
-            path: the file; or the directory of a site, whose working file is made first where it is not there.
+            path: the file; or the directory of a site, or a part of one, whose working file is made first where it is
+                not there.
             check: compare its content with its checksum, for which the whole file is read; without, :attr:`sha256` is
                 what the file says: for one that another process has just checked.
             verify_key: public key, or its PEM file, that the map has to be signed with; its content is compared with
@@ -136,10 +137,12 @@ class BaseMap:
             verify_key = read_verify_key(verify_key)
         trust = Trust(verify_key) if isinstance(verify_key, VerifyKey) else verify_key
         place = Path(path)
-        if place.is_dir():
+        if place.is_dir() or place.suffix == ".tiles":
+            from coview_stream.basemap.site.part import read_part
             from coview_stream.basemap.site.working_file import working_file
 
-            place, trust = working_file(place, None if trust is None else trust.key), None
+            place, keys = (place, None) if place.is_dir() else read_part(place)
+            place, trust = working_file(place, None if trust is None else trust.key, keys=keys), None
         file = file_format.open_file(place, check, trust)
         loaded = cls(file.arrays, file.parameters, file.sha256)
         loaded.path, loaded.identity = place.absolute(), file.identity

@@ -26,11 +26,14 @@ PROGRAM = "coview-stream"
 
 COMMANDS = (
     *("demo", "build", "info", "convert", "locate", "fuse", "eval", "simulate", "airborne"),
-    *("serve", "replay", "watch", "doctor", "train", "keygen"),
+    *("serve", "serve-map", "replay", "watch", "doctor", "train", "keygen"),
 )
 """Names in the order of ``--help``."""
 
-_MODULES = {"eval": "evaluate"}  # a module called eval would shadow the builtin where it is imported
+_MODULES = {
+    "eval": "evaluate",
+    "serve-map": "serve_map",
+}  # a module called eval would shadow the builtin where it is imported
 
 _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}
 """Extras that bring all that a command needs; what the others lack says it by itself."""

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.map_argument import add_map, local_map
 from coview_stream.cli.options import add_mount, add_topics, check_codec, mount_of
 from coview_stream.errors import ConfigError, TransportError
 
@@ -25,7 +26,7 @@ _MAX_SECONDS = 600.0  # to listen, set by hand
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; keys and encodings are those of ``serve``."""
-    parser.add_argument("map", type=Path, nargs="?", metavar="SITE.coview", help="a base map to look at")
+    add_map(parser, optional=True)
     parser.add_argument("--robot", nargs="+", action="extend", metavar="NAME", help="robots to listen to")
     recorded = parser.add_argument_group("a recorded run")
     recorded.add_argument(
@@ -89,15 +90,22 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
 
 
 def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Finding]:
+    from coview_stream.doctor.finding import from_error
     from coview_stream.doctor.machine_checks import machine_findings, memory
     from coview_stream.doctor.map_checks import map_findings, open_map
+    from coview_stream.errors import CoViewError
 
     connect = _endpoints(args)
     zenoh = connect is not None and _check_zenoh_config(args, connect)
     yield from machine_findings()
     sha256 = base_map = None
     if args.map is not None:
-        base_map, finding = open_map(args.map)
+        try:
+            path = local_map(args.map, args.around, base=args.base, connect=connect or ()).path
+        except CoViewError as error:
+            finding = from_error("map", error)
+        else:
+            base_map, finding = open_map(path)
         yield finding
         if base_map is not None:
             sha256 = base_map.sha256

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from coview_stream.cli.map_argument import add_map, open_map_argument
 from coview_stream.cli.options import add_gravity, add_mount, add_topics, add_verify_key, check_picture, lidar_config
 
 HELP = "merge localized runs with the base map: one cloud, tagged by source, and what has changed"
@@ -13,7 +14,7 @@ HELP = "merge localized runs with the base map: one cloud, tagged by source, and
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; ranges are checked by FuseConfig."""
-    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    add_map(parser)
     parser.add_argument("pairs", nargs="+", metavar="RUN:OUT", help="a run, and what `locate` wrote for it on this map")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FUSED.laz", help="las, laz, ply, pcd, npy")
     parser.add_argument("--voxel", type=float, metavar="M", help="metres from point to point, at least (the map's)")
@@ -49,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     pairs = [parse_pair(text) for text in args.pairs]
     check_count(len(pairs))
+    open_map_argument(args)
     check_name(args.output, [args.map, *(path for pair in pairs for path in (pair.run, pair.trajectory, pair.result))])
     check_picture("--picture", args.picture)
     if args.joint:

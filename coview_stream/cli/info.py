@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.map_argument import add_map, open_map_argument
 from coview_stream.cli.options import acceptance_config, add_risk, add_verify_key, check_picture
 from coview_stream.errors import naming_missing_libraries
 
@@ -19,7 +20,7 @@ HELP = "show what is inside a base map file"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    add_map(parser)
     parser.add_argument("--plot", type=Path, metavar="F.png", help="draw the map and its stations")
     parser.add_argument(
         "--ambiguity",
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from coview_stream.basemap.basemap import BaseMap
+    from coview_stream.basemap.site.part import site_directory
     from coview_stream.config import AcceptanceConfig
     from coview_stream.errors import ConfigError
 
@@ -51,11 +53,15 @@ def run(args: argparse.Namespace) -> int:
     acceptance = AcceptanceConfig() if args.risk is None else acceptance_config(args.risk)
     check_picture("-o", args.output)
     check_picture("--plot", args.plot)
+    source = open_map_argument(args)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     facts = describe(base_map)
-    if args.map.is_dir():
-        facts["site"] = _site(args.map)
-    facts["signature"] = _signature(args.map, args.verify_key is not None)
+    directory = site_directory(args.map)
+    if directory is not None:
+        facts["site"] = _site(directory)
+    if source.mirror is not None:
+        facts["from"] = source.mirror.source.name + (", not reached now" if source.mirror.offline else "")
+    facts["signature"] = _signature(directory or args.map, args.verify_key is not None)
     if args.ambiguity:
         facts["ambiguity"] = _ambiguity(base_map, acceptance, args)
     if args.json:

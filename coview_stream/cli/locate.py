@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.map_argument import add_map, open_map_argument
 from coview_stream.cli.options import (
     acceptance_config,
     add_gravity,
@@ -31,7 +32,7 @@ HELP = "localize a recorded run on a base map, offline"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    add_map(parser)
     add_run_path(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="directory to write")
     parser.add_argument(
@@ -79,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.output.is_dir():
         raise InputError(f"{args.output}: is a file; give a directory for the results")
     draws = not args.no_pictures and _can_draw()
+    open_map_argument(args)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
     geo = reference_for(base_map.crs, formats)  # before anything slow: there may be none
     missing = base_map.require_features(args.reloc)

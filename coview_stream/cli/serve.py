@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coview_stream.cli.map_argument import add_map, open_map_argument
 from coview_stream.cli.options import (
     KISS_ICP,
     ROBOT,
@@ -45,7 +46,7 @@ _MAX_SHUTDOWN = 1.5  # seconds after a signal, set by hand: docs/streaming.md pr
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments; values are checked where they are used."""
-    parser.add_argument("map", type=Path, metavar="SITE.coview")
+    add_map(parser)
     parser.add_argument(
         "--robot", nargs="+", action="extend", required=True, metavar="NAME", help="one or several robots"
     )
@@ -173,12 +174,13 @@ def _run(args: argparse.Namespace, children: dict[str, EngineChild]) -> int:
         deskew=not args.no_deskew,
         mount=mount_of(args),
     )
+    source = open_map_argument(args)
     options = ServeOptions(
         args.map, keys, args.connect, [DEFAULT_ENDPOINT] if by_default else args.listen, args.config, node,
         args.cloud_encoding, args.odometry_encoding, args.pose_encoding, lidar,
         args.registration, writable_state_folder(args), args.reloc, risk,
         node_keys(args.base, args.node or args.robot[0]), args.metrics, verify_key,
-        args.geo, initial_guesses(args.initial, args.robot),
+        args.geo, initial_guesses(args.initial, args.robot), source.mirror,
     )  # fmt: skip
     sinks = open_sinks(args)
     hangups: list[int] = []

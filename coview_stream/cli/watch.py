@@ -9,9 +9,9 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from coview_stream.cli.map_argument import local_map
 from coview_stream.cli.options import add_client_network
 from coview_stream.cli.view import add_view
 from coview_stream.errors import ConfigError, MessageError
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print every pose and status as one line of JSON")
     add_view(parser)
-    parser.add_argument("--map", type=Path, metavar="SITE.coview", help="the map to show (the node is asked for one)")
+    parser.add_argument("--map", metavar="SITE", help="the map to show, path or address (the node is asked for one)")
     parser.add_argument(
         "--no-clouds", action="store_true", help="show no scans: clouds are most of what a slow link has to carry"
     )
@@ -58,7 +58,11 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.seconds > 0:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0")
     topics = _topics(args)
-    view, sinks, feed = map_of_watch(args.map), open_sinks(args), None
+    view, sinks, feed = (
+        map_of_watch(None if args.map is None else local_map(args.map, base=args.base).path),
+        open_sinks(args),
+        None,
+    )
     transport = open_client(args.connect, args.listen, args.config)
     try:
         with stop_on_signals() as stop:

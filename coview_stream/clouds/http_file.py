@@ -17,6 +17,7 @@ _TIMEOUT = 30.0  # seconds without a byte; set by hand, as all that follows
 _TRIES = 4
 _WAIT = 0.5  # seconds before the second try, twice as many before each further one
 _BLOCK = 1 << 16  # bytes that are asked for at least: a header, its records and a hierarchy are many small reads
+_ANSWERS = (http.client.NOT_MODIFIED, http.client.REQUESTED_RANGE_NOT_SATISFIABLE)
 _AGAIN = (408, 425, 429, 500, 502, 503, 504)
 _FAILURES = (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError)
 
@@ -118,7 +119,7 @@ def open_web_file(request: urllib.request.Request) -> Any:
         try:
             return urllib.request.urlopen(request, timeout=_TIMEOUT)
         except urllib.error.HTTPError as error:
-            if error.code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+            if error.code in _ANSWERS:
                 return error
             if error.code not in _AGAIN or not left:
                 raise CloudError(f"{address}: the server answers {error.code} {error.reason}; check it") from error

@@ -25,7 +25,9 @@ FILE = "manifest.json"
 LAYERS = ("cloud", "stations", "features")
 """Layers of a tile: its points with normals, its stations, and learned features, which need not be there."""
 
-_MAX_BYTES = 1 << 28  # of a manifest: 400,000 tiles; set by hand
+MAX_MANIFEST = 1 << 28
+"""Bytes of a manifest at most: 400,000 tiles; set by hand."""
+
 _MAX_LAYER = 1 << 28  # bytes
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
@@ -186,13 +188,13 @@ class Manifest:
         path = directory / FILE
         try:
             with path.open("rb") as file:
-                raw = file.read(_MAX_BYTES + 1)
+                raw = file.read(MAX_MANIFEST + 1)
         except OSError as error:
             raise MapError(
                 f"{directory}: is no site, {FILE} cannot be read ({error.strerror}); give a .coview file, or a "
                 "directory that 'build -o DIRECTORY/' made"
             ) from error
-        if len(raw) > _MAX_BYTES:
+        if len(raw) > MAX_MANIFEST:
             raise MapError(f"{path}: is too large for a manifest")
         return cls.from_bytes(raw, str(path))
 

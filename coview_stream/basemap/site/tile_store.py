@@ -14,6 +14,13 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 _FOLDER = "layers"
 
 
+def layer_path(sha256: str) -> str:
+    """Return the place of a layer below a site's directory; MapError where ``sha256`` is no hash."""
+    if not SHA256.fullmatch(sha256):
+        raise MapError(f"{sha256[:80]!r} is no sha256 of a layer")
+    return f"{_FOLDER}/{sha256[:2]}/{sha256}"
+
+
 class TileStore:
     """Layers in the folder ``layers`` of a site's directory, or of a cache.
 
@@ -30,9 +37,7 @@ class TileStore:
         Raises:
             MapError: it is no hash.
         """
-        if not SHA256.fullmatch(sha256):
-            raise MapError(f"{sha256[:80]!r} is no sha256 of a layer")
-        return self.folder / sha256[:2] / sha256
+        return self.folder.parent / layer_path(sha256)
 
     def put(self, content: bytes) -> str:
         """Write a layer, unless it is there, and return its hash.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -80,19 +81,31 @@ def working_file(
 
 
 def evict(folder: Path, keep: Path | None = None) -> None:
-    """Delete the working files that have not been used for longest, until the cache is within its bound."""
-    files = []
-    for path in folder.glob("*.coview"):
+    """Delete what has not been used for longest, working files and mirrors, until the cache is within its bound."""
+    found = []
+    for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
         with contextlib.suppress(OSError):
-            stat = path.stat()
-            files.append((stat.st_mtime, stat.st_size, path))
-    total, bound = sum(size for _, size, _ in files), _bound()
-    for _, size, path in sorted(files):
+            found.append((path.stat().st_mtime, _size(path), path))
+    total, bound = sum(size for _, size, _ in found), _bound()
+    for _, size, path in sorted(found):
         if total <= bound:
             break
         if path != keep:
-            path.unlink(missing_ok=True)  # who has mapped it keeps it until it ends
+            _remove(path)  # who has mapped it keeps it until it ends
             total -= size
+
+
+def _size(path: Path) -> int:
+    if path.is_dir():
+        return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+    return path.stat().st_size
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _bound() -> float:

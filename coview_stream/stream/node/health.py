@@ -72,7 +72,8 @@ class NodeHealth:
             "uptime_s": round(now - node.started, 1),
             "live": {"ok": not live, "reasons": live},
             "ready": {"ok": not (live or ready), "reasons": live + ready},
-            "map": {"sha256": node.map_sha256, "reload": dict(node.reloader.last) if node.reloader else None},
+            "map": {"sha256": node.map_sha256, "reload": dict(node.reloader.last) if node.reloader else None}
+            | ({"source": dict(node.map_follower.last)} if node.map_follower else {}),
             "memory_bytes": _memory(os.getpid()),
             "engines": {
                 name: {

@@ -33,6 +33,15 @@ _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish what they are at
 
 
+class Follower(Protocol):
+    """Follows the source of a map: :class:`~coview_stream.stream.maps.map_follower.MapFollower`."""
+
+    @property
+    def last(self) -> dict[str, Any]:
+        """What became of the newest question to the source."""
+        ...
+
+
 class Reloader(Protocol):
     """Changes the map of a running node: :class:`~coview_stream.stream.node.reload.MapReloader`."""
 
@@ -66,6 +75,7 @@ class Node:
         elections: as given.
         beat: local time at which the pose clock has ticked last.
         reloader: changes the map; None if there is no way to open one.
+        map_follower: has it changed when its source elsewhere changes; None of a map that is here.
         feeds: of the engines of the map that is served, and of another that is to take its place.
     """
 
@@ -100,6 +110,7 @@ class Node:
         self._ending: threading.Thread | None = None
         self.started = self.beat = time.monotonic()
         self.reloader: Reloader | None = None
+        self.map_follower: Follower | None = None
 
     # ---- life
 

@@ -21,6 +21,7 @@ from coview_stream.stream.node.engine_process import CancelledError, DiedError, 
 from coview_stream.stream.transport.keys import NodeKeys, RobotKeys, check_disjoint
 
 if TYPE_CHECKING:
+    from coview_stream.basemap.site.mirror import Mirror
     from coview_stream.localization.search.place_guess import PlaceGuess
     from coview_stream.stream.node.node import Node
     from coview_stream.stream.node.reload import OpenedMap
@@ -53,6 +54,7 @@ class ServeOptions:
         metrics: ``HOST:PORT`` at which health and metrics can be read over HTTP; None for none.
         geo: encoding in which poses go out as places on Earth as well; None: they do not.
         guesses: of the places of robots, by name: tried, never trusted.
+        mirror: of the site that the map is a copy of, whose changes are followed; None of a map that is here.
         verify_key: public key that the map has to be signed with, also one that is loaded later; None for any map.
     """
 
@@ -75,6 +77,7 @@ class ServeOptions:
     verify_key: VerifyKey | None = None
     geo: str | None = None
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
+    mirror: Mirror | None = None
 
 
 def open_node(
@@ -107,6 +110,7 @@ def open_node(
         sha256, engines = start_engines(options, children)
         # imported while the engines start, which takes longer
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
+        from coview_stream.stream.maps.map_follower import MapFollower
         from coview_stream.stream.node.election import Elections
         from coview_stream.stream.node.last_pose_keeper import LastPoseKeeper
         from coview_stream.stream.node.locations import LocationPublisher, MapReference
@@ -145,6 +149,9 @@ def open_node(
             lambda busy: notifier.reloading(busy, "changing the map" if busy else ", ".join(names)),
         )
         node.run_beside("reload", reloader.run)
+        if options.mirror is not None:
+            node.map_follower = follower = MapFollower(options.mirror, node.reload)
+            node.run_beside("map source", follower.run)
         node.run_beside("memory", MemoryRelease().run)
         _add_health(node, options, notifier)
         map_view = MapViewAnswer(options.map_path, lambda: node.map_sha256)

@@ -1,0 +1,139 @@
+"""Mirror of a site: what has been fetched of it, checked, in the cache; maps are opened from it, with or without a net.
+
+Every layer is compared with its hash before it is written, the manifest with its signature where a key is asked for.
+The manifest is written last, so that the mirror is always one state of the site, the old one or the new.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from coview_stream.basemap.signature import VerifyKey
+from coview_stream.basemap.site.manifest import FILE, LayerEntry, Manifest, TileEntry
+from coview_stream.basemap.site.part import Around, part_file, tiles_around
+from coview_stream.basemap.site.site_source import SiteSource
+from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.basemap.site.working_file import cache_folder, evict
+from coview_stream.errors import MapError, TransportError, warn
+
+log = logging.getLogger("coview_stream.maps")
+
+_TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second; set by hand
+
+Progress = Callable[[int, int], None]
+"""Called with bytes fetched, and bytes to fetch."""
+
+
+class Mirror:
+    """The cached state of one site.
+
+    Attributes:
+        source: where the site is.
+        directory: of the mirror, itself a site.
+        around: only tiles within this circle are fetched; None: all.
+        offline: why the source could not be asked the last time; empty where it could.
+    """
+
+    def __init__(self, source: SiteSource, verify_key: VerifyKey | None = None, around: Around | None = None) -> None:
+        """Take the source; nothing is asked for yet. MapError: the cache cannot be used."""
+        self.source = source
+        self.around = around
+        self.offline = ""
+        self._verify_key = verify_key
+        name = hashlib.sha256(source.name.encode()).hexdigest()[:16]
+        self.directory = cache_folder() / "sites" / name
+        self._store = TileStore(self.directory)
+
+    @property
+    def map_path(self) -> Path:
+        """What a map is opened from: the mirror, or the part of it that the circle meets."""
+        if self.around is None:
+            return self.directory
+        manifest = Manifest.load(self.directory)
+        return part_file(self.directory, tiles_around(manifest, self.around), str(self.around))
+
+    def open(self, progress: Progress | None = None) -> Path:
+        """Bring it up to date if the source can be asked, and return :attr:`map_path`.
+
+        Raises:
+            TransportError: the source cannot be asked, and nothing is in the cache.
+            MapError: what came is no site, is not what it should be, or is not signed with the key.
+        """
+        try:
+            self.refresh(progress, check=True)
+            os.utime(self.directory)  # the cache keeps what was used last
+        except TransportError as error:
+            try:
+                kept = Manifest.load(self.directory)
+            except MapError:
+                raise error from None
+            if self._verify_key is not None:
+                kept.check_signature(self._verify_key, str(self.directory))
+            self.offline = str(error)
+            warn(f"{error}; going on with what was fetched before, manifest {kept.sha256[:12]}")
+        return self.map_path
+
+    def refresh(self, progress: Progress | None = None, check: bool = False) -> bool:
+        """Ask the source, fetch what is missing, and return whether the site has changed.
+
+        Args:
+            progress: is told.
+            check: compare layers that are there with their hashes, not with their lengths alone.
+
+        Raises:
+            TransportError: the source cannot be asked; what was fetched is kept. MapError: as of :meth:`open`.
+        """
+        self.offline = ""
+        raw = self.source.manifest()
+        manifest = Manifest.from_bytes(raw, f"{self.source.name}/{FILE}")
+        if self._verify_key is not None:
+            manifest.check_signature(self._verify_key, self.source.name)
+        try:
+            before = Manifest.load(self.directory)
+        except MapError:
+            before = None
+        keys = None if self.around is None else tiles_around(manifest, self.around)
+        wanted = {
+            layer.sha256: (layer, tile)
+            for tile in manifest.tiles
+            if keys is None or (tile.column, tile.row) in keys
+            for layer in tile.layers.values()
+        }
+        there = self._store.is_whole if check else self._store.holds
+        missing = [each for each in wanted.values() if not there(each[0].sha256, each[0].bytes)]
+        done, total = 0, sum(layer.bytes for layer, _ in missing)
+        for layer, tile in missing:
+            self._store.put(self._fetched(layer, tile))
+            done += layer.bytes
+            if progress:
+                progress(done, total)
+        changed = before is None or before.sha256 != manifest.sha256
+        if changed or before != manifest:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            manifest.save(self.directory)
+        if changed and before is not None:  # one state back: somebody may still stand on it
+            self._store.prune(manifest.hashes() | before.hashes())
+        elif changed:
+            evict(cache_folder(), keep=self.directory)
+        return changed or bool(missing)
+
+    def _fetched(self, layer: LayerEntry, tile: TileEntry) -> bytes:
+        for left in reversed(range(_TRIES)):
+            try:
+                raw = self.source.layer(layer.sha256, layer.bytes)
+                break
+            except TransportError:
+                if not left:
+                    raise
+                time.sleep(_WAIT * 2 ** (_TRIES - 2 - left))
+        if len(raw) != layer.bytes or hashlib.sha256(raw).hexdigest() != layer.sha256:
+            raise MapError(
+                f"{self.source.name}: a layer of tile {tile.column}, {tile.row} ({layer.sha256[:12]}) is not what the "
+                "manifest says: damaged or swapped; nothing of it is used. Build or copy the site again"
+            )
+        return raw

@@ -1,0 +1,115 @@
+"""Part of a site: a small file that names a site's directory and some of its tiles, and is opened like a map."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from coview_stream.basemap.site.grid import Key
+from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.working_file import cache_folder
+from coview_stream.clouds.atomic_file import atomic_file
+from coview_stream.errors import ConfigError, MapError
+
+SUFFIX = ".tiles"
+_FORMAT = "coview-part"
+_MAX_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class Around:
+    """A circle.
+
+    Attributes:
+        x, y: its centre, in the frame of the site's sources, metres.
+        radius: metres.
+    """
+
+    x: float
+    y: float
+    radius: float
+
+    def __post_init__(self) -> None:
+        """Check it; ConfigError where it is none."""
+        if not all(map(math.isfinite, (self.x, self.y, self.radius))) or self.radius < 0:
+            raise ConfigError(f"around {self}: give X,Y,RADIUS in the map's coordinates, metres")
+
+    @classmethod
+    def parse(cls, text: str) -> Around:
+        """Return the circle that ``X,Y,RADIUS`` means; ConfigError where it means none."""
+        try:
+            x, y, radius = map(float, text.split(","))
+        except ValueError:
+            raise ConfigError(f"around {text!r}: give X,Y,RADIUS in the map's coordinates, metres") from None
+        return cls(x, y, radius)
+
+    def __str__(self) -> str:
+        """Return it as it is given."""
+        return ",".join(f"{value:.15g}" for value in (self.x, self.y, self.radius))
+
+
+def tiles_around(manifest: Manifest, around: Around) -> set[Key]:
+    """Return the tiles that a circle meets.
+
+    Raises:
+        MapError: there is none; how far the nearest one is, is said.
+    """
+    x, y = around.x - manifest.origin[0], around.y - manifest.origin[1]
+
+    def away(column: int, row: int) -> float:
+        beside = (
+            max(k * manifest.tile - value, 0.0, value - (k + 1) * manifest.tile) for k, value in ((column, x), (row, y))
+        )
+        return math.hypot(*beside)
+
+    found = {key: away(*key) for tile in manifest.tiles if (key := (tile.column, tile.row))}
+    near = {key for key, distance in found.items() if distance <= around.radius}
+    if not near:
+        nearest = f"the nearest is {min(found.values()):.0f} m away" if found else "it has none"
+        raise MapError(f"around {around}: no tile of the site is there, {nearest}; check the coordinates")
+    return near
+
+
+def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
+    """Write which tiles of a site to open, and return the file, one for each site and name.
+
+    Raises:
+        MapError: the cache cannot be written.
+    """
+    place = str(directory.resolve())
+    path = cache_folder() / "parts" / (hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + SUFFIX)
+    data = {"format": _FORMAT, "directory": place, "tiles": sorted(keys)}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            file.write(json.dumps(data).encode())
+    except OSError as error:
+        raise MapError(f"{path}: cannot be written ({error.strerror})") from error
+    return path
+
+
+def read_part(path: Path) -> tuple[Path, set[Key]]:
+    """Return the site's directory and the tiles that a file names.
+
+    Raises:
+        MapError: it is something else.
+    """
+    try:
+        with path.open("rb") as file:
+            data = json.loads(file.read(_MAX_BYTES))
+        if data["format"] != _FORMAT:
+            raise ValueError("another format")
+        return Path(str(data["directory"])), {(int(column), int(row)) for column, row in data["tiles"]}
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise MapError(f"{path}: names no part of a site ({error}); use --around again") from error
+
+
+def site_directory(path: Path) -> Path | None:
+    """Return the directory of the site that a map's path means, or is a part of; None for a file."""
+    if path.suffix == SUFFIX and path.is_file():
+        return read_part(path)[0]
+    return path if path.is_dir() else None

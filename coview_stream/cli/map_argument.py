@@ -1,0 +1,96 @@
+"""The map that a command works on: a file, a site's directory, or the address of a site, of which a copy is kept."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from coview_stream.basemap.signature import VerifyKey
+    from coview_stream.basemap.site.mirror import Mirror
+
+
+class LocalMap(NamedTuple):
+    """A map on this machine.
+
+    Attributes:
+        path: what :meth:`BaseMap.load` takes.
+        mirror: of a site elsewhere, None of a map that is here.
+    """
+
+    path: Path
+    mirror: Mirror | None = None
+
+
+def add_map(parser: argparse.ArgumentParser, optional: bool = False) -> None:
+    """Declare the map's argument, and ``--around``."""
+    parser.add_argument(
+        "map",
+        nargs="?" if optional else None,
+        metavar="SITE",
+        help="SITE.coview, a site's directory, or its address: zenoh://SITE, https://..., s3://...",
+    )
+    parser.add_argument(
+        "--around", metavar="X,Y,RADIUS", help="of a directory or an address only the tiles that this circle meets"
+    )
+
+
+def local_map(
+    name: str,
+    around: str | None = None,
+    verify_key: VerifyKey | None = None,
+    base: str = "coview",
+    connect: Sequence[str] = (),
+    config: Path | None = None,
+) -> LocalMap:
+    """Return the map on this machine that a command was given; of an address, what has been fetched and checked.
+
+    Args:
+        name: path or address.
+        around: ``X,Y,RADIUS``; None for all of it.
+        verify_key: has to have signed it, if it comes from elsewhere.
+        base: first part of zenoh keys.
+        connect: zenoh endpoints, for ``zenoh://SITE``.
+        config: a zenoh configuration, likewise.
+
+    Raises:
+        ConfigError: a malformed address or circle. TransportError: it cannot be fetched, and never was.
+        MapError: what came is not what it should be, or nothing is in the circle.
+    """
+    if around is None and "://" not in name:
+        return LocalMap(Path(name))  # without the modules below: most maps are files
+
+    from coview_stream.basemap.site.manifest import Manifest, is_site
+    from coview_stream.basemap.site.part import Around, part_file, tiles_around
+    from coview_stream.basemap.site.site_source import is_site_address
+    from coview_stream.errors import ConfigError
+
+    circle = None if around is None else Around.parse(around)
+    if is_site_address(name):
+        from coview_stream.stream.maps.fetch_map import open_mirror
+
+        mirror = open_mirror(name, circle, verify_key, base, connect, config)
+        return LocalMap(mirror.map_path, mirror)
+    path = Path(name)
+    if circle is None:
+        return LocalMap(path)
+    if not is_site(path):
+        raise ConfigError(f"--around: {name} is no directory of tiles; `coview-stream convert` makes one")
+    return LocalMap(part_file(path, tiles_around(Manifest.load(path), circle), str(circle)))
+
+
+def open_map_argument(args: argparse.Namespace) -> LocalMap:
+    """Return the map that parsed arguments name, and put its path in the place of ``args.map``.
+
+    Raises:
+        As of :func:`local_map`; InputError: the key cannot be read.
+    """
+    from coview_stream.basemap.signature import read_verify_key
+
+    key = None if getattr(args, "verify_key", None) is None else read_verify_key(args.verify_key)
+    connect, config = getattr(args, "connect", None) or (), getattr(args, "config", None)
+    found = local_map(str(args.map), args.around, key, getattr(args, "base", "coview"), connect, config)
+    args.map = found.path
+    return found

@@ -1,0 +1,128 @@
+"""Map server: answers queries for the manifest and the layers of a site's directory on zenoh."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.errors import MapError
+from coview_stream.stream.maps.map_keys import MapKeys
+from coview_stream.stream.transport import zenoh_config
+from coview_stream.stream.transport.error_guard import RateLimitedErrors
+
+log = logging.getLogger("coview_stream.maps")
+
+_LOOK = 1.0  # seconds between two looks at the manifest's file; set by hand
+_QUEUE = 64  # queries that wait, more are dropped and asked again; set by hand
+
+
+class MapServer:
+    """Serves one site; of its directory only the manifest and the layers that it names, or named before.
+
+    One thread answers, one query after the other; another looks whether the manifest has changed.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        keys: MapKeys,
+        connect: Sequence[str] = (),
+        listen: Sequence[str] = (),
+        config: Path | None = None,
+    ) -> None:
+        """Open a session and begin to answer.
+
+        Raises:
+            MapError: the directory is no site. TransportError: the network cannot be used.
+        """
+        import zenoh
+
+        self.manifest = Manifest.load(directory)
+        self.answered = 0
+        """Queries that were answered with bytes."""
+        self.sent = 0
+        """Bytes of these answers."""
+        self._directory, self._keys = directory, keys
+        self._store = TileStore(directory)
+        self._raw = self.manifest.to_bytes()
+        self._layers = _sizes(self.manifest)
+        self._guard = RateLimitedErrors(log)
+        self._stopping = threading.Event()
+        with zenoh_config.zenoh_errors("zenoh session"):
+            self._session: Any = zenoh.open(zenoh_config.compose(connect, listen, config))
+            self._queryable: Any = self._session.declare_queryable(
+                keys.all, zenoh.handlers.FifoChannel(_QUEUE), complete=True
+            )
+            self._publisher = self._session.declare_publisher(keys.changed)
+        self._threads = [
+            threading.Thread(target=work, name=f"coview {name}", daemon=True)
+            for name, work in (("maps", self._answer_all), ("manifest", self._look))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._stopping.set()
+        with self._guard.catch("closing"):
+            self._session.close()  # and all that was declared on it
+        for thread in self._threads:
+            thread.join(2.0)
+
+    def _answer_all(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                query = self._queryable.recv()
+            except Exception:  # the channel's end has no class of its own
+                return
+            with self._guard.catch("answering"), query:
+                self._answer(query)
+
+    def _answer(self, query: Any) -> None:
+        asked = query.key_expr
+        if asked.intersects(self._keys.manifest):
+            self._reply(query, self._keys.manifest, self._raw)
+        key = str(asked)  # a wildcard would ask for the whole site at once: layers are given by their names alone
+        prefix = self._keys.layer("")
+        sha256 = key.removeprefix(prefix)
+        if key.startswith(prefix) and sha256 in self._layers:
+            try:
+                raw = self._store.get(sha256, self._layers[sha256])
+            except MapError as error:
+                log.error("%s", error)
+                query.reply_err(str(error).encode())
+                return
+            self._reply(query, key, raw)
+
+    def _reply(self, query: Any, key: str, raw: bytes) -> None:
+        query.reply(key, raw)
+        self.answered += 1
+        self.sent += len(raw)
+
+    def _look(self) -> None:
+        refused = ""
+        while not self._stopping.wait(_LOOK):
+            with self._guard.catch("looking at the manifest"):
+                try:
+                    found = Manifest.load(self._directory)
+                except MapError as error:
+                    if str(error) != refused:
+                        log.error("%s; going on with manifest %s", error, self.manifest.sha256[:12])
+                    refused = str(error)
+                    continue
+                refused = ""
+                if found == self.manifest:
+                    continue
+                self._layers = _sizes(self.manifest) | _sizes(found)  # who has the last manifest still asks for its
+                self.manifest, self._raw = found, found.to_bytes()
+                log.info("manifest %s is served now", found.sha256[:12])
+                self._publisher.put(found.sha256)
+
+
+def _sizes(manifest: Manifest) -> dict[str, int]:
+    return {layer.sha256: layer.bytes for tile in manifest.tiles for layer in tile.layers.values()}

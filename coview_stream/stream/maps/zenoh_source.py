@@ -1,0 +1,65 @@
+"""Site of a map server on zenoh, as a source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coview_stream.basemap.site.manifest import MAX_MANIFEST
+from coview_stream.errors import TransportError
+from coview_stream.stream.maps.map_keys import MapKeys
+from coview_stream.stream.transport import zenoh_config
+
+_NO_ANSWER = "Timeout"  # zenoh's word
+_TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s; set by hand
+
+
+class ZenohSource:
+    """A site by its name; the session is opened when something is asked for, and kept."""
+
+    def __init__(
+        self,
+        site: str,
+        base: str = "coview",
+        connect: Sequence[str] = (),
+        listen: Sequence[str] = (),
+        config: Path | None = None,
+    ) -> None:
+        """Take the site's name and where the network is; ConfigError where the name is no part of a key."""
+        where = ",".join(connect) or ("" if config is None else str(config))
+        self.name = f"zenoh://{site}" + (f" ({where})" if where else "")
+        self._keys = MapKeys.of(site, base)
+        self._given = connect, listen, config
+        self._session: Any = None
+
+    def manifest(self) -> bytes:
+        """Return the manifest's bytes. TransportError: nobody answers."""
+        return self._get(self._keys.manifest, MAX_MANIFEST)
+
+    def layer(self, sha256: str, size: int) -> bytes:
+        """Return a layer's bytes. TransportError: nobody answers, or the server cannot read it."""
+        return self._get(self._keys.layer(sha256), size)
+
+    def close(self) -> None:
+        """Close the session."""
+        session, self._session = self._session, None
+        if session is not None:
+            with zenoh_config.zenoh_errors("zenoh session"):
+                session.close()
+
+    def _get(self, key: str, limit: int) -> bytes:
+        import zenoh
+
+        with zenoh_config.zenoh_errors(self.name):
+            if self._session is None:
+                self._session = zenoh.open(zenoh_config.compose(*self._given))
+            told = ""
+            for reply in self._session.get(key, timeout=_TIMEOUT, target=zenoh.QueryTarget.BEST_MATCHING):
+                if reply.ok is None:
+                    told = reply.err.payload.to_string()[:300].replace(_NO_ANSWER, "")
+                    continue
+                if len(reply.ok.payload) > limit:
+                    raise TransportError(f"{self.name}: the answer has {len(reply.ok.payload)} bytes, {limit} at most")
+                return bytes(reply.ok.payload)
+        raise TransportError(f"{self.name}: {told or 'no map server answers; is serve-map running there?'}")

@@ -1,0 +1,234 @@
+"""Mirrors of sites: fetched, checked, kept; what is damaged or swapped on the way is refused and named."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import threading
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.signature import SigningKey, read_verify_key
+from coview_stream.basemap.site.manifest import FILE, Manifest
+from coview_stream.basemap.site.mirror import Mirror
+from coview_stream.basemap.site.part import Around, part_file, read_part, tiles_around
+from coview_stream.basemap.site.site_build import build_site
+from coview_stream.basemap.site.site_source import DirectorySource, ObjectStoreSource, WebSource, is_site_address
+from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.cli import main
+from coview_stream.clouds.files import write_cloud
+from coview_stream.config import map_preset
+from coview_stream.errors import ConfigError, CoViewWarning, MapError, TransportError
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def site(map_points, tmp_path_factory):
+    """The small world about the corner of four tiles."""
+    folder = tmp_path_factory.mktemp("mirrored")
+    write_cloud(folder / "yard.las", map_points + np.array([512_003.0, 5_120_005.0, 100.0]))
+    assert len(build_site(folder / "yard.las", folder / "yard", map_preset("slam", learned=False)).manifest.tiles) == 4
+    return folder / "yard"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("coview_stream.basemap.site.mirror._WAIT", 0.0)
+    return tmp_path / "cache"
+
+
+class Faulty(DirectorySource):
+    """A directory that answers wrongly, or not at all."""
+
+    def __init__(self, directory, change=lambda sha256, raw: raw):
+        super().__init__(directory)
+        self.change = change
+        self.gone = False
+        self.asked = []
+
+    def manifest(self):
+        if self.gone:
+            raise TransportError("yard: nobody answers")
+        return super().manifest()
+
+    def layer(self, sha256, size):
+        self.asked.append(sha256)
+        if self.gone:
+            raise TransportError("yard: nobody answers")
+        return self.change(sha256, super().layer(sha256, size))
+
+
+def test_mirror_is_the_site_and_is_opened_without_the_source(site):
+    source = Faulty(site)
+    mirror = Mirror(source)
+    path = mirror.open()
+    assert Manifest.load(path) == Manifest.load(site)
+    assert sorted(source.asked) == sorted(Manifest.load(site).hashes())
+    assert len(BaseMap.load(path)) == sum(tile.stations for tile in Manifest.load(site).tiles)
+    source.gone = True
+    again = Mirror(source)
+    with pytest.warns(CoViewWarning, match="nobody answers; going on with what was fetched before"):
+        assert again.open() == path
+    assert "nobody answers" in again.offline
+    source.gone, asked = False, len(source.asked)
+    assert not mirror.refresh()
+    assert len(source.asked) == asked
+
+
+def test_site_that_was_never_fetched_needs_its_source(site):
+    source = Faulty(site)
+    source.gone = True
+    with pytest.raises(TransportError, match="nobody answers"):
+        Mirror(source).open()
+
+
+@pytest.mark.parametrize(
+    "change", [lambda sha256, raw: raw[:-1] + b"x", lambda sha256, raw: raw[:9], lambda sha256, raw: raw * 2]
+)
+def test_damaged_layers_are_refused_and_named(site, change):
+    mirror = Mirror(Faulty(site, change))
+    with pytest.raises(MapError, match=r"yard: a layer of tile -?\d+, -?\d+ \([0-9a-f]{12}\) is not what the manifest"):
+        mirror.open()
+    assert not (mirror.directory / FILE).exists()
+
+
+def test_swapped_layers_are_refused_and_the_map_before_is_kept(site):
+    mirror = Mirror(Faulty(site))
+    path = mirror.open()
+    before = Manifest.load(path)
+    store = TileStore(path)
+    other = next(iter(before.tiles[-1].layers.values()))
+    victim = before.tiles[0].layers["cloud"]
+    store.path(victim.sha256).write_bytes(store.get(other.sha256, other.bytes))  # damaged in the cache
+    mirror.source.change = lambda sha256, raw: store.get(other.sha256, other.bytes)
+    with pytest.raises(MapError, match="damaged or swapped"):
+        mirror.open()
+    mirror.source.change = lambda sha256, raw: raw
+    mirror.open()
+    assert store.is_whole(victim.sha256, victim.bytes)
+    assert Manifest.load(path) == before
+
+
+def test_what_was_fetched_before_a_source_broke_off_is_not_fetched_again(site):
+    source = Faulty(site)
+    count = len(Manifest.load(site).hashes())
+
+    def break_off(sha256, raw):
+        if len(source.asked) > count // 2:
+            source.gone = True
+        return raw
+
+    source.change = break_off
+    mirror = Mirror(source)
+    with pytest.raises(TransportError):
+        mirror.open()
+    source.gone, source.change, source.asked = False, lambda sha256, raw: raw, []
+    mirror.open()
+    assert 0 < len(source.asked) <= count - count // 2
+
+
+def test_manifest_has_to_be_signed_where_a_key_is_asked_for(site, tmp_path):
+    main(["keygen", str(tmp_path / "owner")])
+    main(["keygen", str(tmp_path / "other")])
+    site = shutil.copytree(site, tmp_path / "signed")
+    Manifest.load(site).signed(SigningKey(tmp_path / "owner.key")).save(site)
+    owner, other = (read_verify_key(tmp_path / f"{name}.pub") for name in ("owner", "other"))
+    path = Mirror(DirectorySource(site), owner).open()
+    assert len(BaseMap.load(path, verify_key=owner)) > 0
+    with pytest.raises(MapError, match="is not signed with"):
+        Mirror(DirectorySource(site), other).open()
+    manifest = Manifest.load(site)
+    replace(manifest, tiles=manifest.tiles[1:]).save(site)
+    with pytest.raises(MapError, match="is not signed with"):
+        Mirror(DirectorySource(site), owner).open()
+    source = Faulty(site)
+    source.gone = True
+    with pytest.raises(MapError, match="is not signed with"):
+        Mirror(source, other).open()
+
+
+def test_changed_site_is_fetched_and_what_is_no_longer_named_goes_with_the_next_change(site, tmp_path):
+    place = shutil.copytree(site, tmp_path / "changing")
+    source = Faulty(place)
+    mirror = Mirror(source)
+    path = mirror.open()
+    whole = Manifest.load(place)
+    source.asked = []
+    replace(whole, tiles=whole.tiles[1:]).save(place)
+    assert mirror.refresh()
+    assert not source.asked
+    gone = set(whole.hashes()) - Manifest.load(place).hashes()
+    assert all(TileStore(path).path(sha256).exists() for sha256 in gone)  # somebody may still stand on it
+    replace(whole, tiles=whole.tiles[2:]).save(place)
+    assert mirror.refresh()
+    assert not any(TileStore(path).path(sha256).exists() for sha256 in gone)
+
+
+def test_only_tiles_around_a_place_are_fetched(site):
+    manifest = Manifest.load(site)
+    tile = manifest.tiles[0]
+    centre = [manifest.origin[k] + (index + 0.5) * manifest.tile for k, index in enumerate((tile.column, tile.row))]
+    around = Around(*centre, 1.0)
+    source = Faulty(site)
+    mirror = Mirror(source, around=around)
+    path = mirror.open()
+    assert len(source.asked) == len(tile.layers)
+    assert read_part(path) == (mirror.directory.resolve(), {(tile.column, tile.row)})
+    part = BaseMap.load(path)
+    assert len(part) == tile.stations
+    local = BaseMap.load(part_file(site, tiles_around(manifest, around), str(around)))
+    assert local.sha256 == part.sha256
+    with pytest.raises(MapError, match=r"no tile of the site is there, the nearest is \d+ m away"):
+        Mirror(source, around=Around(1e6, 1e6, 10.0)).open()
+    with pytest.raises(ConfigError, match="X,Y,RADIUS"):
+        Around.parse("1,2")
+    with pytest.raises(MapError, match="names no part"):
+        read_part(site / FILE)
+
+
+def test_site_of_a_web_server(site, tmp_path, capsys):
+    served = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+    threading.Thread(target=served.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{served.server_address[1]}"
+    try:
+        assert Manifest.load(Mirror(WebSource(address + "/")).open()) == Manifest.load(site)
+        assert main(["info", address, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["from"] == address
+    finally:
+        served.shutdown()
+        served.server_close()
+    assert main(["info", address]) == 0
+    said = capsys.readouterr()
+    assert "cannot be reached" in said.err
+    assert "not reached now" in said.out
+    assert main(["info", address + "/elsewhere"]) == 2
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """A web server that says nothing."""
+
+    def log_message(self, *_):
+        """Say nothing."""
+
+
+def test_site_of_an_object_store(site):
+    pytest.importorskip("obstore", reason="obstore is not here; pip install 'coview-stream[s3]'")
+    source = ObjectStoreSource(site.resolve().as_uri())
+    assert Manifest.load(Mirror(source).open()) == Manifest.load(site)
+    with pytest.raises(TransportError):
+        source.layer(hashlib.sha256(b"").hexdigest(), 10)
+    with pytest.raises(TransportError, match="check the address"):
+        ObjectStoreSource("s4://x")
+
+
+def test_addresses_are_told_from_paths(tmp_path):
+    assert all(map(is_site_address, ("zenoh://yard", "https://host/yard", "s3://bucket/yard")))
+    assert not any(map(is_site_address, ("yard", "/maps/yard/", "C:\\maps\\yard", "file:///yard", tmp_path)))

@@ -1,0 +1,159 @@
+"""Sites over zenoh, on loopback: served, fetched, followed while they change; nothing else of a directory is given."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import zenoh
+from sockets import free_endpoint, until
+
+from coview_stream.basemap.basemap import BaseMap
+from coview_stream.basemap.site.manifest import Manifest
+from coview_stream.basemap.site.mirror import Mirror
+from coview_stream.basemap.site.site_build import build_site
+from coview_stream.basemap.site.tile_store import TileStore
+from coview_stream.clouds.files import write_cloud
+from coview_stream.config import map_preset
+from coview_stream.errors import ConfigError, TransportError
+from coview_stream.stream.maps.map_address import source_of
+from coview_stream.stream.maps.map_follower import MapFollower
+from coview_stream.stream.maps.map_keys import MapKeys
+from coview_stream.stream.maps.map_server import MapServer
+from coview_stream.stream.maps.zenoh_source import ZenohSource
+from coview_stream.stream.transport.zenoh_config import compose
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def built(map_points, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("served")
+    write_cloud(folder / "yard.las", map_points + np.array([512_003.0, 5_120_005.0, 100.0]))
+    build_site(folder / "yard.las", folder / "yard", map_preset("slam", learned=False))
+    return folder / "yard"
+
+
+@pytest.fixture
+def site(built, tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("coview_stream.basemap.site.mirror._WAIT", 0.0)
+    monkeypatch.setattr("coview_stream.stream.maps.map_server._LOOK", 0.05)
+    monkeypatch.setattr("coview_stream.stream.maps.zenoh_source._TIMEOUT", 5.0)
+    return shutil.copytree(built, tmp_path / "yard")
+
+
+@pytest.fixture
+def endpoint():
+    return free_endpoint()
+
+
+@pytest.fixture
+def server(site, endpoint):
+    made = MapServer(site, MapKeys.of("yard"), listen=[endpoint])
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def source(endpoint):
+    made = source_of(f"zenoh://{endpoint.removeprefix('tcp/')}/yard")
+    yield made
+    made.close()
+
+
+def test_site_is_fetched_and_its_server_may_go(server, source, site):
+    mirror = Mirror(source)
+    path = mirror.open()
+    assert Manifest.load(path) == Manifest.load(site)
+    assert server.answered == 1 + len(Manifest.load(site).hashes())
+    stations = len(BaseMap.load(path))
+    server.close()
+    with pytest.warns(UserWarning, match="no map server answers"):
+        assert Mirror(source).open() == path
+    assert len(BaseMap.load(path)) == stations
+
+
+def test_only_the_manifest_and_named_layers_are_given(server, source, site, endpoint):
+    (site / "layers" / "secret").write_bytes(b"not for you")
+    (site / "secret").write_bytes(b"not for you")
+    session = zenoh.open(compose([endpoint]))
+    try:
+        for key in (
+            "coview/maps/yard/secret", "coview/maps/yard/layers/secret", "coview/maps/yard/layers/" + "0" * 64,
+            "coview/maps/yard/layers/*", "coview/maps/other/manifest",
+        ):  # fmt: skip
+            assert [reply for reply in session.get(key, timeout=2.0) if reply.ok] == [], key
+        found = [reply.ok for reply in session.get("coview/maps/*/manifest", timeout=2.0)]
+        assert [str(each.key_expr) for each in found] == ["coview/maps/yard/manifest"]
+    finally:
+        session.close()
+    with pytest.raises(TransportError, match="no map server answers"):
+        source.layer("0" * 64, 10)
+
+
+def test_damaged_layer_is_told_by_the_server_and_never_used(server, source, site):
+    layer = Manifest.load(site).tiles[0].layers["cloud"]
+    path = TileStore(site).path(layer.sha256)
+    path.write_bytes(b"x" * layer.bytes)
+    with pytest.raises(TransportError, match="damaged or swapped"):
+        Mirror(source).open()
+
+
+def test_answer_that_is_too_large_is_not_read(server, source, site):
+    layer = Manifest.load(site).tiles[0].layers["cloud"]
+    with pytest.raises(TransportError, match="bytes, 10 at most"):
+        source.layer(layer.sha256, 10)
+
+
+def test_change_of_the_site_is_followed_and_an_outage_is_told(server, source, site):
+    mirror = Mirror(source)
+    mirror.open()
+    calls, stopping = [], threading.Event()
+    follower = MapFollower(mirror, lambda: calls.append(1), period=0.05)
+    thread = threading.Thread(target=follower.run, args=(stopping,))
+    thread.start()
+    try:
+        whole = Manifest.load(site)
+        replace(whole, tiles=whole.tiles[1:]).save(site)
+        until(lambda: calls)
+        assert Manifest.load(mirror.directory).tiles == whole.tiles[1:]
+        (site / "manifest.json").write_text("{}")  # the server goes on with the one before
+        until(lambda: follower.last["result"] == "current")
+        server.close()
+        until(lambda: follower.last["result"] == "unreachable")
+        assert "no map server answers" in follower.last["error"]
+        assert len(calls) == 1
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def test_addresses(endpoint):
+    source = source_of("zenoh://yard", connect=[endpoint])
+    assert isinstance(source, ZenohSource)
+    assert source.name == f"zenoh://yard ({endpoint})"
+    for address in ("zenoh://host/yard", "zenoh://a*b", "ftp://x/y"):
+        with pytest.raises(ConfigError):
+            source_of(address)
+
+
+def test_command_says_what_it_serves_and_ends_with_a_signal(site, endpoint):
+    command = [sys.executable, "-m", "coview_stream", "serve-map", str(site), "--listen", endpoint, "--name", "north"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            line = process.stdout.readline()
+            assert line.startswith("coview/maps/north: ")
+            assert "4 tiles" in line
+            source = source_of(f"zenoh://{endpoint.removeprefix('tcp/')}/north")
+            assert Manifest.from_bytes(source.manifest(), "") == Manifest.load(site)
+            source.close()
+        finally:
+            process.send_signal(signal.SIGTERM)
+        assert process.wait(10.0) == 0
